@@ -16,13 +16,14 @@ barriers, waits; other: reciprocals, conversions, votes, special registers; scal
 @dataclass(frozen=True)
 class Instruction:
     """An instruction. target: the label that it may jump to. ends: True if the next instruction never follows it.
-    source: its line in the kernel's text, or 0 if unknown."""
+    source: its line in the kernel's text, 0 if unknown. control: NVIDIA's scheduling bits (`gpu_chain.py`), or 0."""
 
     name: str
     kind: str
     target: str = ""
     ends: bool = False
     source: int = 0
+    control: int = 0
 
 
 @dataclass
@@ -69,10 +70,11 @@ def kernel_of(blocks: list[Block]) -> Loop:
         return Loop([], set())
     after = _successors(blocks)
     dominators = _dominators(after)
+    reached = [block for block, found in enumerate(dominators) if 0 in found]  # not slow paths of divisions, padding
     bodies: dict[int, set[int]] = {}
     latches: dict[int, set[int]] = {}
-    for block, following in enumerate(after):
-        for head in following:
+    for block in reached:
+        for head in after[block]:
             if head in dominators[block]:
                 bodies.setdefault(head, {head}).update(_natural(after, head, block))
                 latches.setdefault(head, set()).add(block)
@@ -84,7 +86,8 @@ def kernel_of(blocks: list[Block]) -> Loop:
         (whole if outer is None else loops[outer]).inner.append(loops[head])
     for number, each in enumerate(blocks):
         inmost = next((head for head in reversed(nested) if number in bodies[head]), None)
-        (whole if inmost is None else loops[inmost]).blocks.append(each)
+        if number in reached:
+            (whole if inmost is None else loops[inmost]).blocks.append(each)
     return whole
 
 
@@ -194,7 +197,10 @@ def _classifier(kinds: tuple[tuple[str, str], ...]) -> Callable[[str], str]:
 
 sass_kind, gcn_kind = _classifier(SASS_KINDS), _classifier(GCN_KINDS)
 
-_SASS_LINE = re.compile(r"^\s+/\*[0-9a-f]+\*/\s+(?P<guard>@!?\w+\s+)?(?P<name>[A-Z][\w.]*)(?P<rest>[^;]*);")
+_SASS_LINE = re.compile(
+    r"^\s+/\*[0-9a-f]+\*/\s+(?P<guard>@!?\w+\s+)?(?P<name>[A-Z][\w.]*)(?P<rest>[^;]*);(\s*/\*(?P<upper>0x[0-9a-f]+))?"
+)
+_SASS_WORDS = re.compile(r"/\* 0x[0-9a-f]{16} \*/\s*/\* (0x[0-9a-f]{16}) \*/")
 _SASS_LABEL = re.compile(r"^(\.[\w$]+):")
 _SASS_SOURCE = re.compile(r'^\s*//## File "[^"]*", line (\d+)')
 _SECTION = re.compile(r"^\.text\.([\w$]+):")
@@ -204,7 +210,8 @@ _GCN_SOURCE = re.compile(r"^\s+\.loc\s+\d+\s+(\d+)")
 
 
 def parse_sass(text: str) -> dict[str, Loop]:
-    """Kernels by name, from the output of `nvdisasm -c`. They have source lines if compiled with -g."""
+    """Kernels by name, from the output of `nvdisasm -c -g -hex`: with source lines and scheduling bits."""
+    text = _SASS_WORDS.sub(r"/*\1*/", text)  # of an instruction's two words, the upper one has the bits
     return _parsed(text, (_SECTION, _SASS_SOURCE, _SASS_LABEL, _SASS_LINE), _sass)
 
 
@@ -247,7 +254,8 @@ def _sass(match: re.Match[str], source: int) -> Instruction:
     target = re.search(r"`\((\.[\w$]+)\)", rest) if family in ("BRA", "BRX", "JMP", "CALL") else None
     always = not match["guard"] and not re.match(r"\s*!?U?P[0-6]", rest)
     ends = always and (family in ("BRA", "BRX", "JMP", "EXIT", "RET") or target is not None)
-    return Instruction(name, sass_kind(name), target[1] if target else "", ends, source)
+    control = {"control": int(match["upper"], 16) >> 41} if match["upper"] else {}
+    return Instruction(name, sass_kind(name), target[1] if target else "", ends, source, **control)
 
 
 def _gcn(match: re.Match[str], source: int) -> Instruction:

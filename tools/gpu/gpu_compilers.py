@@ -201,7 +201,7 @@ def compile_source(source: Source, target: str, builtins: Path) -> list[Built]:
             return read_amd(written, target)
         ptxas = (nvidia("ptxas"), "-v", "-lineinfo", f"-arch={target}", *source.register_limit)
         told = run_checked([*ptxas, str(assembly), "-o", str(cubin)], what)
-        return read_nvidia(told, run_checked([nvidia("nvdisasm"), "-c", "-g", str(cubin)], what), target)
+        return read_nvidia(told, run_checked([nvidia("nvdisasm"), "-c", "-g", "-hex", str(cubin)], what), target)
 
 
 _FUNCTION = re.compile(

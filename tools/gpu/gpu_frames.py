@@ -2,19 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Count Gaussians, visible Gaussians, pairs and pixels of real frames, for the predictions of `gpu_static.py`.
 
-    python tools/gpu/gpu_frames.py NAME=PATH...
+    python tools/gpu/gpu_frames.py "made up, 1 M=synthetic:1000000:1600x1060" "fox, step 7000=PATH"...
 
-PATH is a run, a model or a scene, as for `clsplat bench`; its first view is rendered. `listed` counts the (tile,
-Gaussian) pairs in the tiles' lists, `walked` those up to the last pair that a pixel of the tile needs. The rows of
-these names in gpu_frames.json are replaced. Rows that were not counted are hypothetical frames with assumed counts. A
-row with `picture` is only rendered, not trained.
+PATH is a run, a model or a scene, as for `clsplat bench`; its first view is rendered. Or it is the bench's synthetic
+scene. `listed` counts the (tile, Gaussian) pairs in the tiles' lists, `walked` those up to the last pair that a pixel
+of the tile needs; `walk_of`, `visits_of` and `summary` explain the rest. The rows of these names in gpu_frames.json are
+replaced. A row with `picture` is only rendered, not trained; one with `held_out` is only compared with measurements. A
+frame that was measured elsewhere gets the numbers that it had there (`as_measured`).
 """
 
 from __future__ import annotations
 
 import json
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +24,16 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bench"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
+from gpu_measured import CALIBRATION
+from gpu_rules import BLOCKS, VISITS, WARPS
 from measuring import plain_parser, require, tool
 
-from clsplat.bench.workload import Subject, load_subject
+from clsplat.bench.workload import Subject, load_subject, synthetic
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import open_device
 from clsplat.files.atomic import atomic_write
-from clsplat.layouts.columns import TILE
+from clsplat.layouts.columns import SPLAT, TILE
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.device_gaussians import upload_gaussians
 
@@ -43,10 +48,18 @@ def count(name: str, subject: Subject) -> dict[str, Any]:
     frame = rasterizer.forward(gaussians, camera, upload(device, np.zeros(3, np.float32)), backward=False)
     require(len(frame.bands) == 1, f"{name}: the frame needs more memory than there is, expected one band")
     lists, counted = frame.listed.lists, frame.listed.counted
-    ranges = lists.ranges.get().astype(np.int64)
     stops = frame.blended.stops.get()
-    tiles = stops.reshape(stops.shape[0] // TILE, TILE, stops.shape[1] // TILE, TILE)
-    last = np.maximum(tiles.max(axis=(1, 3)).ravel(), ranges[:, 0])
+    tiles = stops.reshape(stops.shape[0] // TILE, TILE, stops.shape[1] // TILE, TILE).swapaxes(1, 2)
+    splats, order = frame.projected.splats.get(), lists.gaussian_from_sorted.get()
+    walks = [
+        walk_of(splats[order[begin:end]], tile - begin, np.array(place[::-1]) * TILE)
+        for (begin, end), tile, place in zip(
+            lists.ranges.get().astype(np.int64),
+            tiles.reshape(-1, TILE, TILE),
+            np.ndindex(tiles.shape[:2]),
+            strict=True,
+        )
+    ]
     return {
         "name": name,
         "width": camera.width,
@@ -55,9 +68,102 @@ def count(name: str, subject: Subject) -> dict[str, Any]:
         "sh_degree": subject.gaussians.sh_degree,
         "visible": counted.visible,
         "listed": counted.pairs,
-        "walked": int((last - ranges[:, 0]).sum()),
         "key_bits": counted.key_bits,
+        **summary(np.array(walks)),
     }
+
+
+WALK = ("walked", "reached", "taken", "halves", "longer_reached", "longer_taken")
+"""Counts of a tile: walked pairs; over these, blocks of 8x4 pixels that the ellipse reaches while one of their pixels
+is not finished, and those with a pixel that takes the pair; halves of the tile (warps of 1x64, which own every other
+column of blocks) that it reaches; and the blocks of the half with more of them."""
+
+
+def walk_of(splats: np.ndarray, stops: np.ndarray, corner: np.ndarray) -> list[int]:
+    """WALK of a tile, and VISITS for each of WARPS, of all warps and of the one with most blocks. splats: of its pairs,
+    front to back. stops (16, 16): the first pair that each pixel does not take. corner: x and y of the first pixel."""
+    walked = max(int(stops.max()), 0)
+    splats = splats[: -(-walked // LARGEST_BATCH) * LARGEST_BATCH]
+    field = dict(zip(SPLAT, splats.T[:, :, None, None], strict=False))
+    at = np.arange(TILE, dtype=np.float32) + np.float32(0.5)
+    dx = field["PIXEL_X"] - corner[0] + field["SUB_X"] - at
+    dy = field["PIXEL_Y"] - corner[1] + field["SUB_Y"] - at[:, None]
+    power = field["LOG2O"] - (field["L11"] * dx + field["L12"] * dy) ** 2 - (field["L22"] * dy) ** 2
+    reaches = power >= np.log2(RasterizerConfig().alpha_min)
+    pair = np.arange(len(splats))[:, None, None]
+    ellipse, takes, ends = (_blocks(each) for each in (reaches, reaches & (pair < stops), reaches & (pair <= stops)))
+    last = _blocks(stops[None], np.max)
+    back = ellipse & (pair[:, 0] < last)
+    found = (each[:walked].reshape(-1, BLOCKS // 2, 2).sum(1) for each in (ellipse, back, takes))
+    halves, reached, taken = found
+    more = reached.argmax(1)[:, None]
+    longer = (int(np.take_along_axis(each, more, 1).sum()) for each in (reached, taken))
+    walk = [walked, int(reached.sum()), int(taken.sum()), int((halves > 0).sum()), *longer]
+    return walk + [count for warps in WARPS for count in visits_of(warps, ellipse, ends, back, last)]
+
+
+LARGEST_BATCH = 256
+"""BATCH in blocks.h of the largest of WARPS."""
+
+
+def _blocks(pixels: np.ndarray, over: Callable[..., np.ndarray] = np.any) -> np.ndarray:
+    """Reduce pixels (n, 16, 16) to blocks (n, BLOCKS)."""
+    return over(pixels.reshape(-1, TILE // 4, 4, TILE // 8, 8), axis=(2, 4)).reshape(-1, BLOCKS)
+
+
+def visits_of(warps: int, ellipse: np.ndarray, ends: np.ndarray, back: np.ndarray, last: np.ndarray) -> list[int]:
+    """VISITS of a tile, and those of its warp with most blocks. Of pairs and blocks (n, BLOCKS): those that the
+    ellipse reaches, those in which a pixel takes it or is finished by it, and those that the gradient visits. last (1,
+    BLOCKS): the largest stop."""
+    batch, owned = max(64, 32 * warps), BLOCKS // warps
+    live = last >= np.arange(len(ellipse))[:, None] // batch * batch
+    shape = (-1, owned, warps)
+    reached, taken, gradient = (each.reshape(shape).sum(1) for each in (ellipse & live, ends & live, back))
+    dense = reached > (owned // 2)
+    of_warp = np.stack(
+        [(reached > 0).sum(0), dense.sum(0), (reached * ~dense).sum(0), (taken * ~dense).sum(0), (gradient > 0).sum(0)]
+    )
+    return [*map(int, of_warp.sum(1)), *map(int, of_warp[:, reached.sum(0).argmax()])]
+
+
+def summary(walks: np.ndarray) -> dict[str, Any]:
+    """Keys of a frame's row, from WALK and VISITS of its tiles (tiles, counts). Of the slowest tile, which has the most
+    pairs and blocks in one half: its pairs, and the counts of its longer half or longest warp. All other counts are per
+    walked pair; those of VISITS are lists over WARPS."""
+    walked = walks[:, 0]
+    slowest = walks[walks[:, (0, 4, 5)].sum(1).argmax()]
+    mean, longest = (each / max(each[0], 1) for each in (walks.sum(0), slowest))
+    visits = len(WALK) + np.arange(2 * len(WARPS) * len(VISITS)).reshape(len(WARPS), 2, len(VISITS))
+    return {
+        "walked": int(walked.sum()),
+        **{name: round(float(value), 3) for name, value in zip(WALK[1:4], mean[1:4], strict=True)},
+        "list_99": int(np.percentile(walked, 99)),
+        "longest": int(walked.max()),
+        "slowest": int(slowest[0]),
+        **{name: round(float(value), 3) for name, value in zip(WALK[4:], longest[4 : len(WALK)], strict=True)},
+        **{name: mean[visits[:, 0, k]].round(3).tolist() for k, name in enumerate(VISITS)},
+        **{f"longest_{name}": longest[visits[:, 1, k]].round(3).tolist() for k, name in enumerate(VISITS)},
+    }
+
+
+def as_measured(row: Mapping[str, Any], calibration: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The row of a frame, with the numbers of Gaussians, visible ones and listed pairs of the frame of this name that
+    was measured, if any, and with lists as much longer as it has more pairs. counted: the model's own Gaussians."""
+    scenes = (scene for measured in calibration for scene in measured["scenes"])
+    scene = next((each for each in scenes if each.get("frame") == row["name"] and "pairs" in each), None)
+    if scene is None:
+        return dict(row)
+    longer = scene["pairs"]["listed"] / row["listed"]
+    lists = {name: round(row[name] * longer) for name in ("walked", "list_99", "longest", "slowest")}
+    numbers = {"gaussians": scene["gaussians"], "visible": scene["visible"], "listed": scene["pairs"]["listed"]}
+    return {**row, **numbers, **lists, "counted": row["gaussians"]}
+
+
+def subject_of(path: str) -> Subject:
+    """The subject at a path, or the bench's synthetic scene as `synthetic:COUNT:WIDTHxHEIGHT`."""
+    if made := re.fullmatch(r"synthetic:(\d+):(\d+)x(\d+)", path):
+        return synthetic(*map(int, made.groups()))
+    return load_subject(Path(path))
 
 
 @tool("gpu_frames")
@@ -69,10 +175,13 @@ def main(arguments: Sequence[str]) -> int:
     for text in parser.parse_args(arguments).subjects:
         name, equals, path = text.partition("=")
         require(bool(name and equals and path), f"{text}: expected NAME=PATH")
-        frames[name] = count(name, load_subject(Path(path)))
+        row = as_measured(count(name, subject_of(path)), json.loads(CALIBRATION.read_text()))
+        frames[name] = {**frames.get(name, {}), **row}
         print(json.dumps(frames[name]))
     rows = sorted(frames.values(), key=lambda row: (row.get("picture", False), row["gaussians"]))
-    atomic_write(FRAMES, (json.dumps({"frames": rows}, indent=2) + "\n").encode())
+    text = json.dumps({"frames": rows}, indent=2)
+    text = re.sub(r"\[\s+([\d.,\s]+?)\s+\]", lambda match: f"[{' '.join(match[1].split())}]", text)  # a list a line
+    atomic_write(FRAMES, (text + "\n").encode())
     return 0
 
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from gpu_assembly import CLASSES, Loop
+from gpu_assembly import CLASSES, Block, Instruction, Loop
+from gpu_chain import ENDLESS, NEAR, NOTHING, Chain, chain_of
 from gpu_compilers import Built
-from gpu_rules import BY_ITEM, BY_PAIR, EVERYWHERE, Rule, Run
+from gpu_rules import BY_ITEM, BY_PAIR, EVERYWHERE, Rule, Run, lines_touched
 
 from clsplat.errors import ClsplatError
 
@@ -25,11 +26,13 @@ class UnknownLoopError(ClsplatError):
 @dataclass(frozen=True)
 class Cost:
     """Average number of instructions by class that a wave runs. once: outside of loops. rounds: in loops. rules: the
-    rules that apply to a loop or branch."""
+    rules that apply to a loop or branch. first, then: the chain of a warp outside of loops, and in them."""
 
     once: Counter[str]
     rounds: Counter[str]
     rules: frozenset[Rule]
+    first: Chain = NOTHING
+    then: Chain = NOTHING
 
 
 def rules_of(kernel: str) -> tuple[Rule, ...]:
@@ -67,12 +70,17 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
     unknown: list[str] = []
     parts = [rule for rule in rules if rule.part]
     used: set[Rule] = set()
-    once = _share(built.whole, lines, parts, run, used)
+    then = NOTHING
+
+    def shared(loop: Loop) -> list[tuple[Block, float]]:
+        return list(_shares(loop, lines, parts, run, used))
+
+    def lines_of(each: Instruction) -> float:
+        return lines_touched(each, lines[each.source - 1] if each.source else "", run)
 
     def visit(outer: Loop, outer_rounds: float) -> None:
+        nonlocal then
         for loop in outer.inner:
-            if loop.size <= 1 and not loop.inner:  # a jump to itself after the end of the kernel
-                continue
             matching = [rule for rule in rules if not rule.part and rule.opens(loop, lines)]
             if len(matching) != 1:
                 unknown.append(_title(loop, lines))
@@ -81,8 +89,10 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
             twins = [each for each in outer.inner if matching[0].opens(each, lines) and _same(each, loop, lines)]
             times = outer_rounds if matching[0].inner else 1
             factor = times * matching[0].rounds(run) / _unrolled(loop, matching[0], twins)
-            for kind, count in _share(loop, lines, parts, run, used).items():
+            blocks = shared(loop)
+            for kind, count in _counts(blocks).items():
                 rounds[kind] += factor * count  # type: ignore[assignment]
+            then += chain_of(blocks, lines_of, 2, NEAR if matching[0].near else ENDLESS).times(factor)
             visit(loop, factor)
 
     visit(built.whole, 1)
@@ -91,7 +101,8 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
             f"{built.kernel} for {built.target} in groups of {run.items}: no rule of tools/gpu/gpu_rules.py, or more "
             f"than one, is for {'; '.join(unknown)}"
         )
-    return Cost(once, rounds, frozenset(used))
+    whole = shared(built.whole)
+    return Cost(_counts(whole), rounds, frozenset(used), chain_of(whole, lines_of, 1), then)
 
 
 def unused_rules(used: Mapping[str, Iterable[Rule]]) -> list[str]:
@@ -111,16 +122,22 @@ def _title(loop: Loop, lines: Sequence[str]) -> str:
     return f"the loop of {' or '.join(named) or 'an unknown line'} ({loop.size} instructions)"
 
 
-def _share(loop: Loop, lines: Sequence[str], parts: Sequence[Rule], run: Run, used: set[Rule]) -> Counter[str]:
+def _shares(
+    loop: Loop, lines: Sequence[str], parts: Sequence[Rule], run: Run, used: set[Rule]
+) -> Iterator[tuple[Block, float]]:
+    """The blocks of a loop, each with the fraction of rounds that run it."""
+    for block in loop.blocks:
+        inside = [rule for rule in parts if rule.holds({each.source for each in block.body}, lines)]
+        used.update(inside)
+        yield block, inside[0].rounds(run) if inside else 1
+
+
+def _counts(blocks: Iterable[tuple[Block, float]]) -> Counter[str]:
     """Instructions by class in a round, weighted by how often each runs."""
     counts: Counter[str] = Counter()
-    for block in loop.blocks:
-        sources = {each.source for each in block.body}
-        inside = [rule for rule in parts if any(rule.matches(number, lines) for number in sources)]
-        used.update(inside)
-        factor = inside[0].rounds(run) if inside else 1
+    for block, share in blocks:
         for each in block.body:
-            counts[each.kind] += factor  # type: ignore[assignment]
+            counts[each.kind] += share  # type: ignore[assignment]
     return counts
 
 

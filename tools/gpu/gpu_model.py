@@ -1,44 +1,114 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Predict the milliseconds of a training step on a GPU from its instructions and from the bytes that it moves.
+"""Predict the milliseconds of a training step on a GPU, and fit the model's few constants to measured steps.
 
-The model assumes that every unit starts the maximum number of instructions in each cycle at its boost clock, that
-memory has the bandwidth of its data sheet, and that each launch reads and writes its arrays once. Nothing ever waits:
-ratios can be trusted, but real times are longer.
+A launch takes the time of its bytes, and after that the longest of: starting its instructions, looking up its cache
+lines, starting its groups, and the chains of its warps (`gpu_chain.py`), as many at a time as fit, or the chain of the
+slowest tile's alone. No launch takes less than LAUNCH. Bytes are added because an H100 and an H200, which differ in
+nothing but memory, differ in each stage by the time of its bytes. Every constant is shared by all stages.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import Any
 
+from gpu_chain import NOTHING, Chain
 from gpu_compilers import Built, Source
-from gpu_devices import ARCHITECTURES, Gpu
+from gpu_devices import ARCHITECTURES, Gpu, waves_at_a_time
 from gpu_loops import Cost, cost_of, rules_of
-from gpu_rules import BY_PAIR, NUMBERS, Run
+from gpu_rules import BLOCKS, BY_PAIR, NUMBERS, VISITS, WARPS, Run
 
 from clsplat.layouts.columns import TILE
 
 COPIES = ("write", "read")
 """Transfers between host and device, which are not predicted."""
+LAUNCH = 0.003
+"""Least milliseconds of a launch: those of the shortest in docs/gpus/calibration.json."""
+LINES = 2
+"""Cache lines that a unit looks up per cycle."""
+DRIVERS_ITEMS = 256
+"""Items per group where the driver chooses."""
+
+
+@dataclass(frozen=True)
+class Constants:
+    """efficiency: fraction of a unit's issue slots that are used when it has enough to do. access: nanoseconds of an
+    access to global memory. host: milliseconds in which the host queues a launch. copy: fraction of the data sheet's
+    bandwidth. groups: started per cycle."""
+
+    efficiency: float = 0.71
+    access: float = 600
+    host: float = 0.04
+    copy: float = 0.9
+    groups: float = 0.83
+
+
+FITTED = {"efficiency": (0.5, 1, 0.01), "access": (100, 1000, 10), "host": (0.005, 0.1, 0.001)}
+"""The constants that are fitted: lower and upper limit, and step."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Milliseconds of a stage for instructions and for bytes, and its number of launches, including fills."""
+    """Milliseconds of a stage: for instructions, for bytes, of its warps' chains, and in all; its number of launches,
+    including fills."""
 
     issue: float = 0.0
     memory: float = 0.0
+    chain: float = 0.0
+    ms: float = 0.0
     launches: int = 0
 
-    @property
-    def both(self) -> float:
-        """The sum of both times, as if they did not overlap."""
-        return self.issue + self.memory
-
     def __add__(self, other: Stage) -> Stage:
-        return Stage(self.issue + other.issue, self.memory + other.memory, self.launches + other.launches)
+        return Stage(*(getattr(self, each.name) + getattr(other, each.name) for each in fields(Stage)))
+
+
+@dataclass(frozen=True)
+class Work:
+    """The work of a launch. kernel: its name, of a fill `fill`. instructions: of all waves. resident: waves that
+    fit in a unit. chain: of an average wave. longest: of a wave in the slowest tile."""
+
+    stage: str
+    bytes: float
+    instructions: float = 0.0
+    waves: float = 1.0
+    groups: float = 0.0
+    resident: int = 1
+    chain: Chain = NOTHING
+    longest: Chain = NOTHING
+    kernel: str = ""
+
+    def on(self, gpu: Gpu, constants: Constants) -> Stage:
+        """The launch's part of its stage."""
+        rounds = max(self.waves / gpu.units / self.resident, 1)
+        waited = (
+            each.cycles + each.accesses * constants.access * gpu.ghz
+            for each in (self.chain.times(rounds), self.longest)
+        )
+        issue, chain = self.instructions / gpu.issued / constants.efficiency, max(waited) / gpu.ghz * 1e-6
+        lines = self.waves * self.chain.lines / LINES / gpu.units / gpu.ghz * 1e-6
+        starts = self.groups / constants.groups / gpu.ghz * 1e-6
+        memory = self.bytes / gpu.gb / constants.copy * 1e-6
+        return Stage(issue, memory, chain, max(LAUNCH, memory + max(issue, lines, starts, chain)), 1)
+
+
+def blocks_of(frame: Mapping[str, Any], items: int) -> dict[str, Any]:
+    """The numbers of a frame that tell how a group's warps walk a pair. A group has a warp for each 32 items."""
+    warps = max(items // 32, 1)
+    found = {name: frame[name][WARPS.index(warps)] for name in VISITS}
+    for name in ("visits", "dense", "visits_back"):
+        found[name] /= warps
+    return {"reached": frame["reached"], "taken": frame["taken"], **found}
+
+
+def longest_of(frame: Mapping[str, Any], items: int) -> dict[str, Any]:
+    """The same, as if each warp had the pairs of the longest one in the slowest tile."""
+    warps = max(items // 32, 1)
+    longest = {name: [value * warps for value in frame[f"longest_{name}"]] for name in VISITS}
+    halves = {name: BLOCKS / 4 * frame[f"longer_{name}"] for name in ("reached", "taken")}
+    return blocks_of({**longest, **halves}, items)
 
 
 def run_of(frame: Mapping[str, Any], launch: Mapping[str, Any], items: int, wave: int) -> Run:
@@ -50,6 +120,7 @@ def run_of(frame: Mapping[str, Any], launch: Mapping[str, Any], items: int, wave
         wave,
         addends=frame["listed"] / max(frame["visible"], 1),
         listed=frame["walked"] / tiles,
+        **blocks_of(frame, items),
         coefficients=(frame["sh_degree"] + 1) ** 2,
         groups=math.prod(launch["size"]) // items,
         **{name: numbers[name] for name in ("elements", "digits") if name in numbers},
@@ -66,29 +137,81 @@ def issued(cost: Cost, target: str) -> tuple[float, float]:
     return once, rounds
 
 
-def predict(
+def works_of(
     launches: Iterable[Mapping[str, Any]],
     built: Mapping[tuple[Source, str], Built],
     frame: Mapping[str, Any],
-    gpu: Gpu,
-) -> dict[str, Stage]:
-    """The stages of a step in order, from its launches (`gpu_variants.py`) and kernels compiled for the GPU."""
-    stages: dict[str, Stage] = {}
-    wave = ARCHITECTURES[gpu.target].wave
+) -> list[Work | None]:
+    """The work of a step's launches in order (`gpu_variants.py`), with kernels compiled for one target. None: the host
+    waits for a number, as in a frame; a step does not (decision 0025)."""
+    works: list[Work | None] = []
+    costs = cache(lambda source, name, run: cost_of(built[source, name], source.lines, rules_of(name), run))
     for launch in launches:
-        if launch["kernel"] in COPIES:
-            continue
-        instructions = 0.0
         if "stem" in launch:
-            source, name = Source(launch["stem"], tuple(launch["options"])), launch["kernel"]
-            run = run_of(frame, launch, source.items, wave)
-            once, rounds = issued(cost_of(built[source, name], source.lines, rules_of(name), run), gpu.target)
-            waves = math.prod(launch["size"]) / wave
-            if name in BY_PAIR:
-                waves = max(waves, math.prod(launch["size"]) / source.items)
-                instructions = waves * once + frame["walked"] * rounds * run.waves
-            else:
-                instructions = waves * (once + rounds)
-        stage = Stage(instructions / gpu.issued, launch["bytes"] / gpu.gb * 1e-6, 1)
-        stages[launch["stage"]] = stages.get(launch["stage"], Stage()) + stage
+            kernel = built[Source(launch["stem"], tuple(launch["options"])), launch["kernel"]]
+            works.append(_work_of(launch, kernel, frame, costs))
+        elif launch["kernel"] not in COPIES:
+            works.append(Work(launch["stage"], launch["bytes"], kernel=launch["kernel"]))
+        elif launch["kernel"] == "read":
+            works.append(None)
+    return works
+
+
+def _work_of(
+    launch: Mapping[str, Any], kernel: Built, frame: Mapping[str, Any], costs: Callable[[Source, str, Run], Cost]
+) -> Work:
+    source, name = Source(launch["stem"], tuple(launch["options"])), launch["kernel"]
+    wave = ARCHITECTURES[kernel.target].wave
+    run = run_of(frame, launch, source.items, wave)
+    items, size = math.prod(launch["local"] or (DRIVERS_ITEMS,)), math.prod(launch["size"])
+    waves, pairs, longest = size / wave, 1.0, NOTHING
+    cost = costs(source, name, run)
+    once, rounds = issued(cost, kernel.target)
+    if name in BY_PAIR:
+        waves = max(waves, size / source.items)
+        pairs = frame["walked"] * run.waves / waves
+        slow = costs(source, name, replace(run, listed=frame["slowest"], **longest_of(frame, source.items)))
+        longest = slow.first + slow.then.times(frame["slowest"])
+    return Work(
+        launch["stage"],
+        launch["bytes"],
+        waves * (once + rounds * pairs),
+        waves,
+        size / items,
+        max(waves_at_a_time(kernel, items, launch["shared"]), 1),
+        cost.first + cost.then.times(pairs),
+        longest,
+        name,
+    )
+
+
+def stages_of(works: Iterable[Work | None], gpu: Gpu, constants: Constants) -> dict[str, Stage]:
+    """The stages of a step in order."""
+    stages: dict[str, Stage] = {}
+    for work in filter(None, works):
+        stages[work.stage] = stages.get(work.stage, Stage()) + work.on(gpu, constants)
     return stages
+
+
+def wall(works: Iterable[Work | None], gpu: Gpu, constants: Constants) -> float:
+    """Milliseconds until all is done. A launch begins when the host has queued it and the one before is done."""
+    queued = done = 0.0
+    for work in works:
+        if work is None:
+            queued = max(queued, done)
+        else:
+            queued += constants.host
+            done = max(queued, done) + work.on(gpu, constants).ms
+    return done
+
+
+def fit(error: Callable[[Constants], float], begin: Constants) -> Constants:
+    """The constants with the least error, one after the other until none changes."""
+    best = begin
+    while True:
+        before = best
+        for name, (low, high, step) in FITTED.items():
+            values = (round(low + step * k, 6) for k in range(round((high - low) / step) + 1))
+            best = min((replace(best, **{name: value}) for value in values), key=error)
+        if best == before:
+            return best

@@ -9,14 +9,16 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any
 
-from gpu_devices import GPUS, Gpu, occupancy
+from gpu_chain import NEAR
+from gpu_devices import GPUS, occupancy
 from gpu_intel import INTEL, IntelBuilt
-from gpu_model import Stage
+from gpu_measured import PARTS, WALLS, Fit, Measured, milliseconds
+from gpu_model import LAUNCH, LINES, Constants, Stage
 from plotting import plot_stacks
 
 from clsplat.errors import ClsplatError
 from clsplat.files.atomic import atomic_write
-from clsplat.gaussians import floats_of
+from clsplat.layouts.columns import TILE
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE, PLOT = ROOT / "docs/gpu-static.md", ROOT / "docs/images/gpu-static.svg"
@@ -24,19 +26,9 @@ SHAPE, TARGET, GPU = "1x64", "sm_89", "RTX 4090"
 """Shape, target and GPU of the tables that show only one."""
 LETTERS = 128
 """Length of a line of text."""
-PARTS = {
-    "project": ("project",),
-    "lists and sorts": ("duplicate", "ranges"),
-    "blend": ("blend",),
-    "loss": ("target", "loss"),
-    "blend_grad": ("blend_grad",),
-    "project_grad, Adam": ("project_grad", "adam"),
-    "statistics": ("statistics",),
-}
-"""Parts of a step, each a row of the table and a part of the plot's bars, with the names of their stages."""
 VKSPLAT, VKSPLAT_GPU = (19, 25, 25, 32, 130, 131, 5), "RTX 3090"
-"""Seconds of these parts in VkSplat's trainings of 30,000 steps: means of seven scenes, from its project's page."""
-WANTED, FRAMES_WANTED, LITEGS = 12, 200, 4.0
+"""Seconds of the parts in VkSplat's trainings of 30,000 steps: means of seven scenes, from its project's page."""
+WANTED, FRAMES_WANTED, LITEGS = 8, 400, 4.0
 """Maximum milliseconds of a step, and minimum pictures per second; milliseconds of a step of LiteGS."""
 
 Predictions = Mapping[tuple[str, str, str], Mapping[str, Stage]]
@@ -105,56 +97,36 @@ def parts_of(stages: Mapping[str, Stage]) -> dict[str, Stage]:
     """Milliseconds of the parts of a step. Raises ClsplatError for a stage that belongs to no part."""
     of_part = {stage: part for part, members in PARTS.items() for stage in members}
     if strange := [name for name in stages if name not in of_part]:
-        raise ClsplatError(f"stages {', '.join(strange)}: of no part in PARTS of gpu_page.py")
+        raise ClsplatError(f"stages {', '.join(strange)}: of no part in PARTS of gpu_measured.py")
     return {part: sum((stages[name] for name in members if name in stages), Stage()) for part, members in PARTS.items()}
-
-
-def _gpu(name: str) -> Gpu:
-    return next(gpu for gpu in GPUS if gpu.name == name)
 
 
 def stage_table(predictions: Predictions, frame: str) -> str:
     """Table of the milliseconds of each part of a step on one GPU, beside those of other programs."""
     now, other = (list(parts_of(predictions[SHAPE, gpu, frame]).items()) for gpu in (GPU, VKSPLAT_GPU))
-    lines = [["part", "launches", "issue, ms", "memory, ms", "sum, ms", f"{VKSPLAT_GPU}: sum, ms", "VkSplat there, ms"]]
+    lines = [["part", "launches", "issue, ms", "memory, ms", "chains, ms", "predicted, ms"]]
+    lines[0] += [f"{VKSPLAT_GPU}: predicted, ms", "VkSplat there, ms"]
     theirs = [seconds / 30 for seconds in VKSPLAT]
     for each in (now, other):
         each.append(("all", sum((stage for _, stage in each), Stage())))
     for (name, stage), (_, there), seen in zip(now, other, [*theirs, sum(theirs)], strict=True):
-        numbers = (f"{value:.2f}" for value in (stage.issue, stage.memory, stage.both, there.both, seen))
+        numbers = (f"{value:.2f}" for value in (stage.issue, stage.memory, stage.chain, stage.ms, there.ms, seen))
         lines.append([name, str(stage.launches), *numbers])
     return markdown(lines)
 
 
-def goals(rows: Sequence[Any], predictions: Predictions, frame: Mapping[str, Any], picture: str) -> str:
-    """A sentence each about a step and a picture, and about a step as fast as that of LiteGS."""
-    gpu = _gpu(GPU)
-    stages, drawn = (predictions[SHAPE, GPU, name] for name in (frame["name"], picture))
-    whole, shown = (sum(each.values(), Stage()) for each in (stages, drawn))
-    shown_rows = [row for row in rows if (row.built.target, row.source.shape) == (TARGET, SHAPE)]
-    pair = sum({row.built.kernel: row.a_pair for row in shown_rows if row.a_pair}.values())
-    hidden = frame["gaussians"] - frame["visible"]
-    saved = hidden * 4 * 6 * floats_of((frame["sh_degree"] + 1) ** 2) / gpu.gb * 1e-6
-    beside = [stage for name, stage in stages.items() if name not in ("blend", "blend_grad")]
-    left = LITEGS - sum(max(stage.issue, stage.memory) for stage in beside) + saved
-    instructions = max(left, 0) * gpu.issued / frame["walked"]
-    return "\n\n".join(
-        (
-            fill(
-                f"A step of the largest frame on an {GPU}: **{whole.both:.1f} ms** (wanted: at most {WANTED}), as if "
-                f"nothing hid behind anything. The picture of 1080p: **{1000 / shown.both:.0f} a second** (wanted: at "
-                f"least {FRAMES_WANTED}).",
-                LETTERS,
-            ),
-            fill(
-                f"LiteGS takes {LITEGS:.1f} ms a step there, mean of trainings that end at 1 M Gaussians. For as much "
-                "of this frame, memory and instructions would have to hide each other in each stage, rows of Gaussians "
-                f"that are not visible to stay as they are ({saved:.1f} ms), and blending with its gradient to take "
-                f"{left:.1f} ms: {instructions:.0f} instructions of a warp for a pair in place of {pair:.0f}.",
-                LETTERS,
-            ),
-        )
+def goals(predictions: Predictions, frame: str, picture: str) -> str:
+    """A sentence each about a step and a picture, and about LiteGS."""
+    stages, drawn = (predictions[SHAPE, GPU, name] for name in (frame, picture))
+    whole, shown = (sum(each.values(), Stage()).ms for each in (stages, drawn))
+    beside = whole - stages["blend"].ms - stages["blend_grad"].ms
+    told = (
+        f"A step of the largest frame on an {GPU}: **{whole:.1f} ms** (wanted: at most {WANTED}). The picture of "
+        f"1080p: **{1000 / shown:.0f} a second** (wanted: at least {FRAMES_WANTED}). LiteGS takes {LITEGS:.1f} ms a "
+        "step there, mean of trainings that end at 1 M Gaussians; all but blending and its gradient takes "
+        f"{beside:.1f} ms here."
     )
+    return fill(told, LETTERS)
 
 
 def device_table(predictions: Predictions, frames: Sequence[str], picture: str) -> str:
@@ -167,26 +139,79 @@ def device_table(predictions: Predictions, frames: Sequence[str], picture: str) 
     for gpu in GPUS:
         sums = [sum(predictions[shape, gpu.name, frame].values(), Stage()) for shape, frame in columns]
         drawn = sum(predictions[SHAPE, gpu.name, picture].values(), Stage())
-        cells = (f"{each.issue:.1f} + {each.memory:.1f}" for each in sums)
-        lines.append([gpu.name, *cells, f"{1000 / drawn.both:.0f}"])
+        lines.append([gpu.name, *(f"{each.ms:.1f}" for each in sums), f"{1000 / drawn.ms:.0f}"])
     return markdown(lines)
 
 
 def frame_table(frames: Sequence[Mapping[str, Any]]) -> str:
     """Table of the frames' counts."""
+    counts = ("gaussians", "visible", "listed", "walked")
     lines = [["frame", "pixels", "Gaussians", "visible", "pairs listed", "pairs walked"]]
+    lines[0] += ["list: mean, 99 %, longest", "blocks reached, taken", "halves reached"]
     for frame in frames:
+        tiles = -(-frame["width"] // TILE) * -(-frame["height"] // TILE)
+        lists = f"{frame['walked'] / tiles:.0f}, {frame['list_99']}, {frame['longest']}"
+        blocks = (f"{frame['reached']:.2f}, {frame['taken']:.2f}", f"{frame['halves']:.2f}")
         size = f"{frame['width']}x{frame['height']}"
-        lines.append(
-            [frame["name"], size, *(f"{frame[key]:,}" for key in ("gaussians", "visible", "listed", "walked"))]
-        )
+        numbers = [f"{frame[key]:,}" for key in counts]
+        if frame.get("counted", frame["gaussians"]) != frame["gaussians"]:
+            numbers[0] += f" (lists of {frame['counted']:,})"
+        lines.append([frame["name"], size, *numbers, lists, *blocks])
     return markdown(lines)
 
 
-def gpu_table() -> str:
+def gpu_table(measured: Sequence[Measured]) -> str:
     """Table of the devices' data."""
-    lines = [["GPU", "code for", "units", "instructions a cycle and unit", "GHz", "GB/s"]]
-    lines += [[g.name, g.target, str(g.units), str(g.issue), f"{g.ghz:g}", f"{g.gb:g}"] for g in GPUS]
+    lines = [["GPU", "code for", "units", "instructions a cycle and unit", "GHz", "GB/s", "constants"]]
+    held = {each.gpu for each in measured}
+    for g in GPUS:
+        how = "measured" if g in held else "assumed" if g.target.startswith("sm_") else "assumed, without chains"
+        lines.append([g.name, g.target, str(g.units), str(g.issue), f"{g.ghz:g}", f"{g.gb:g}", how])
+    return markdown(lines)
+
+
+def constant_table(constants: Constants) -> str:
+    """Table of the model's constants."""
+    lines = [
+        ["constant", "value", "from"],
+        ["issue slots used where there is enough to do", f"{constants.efficiency:.0%}", "fit"],
+        ["an access to global memory", f"{constants.access:.0f} ns", "fit"],
+        ["an access to lines that the unit has just read", f"{NEAR} cycles", "H100, a chain of loads"],
+        ["the host queues a launch", f"{constants.host * 1e3:.0f} µs", "fit"],
+        ["a launch, at least", f"{LAUNCH * 1e3:.0f} µs", "H100, its shortest kernels"],
+        ["memory, of the data sheet's bandwidth", f"{constants.copy:.0%}", "H100, copying"],
+        ["groups started a cycle", f"{constants.groups:.2f}", "H100, empty groups"],
+        ["lines looked up a cycle and unit", f"{LINES}", "assumed; `project` agrees"],
+    ]
+    return markdown(lines)
+
+
+def measured_table(measured: Sequence[Measured], constants: Constants, unused: Sequence[str]) -> str:
+    """Table of what was measured and is predicted, each with their ratio, and a sentence about what is not used."""
+    lines = [["stage", *(f"{each.gpu.name}, {each.frame}: measured, predicted, ratio" for each in measured)]]
+    predicted = [each.predicted(constants) for each in measured]
+    for name in (*PARTS, *WALLS):
+        cells = []
+        for each, found in zip(measured, predicted, strict=True):
+            ms = each.ms.get(name)
+            cells.append("" if ms is None else f"{ms:.3f}, {found[name]:.3f}, **{found[name] / ms:.2f}**")
+        lines.append([name, *cells])
+    told = f"Code: {' and '.join(sorted({each.code for each in measured}))}. "
+    told += f"Not used: {'; '.join(unused)}." if unused else "Every row is used."
+    return f"{markdown(lines)}\n\n{fill(told, LETTERS)}"
+
+
+def now_table(measured: Sequence[Measured], constants: Constants) -> str:
+    """Table of the predictions of the code that was measured, and of the present kernels, with their ratio."""
+    held = [each for each in measured if each.now]
+    lines = [["stage", *(f"{each.gpu.name}, {each.frame}: then, now, ratio" for each in held)]]
+    pairs = [[milliseconds(works, each.gpu, constants) for works in (each.works, each.now)] for each in held]
+    for name in (*PARTS, *WALLS):
+        cells = []
+        for each, (then, now) in zip(held, pairs, strict=True):
+            of_both = f"{then[name]:.3f}, {now[name]:.3f}, **{now[name] / then[name]:.2f}**" if name in each.ms else ""
+            cells.append(of_both)
+        lines.append([name, *cells])
     return markdown(lines)
 
 
@@ -209,8 +234,9 @@ def _between(text: str) -> Callable[[re.Match[str]], str]:
 
 
 def trained_and_picture(frames: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str, Any]], str]:
-    """The frames that are trained, the largest last, and the name of the frame that is only rendered."""
-    trained = [frame for frame in frames if not frame.get("picture")]
+    """The frames that are trained, the largest last, and the name of the frame that is only rendered. Frames that are
+    held out of the fit are only compared with what was measured."""
+    trained = [frame for frame in frames if not frame.get("picture") and not frame.get("held_out")]
     return trained, next(frame["name"] for frame in frames if frame.get("picture"))
 
 
@@ -218,7 +244,7 @@ def missed_goals(predictions: Predictions, frames: Sequence[Mapping[str, Any]]) 
     """Descriptions of the goals that the predictions miss."""
     trained, picture = trained_and_picture(frames)
     largest = trained[-1]["name"]
-    step, shown = (sum(predictions[SHAPE, GPU, name].values(), Stage()).both for name in (largest, picture))
+    step, shown = (sum(predictions[SHAPE, GPU, name].values(), Stage()).ms for name in (largest, picture))
     found = []
     if step > WANTED:
         found.append(f"{largest}, {SHAPE}, {GPU}: {step:.1f} ms a step predicted, expected at most {WANTED}")
@@ -232,6 +258,7 @@ def tables_of(
     predictions: Predictions,
     frames: Sequence[Mapping[str, Any]],
     compilers: str,
+    fitted: Fit,
     intel: Sequence[IntelBuilt] = (),
 ) -> dict[str, str]:
     """The page's tables, keyed by name. compilers: their versions. intel: empty to omit Intel's table."""
@@ -243,9 +270,12 @@ def tables_of(
         "pairs": pair_table(rows),
         "frames": frame_table(frames),
         "stages": stage_table(predictions, largest),
-        "goals": goals(rows, predictions, trained[-1], picture),
+        "goals": goals(predictions, largest, picture),
         "steps": device_table(predictions, names, picture),
-        "devices": gpu_table(),
+        "devices": gpu_table(fitted[0]),
+        "constants": constant_table(fitted[1]),
+        "measured": measured_table(*fitted),
+        "now": now_table(*fitted[:2]),
     }
     if intel:
         tables["intel"] = intel_table(intel)
@@ -264,7 +294,7 @@ def write_page(tables: Mapping[str, str], predictions: Predictions, frames: Sequ
     atomic_write(PAGE, fill_in(PAGE.read_text("utf-8"), tables).encode())
     largest = trained_and_picture(frames)[0][-1]["name"]
     bars = {
-        gpu.name: {part: stage.both for part, stage in parts_of(predictions[SHAPE, gpu.name, largest]).items()}
+        gpu.name: {part: stage.ms for part, stage in parts_of(predictions[SHAPE, gpu.name, largest]).items()}
         for gpu in GPUS
     }
-    plot_stacks(PLOT, bars, f"A training step, {largest}, {SHAPE}: predicted", "ms: issue and memory added up")
+    plot_stacks(PLOT, bars, f"A training step, {largest}, {SHAPE}: predicted", "ms")

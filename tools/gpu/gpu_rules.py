@@ -8,7 +8,8 @@ that a rewritten kernel needs new rules (`gpu_loops.py`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,10 +17,18 @@ from clsplat.device.launch import DEFAULT_GROUP_ITEMS
 from clsplat.layouts.columns import LOSS_PARTS, PLAIN_SLOTS
 
 if TYPE_CHECKING:
-    from gpu_assembly import Loop
+    from gpu_assembly import Instruction, Loop
 
 PER_ITEM = 16
 """Keys per item in a tile of the radix sort: RUN in sort_radix.cl."""
+BLOCKS = 8
+"""Blocks of 8 x 4 pixels in a tile: BLOCK_COLUMNS * BLOCK_ROWS in blocks.h."""
+WARPS = (1, 2, 4, 8)
+"""Warps of a tile for which gpu_frames.json has counts."""
+VISITS = ("visits", "dense", "sparse_reached", "sparse_taken", "visits_back")
+"""These counts, of a walked pair: over the pairs of the batches that blending fetches, warps that walk the pair, and
+those for which it is dense (blocks.h); of the others, blocks that it reaches and blocks with a pixel that takes it or
+is finished by it; and warps that the gradient's walk does not skip."""
 _UNEVEN = 2
 """Estimated ratio of a wave's rounds, which are those of its longest item, to the rounds of an average item, if
 neighbouring Gaussians have all sizes."""
@@ -28,14 +37,24 @@ neighbouring Gaussians have all sizes."""
 @dataclass(frozen=True)
 class Run:
     """Numbers on which the rounds of a loop depend. items: per group. wave: items that run in step. subgroup: items
-    that exchange values. addends: pairs per visible Gaussian. listed: pairs per tile. coefficients: of SH. groups,
-    elements: of the launch. digits: of a pass of the sort."""
+    that exchange values. addends: pairs per visible Gaussian. listed: pairs per tile. reached, taken: of the blocks of
+    a pair's tile, those that its ellipse reaches, and those with a pixel that takes it; sparse_reached, sparse_taken:
+    only those of warps that walk it and for which it is not dense. visits, dense, visits_back: fractions of the tile's
+    warps that walk a pair, for which it is dense, and that the gradient's walk does not skip (`gpu_frames.py`).
+    coefficients: of SH. groups, elements: of the launch. digits: of a pass of the sort."""
 
     items: int
     wave: int = 32
     subgroup: int = 1
     addends: float = 12.5
     listed: float = math.inf
+    reached: float = BLOCKS
+    taken: float = BLOCKS
+    visits: float = 1
+    dense: float = 1
+    sparse_reached: float = 0
+    sparse_taken: float = 0
+    visits_back: float = 1
     coefficients: int = 16
     groups: int = 1
     elements: int = 1
@@ -104,8 +123,10 @@ class Rule:
     function: a part of the head of the function with the line, if several functions have such a line.
     part: True for a branch that contains the line; rounds is then the fraction of its loop's rounds that take it. Of
     several such rules the first counts.
+    alone: True for a branch that contains no other lines than this and `ends`.
     mark: number of instructions of a class in a round, such as ("shared", 2). A loop with more of them is unrolled.
     inner: True if rounds are per round of the enclosing loop.
+    near: True if it reads what the group's items have just read.
     """
 
     text: str
@@ -113,8 +134,10 @@ class Rule:
     ends: tuple[str, ...] = ()
     function: str = ""
     part: bool = False
+    alone: bool = False
     mark: tuple[str, int] | None = None
     inner: bool = False
+    near: bool = False
 
     def matches(self, number: int, lines: Sequence[str]) -> bool:
         """True if the rule matches the line with this number, counted from 1."""
@@ -122,6 +145,10 @@ class Rule:
             return False
         heads = (line for line in reversed(lines[: number - 1]) if line.startswith(_HEADS))
         return self.function in next(heads, "")
+
+    def holds(self, sources: Collection[int], lines: Sequence[str]) -> bool:
+        """True if the rule is for a branch with these source lines."""
+        return (all if self.alone else any)(self.matches(number, lines) for number in sources)
 
     def opens(self, loop: Loop, lines: Sequence[str]) -> bool:
         """True if a source line of the loop matches the rule."""
@@ -147,18 +174,37 @@ _BEFORE_PAIRS = (
     Rule("for (int first = last; first < end; first += ITEMS)", lambda run: 0),  # for pairs beyond the last
     Rule("RAISE_TO_GROUP_MAX(last)", lambda run: 0),  # once a tile
 )
+
+
+def _in_block(text: str, *ends: str) -> Rule:
+    return Rule(text, lambda run: run.reached / BLOCKS, (*ends, "return fma(a, b, c);"), part=True, alone=True)
+
+
+def _of_visit(text: str, share: Rounds) -> Rule:
+    return Rule(text, lambda run: share(run) / run.visits, part=True)
+
+
+def _visits_back(run: Run) -> float:
+    return run.visits_back if run.subgroup == 1 else 1  # an exchange needs every item
+
+
 BY_PAIR: dict[str, tuple[Rule, ...]] = {
     "blend": (
         Rule("for (int batch = begin", lambda run: run.batches, ends=("if (live == 0) break;",)),
         Rule("for (int j = ITEM; j < BATCH; j += ITEMS)", lambda run: run.fetches),
-        Rule("for (int k = 1; k <= count; ++k)", lambda run: 1),
-        Rule("ALL_CELLS(cell) { BLEND(", lambda run: 1, part=True),  # an ellipse that reaches every block
-        Rule("const floatL power = LOG2_ALPHA(", lambda run: 0, part=True),
-        Rule("p->t = goes_on ? after : -fabs(before);", lambda run: 0, part=True),
+        Rule("for (int k = 1; k <= count; ++k)", lambda run: run.visits),
+        _of_visit("for (int k = 1; k <= count; ++k)", lambda run: run.visits),
+        _of_visit("ALL_CELLS(cell) { BLEND(", lambda run: run.dense),
+        _of_visit("FOR_CELLS(cell, reach) {", lambda run: run.visits - run.dense),
+        _of_visit("p->t = goes_on ? after : -fabs(before);", lambda run: run.sparse_taken / BLOCKS),
+        _of_visit("const floatL power = LOG2_ALPHA(", lambda run: run.sparse_reached / BLOCKS),
     ),
     "blend_grad": (
         *_BEFORE_PAIRS,
         Rule("atomic_max(lasts", lambda run: 0),  # once a tile: AMD's compiler loops over a wave's items
+        Rule("const floatL before = p->t[cell] * inverse;", lambda run: run.taken / BLOCKS, part=True),
+        _in_block("TAKE_PAIR(reach)"),
+        Rule("SPLAT_STAGED(staged[first + j])", _visits_back, ("sums[field] = 0.0f;", "= sums[field];"), part=True),
         Rule("for (int batch = last", lambda run: run.batches),
         Rule("for (int j = ITEM; j < BATCH; j += ITEMS)", lambda run: run.fetches),
         Rule("for (int first = 0; first < count; first += TOGETHER)", lambda run: 1 / run.together),
@@ -266,7 +312,7 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
         Rule("for (uint tile_begin = begin; tile_begin < end; tile_begin += TILE)", lambda run: run.tiles),
         Rule("for (uint i = item; i < TILE; i += ITEMS)", lambda run: PER_ITEM * run.tiles, mark=("shared", 1)),
         Rule("digits >> bits > 1; bits += 4) sort_tile(", lambda run: run.tiles * math.ceil(math.log2(run.digits) / 4)),
-        Rule("for (uint i = item; i < count; i += ITEMS) {", _of_item),
+        Rule("for (uint i = item; i < count; i += ITEMS) {", _of_item, near=True),
     ),
     "ranges": (),
     "loss_ssim": (  # loops in groups of fewer items than parts
@@ -296,6 +342,25 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "density_statistics": (),
 }
 """Rules of the other kernels of a training step: rounds per item."""
+
+APART = (
+    (r"\bf\[0\]", 4 * 45),
+    (r"splat\[|rgb\[|fields\[k\]", 64),
+    (r"\+= slot\[|\[place\]|\[from\]|pair_ids\[pair_from|slots\[i\]|\[order\[|tile_counts\[i\];", 128),
+    (r"GATHER\(\w+, 3|FROM_CAMERA\(means|dc\[0\]", 12),
+    (r"GATHER\(quaternions", 16),
+)
+"""Bytes between what neighbouring items access, where a line of the kernel's text matches; 128 for scattered ones."""
+
+
+def lines_touched(each: Instruction, text: str, run: Run) -> float:
+    """Cache lines of 128 bytes that an instruction's items touch. text: its line in the kernel's text."""
+    if each.kind != "global":
+        return 0
+    width = next((bits // 8 for bits in (128, 64) if f".{bits}" in each.name), 4)
+    apart = next((apart for pattern, apart in APART if re.search(pattern, text)), width)
+    return run.wave * min(apart, 128) / 128
+
 
 NUMBERS = {
     "visible_sums": ("elements",),

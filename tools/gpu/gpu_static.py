@@ -5,6 +5,7 @@
     python tools/gpu/gpu_static.py [--shapes 1x64] [--targets sm_89,gfx1100] [--stems blend,...] [--loops] [--json]
     python tools/gpu/gpu_static.py --check
     python tools/gpu/gpu_static.py --page
+    python tools/gpu/gpu_static.py --inputs
     python tools/gpu/gpu_static.py --intel [--shapes 1x64] [--stems blend,...]
 
 The kernels are those of a training step, with clsplat's defines (`gpu_variants.py`). clang 19 compiles them to
@@ -13,9 +14,12 @@ are rounded correctly.
 
 Instructions per (tile, Gaussian) pair are those of all waves of a group, from its loops (`gpu_rules.py`). --intel
 prints a table from Intel's compiler, which reports less (`gpu_intel.py`). --page writes docs/gpu-static.md, with the
-times that `gpu_model.py` predicts. --check tests the ceilings below and the page's goals, and compares the page with
+times that `gpu_model.py` predicts, and fits the model's constants to docs/gpus/calibration.json on the way. --check
+tests the ceilings below, the page's goals, and the predictions against what was measured, and compares the page with
 current kernels. The exit status is 0 if all is as expected, 2 if a compiler is missing, and 1 if a ceiling is exceeded,
-a goal is missed, the page is out of date, a loop or rule lacks the other, or a compiler refuses a kernel.
+a goal is missed, a prediction is too far off, the page is out of date, a loop or rule lacks the other, or a compiler
+refuses a kernel.
+--inputs completes the new rows of docs/gpus/calibration.json, in a checkout of the code that was measured.
 """
 
 from __future__ import annotations
@@ -41,11 +45,13 @@ from gpu_compilers import TARGETS, Built, Source, ask_package, build_builtins, c
 from gpu_devices import ARCHITECTURES, GPUS, occupancy
 from gpu_intel import IntelBuilt, compiled_for_intel, ocloc
 from gpu_loops import UnknownLoopError, by_pair, cost_of, loop_table, rules_of, unused_rules
-from gpu_model import Stage, predict
-from gpu_page import PAGE, Predictions, missed_goals, stale_tables, tables_of, trained_and_picture, write_page
+from gpu_measured import CALIBRATION, Fit, Works, beyond, fit_constants, read, with_inputs
+from gpu_model import blocks_of, stages_of, works_of
+from gpu_page import PAGE, SHAPE, Predictions, missed_goals, stale_tables, tables_of, trained_and_picture, write_page
 from gpu_rules import ABREAST, ADAM, BY_PAIR, WALK, Rule, Run
 from measuring import plain_parser, require, tool
 
+from clsplat.files.atomic import atomic_write
 from clsplat.layouts.columns import LOSS_GROUP_COLUMNS, LOSS_GROUP_ROWS, LOSS_PARTS
 from clsplat.progress import aligned
 
@@ -59,8 +65,8 @@ NO_STACK = ("blend", "blend_grad", "project_grad", "sort_radix")
 """Kernel files that must use no stack memory and no spills on NVIDIA's GPUs."""
 NO_SCRATCH = ("blend", "blend_grad", "project_grad")
 """Kernel files that must use no stack memory and no spills on AMD's GPUs."""
-MOST_A_PAIR = {"blend": 290, "blend_grad": 600}
-"""Maximum number of a warp's instructions per pair, on NVIDIA's GPUs."""
+MOST_A_PAIR = {"blend": 140, "blend_grad": 280}
+"""Maximum number of a warp's instructions per pair of the largest frame, on NVIDIA's GPUs."""
 MOST_A_SAMPLE = {"sm_89": 450, "sm_90": 450, "gfx1100": 540, "gfx90a": 540}
 """Maximum number of instructions of the loss for a pixel and channel, of all items of a block. On these targets the
 loss uses no stack memory and no spills, and it has two launches."""
@@ -99,6 +105,11 @@ class Row:
         """Number of instructions per pair."""
         return None if self.pair is None else sum(self.pair.values())
 
+    @property
+    def instructions(self) -> int:
+        """Number of instructions of the kernel's code."""
+        return sum(loop.size for _, loop in self.built.whole.walk())
+
     def told(self) -> dict[str, Any]:
         """The row as a dict for JSON."""
         built = self.built
@@ -117,7 +128,7 @@ class Row:
             "stack": built.stack,
             "shared": built.shared + self.more_shared,
             "occupancy": round(occupancy(built, self.items, self.more_shared), 3),
-            "instructions": built.whole.size + sum(loop.size for depth, loop in built.whole.walk() if depth),
+            "instructions": self.instructions,
             "loops": loops,
             "a_pair": None if self.pair is None else {kind: round(self.pair[kind], 1) for kind in CLASSES},
         }
@@ -146,8 +157,9 @@ def compiled(
     targets: Sequence[str],
     jobs: int,
     say: Callable[[str], None],
+    frame: Mapping[str, Any],
 ) -> list[Row]:
-    """The rows of all sources for all targets. Raises ClsplatError."""
+    """The rows of all sources for all targets. frame: has the blocks that a pair reaches. Raises ClsplatError."""
     clang()
     if any(target.startswith("sm_") for target in targets):
         nvidia("ptxas")
@@ -160,19 +172,20 @@ def compiled(
         built = pool.map(lambda each: compile_source(each[0], each[1], builtins[each[1]]), new.values())
         _COMPILED.update(zip(new, built, strict=True))
         return [
-            row_of(source, kernel, sources[source].get(kernel.kernel))
+            row_of(source, kernel, sources[source].get(kernel.kernel), frame)
             for (source, _), used in asked.items()
             for kernel in _COMPILED[used]
             if not sources[source] or kernel.kernel in sources[source]
         ]
 
 
-def row_of(source: Source, built: Built, launch: tuple[int, int] | None) -> Row:
+def row_of(source: Source, built: Built, launch: tuple[int, int] | None, frame: Mapping[str, Any]) -> Row:
     """The row of a kernel. launch: items per group and shared memory, if the kernel is launched."""
     items, more_shared = launch or (source.items if built.kernel in BY_PAIR else 64, 0)
     pair, rules, unknown, a_wave = None, frozenset[Rule](), "", 0.0
     if launch or built.kernel in BY_PAIR:
-        run = Run(source.items, ARCHITECTURES[built.target].wave, source.subgroup)
+        wave = ARCHITECTURES[built.target].wave
+        run = Run(source.items, wave, source.subgroup, **blocks_of(frame, source.items))
         try:
             cost = cost_of(built, source.lines, WALK if source.by_gaussian else rules_of(built.kernel), run)
             rules, pair = cost.rules, by_pair(cost, run) if built.kernel in BY_PAIR else None
@@ -305,6 +318,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--check", action="store_true", help="hold the ceilings, the goals and the page")
     parser.add_argument("--page", action="store_true", help="write the tables and the plot of docs/gpu-static.md")
+    parser.add_argument("--inputs", action="store_true", help="write the model's inputs of newly measured steps")
     parser.add_argument("--intel", action="store_true", help="Intel's GPUs in place of --targets")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="compilers at once")
     options = parser.parse_args(arguments)
@@ -312,6 +326,10 @@ def main(arguments: Sequence[str]) -> int:
     trained, _ = trained_and_picture(frames)
     if options.page:
         return make_page(frames, options.jobs)
+    if options.inputs:
+        _, works = works_in(SHAPE, frames, options.jobs)
+        atomic_write(CALIBRATION, with_inputs(json.loads(CALIBRATION.read_text()), works).encode())
+        return 0
     if options.check:
         return check(frames, options.jobs)
     shapes = options.shapes.split(",")
@@ -331,7 +349,7 @@ def main(arguments: Sequence[str]) -> int:
             built = compiled_for_intel(sources, options.jobs, partial(note_of, shape))
             print("\n".join(intel_lines(built)))
             continue
-        rows += compiled(sources, targets, options.jobs, partial(note_of, shape))
+        rows += compiled(sources, targets, options.jobs, partial(note_of, shape), trained[-1])
     if options.intel:
         return 0
     if options.json:
@@ -345,12 +363,13 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def check(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
-    """Print the rows that have ceilings, exceeded ceilings, missed goals and outdated tables."""
-    rows, predictions = counted(frames, jobs)
+    """Print the rows that have ceilings, exceeded ceilings, missed goals, predictions that are too far from what was
+    measured, and outdated tables."""
+    rows, predictions, fit = counted(frames, jobs)
     shapes, targets = CHECKED
     held = [row for row in rows if row.source.shape in shapes and row.built.target in targets]
-    found = broken(held) + loss_faults(rows) + missed_goals(predictions, frames)
-    tables = tables_of(rows, predictions, frames, compilers())
+    found = broken(held) + loss_faults(rows) + missed_goals(predictions, frames) + beyond(fit[0], fit[1])
+    tables = tables_of(rows, predictions, frames, compilers(), fit)
     if stale := stale_tables(PAGE.read_text("utf-8"), tables):
         found.append(f"{PAGE.name}: of older kernels in {', '.join(stale)}; python tools/gpu/gpu_static.py --page")
     print("\n".join([*table(held), "", *(found or ["every ceiling holds, and the page is today's"])]))
@@ -359,38 +378,57 @@ def check(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
 
 def make_page(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
     """Count and predict everything, and write the page. Without ocloc, Intel's table is unchanged."""
-    rows, predictions = counted(frames, jobs)
+    rows, predictions, fit = counted(frames, jobs)
     sources = dict.fromkeys(row.source for row in rows if row.source.stem in NO_STACK and not row.source.by_gaussian)
     intel = compiled_for_intel(list(sources), jobs, note) if ocloc() else []
-    write_page(tables_of(rows, predictions, frames, compilers(), intel), predictions, frames)
+    write_page(tables_of(rows, predictions, frames, compilers(), fit, intel), predictions, frames)
+    for each in beyond(fit[0], fit[1]):
+        note(each)
     return 0
 
 
-def counted(frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], Predictions]:
-    """The rows of a step's kernels in every shape for every target, and the stages of each frame on every GPU. Raises
-    UnknownLoopError for a loop without a rule and a rule without a loop."""
+def counted(frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], Predictions, Fit]:
+    """The rows of a step's kernels in every shape for every target, the stages of each frame on every GPU, and the
+    constants that were fitted. Raises UnknownLoopError for a loop without a rule and a rule without a loop."""
     rows: list[Row] = []
     used: dict[str, set[Rule]] = {}
-    predictions: dict[tuple[str, str, str], dict[str, Stage]] = {}
+    works: dict[str, Works] = {}
+    trained, _ = trained_and_picture(frames)
     for shape in SHAPES:
-        steps = ask_package(shape, frames)
-        sources = sources_of(launch for step in steps for launch in step)
-        found = compiled(sources, TARGETS, jobs, partial(note_of, shape))
+        found, works[shape] = works_in(shape, frames, jobs)
         rows += found
         for row in found:
             used.setdefault(row.built.kernel, set()).update(row.rules)
-        for gpu in GPUS:
-            built = {(row.source, row.built.kernel): row.built for row in found if row.built.target == gpu.target}
-            for frame, step in zip(frames, steps, strict=True):
-                predictions[shape, gpu.name, frame["name"]] = predict(step, built, frame, gpu)
-    trained, _ = trained_and_picture(frames)
     for shape in FORMS:
         sources = sources_of(ask_package(shape, trained[-1:])[0])
         formed = {source: kernels for source, kernels in sources.items() if source.shape == shape}
-        rows += compiled(formed, TARGETS, jobs, partial(note_of, shape))
+        rows += compiled(formed, TARGETS, jobs, partial(note_of, shape), trained[-1])
     if unused := unused_rules(used):
         raise UnknownLoopError("; ".join(unused))
-    return rows, predictions
+    calibration = json.loads(CALIBRATION.read_text())
+    measured, unread = read(calibration, works[SHAPE])
+    constants = fit_constants(calibration, measured)
+    predictions = {
+        (shape, gpu.name, frame): stages_of(each, gpu, constants)
+        for shape, of_shape in works.items()
+        for (target, frame), each in of_shape.items()
+        for gpu in GPUS
+        if gpu.target == target
+    }
+    return rows, predictions, (measured, constants, unread)
+
+
+def works_in(shape: str, frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], Works]:
+    """The rows of a step's kernels in a shape for every target, and the work of each frame's launches."""
+    steps = ask_package(shape, frames)
+    sources = sources_of(launch for step in steps for launch in step)
+    rows = compiled(sources, TARGETS, jobs, partial(note_of, shape), trained_and_picture(frames)[0][-1])
+    works = {}
+    for target in TARGETS:
+        built = {(row.source, row.built.kernel): row.built for row in rows if row.built.target == target}
+        for frame, step in zip(frames, steps, strict=True):
+            works[target, frame["name"]] = works_of(step, built, frame)
+    return rows, works
 
 
 def note_of(shape: str, text: str) -> None:

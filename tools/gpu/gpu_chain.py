@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How long one warp takes alone, from the scheduling bits in NVIDIA's code.
+
+Each instruction says how many cycles pass before the next. One whose time varies (a load, a reciprocal) sets one of six
+scoreboards, and later instructions name the scoreboards for which they wait. So the compiler's own code tells which
+loads are under way together, and how often a warp waits for one after another.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from gpu_assembly import Block, Instruction
+
+VARIABLE = (("LDS|LDL|LDC|ATOMS", 30), ("LD|ATOM", None), ("", 20))
+"""Cycles until a result of varying time is there, by the first pattern with which the instruction's name begins. None:
+an access to global memory."""
+ENDLESS = 1 << 30
+"""Cycles of an access to global memory while counting: so many that all else is done in the meantime."""
+BARRIER = 30
+"""Cycles of a barrier of a group: about the 16 ns of an H100 (docs/gpus/calibration.json)."""
+NEAR = 150
+"""Cycles of an access to lines that the unit has just read: 77 ns on an H100."""
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A warp's waits in turn: cycles for its own instructions, and accesses to global memory. lines: cache lines of 128
+    bytes that all of its accesses touch, one for each instruction and line."""
+
+    cycles: float = 0.0
+    accesses: float = 0.0
+    lines: float = 0.0
+
+    def __add__(self, other: Chain) -> Chain:
+        return Chain(self.cycles + other.cycles, self.accesses + other.accesses, self.lines + other.lines)
+
+    def times(self, rounds: float) -> Chain:
+        """The chain of so many rounds."""
+        return Chain(self.cycles * rounds, self.accesses * rounds, self.lines * rounds)
+
+
+NOTHING = Chain()
+
+
+def chain_of(
+    blocks: Iterable[tuple[Block, float]],
+    lines_of: Callable[[Instruction], float],
+    rounds: int = 2,
+    access: int = ENDLESS,
+) -> Chain:
+    """The chain of the last of some rounds of a loop: its blocks, each with the fraction of the rounds that run it."""
+    weighted = [(each, share) for block, share in blocks if share for each in block.body]
+    now, ready = 0, [0] * 8
+    whole = Chain()
+    for _ in range(rounds):
+        whole = Chain()
+        for each, share in weighted:
+            before = now
+            now = _issued(each, now, ready, access)
+            accesses = round((now - before) / ENDLESS)
+            whole += Chain(now - before - accesses * ENDLESS, accesses, lines_of(each)).times(share)
+    return whole
+
+
+def _issued(each: Instruction, now: int, ready: list[int], access: int) -> int:
+    """The time at which the next instruction may begin. ready: when each scoreboard is clear; changed in place."""
+    stall, result, operands, waits = (
+        each.control >> shift & mask for shift, mask in ((0, 15), (5, 7), (8, 7), (11, 63))
+    )
+    start = max([now, *(ready[board] for board in range(6) if waits >> board & 1)])
+    cycles = next(cycles for pattern, cycles in VARIABLE if re.match(pattern, each.name))
+    ready[operands] = max(ready[operands], start + 20)
+    ready[result] = max(ready[result], start + (access if cycles is None else cycles))
+    ready[7] = 0
+    return start + stall + (BARRIER if each.name.startswith("BAR") else 0)

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The measured steps of docs/gpus/calibration.json, beside the model's predictions of them.
+
+A row of the file is a device, its driver, date and commit, and scenes: `frame` is their name in gpu_frames.json,
+`parts_ms` or `kernels_ms` the device's times, `frame_ms` and `step_ms` wall times. `inputs` are what the model takes of
+the step's launches, as the code that was measured has them, so that a row says the same of the model whatever the
+kernels are now. For a new row, `gpu_static.py --inputs` writes them in a checkout of that code. A row without them, or
+of a device that is not in `gpu_devices.py`, is not used.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from gpu_chain import Chain
+from gpu_devices import GPUS, Gpu
+from gpu_model import Constants, Stage, Work, fit, stages_of, wall
+
+CALIBRATION = Path(__file__).resolve().parents[2] / "docs/gpus/calibration.json"
+DIGITS = 6
+"""Digits of a row's inputs."""
+WITHIN = {"made up, 1 M": 0.25, "fox, step 7000": 0.4}
+"""Most by which a prediction may differ from what was measured, by frame. Others are held out of the fit."""
+PARTS = {
+    "project": ("project",),
+    "lists and sorts": ("duplicate", "ranges"),
+    "blend": ("blend",),
+    "loss": ("target", "loss"),
+    "blend_grad": ("blend_grad",),
+    "project_grad, Adam": ("project_grad", "adam"),
+    "statistics": ("statistics",),
+}
+"""Parts of a step, with the names of their stages."""
+OF_FRAME = ("project", "duplicate", "ranges", "blend")
+"""Stages of a frame."""
+WALLS = ("frame, wall", "step, wall")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A scene of a row. code: its commit and date. ms: what was measured, by part and WALLS. works: of the launches
+    that were measured. now: of those of the present kernels, if the frame has counts."""
+
+    gpu: Gpu
+    frame: str
+    code: str
+    ms: Mapping[str, float]
+    works: Sequence[Work | None]
+    now: Sequence[Work | None] = ()
+
+    def predicted(self, constants: Constants) -> dict[str, float]:
+        """Milliseconds of all that was measured."""
+        found = milliseconds(self.works, self.gpu, constants)
+        return {name: found[name] for name in self.ms}
+
+
+def milliseconds(works: Sequence[Work | None], gpu: Gpu, constants: Constants) -> dict[str, float]:
+    """Milliseconds of PARTS and WALLS."""
+    stages = stages_of(works, gpu, constants)
+    found = {
+        part: sum((stages[name] for name in members if name in stages), Stage()).ms for part, members in PARTS.items()
+    }
+    drawn = [work for work in works if work is None or work.stage in OF_FRAME]
+    for name, each in zip(WALLS, (drawn, filter(None, works)), strict=True):
+        found[name] = wall(each, gpu, constants)
+    return found
+
+
+Works = Mapping[tuple[str, str], Sequence[Work | None]]
+"""The work of a step's launches, by target and frame."""
+
+
+def with_inputs(rows: Sequence[Mapping[str, Any]], works: Works) -> str:
+    """The file's text, with the inputs of all scenes that have none. works: of the code that was measured."""
+
+    def told(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {key: told(each) for key, each in value.items()}
+        return value if isinstance(value, str) else float(f"{value:.{DIGITS}g}")
+
+    inputs, rows = [], deepcopy(rows)
+    for row in rows:
+        target = next((each.target for each in GPUS if each.name == row.get("gpu")), "")
+        for scene in row["scenes"]:
+            found = scene.get("inputs")
+            if found is None and (target, scene.get("frame")) in works:
+                found = [work and told(asdict(work)) for work in works[target, scene["frame"]]]
+            if found is not None:
+                inputs.append(",\n".join(f"     {json.dumps(each)}" for each in found))
+                scene["inputs"] = f"inputs {len(inputs) - 1}"
+    text = json.dumps(rows, indent=1)
+    return re.sub(r'"inputs (\d+)"', lambda match: f"[\n{inputs[int(match[1])]}\n    ]", text) + "\n"
+
+
+def _work(given: Mapping[str, Any] | None) -> Work | None:
+    """The work of an input."""
+    return None if given is None else Work(**{**given, **{name: Chain(**given[name]) for name in ("chain", "longest")}})
+
+
+def read(rows: Sequence[Mapping[str, Any]], now: Works) -> tuple[list[Measured], list[str]]:
+    """The scenes that can be compared, and descriptions of what is not used. now: of the present kernels."""
+    found, unused = [], []
+    of_stage = {stage: part for part, members in PARTS.items() for stage in members}
+    for row in rows:
+        gpu = next((each for each in GPUS if each.name == row.get("gpu")), None)
+        if gpu is None:
+            unused.append(f"{row['device']}: unknown device")
+            continue
+        code = f"{row['commit']} of {row['date']}"
+        for scene in row["scenes"]:
+            if "inputs" not in scene:
+                unused.append(f"{row['device']}, {row['date']}: {scene['scene']} has no inputs")
+                continue
+            works = [_work(each) for each in scene["inputs"]]
+            stage_of = {work.kernel: work.stage for work in works if work}
+            parts = dict(scene.get("parts_ms", {}))
+            for name, ms in scene.get("kernels_ms", {}).items():
+                stage, colon, _ = name.partition(":")
+                part = of_stage.get(stage if colon else stage_of.get(name, ""), "")
+                parts[part] = parts.get(part, 0) + ms
+            parts = {part: parts[part] for part in PARTS if part in parts}
+            parts |= dict(zip(WALLS, (scene["frame_ms"], scene["step_ms"]), strict=True))
+            today = now.get((gpu.target, scene["frame"]), ())
+            found.append(Measured(gpu, scene["frame"], code, parts, works, today))
+    return found, unused
+
+
+Fit = tuple[Sequence[Measured], Constants, Sequence[str]]
+"""Scenes that were measured, the constants, and descriptions of rows that are not used."""
+
+
+def fit_constants(rows: Sequence[Mapping[str, Any]], measured: Sequence[Measured]) -> Constants:
+    """The constants with the least sum of squared logarithms of ratios over all that was measured of frames in WITHIN;
+    those that small kernels measured are taken from the rows."""
+    limits = next(row["limits"] for row in rows if "limits" in row and "copy float4 x1, 1024" in row["limits"])
+    gpu = next(each for row in rows if row.get("limits") is limits for each in GPUS if each.name == row["gpu"])
+    begin = Constants(
+        copy=limits["copy float4 x1, 1024"] / gpu.gb, groups=limits["groups G/s, 64"] * 1e3 / limits["clock"]
+    )
+
+    def error(constants: Constants) -> float:
+        return sum(math.log(ms / each.ms[name]) ** 2 for each in used for name, ms in each.predicted(constants).items())
+
+    used = [each for each in measured if each.frame in WITHIN]
+    return fit(error, begin) if used else begin
+
+
+def beyond(measured: Sequence[Measured], constants: Constants) -> list[str]:
+    """Descriptions of predictions that are further from what was measured than WITHIN."""
+    return [
+        f"{each.frame}, {each.gpu.name}, {name}: {ms:.3f} ms predicted, {each.ms[name]:.3f} measured, expected within "
+        f"{WITHIN[each.frame]:.0%}"
+        for each in measured
+        if each.frame in WITHIN
+        for name, ms in each.predicted(constants).items()
+        if abs(ms / each.ms[name] - 1) > WITHIN[each.frame]
+    ]
