@@ -14,7 +14,7 @@ from clsplat.reference.loss import alpha_loss, l1_dssim, masked_l1_dssim
 from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly
 from clsplat.selftest.harness import Array, CaseBench, cropped, planes_of
 from clsplat.selftest.scenes import evenly
-from clsplat.stages.blend import Blended
+from clsplat.stages.blend import Blended, tile_items
 from clsplat.stages.device_camera import padded_size
 from clsplat.stages.loss import Loss, loss
 from clsplat.stages.loss_terms import AlphaTerm, DepthTerm
@@ -71,8 +71,9 @@ def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
 
     levels = np.rint(given.photograph * 255).astype(np.uint8)
     exact = bool((levels * np.float32(1 / 255) == given.photograph).all())
-    differing = [again(source) for source in (given.photograph, levels)[: 1 + exact]]
-    return lambda: {**first, "photograph": np.array(differing)}
+    sources = (given.photograph, levels)[: 1 + exact] if tile_items(device) > 1 else ()  # else it reads planes alone
+    differing = [again(source) for source in sources]
+    return lambda: {**first, "photograph": np.array([0.0, *differing])}
 
 
 def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
