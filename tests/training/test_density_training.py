@@ -56,8 +56,8 @@ def test_everything_happens(scene: Scene, default_device: Device, monkeypatch: p
     def noted(name: str) -> Any:
         real = getattr(adaptive, name)
 
-        def call(config: Any, model: ModelState) -> RowPlan:
-            result: RowPlan = real(config, model)
+        def call(config: Any, model: ModelState, **options: bool) -> RowPlan:
+            result: RowPlan = real(config, model, **options)
             entries = result.listed.rows.get() if isinstance(result.listed, DeviceRowList) else np.zeros(0, np.uint32)
             made[name, model.step] = (model.count, entries)
             largest = [model.statistics[f"{epoch}_largest"].get() for epoch in ("current", "whole")]

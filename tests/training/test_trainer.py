@@ -134,9 +134,9 @@ def test_the_test_run_has_everything_in_it(
     plans: dict[int, RowPlan] = {}
     resets, counts, real = [], [], adaptive.plan
 
-    def plan(config: DensityConfig, model: ModelState) -> RowPlan:
+    def plan(config: DensityConfig, model: ModelState, **options: bool) -> RowPlan:
         counts.append(model.count)
-        made = real(config, model)
+        made = real(config, model, **options)
         plans[model.step] = looked_at(made, config, trainer)
         return made
 
@@ -337,8 +337,8 @@ def test_moments_move_with_their_rows(scene: Scene, default_device: Device, monk
     trainer = trained_to(25, scene, CONFIG, default_device)
     plans, real = [], adaptive.plan
 
-    def noted(config: DensityConfig, model: ModelState) -> RowPlan:
-        made = real(config, model)
+    def noted(config: DensityConfig, model: ModelState, **options: bool) -> RowPlan:
+        made = real(config, model, **options)
         plans.append(looked_at(made, config, trainer))
         return made
 
