@@ -215,9 +215,10 @@ def test_limits_are_finite_in_every_shape(shaped_device: Device) -> None:
 def test_stages(profiled: Device, shape: tuple[int, int] | None) -> None:
     device = profiled.with_shape(lanes=shape[0], items=shape[1]) if shape else profiled
     result = bench_stages.bench(bench_subject.synthetic(300, 50, 40), device, repeat=2, limits=LIMITS)
-    assert set(result["stages"]) >= FRAME | STEP
+    stages = (FRAME | STEP) - ({"target"} if shape else set())  # the loss of groups reads the photograph itself
+    assert set(result["stages"]) >= stages
     assert result["timer"] == "events"
-    for name in FRAME | STEP:
+    for name in stages:
         row = result["stages"][name]
         assert row["ms"] > 0
         assert row["wall_ms"] > 0

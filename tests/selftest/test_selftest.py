@@ -172,7 +172,7 @@ SLOPPY = {
     "project_rays: sqrt(syy / det)": "(sqrt(syy / det) * 1.0000003f)",
     "blend_grad: INVERSE(1.0f - alpha)": "INVERSE(1.0f - alpha) * 1.00000024f",
     "loss: 1.0f / (c * d)": "1.0f / (c * d) * 0.9999998f",
-    "adam: sqrt(*v)": "sqrt(*v) * 1.0000003f",
+    "adam: sqrt(v)": "sqrt(v) * 1.0000003f",
     "density: sqrt(fma1(gx, gx, gy * gy))": "(sqrt(fma1(gx, gx, gy * gy)) * 1.0000003f)",
 }
 """A division or a square root that is off by two or three ulp, which OpenCL allows a GPU."""
