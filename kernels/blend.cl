@@ -1,9 +1,9 @@
 // Front-to-back blending until a pixel's alpha saturates: the image from each tile's list of Gaussians.
 //
 // Owner: A group owns a tile. On a CPU (ITEMS == 1) one work-item walks the tile's Gaussians, and for each Gaussian
-//   only the open cells that its ellipse reaches. On a GPU (LANES == 1) each work-item has its own pixels, and the
-//   group fetches Gaussians in batches, as in Kerbl et al.; then each warp walks those that reach its blocks. Both give
-//   the same bits.
+//   only the open cells that its ellipse reaches. On a GPU (LANES == 1) each work-item has its own pixels. The group
+//   fetches Gaussians in batches, as in Kerbl et al., and each warp walks those that reach its blocks. Both give the
+//   same bits.
 // Launch: One group of ITEMS work-items for each tile of a band or of the whole image, in row-major order from
 //   first_tile on.
 // Buffers: ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE) in pixels, background (3), with RAYS

@@ -102,7 +102,7 @@ class Case:
     frozen: inputs from a frozen scene, each of which the self-test launches; None if it has no such stage.
     digested: names of the results in the self-test's digest, in order.
     by_shape: True if the kernels or their launches depend on the kernel shape.
-    own_bits_of_groups: True if the digested results have other bits in shapes of several items than in those of one.
+    own_bits_of_groups: True if shapes of several items have a digest of their own.
     """
 
     sizes: Sequence[Any]

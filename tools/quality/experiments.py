@@ -50,6 +50,8 @@ from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import Image, background_colour, composite
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.appearance import held_out_looks
+from clsplat.runs.run import Run
+from clsplat.runs.scene_record import length_unit_of
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene, View
 from clsplat.training.held_out_alignment import aligned
@@ -149,12 +151,17 @@ def trained(
     run = given.folder / "runs" / f"{name.replace(', ', '-').replace(' ', '-').replace('/', '-')}-{digest}"
     if not (run / "eval.json").is_file():
         more = ["--resume"] if (run / "config.toml").is_file() else every
-        services = Services() if isinstance(scene, Path) else Services(load_scene=lambda *_, **__: scene)
-        with redirect_stdout(sys.stderr):  # standard output is for the table
-            status = clsplat(["train", str(folder), "-o", str(run), "--no-report", *more], services)
-        if status:
-            raise SystemExit(status)
+        services = None if isinstance(scene, Path) else Services(load_scene=lambda *_, **__: scene)
+        call(["train", str(folder), "-o", str(run), "--no-report", *more], services)
     return Trained(run)
+
+
+def call(words: list[str], services: Services | None = None) -> None:
+    """Call `clsplat`. Raises SystemExit with its status if that is not 0."""
+    with redirect_stdout(sys.stderr):  # standard output is for the table
+        status = clsplat(words, services)
+    if status:
+        raise SystemExit(status)
 
 
 def picture_of(renderer: Renderer, model: Gaussians, view: View) -> Image:
@@ -497,9 +504,7 @@ def towns(given: Namespace) -> Rows:
         folder = given.folder / size
         if not folder.exists():
             town = "--town", size, "--town-photos", str(given.town_photos), "--town-size", given.town_size
-            with redirect_stdout(sys.stderr):
-                if status := clsplat(["demo", *town, "-o", str(folder)]):
-                    raise SystemExit(status)
+            call(["demo", *town, "-o", str(folder)])
         scene = load_scene(folder if metres == 1 else rescaled(folder, 1 / metres))
         blocks = len({view.name.split("/")[0] for view in scene.views})
         limit = f"density.growth=budget,density.max-gaussians={given.sky + given.gaussians * blocks}"
@@ -508,9 +513,9 @@ def towns(given: Namespace) -> Rows:
             settings = ",".join([limit, f"sky={given.sky}", given.settings])
             done = trained(given, f"{size} {metres:g} {kind}", replace(scene, unit=unit), settings=settings, **usual)
             draw = partial(picture_of, renderer, done.model)
-            of = {name: [view for view in scene.test_views if view.name.startswith(name)] for name in BLOCKS}
-            psnr = [f"{psnr_of(draw, views):.2f}" if views else "" for views in of.values()]
-            used = _json(done.run / "scene.json").get("length_unit", scene.extent)
+            shown = ([view for view in scene.test_views if view.name.startswith(block)] for block in BLOCKS)
+            psnr = [f"{psnr_of(draw, views):.2f}" if views else "" for views in shown]
+            used = length_unit_of(Run.open(done.run), scene)
             cells = f"{used:.3g}", f"{done.last['step']:,}", f"{len(done.model):,}"
             yield size, f"{metres:g}", *cells, *psnr, f"{done.last['seconds']:.0f}"
             if used == scene.extent:
