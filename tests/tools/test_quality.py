@@ -103,7 +103,7 @@ def test_an_experiment_makes_its_table(
         "views": ["--views", "2,3"],
         "exposure": ["--appearance", "ppisp", "--mixes", "0.1"],
         "poses": ["--width", "40"],
-        "towns": ["--towns", "1x1", "--scaled", "1x1", "--town-photos", "9", "--town-size", "32x20", "--sky", "10"],
+        "towns": ["--towns", "1x1", "--scaled", "1x1", "--town-photos", "9", "--town-size", "32x20", "--own-block"],
     }
     words = [name, str(tmp_path / "out"), *scenes, "--iterations", "2", *more.get(name, ())]
     status = main(words)

@@ -24,6 +24,7 @@ from quality.made_scenes import (
     disturbed,
     fisheye_of,
     in_units,
+    own_blocks,
     photograph,
     picked,
     refocused,
@@ -496,21 +497,26 @@ def towns(given: Namespace) -> Rows:
 
     All towns have as many photographs and Gaussians a block, and as many passes. PSNR is that of all held-out
     photographs, of those of block 0, 0, and of those of block 1, 1, which has neighbours on all sides from 3x3 on.
+    With --own-block the growing towns' photographs count only where they show their own block.
     """
     renderer = Renderer(open_device())
     yield "town", "metres a unit", "unit", "steps", "Gaussians", "PSNR, dB", "block 0, 0", "block 1, 1", "seconds"
-    towns = [(size, 1.0) for size in given.towns.split(",")]
-    for size, metres in [*towns, *((given.scaled, metres) for metres in (1.0, 1e-3, 1e3))]:
+    load, masks = (own_blocks, "masks=ignore") if given.own_block else (load_scene, "")
+    towns = [(size, 1.0, load, masks) for size in given.towns.split(",")]
+    for metres in (1.0, 1e-3, 1e3):
+        scaled = load_scene if metres == 1 else lambda town, by=1 / metres: load_scene(rescaled(town, by))
+        towns.append((given.scaled, metres, scaled, ""))
+    for size, metres, load, masks in towns:
         folder = given.folder / size
         if not folder.exists():
             town = "--town", size, "--town-photos", str(given.town_photos), "--town-size", given.town_size
             call(["demo", *town, "-o", str(folder)])
-        scene = load_scene(folder if metres == 1 else rescaled(folder, 1 / metres))
+        scene = load(folder)
         blocks = len({view.name.split("/")[0] for view in scene.views})
         limit = f"density.growth=budget,density.max-gaussians={given.sky + given.gaussians * blocks}"
         usual = {"iterations": given.iterations or None, "passes": None if given.iterations else given.passes}
         for kind, unit in (("depths", None), ("extent", scene.extent)):
-            settings = ",".join([limit, f"sky={given.sky}", given.settings])
+            settings = ",".join([limit, f"sky={given.sky}", masks, given.settings])
             done = trained(given, f"{size} {metres:g} {kind}", replace(scene, unit=unit), settings=settings, **usual)
             draw = partial(picture_of, renderer, done.model)
             shown = ([view for view in scene.test_views if view.name.startswith(block)] for block in BLOCKS)
@@ -559,6 +565,7 @@ TOWNS = {
     "--town-size": {"default": "320x200", "help": "size of the photographs"},
     "--gaussians": _number(5000, "Gaussians a block"),
     "--sky": _number(3000, "Gaussians of the sky"),
+    "--own-block": {"action": "store_true", "help": "photographs of --towns count where they show their own block"},
     "--passes": _number(30, "passes through the photographs, if --iterations is 0"),
 }
 EXPERIMENTS = {

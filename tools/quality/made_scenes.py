@@ -19,8 +19,15 @@ from ring import write_cloud
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.config.cli_defaults import TEST_EVERY
+from clsplat.config.masks import MaskUse
 from clsplat.config.training import TrainConfig
 from clsplat.demo.ray_caster import Floor, Surface, Wall, bake, cameras, render, still_life
+from clsplat.demo.town.blocks import BLOCK_METRES, GROUND_FACE
+from clsplat.demo.town.flights import TownPhotograph, photographs
+from clsplat.demo.town.settings import TownConfig
+from clsplat.demo.town.solids import FACES_PER_SOLID
+from clsplat.demo.town.visibility import Caster, blocks_in_sight
+from clsplat.demo.town.writing import TOWN_RECORD_FILE
 from clsplat.errors import InputError
 from clsplat.images.alpha import Image, composite
 from clsplat.images.reading import downscale, open_image, read_image
@@ -29,6 +36,7 @@ from clsplat.reference.cameras import cam_from_pixel, pixel_grid
 from clsplat.reference.ppisp import light, spread
 from clsplat.runs.appearance import unmixing
 from clsplat.scenes.dataset import Lens
+from clsplat.scenes.loading import load_scene
 from clsplat.scenes.readers.colmap_writer import write_model
 from clsplat.scenes.readers.transforms import COLMAP_FROM_OPENGL
 from clsplat.scenes.scene import Scene, View
@@ -296,6 +304,43 @@ def rescaled(folder: Path, factor: float) -> Path:
     return remodelled(
         folder, folder.with_name(f"{folder.name}-times-{factor:g}"), lambda model: model.transform(larger)
     )
+
+
+def own_blocks(town: Path) -> Scene:
+    """A town at the origin whose photographs count only where they show their own block.
+
+    Masks leave out the other pixels, and points beyond the town's blocks are dropped. So no block depends on its
+    neighbours.
+    """
+    settings = json.loads((town / TOWN_RECORD_FILE).read_text("utf-8"))["town"]
+    config = TownConfig(**settings | {"origin": tuple(settings["origin"])})
+    for i, j in np.ndindex(config.columns, config.rows):
+        for shot in photographs(config, i, j):
+            path = town / "masks" / f"{shot.name}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if not path.exists():
+                write_image(path, own_block_mask(config, shot).astype(np.uint8) * 255)
+    scene = load_scene(town, masks=MaskUse(masks="ignore"))
+    x, y = scene.points.T[:2] / BLOCK_METRES
+    kept = (x >= 0) & (x <= config.columns) & (y >= 0) & (y <= config.rows)
+    return replace(scene, points=scene.points[kept], point_colors=scene.point_colors[kept])
+
+
+def own_block_mask(config: TownConfig, shot: TownPhotograph) -> NDArray[np.bool_]:
+    """The pixels (H, W) of a town's photograph that show nothing but its own block."""
+    blocks = blocks_in_sight(config.seed, shot.camera)
+    caster = Caster(shot.camera, blocks)
+    sight = caster.sight(0, shot.camera.height)
+    begins, ends = (FACES_PER_SOLID * caster.starts[each] for each in (slice(None, -1), slice(1, None)))
+    own = np.array([(block.i, block.j) == (shot.i, shot.j) for block in blocks])
+    shown = np.zeros(sight.surfaces.shape, np.bool_)
+    for begin, end in zip(begins[own], ends[own], strict=True):
+        shown |= (begin <= sight.surfaces) & (sight.surfaces < end)
+    x, y, z = sight.directions
+    with np.errstate(divide="ignore", invalid="ignore"):
+        i, j = ((caster.position[k] - of / z * caster.position[2]) // BLOCK_METRES for k, of in enumerate((x, y)))
+    shown |= (sight.surfaces == GROUND_FACE) & (i == shot.i) & (j == shot.j)
+    return np.asarray(shown.all(axis=0))
 
 
 def disturbed(scene: Scene, degrees: float, percent: float, seed: int) -> Scene:
