@@ -35,8 +35,8 @@ def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
     short: for runs of about 7000 steps, which the paper's rates leave unfinished. Colours, opacities and rotations
     learn faster, and SH degrees rise twice as fast. The means' rate reaches its minimum at the last step. Density
     control ends at five sevenths, and the last seventh is a cooldown (docs/decisions/0013-a-short-schedule.md).
-    high-rates: like short, but means, sizes, rotations and higher SH bands learn even faster and cool down further. SH
-    degrees rise every 300 steps, and mcmc has less noise relative to its rate (docs/decisions/0031-high-rates.md).
+    high-rates: like short, but with higher learning rates of means, sizes, rotations and higher SH bands, and a lower
+    end of the cooldown. SH degrees rise every 300 steps, and mcmc has less noise (docs/decisions/0031-high-rates.md).
     """
     if schedule == "paper":
         return TrainConfig(iterations=iterations)

@@ -79,7 +79,7 @@ def _take(path: Path, folder: Path) -> IO[bytes]:
         with suppress(OSError):
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 return file
-        file.close()  # the previous holder has just removed this file, so another one has to be locked
+        file.close()  # the previous holder has just removed this file, so open a new one
 
 
 def try_lock(file: IO[bytes]) -> None:

@@ -139,7 +139,7 @@ def own_cameras(run: Run | None) -> list[Camera]:
 def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
     """Short descriptions of the differences between a run's recorded scene and the scene as it is now.
 
-    With another --resolution, different sizes and replacement files of another size are not differences.
+    If --resolution has changed, new sizes do not count, nor changed photographs that come from another file.
     """
     was, new, resized = earlier["views"], now["views"], earlier["resolution"] != now["resolution"]
     held_out = "held out in one and not in the other"
