@@ -28,7 +28,7 @@ NO_CACHE = "none"
 
 
 def model_bytes(config: TrainConfig) -> int:
-    """Bytes of a Gaussian's parameters, moments and statistics, and with a batch of its gradients and their sums."""
+    """Bytes per Gaussian: parameters, moments and statistics, and with a batch also gradients and their sums."""
     arrays = MODELS if config.batch == 1 else OWNER_ARRAYS_PER_PARAMETER
     return arrays * 4 * floats_of((config.sh_degree + 1) ** 2) + gaussian_bytes(contributions=False)
 

@@ -176,7 +176,7 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
 
 
 def _unmarked(models: dict[str, HostGaussians]) -> dict[str, HostGaussians]:
-    """The models, with moments that mark a refused step set back to their earlier values, as far as these are known."""
+    """The models, with zeros in place of non-finite moments, which may mark a refused step."""
     for kind in ("first", "second"):
         arrays = {g: HostArray(finite_or_zero(array.values)) for g, array in models[kind].arrays.items()}
         models[kind] = replace(models[kind], arrays=arrays)

@@ -390,8 +390,8 @@ class Trainer:
     def step_back(self) -> bool:
         """After an error, return to the last point at which a checkpoint was possible.
 
-        That is before the current step or, once its density control is done, after that. Returns False if the state
-        there is lost.
+        That point is before the current step, or after the step's density control if that is done. Returns False if the
+        state there is lost.
         """
         mark = self.mark
         if mark is None:

@@ -34,7 +34,7 @@ def steps_of(config: TrainConfig) -> tuple[int, ...]:
     """Steps after which cameras are validated, ascending: when refinement begins, and at every tenth of the training.
 
     Just after a densification, and for long after an opacity reset, the model is too bad to validate cameras with. A
-    measurement due then is made at the last step before, ahead of that change of the model.
+    measurement that is due then is made earlier, at the last step before the densification or reset.
     """
     density, first = config.density, first_step(config)
     settling = (density.opacity_reset_every or DensityConfig.opacity_reset_every) // RESET_SETTLING_DIVISOR
@@ -124,7 +124,7 @@ class CameraGate:
 
     @property
     def best(self) -> tuple[int, float]:
-        """Step and dB of the best measurement before refinement ended; the first of equals."""
+        """Step and dB of the best measurement before refinement ended; the first one if several are equal."""
         known = [each for each in self.measured if self.ended is None or each[0] <= self.ended]
         return max(known, key=lambda each: each[1])
 

@@ -87,7 +87,7 @@ def plan(config: DensityConfig, model: ModelState, *, sky: bool = False) -> RowP
     """Clone small and split large Gaussians with a large mean gradient. Prune Gaussians that are transparent, oversized
     or contribute little.
 
-    sky: True if some of the Gaussians are a sky, whose size follows the extent. All may then be as large.
+    sky: True if the model has sky Gaussians. The size limit then follows the extent, for all Gaussians.
     Retained Gaussians come first, in order. Clones and halves are fresh.
     """
     # Each rule compares like NumPy: a float32 array with a Python number, in float32.
@@ -200,7 +200,7 @@ def long_halves(split: Mapping[str, Float32]) -> dict[str, Float32]:
 def split_halves(
     config: DensityConfig, *, means: Float32, quaternions: Float32, log_scales: Float32, rng: np.random.Generator
 ) -> tuple[Float32, Float32]:
-    """Means and log scales of halves: drawn from their original Gaussian, and smaller. (m, 3), (m, 4), (m, 3)."""
+    """Means (m, 3) and log scales (m, 3) of halves, which are drawn from their original Gaussians and smaller."""
     offsets = draw_offsets(quaternions, log_scales, rng)
     smaller = log_scales - np.float32(np.log(config.split_factor))
     return (means + offsets).astype(np.float32), smaller.astype(np.float32)

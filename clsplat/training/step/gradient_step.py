@@ -53,8 +53,8 @@ class GradientStep:
     """Forward, loss, backward and Adam of one view, on a device and in a rasterizer's memory.
 
     fields: the slot fields that the step fills.
-    turn: `turn` of `stages.loss.loss`.
-    room: `room` of `Rasterizer.forward`.
+    turn: number of the array for the loss's sums (`stages.loss.loss`).
+    room: capacity in pairs (`Rasterizer.forward`).
     explore: noise and penalties of the step.
     """
 
@@ -86,7 +86,7 @@ class GradientStep:
         """Update the model (parameters, first and second moments) with a view.
 
         gradients: arrays for the gradients of the rows on the device at once, if a probe or a part reads them. They are
-        zero before and after, and do not change the bits of the model.
+        zero before and after. The model has the same bits with and without them.
         reads_loss: True if the loss will be read.
         """
         rasterizer, work, camera = self.rasterizer, self.rasterizer.work, inputs.camera

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 HDR_SUFFIXES = (".exr", ".hdr", ".tif", ".tiff")
 """Endings of files whose values may be outside 0 to 1, so that 8 bits may not hold them."""
 DECODING_PIXEL_BYTES, UNDISTORTING_PIXEL_BYTES = 40, 120
-"""Approximate peak of memory, in bytes for each pixel of the file, while a photograph is decoded and resized, and while
-it is undistorted too."""
+"""Approximate peak of memory, in bytes per pixel of the file: to decode and resize a photograph, and to undistort it
+too."""
 
 
 class PhotographError(InputError):
@@ -106,7 +106,7 @@ class Decoder:
         return key_of((files, stamps, asdict(view.lens), intrinsics, bent, view.upright, mask, self.rounds, size))
 
     def largest(self) -> int:
-        """Bytes of the largest view at its full size, at most."""
+        """Upper limit of the bytes of the largest view at full size."""
         return max(
             view.camera.width
             * view.camera.height
@@ -116,7 +116,7 @@ class Decoder:
         )
 
     def working(self) -> int:
-        """Approximate bytes that the decoding of a photograph needs besides the result, at most."""
+        """Approximate upper limit of the bytes that decoding a photograph needs besides the result."""
         return max(
             view.lens.width
             * view.lens.height
