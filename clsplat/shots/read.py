@@ -176,7 +176,7 @@ def shot_around(
 
 
 def check_around(path: str | None, *, among_own: bool = False) -> str:
-    """The name of a path around a model, or among the photographs' own cameras, after a check.
+    """Check the name of a path around a model, or among the photographs' own cameras, and return it.
 
     Raises InputError for None, and for a path that needs --cameras.
     """

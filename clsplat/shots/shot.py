@@ -77,7 +77,7 @@ class Shot:
         )
 
     def only(self, text: str) -> Shot:
-        """The frames of the shot that `text`, such as 1-100:2, lists. Adds a warning if it lists other frames too.
+        """The frames of the shot that `text`, such as 1-100:2, lists. Adds a warning if the shot lacks some of them.
 
         Raises InputError for a text that `parse_frames` refuses, and if the shot has none of the listed frames.
         """
