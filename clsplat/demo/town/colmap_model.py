@@ -17,7 +17,7 @@ from clsplat.rotations import quaternion_of
 from clsplat.scenes.dataset import Lens, models
 
 UNKNOWN_POINT = np.uint64(2**64 - 1)
-"""Point of an observation that belongs to no track."""
+"""Point number of an observation that belongs to no track."""
 _OBSERVATION = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
 _COUNT = struct.Struct("<Q")
 
@@ -46,7 +46,7 @@ class ModelPoints:
 
     places: (n, 3) float64, world coordinates.
     colours: (n, 3) uint8.
-    tracks: (n + 1,), where each point's observations begin in the two next arrays.
+    tracks: (n + 1,), index of each point's first observation in the next two arrays; last, their length.
     images: numbers of the images that show it, from 1.
     observations: the observation's index in that image.
     """

@@ -37,7 +37,7 @@ GROUND_DENSITY = np.float32(np.log2(TEXTURE_SIDE / GROUND_METRES))
 class Shader:
     """Shades the rays of one photograph.
 
-    blocks: blocks whose solids are numbered through from `starts`, as by the `Caster`.
+    blocks, starts: the photograph's blocks, and the number of each block's first solid, as in `Caster`.
     """
 
     def __init__(
@@ -50,8 +50,8 @@ class Shader:
     def colours(self, directions: Float32, surfaces: NDArray[np.int32]) -> Float32:
         """Linear colours (n, 3) of rays.
 
-        directions: (n, 3), as of `world_rays`.
-        surfaces: (n,), as of `Sight`.
+        directions: (n, 3), as from `world_rays`.
+        surfaces: (n,), as in `Sight`.
         """
         result = np.empty((len(surfaces), 3), np.float32)
         for surface, shade in ((SKY_FACE, self.textures.sky), (GROUND_FACE, self._ground)):
@@ -70,9 +70,9 @@ class Shader:
         return result
 
     def _faces(self, surfaces: NDArray[np.int32]) -> tuple[NDArray[np.int64], Float32, Bool]:
-        """Row for each surface, the rows of the table of faces that are seen, and whether each belongs to a ball.
+        """Row (n,) of each surface in a table of the seen faces; that table; and for each of its rows, True for a ball.
 
-        The rows are in metres from the camera. U and V of balls are their centres and radii.
+        Faces are in metres from the camera. In the row of a ball, its centre and radius take the place of the plane.
         """
         seen = np.zeros(self.starts[-1] * FACES_PER_SOLID, np.bool_)
         seen[surfaces] = True
@@ -218,7 +218,7 @@ def _cube_coordinates(normals: Float32, radius: Float32) -> tuple[Float32, Float
 
 
 def _mark_streets(colours: Float32, fx: Float32, fy: Float32, width: Float32) -> None:
-    """Paint kerbs, dashes and zebra crossings, in place. width: (n,), of a pixel on the ground in metres."""
+    """Paint kerbs, dashes and zebra crossings, in place. width: (n,), width of a pixel on the ground, in metres."""
     away_x, away_y = _to_street(fx), _to_street(fy)
     near, far = np.minimum(away_x, away_y), np.maximum(away_x, away_y)
     along = np.where(away_x < away_y, fy, fx)
