@@ -171,10 +171,10 @@ class FrameRenderer:
         return RenderedFrame(planes, time.monotonic() - start, finish, Measured(blank))
 
     def _placed(self, task: Task) -> tuple[Callable[[float], Gaussians], tuple[Gaussians | None, Gaussians | None]]:
-        """A function from a time in frames from the frame to the models, merged; and the models at the targets of
-        motion.
+        """A function from a time to all models, merged; and the models one frame later and one frame earlier.
 
-        These are for motion and backward motion, None if nothing moves or the channel is not requested.
+        Times are in frames from the frame. The later and earlier models serve the channels motion and backward. They
+        are None if nothing moves or the channel is not requested.
         """
         ensemble, middle = self._ensemble, sampling_of(task, self.options.pictures).middle
         if (placed := task.placed) is None:
@@ -193,7 +193,7 @@ class FrameRenderer:
         device = self._renderer.device
         if require(device, RAY_STAGES) is not device:  # too late to change the kernel shape
             raise DriverError(
-                f"{device.name}: the driver failed in the shape {device.shape.label}; another works, call again"
+                f"{device.name}: the driver failed in the shape {device.shape.label}; another shape works, call again"
             )
         self._rays_tested = True
 

@@ -108,7 +108,7 @@ class Task:
     number, name: as in `shots.Frame`.
     camera: camera of the whole frame, in its final size.
     path: path of the file.
-    after, earlier: cameras that motion and backward motion lead to, of the same size; None unless requested.
+    after, earlier: cameras of the next and the previous frame, for motion channels, of the same size; or None.
     stretch: cameras while the shutter is open, None for a static camera.
     before: state of the file when the job began (`finished_frames.stamp`).
     sampling: shutter and lens of this frame; None means the job's.
@@ -297,21 +297,21 @@ def straight_camera(task: Task, pictures: PictureConfig) -> Camera:
 
 
 def camera_after(task: Task, pictures: PictureConfig) -> Camera | None:
-    """Camera of the whole frame that motion leads to: one frame after the middle of the shutter."""
+    """Camera of the whole frame for the channel motion: one frame after the middle of the shutter."""
     middle = sampling_of(task, pictures).middle
     still = middle == 0 or task.after is None or isinstance(task.stretch, Moments)
     return task.after if still else task.at(middle + 1)
 
 
 def camera_before(task: Task, pictures: PictureConfig) -> Camera | None:
-    """Camera of the whole frame that backward motion leads to: one frame before the middle of the shutter."""
+    """Camera of the whole frame for the channel backward: one frame before the middle of the shutter."""
     middle = sampling_of(task, pictures).middle
     still = middle == 0 or task.earlier is None or isinstance(task.stretch, Moments)
     return task.earlier if still else task.at(middle - 1)
 
 
 def end_before(task: Task, time: float, pictures: PictureConfig) -> float | None:
-    """The time from which the camera at another time is extrapolated, both in frames from the frame.
+    """Time from which the camera at `time` is extrapolated. Both times are in frames from the frame.
 
     None if the shot's source defines the camera at that time, and for a shot of one frame. A stage defines its camera
     while the shutter is open; motion is extrapolated from the shutter's middle.
@@ -362,7 +362,7 @@ def digest_of(*parts: Any) -> str:
 
 
 def settings_digest(task: Task, options: RenderOptions) -> str:
-    """Digest of everything but the model files that a frame depends on.
+    """Digest of everything that a frame depends on, except the model files.
 
     Includes cameras, channels, encoding, pictures, rasterizer, the content of its holdout, and the models' placements.
     For models with one file per frame, it includes the content of these files.
