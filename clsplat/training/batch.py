@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A step of several views, on one device or several: gradients are summed in the order of the views, then Adam's step.
+"""A step of several views, on one device or several. Gradients are summed in the order of the views; then Adam steps.
 
 The first device has the model. Each further device has a thread and a copy of the parameters, and returns the results
 of its views. Neither the speed nor the number of devices changes a bit of the result.
@@ -88,7 +88,7 @@ class Losses:
 
 @dataclass(frozen=True, eq=False)
 class _AddedView(GradientStep):
-    """A view whose gradients are added to the sums over the views. The sums are the second member of its model.
+    """A view whose gradients are added to the sums over the views. In its model the sums come second.
 
     shown: (n,), nonzero for Gaussians that any view shows; None if Adam does not need it.
     own: by each view's place, the gradients with respect to the parameters of its parts.
@@ -229,7 +229,7 @@ class Replica:
         return ViewOutcome(arrays, gradients, view.run((parameters,), here, StepProbe(), room, reads_loss=True), own)
 
     def _host(self, place: int, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> NDArray[Any]:
-        """Memory on the host, the same from step to step, as fresh pages would cost as much time as the copy."""
+        """Host memory that is reused from step to step, as fresh pages would cost as much time as the copy."""
         held = self._room.get((place, name))
         if held is None or held.shape != shape:
             held = self._room[place, name] = np.empty(shape, dtype)

@@ -23,10 +23,10 @@ The prior is a factor times a power of the initial number of Gaussians. Five sce
 GROWTH_RAMP = (0.35, 0.55, 0.75, 0.9)
 """Growth of the first densifications, as fractions of the peak: split Gaussians have to accumulate gradients first."""
 PEAK_DENSIFICATIONS = 3
-"""Number of densifications at the peak that follow the ramp."""
+"""Number of densifications after the ramp in which the growth stays at its peak."""
 GROWTH_DECAY_STEPS, GROWTH_FLOOR_FRACTION = 1100.0, 0.2
-"""Steps in which the growth decays to 1/e, and the fraction of the peak that it decays to: Gaussians that are small
-enough fall below the threshold."""
+"""Time constant in steps of the growth's exponential decay, and the fraction of the peak that it decays to: Gaussians
+that are small enough fall below the threshold."""
 RECENT_DENSIFICATIONS = 4
 """Number of latest densifications that predict the next ones."""
 PRIOR_GROWTH_WEIGHT = 0.5
@@ -36,7 +36,7 @@ PRIOR_COSTS = np.array([8000.0, 0.6, 1.2, 80_000.0])
 PRIOR_COST_WEIGHT_SECONDS = 0.03
 """Weight of the prior costs: they count as much as this many measured seconds."""
 OUTLIER_FACTOR = 4.0
-"""Reports that took this many times their usual time are left out of the prediction: a kernel was built."""
+"""Reports that took over this many times their usual time are left out of the prediction: a kernel was built."""
 PACE_WINDOW_SECONDS = 60.0
 """Seconds of recent steps that give the machine's current speed."""
 
@@ -162,7 +162,7 @@ class Forecast:
         return 1.0, self.pixels / span.factor**2, span.gaussians, span.reads / span.steps
 
     def _cost(self) -> tuple[Float64, float]:
-        """Seconds for a unit of each of the `_amounts` (4,), and the factor by which recent steps took longer."""
+        """Seconds per unit of each of the `_amounts` (4,), and the factor by which recent steps took longer."""
         spans = self.spans[1:] or self.spans  # the first span includes building kernels
         parts = np.array(self.amounts[-len(spans) :])
         steps, seconds = np.array([(span.steps, span.seconds) for span in spans]).T

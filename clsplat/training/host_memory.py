@@ -46,7 +46,7 @@ class HostMemory:
 
     @classmethod
     def chosen(cls, max_host_mem: str | int | None, cache: str | Path | None, run: Run | None) -> HostMemory:
-        """Main memory by the arguments of `clsplat.train`. Raises InputError.
+        """Main memory as the arguments of `clsplat.train` set it. Raises InputError.
 
         cache: a folder, "none", or None for the run's folder if there is a limit.
         """

@@ -144,7 +144,7 @@ class TrainingSession:
     def rescue(self) -> str:
         """Write a checkpoint of the state at the start of the step, if that is intact.
 
-        It is for failed or interrupted trials of kernels, and for photographs that cannot be read.
+        Called after a failed or interrupted trial of kernels, and for a photograph that cannot be read.
 
         Returns the end of an error message, which names the checkpoint, or "".
         """

@@ -101,7 +101,7 @@ class StepRecord(TypedDict):
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """One training step.
+    """A training step with everything that a replay needs.
 
     models: parameters and moments by group.
     """
@@ -254,8 +254,8 @@ class _Counts(StepProbe):
 
 
 def replay(bundle: Bundle, device: Device) -> dict[str, int]:
-    """Repeat the step. Returns the number of non-finite values after each stage, and of the steps that `adam`
-    refuses."""
+    """Repeat the step. Returns the number of non-finite values after each stage, and of array elements that
+    `adam` refuses to step."""
     config, record = bundle.config, bundle.record
     rasterizer = Rasterizer(device, config.rasterizer, antialiased=config.antialiased)
     probe = _Counts(bundle.inputs.camera)

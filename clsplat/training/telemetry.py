@@ -31,7 +31,7 @@ REPORTED_PACKAGES = ("numpy", "pyopencl", "OpenImageIO", "scipy", "scikit-image"
 CONTRIBUTION_SECONDS = 1.0
 """Seconds for sampling training views for contributions, counted from the end of the first view."""
 CONTRIBUTION_BIN_EDGES = tuple(float(edge) for edge in np.round(np.arange(-3.0, 5.01, 0.2), 1))
-"""Edges of the bins of contributions, as powers of ten of pixels."""
+"""Edges of the bins of contributions, as base-10 logarithms of pixels."""
 
 
 def session(device: Device, step: int) -> dict[str, Any]:

@@ -113,7 +113,7 @@ class Trainer:
         self.given = initial
         self.monitor = NonFiniteMonitor(self.rasterizer.readback, [view.name for view in self.views])
         self.pending = SpeculativeSteps(device, self.monitor, self._begin_again)
-        self.pending.on &= self.batch is None and not config.refines  # a batch reads losses, and refinement gradients
+        self.pending.on &= self.batch is None and not config.refines  # batches read losses, refinement reads gradients
         self._start()
 
     def _start(self) -> None:
@@ -255,7 +255,7 @@ class Trainer:
         return result
 
     def _next_photographs(self) -> list[tuple[int, float]]:
-        """Views of the next steps and their factors, in the order of their use, until the end of the epoch."""
+        """Views of the next steps and their size divisors, in the order of their use, until the end of the epoch."""
         batch, ahead = self.config.batch, self.queue[: -1 - reading_threads() - self.config.batch : -1]
         return [(view, self.sizes.factor(self.step + (1 + place // batch) * batch)) for place, view in enumerate(ahead)]
 
@@ -274,7 +274,7 @@ class Trainer:
         return inputs
 
     def _gradient_step(self) -> GradientStep:
-        """The step, with exact counts."""
+        """The step, with an exact count of pairs."""
         rates = self.rates()
         return GradientStep(
             self.device,
@@ -313,7 +313,7 @@ class Trainer:
         self.mend()
 
     def settle(self) -> None:
-        """Wait until all steps are known to be complete, or repeat them (`SpeculativeSteps`)."""
+        """Wait for all launched steps, and repeat the incomplete ones (`SpeculativeSteps`)."""
         self.pending.settle()
 
     def _pixels(self, view: int) -> NDArray[Any]:
@@ -499,7 +499,7 @@ class Trainer:
             self.batch.close()
 
     def local(self, camera: Camera) -> Camera:
-        """Camera in the coordinates of the model in training, from one in world coordinates: see `Gaussians.local`."""
+        """Camera in the coordinates of the model in training, from a camera in the world: see `Gaussians.local`."""
         return camera.from_origin(self.origin).before(self.near).along_rays(self.by_rays)
 
     def camera(self, view: int, width: int, height: int) -> Camera:

@@ -39,7 +39,7 @@ START_GAIN_STEP_OCTAVES = 2.0**-10
 """Gains from points are rounded to multiples of this, in octaves, so that they do not depend on the order of sums."""
 
 VIEW_PULL_WEIGHT, NEIGHBOUR_PULL_WEIGHT = 0.02, 0.7
-"""Weights of the pulls towards the gains from points, as fractions of the distance in octaves, in the loss's gradient.
+"""Weights of two terms of the loss's gradient that pull gains towards the gains from points, per octave of distance.
 
 The first pulls the gains of each photograph. The second pulls the part that gains of neighbouring photographs have in
 common. Without it neighbours may all become slightly too bright, where no other photograph shows a dark surface. Gains

@@ -90,7 +90,7 @@ class Incident:
 
 @dataclass
 class RetryBudget:
-    """Count of recent trouble, and effects of earlier trouble on the training. Checkpoints contain it."""
+    """Recent troubled steps, and the effects of returns to checkpoints on the training. Checkpoints contain it."""
 
     troubled: list[int] = field(default_factory=list)
     rate_factor: float = 1.0

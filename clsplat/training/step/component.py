@@ -38,7 +38,7 @@ class Component:
         return 0
 
     def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002
-        """True if `before_step` has work before a step of `views` views that ends as number `step`."""
+        """True if `before_step` has work before a step of `views` views, the last of which is number `step`."""
         return False
 
     def before_step(self, gaussians: AnyGaussians) -> None:

@@ -71,7 +71,7 @@ class GradientStep:
 
     @property
     def adam_step(self) -> AdamStep:
-        """Adam's step with this step's number."""
+        """Constants, number and learning rates of Adam's step."""
         return AdamStep(self.config.optimiser, self.step, self.rates)
 
     def run(
@@ -195,7 +195,7 @@ class GradientStep:
     def replayed(
         self, of: object, key: tuple[object, ...], make: Callable[[], R], numbers: tuple[float, ...] = ()
     ) -> R:
-        """The result of `make`, through `Workspace.replayed` if the step is launched by capacity.
+        """The result of `make`, from a command buffer (`Workspace.replayed`) if the step is launched by capacity.
 
         A step with exact counts has new arrays each time, so its command buffer would never be reused.
         """

@@ -25,7 +25,7 @@ BY_CAPACITY_VARIABLE = "CLSPLAT_BY_CAPACITY"
 """Environment variable that decides if steps are launched by capacity. By default they are, except on CPUs."""
 
 Run = Callable[[int, PairCapacity | None], Loss]
-"""A function that runs one step. It takes the step's turn, and a capacity, or None to count the pairs first."""
+"""Runs one step. It takes the number of the loss's array of sums, and a capacity, or None to count the pairs first."""
 
 
 @dataclass(eq=False)

@@ -62,7 +62,7 @@ class Decoder:
         return max(int(camera.width / factor), 1), max(int(camera.height / factor), 1)
 
     def pixels(self, index: int, factor: float, *, keeps: bool) -> dict[float, NDArray[Any]]:
-        """Pixels (H, W, C) of view `index` at 1/factor of its size. The keys are factors.
+        """Pixels (H, W, C) of view `index`, by factor: 1/factor of the view's size.
 
         keeps: also return the sizes that the training needs later, if the file has to be decoded.
         Raises PhotographError.
@@ -86,7 +86,7 @@ class Decoder:
                 sizes = [self.size(index, factor) for factor in factors]
                 images = view.load_sizes(sizes, reduce=self.rounds)
             finally:
-                view.check_unchanged()  # it may have been replaced meanwhile, which may be the reason of an error
+                view.check_unchanged()  # a file that was replaced may cause any error
         except InputError as error:
             raise PhotographError(str(error)) from None
         except OSError as error:

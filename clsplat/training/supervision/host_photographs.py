@@ -22,7 +22,7 @@ Key = tuple[int, float]
 
 
 def reading_threads() -> int:
-    """Number of threads that read ahead, and of views that they read ahead."""
+    """Number of threads that read ahead, which is also the number of views that are read ahead."""
     return min(2 * (os.cpu_count() or 1), MAX_READING_THREADS)
 
 
