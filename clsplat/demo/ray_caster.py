@@ -9,7 +9,7 @@ Its light (sun with soft shadows, sky) is therefore baked into one texture per o
 A photo needs only the nearest hit and a texture look-up for each ray.
 
 In the world, z is up and units are metres. The scene is a paved floor inside a round wall. The wall hides the sky, for
-which there would be no initial points: training might place its Gaussians in front of another camera.
+which there would be no initial points: training might place the sky's Gaussians in front of another camera.
 """
 
 from __future__ import annotations

@@ -112,8 +112,8 @@ def frames_there(tasks: Sequence[Task], options: RenderOptions, video: VideoConf
 
 
 def _state(task: Task, options: RenderOptions) -> Literal["told", "untold", "changed", "missing"]:
-    """State of a frame's file: complete, with its settings recorded or not; of another model or settings; or missing,
-    damaged or of another kind."""
+    """State of a frame's file. told, untold: complete, and its settings are recorded or not. changed: of another model
+    or settings. missing: not there, damaged, or of another kind."""
     wanted = _identity(task, options)
     if _is_whole(task, options, wanted):
         return "untold" if attribute(task.path, SETTINGS_DIGEST_ATTRIBUTE) is None else "told"

@@ -112,7 +112,7 @@ class FrameRenderer:
                     check_parts(camera, self.options.encoding, views=len(task.views))
 
     def __call__(self, task: Task) -> RenderedFrame:
-        """Render a frame. Raises ClsplatError if it cannot be rendered or, for a frame in strips, not be written."""
+        """Render a frame. Raises ClsplatError if it cannot be rendered or, in strips, cannot be written."""
         device = self._renderer.device
         if not device.profile:
             return self._pair(task)
@@ -171,7 +171,7 @@ class FrameRenderer:
         return RenderedFrame(planes, time.monotonic() - start, finish, Measured(blank))
 
     def _placed(self, task: Task) -> tuple[Callable[[float], Gaussians], tuple[Gaussians | None, Gaussians | None]]:
-        """A function from a time to all models, merged; and the models one frame later and one frame earlier.
+        """Function that returns all models merged at a time; and the models one frame later and one frame earlier.
 
         Times are in frames from the frame. The later and earlier models serve the channels motion and backward. They
         are None if nothing moves or the channel is not requested.
@@ -198,7 +198,7 @@ class FrameRenderer:
         self._rays_tested = True
 
     def _rows(self, camera: Camera, planes: int) -> int:
-        """Rows of the strips that the camera's picture is rendered in, its height if it needs no strips.
+        """Number of rows of a strip of the camera's picture; the picture's height if it needs no strips.
 
         planes: bytes per pixel for a holdout.
         """

@@ -25,7 +25,7 @@ from clsplat.shots.shot_file import KeyedTrack, Volume, Within, is_layout, read_
 from clsplat.shots.usd_models import read_stage
 
 Known = dict[Placement | State, Placement | State]
-"""Placements by themselves: a cache through which equal placements are stored once."""
+"""Cache of placements, each under itself as the key, so that equal placements are stored once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ class JobModels:
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """Rising frame numbers for which models that change have files."""
+        """Frame numbers, rising, for which changing models have files."""
         return tuple(sorted({number for files in self.numbered for number in files}))
 
     def state(self, frame: float) -> State | None:
@@ -103,7 +103,7 @@ class JobModels:
         return placed
 
     def _seen(self, task: Task, pictures: PictureConfig, times: Sequence[float], known: Known) -> Task:
-        """A view with placements of the models."""
+        """The task of one view, with placements of the models."""
         model = kind_of(self.models[0])
         if self.tracks is None:
             return task.seen_by(model, dict.fromkeys(times, model.near))

@@ -266,8 +266,8 @@ class RenderOptions:
 
 
 def picture_camera(task: Task, pictures: PictureConfig) -> Camera:
-    """Camera of the written picture: its size, its window, and the middle of the shutter. For a warped picture only
-    size and window count.
+    """Camera of the written picture: its size, its window, and the middle of the shutter. Of a warped picture's camera
+    only size and window are used.
 
     Raises InputError for a region outside the frame.
     """
@@ -284,7 +284,7 @@ def lens_of(task: Task, pictures: PictureConfig) -> Places | None:
 
 
 def warp_of(task: Task, pictures: PictureConfig) -> Warp | None:
-    """The warp of the picture, None for a straight one."""
+    """The warp of the picture, None without distortion."""
     lens = lens_of(task, pictures)
     return None if lens is None else Warp(lens, task.at(sampling_of(task, pictures).middle))
 
@@ -325,8 +325,8 @@ def end_before(task: Task, time: float, pictures: PictureConfig) -> float | None
 
 
 def model_times(task: Task, pictures: PictureConfig, channels: Collection[str]) -> list[float]:
-    """Times at which the models of a frame are evaluated, in frames from it: the shutter's middle, its samples, and the
-    targets of motion."""
+    """Times at which the models of a frame are evaluated, in frames from it: the shutter's middle, its samples, and one
+    frame later or earlier for motion channels."""
     sampling = sampling_of(task, pictures)
     times = [sampling.middle, *(sample_moments(sampling) if sampling.moves else ())]
     times += [sampling.middle + by for name, by in (("motion", 1), ("backward", -1)) if name in channels]

@@ -36,8 +36,8 @@ MAX_SCENE_REGION_RADIUS_RATIO = 0.2
 """Radius of the most detailed region, relative to the model's, up to which the model is a scene around an object.
 Models of a single object have at least 0.3; a room with a table in the middle has 0.05."""
 MIN_DETAIL_SIZE_QUANTILE, MIN_DETAIL_SIZE_RATIO = 0.02, 1e-4
-"""Sizes below which a Gaussian shows no more detail: this quantile of all sizes, and this fraction of the model's
-radius. Some files have Gaussians of size 0."""
+"""Sizes below which smaller Gaussians do not show more detail: this quantile of all sizes, and this fraction of the
+model's radius. Some files have Gaussians of size 0."""
 SCENE_RADIUS_MARGIN = 1.3
 """Radius of the part of a scene that is shown, relative to the radius of its most detailed region."""
 ORBIT_FRAMING_MARGIN = 1.1

@@ -68,7 +68,7 @@ class Shot:
         return [frame.camera for frame in self.frames]
 
     def standing(self, numbers: Sequence[int]) -> Shot:
-        """The camera of a single-frame shot, repeated at the frames of these numbers. Other shots are returned
+        """The shot with its only frame repeated at these frame numbers. A shot of several frames is returned
         unchanged."""
         if len(self.frames) != 1 or not numbers:
             return self

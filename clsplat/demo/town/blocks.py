@@ -229,7 +229,7 @@ def _parked_cars(builder: Builder, generator: np.random.Generator) -> None:
 def _points(
     solids: Solids, generator: np.random.Generator
 ) -> tuple[Float64, NDArray[np.int64], NDArray[np.int64], Float64]:
-    """Points on the surfaces, their solids, faces and normals. Undersides have none."""
+    """Points on the surfaces, their solids, faces and normals. Undersides have no points."""
     ground = np.zeros((GROUND_POINTS, 3))
     ground[:, :2] = generator.uniform(0, BLOCK_METRES, (GROUND_POINTS, 2))
     count = POINTS_PER_BLOCK - GROUND_POINTS

@@ -29,7 +29,7 @@ class ModelImage:
     camera: number of its camera, from 1.
     rotation, translation: (3, 3) and (3,) float64, `cam_from_world`.
     pixels: (n, 2) float64, its observations.
-    points: (n,) uint64, numbers of the points; UNKNOWN_POINT for none.
+    points: (n,) uint64, number of the point of each observation; UNKNOWN_POINT for none.
     """
 
     name: str

@@ -27,7 +27,7 @@ SLANT_RADIANS = math.radians(40.0)
 """Angle of the slanted flights' axes below the horizon."""
 TOWN_FISHEYE_COEFFICIENTS = (-0.02, 0.0005, 0.0, 0.0)
 STRAIGHT_SHARE, STREET_SHARE = 0.3, 0.3
-"""Fractions of a block's photographs. The rest is slanted."""
+"""Fractions of a block's photographs that look straight down, and that are taken in streets. The rest is slanted."""
 DIRECTIONS: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]])
 _YAWS = (0.38, -0.38)
 

@@ -29,7 +29,7 @@ from clsplat.demo.town.visibility import SIGHT_METRES
 HAZE_METRES = 150.0
 """Distance at which haze begins."""
 SLANT_BLUR = np.float32(0.7)
-"""Exponent with which a surface seen at a slant gets a coarser mip level."""
+"""A surface seen at a slant has a mip level coarser by this times log2(1 / cosine of the slant)."""
 LOT_COVERS: Final = np.array([paint.GRASS] * 9 + [paint.SOIL] * 3 + [paint.GRAVEL] * 2 + [paint.PAVING] * 2, np.int32)
 GROUND_DENSITY = np.float32(np.log2(TEXTURE_SIDE / GROUND_METRES))
 
@@ -70,7 +70,7 @@ class Shader:
         return result
 
     def _faces(self, surfaces: NDArray[np.int32]) -> tuple[NDArray[np.int64], Float32, Bool]:
-        """Row (n,) of each surface in a table of the seen faces; that table; and for each of its rows, True for a ball.
+        """Table of the seen faces: for each surface the index of its row (n,), the rows, and a mask of the balls' rows.
 
         Faces are in metres from the camera. In the row of a ball, its centre and radius take the place of the plane.
         """
@@ -203,7 +203,7 @@ def _hazy(colours: Float32, distance: Float32) -> Float32:
 
 
 def _to_street(place: Float32) -> Float32:
-    """Distance from the middle of the nearest street across one axis. place: in [0, BLOCK_METRES)."""
+    """Distance from the middle of the nearest street, along one axis. place: in [0, BLOCK_METRES)."""
     return np.asarray(np.minimum(place, np.float32(BLOCK_METRES) - place))
 
 

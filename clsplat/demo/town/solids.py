@@ -31,7 +31,7 @@ Triple = tuple[float, float, float]
 
 
 def light_on(normals: Float32) -> Float32:
-    """Light of sky, sun and ground on surfaces with unit normals (n, 3), as (n, 3), without shadows."""
+    """Light of sky, sun and ground (n, 3) on surfaces with unit normals (n, 3), without shadows."""
     rise = normals[:, 2:]
     sun = np.maximum(normals @ SUN_DIRECTION, 0)[:, None]
     return np.asarray(
@@ -43,7 +43,7 @@ def light_on(normals: Float32) -> Float32:
 class Cover:
     """The surface of a face.
 
-    texture: its index.
+    texture: index of its texture.
     metres: length of a side of the texture.
     tint: factors of red, green and blue.
     shift: offset of the texture, in sides.
@@ -127,7 +127,7 @@ class Builder:
         self._rows.append(_Row(SOLID_BALL, centre, (radius, radius, radius), 0.0, cover, cover))
 
     def build(self) -> Solids:
-        """The solids so far."""
+        """All solids that were added."""
         if not self._rows:
             return Solids()
         angles = np.array([row.turn for row in self._rows])

@@ -319,5 +319,5 @@ def _baked_sky(brush: Brush) -> Pixels:
 
 @lru_cache(maxsize=2)
 def textures(seed: int) -> Textures:
-    """The textures of a seed, kept for the next photographs."""
+    """The textures of a seed, cached."""
     return Textures(seed)

@@ -63,7 +63,7 @@ def world_rays(
 
 
 def rectangles(camera: Camera, low: Float64, high: Float64) -> NDArray[np.int32]:
-    """Rectangles (n, 4) of the picture, outside which boxes are not seen: rows from and to, columns from and to.
+    """Rectangles (n, 4) of the picture that contain boxes: first row, end row, first column, end column.
 
     The ends are exclusive. The rectangle of a box that is not seen is empty. In a panorama columns may lie beyond the
     edges, where the picture repeats.
@@ -160,7 +160,7 @@ def _fisheye_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
     x = camera.cx + camera.fx * radius * edge[..., 0] / level
     y = camera.cy + camera.fy * radius * edge[..., 1] / level
     bounds = np.stack([x.min(axis=1), x.max(axis=1), y.min(axis=1), y.max(axis=1)], axis=1)
-    whole = theta + angle >= np.pi  # the cone contains the backward direction, all around the picture's edge
+    whole = theta + angle >= np.pi  # the cone contains the backward direction, which is the picture's whole edge
     bounds[whole] = (-1e9, 1e9, -1e9, 1e9)
     return bounds
 
