@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat demo`: the whole pipeline on a synthetic scene, or a town to try large scenes on."""
+"""`clsplat demo`: the whole pipeline on a synthetic scene, or a town as an example of a large scene."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from clsplat.progress import StageProgress
 class DemoVerb(Verb):
     """Make photographs of a small scene, recover their cameras, train, evaluate and render a turntable.
 
-    With --town, write a town with any number of photographs as a COLMAP scene instead, to try large scenes on.
+    With --town, write a large example scene instead: a town with any number of photographs, as a COLMAP scene.
     """
 
     groups: ClassVar[Groups] = (
@@ -52,7 +52,7 @@ class DemoVerb(Verb):
     """Cameras in the streets: perspective, fisheye (OPENCV_FISHEYE, 180 degrees across the picture) or panorama
     (EQUIRECTANGULAR, W x W/2 pixels)."""
     town_exposure: Annotated[float, arg(metavar="STOPS")] = TownConfig.exposure
-    """Largest change of exposure, in stops: it differs from flight to flight, and drifts along a flight."""
+    """Largest change of exposure, in stops. The exposure differs from flight to flight, and drifts along a flight."""
     town_cars: Annotated[int, arg(metavar="COUNT")] = TownConfig.cars
     """Moving cars in each block. Each photograph shows them in other places, and masks leave them out."""
     town_origin: Annotated[str, arg(metavar="X,Y,Z")] = "0,0,0"

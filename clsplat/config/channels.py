@@ -61,8 +61,8 @@ FRAME_CHANNELS: dict[str, Channel] = {
     "count": Channel(("count",), "whole", "count", "whole", "count", note="of Gaussians"),
     "id": Channel(("id",), "whole", "id", "whole", "index", note="of Gaussians"),
 }
-"""Every channel that `--channels` takes, in the order of a file and of the kernels' planes. In files the v of both
-motions points up; in docs/channels.md y points down."""
+"""Every channel that `--channels` takes, in the order of a file and of the kernels' planes. In files v of both motion
+channels points up; in docs/channels.md y points down."""
 
 CRYPTOMATTE_LAYERS = 3
 """Layers of a Cryptomatte, with two objects each."""

@@ -33,8 +33,8 @@ class RasterizerConfig:
     """Skip a Gaussian at a pixel where its alpha is less than this. Values above the default, 1/255 or one step of 8
     bits, are approximate."""
     transmittance_min: float = 1e-4
-    """Leave out a Gaussian that would reduce a pixel's transmittance to this or less, and end the pixel (approximate
-    above 1e-4)."""
+    """Stop at a pixel before the Gaussian that would reduce its transmittance to this or less (approximate above
+    1e-4)."""
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value is invalid."""
@@ -60,8 +60,8 @@ class BenchSwitches(RasterizerConfig):
     """
 
     extent: Literal["opacity", "constant", "3sigma"] = "opacity"  # type: ignore[assignment]  # it allows one more value
-    """Reach of a Gaussian. opacity: until its alpha falls to alpha-min. constant: the reach of an opaque Gaussian, for
-    all. 3sigma: three standard deviations, which cuts off visible parts of opaque Gaussians (approximate)."""
+    """Reach of a Gaussian. opacity: until its alpha falls to alpha-min. constant: as for an opaque Gaussian. 3sigma:
+    three standard deviations, which cuts off visible parts of opaque Gaussians (approximate)."""
     tile_test: Literal["ellipse", "box", "square"] = "ellipse"
     """Tiles of 16 x 16 pixels that list a Gaussian. ellipse: the tiles that its ellipse reaches, or its whole bounding
     box if that has at most 16 tiles. box: its whole bounding box. square: the tiles within the square of its longest

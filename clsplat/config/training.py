@@ -28,7 +28,7 @@ AppearanceKind = Literal["none", "exposure", "ppisp", "grid"]
 Photos = Literal["auto", "exact", "8bit"]
 
 MANY_PHOTOGRAPHS = 300
-"""From this number of training photographs on, auto keeps them with 8 bits, and decodes them while training runs."""
+"""With this many training photographs or more, auto keeps them with 8 bits, and decodes them while training runs."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ class OptimiserConfig:
     sh_rest_every: int = 1
     """Steps between updates of the higher SH bands (approximate above 1)."""
     cooldown: int = 0
-    """Number of final steps over which every learning rate falls exponentially, to the fraction cooldown-to of itself.
-    0: the rates do not fall."""
+    """Number of final steps over which every learning rate falls exponentially, to cooldown-to times its value. 0: the
+    rates do not fall."""
     cooldown_to: float = 0.1
     """Fraction of every learning rate that is left after the cooldown; more than 0, at most 1."""
     beta1: float = 0.9
@@ -118,8 +118,8 @@ class DensityConfig:
     opacity_reset_to: float = 0.01
     """Maximum opacity after a reset."""
     max_gaussians: int = 10_000_000
-    """Maximum number of Gaussians, at which cloning and splitting stop. Near the limit the Gaussians with the largest
-    gradients go first."""
+    """Maximum number of Gaussians, at which cloning and splitting stop. Near the limit, Gaussians with the largest
+    gradients are cloned and split first."""
     growth: Growth = "paper"
     """paper: densify Gaussians over the threshold. budget: the number of Gaussians rises along a parabola to
     max-gaussians at density.stop, largest gradients first, whatever the threshold (Taming 3DGS). mcmc: Gaussians under
@@ -212,7 +212,7 @@ class TrainConfig:
     evaluations."""
     thinning: float = 0.0
     """Dropout for few photographs (DropGaussian): fraction of the Gaussians to leave out at random, 0 to 0.9. It rises
-    from 0 at the first step to this value at the last. The Gaussians that a step keeps are more opaque in it. 0.2 is as
+    from 0 at the first step to this value at the last. In that step the other Gaussians are more opaque. 0.2 is as
     published; 0 leaves none out."""
     penalty: float = 0.0
     """Weight in the loss of the mean opacity and of the mean scale relative to the scene's length unit. Only Gaussians
@@ -251,7 +251,7 @@ class TrainConfig:
     """Every n-th view by name is held out, including the first; 0 holds out none. A data set's own split takes
     precedence."""
     test_most: int = TEST_MOST
-    """Maximum number of views that test-every holds out, spread evenly over them; 0 for no maximum."""
+    """Maximum number of views that test-every holds out, which are then evenly spread; 0 for no maximum."""
     missing: Missing = "few"
     """Handling of pictures that the scene lists but that are missing. few: up to a tenth of them are left out, with a
     warning, and more are an error. skip: any number is left out. error: none may be missing. The held-out views stay
@@ -303,7 +303,7 @@ class TrainConfig:
     covers changes by place and brightness, such as in edited photographs. none: photographs are used unchanged."""
     appearance_rate: float = 2e-3
     """Learning rate of appearance, for base-2 logarithms of gains, or for coefficients of a grid. It is multiplied by
-    the root of the number of photographs. For gains, trainings of fewer than 10,000 steps raise it in proportion."""
+    the root of the number of photographs. For gains, a training of fewer than 10,000 steps raises it in proportion."""
     refine_poses: bool = False
     """Refine the poses of the training views, except two, with the model. refined/ in the run gets the cameras as a
     COLMAP model; eval.json gets the PSNR of held-out views after aligning them with the model. Not with batches."""
@@ -415,7 +415,7 @@ class TrainConfig:
         return MaskUse(self.masks, self.alpha, self.invert_masks)
 
     def rounds_photos(self, photographs: int) -> bool:
-        """True if pixels are rounded to 8 bits, in a scene of so many training photographs."""
+        """True if pixels are rounded to 8 bits, in a scene with `photographs` training photographs."""
         return self.photos == "8bit" or (self.photos == "auto" and photographs >= MANY_PHOTOGRAPHS)
 
     @property

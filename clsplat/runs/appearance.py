@@ -74,7 +74,7 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
 
 
 def looks_of_run(run: Run | None) -> Look:
-    """The function of `held_out_looks` for a run. It changes nothing without an appearance.json. Raises InputError."""
+    """The function of `held_out_looks` for a run; without appearance.json it changes nothing. Raises InputError."""
     path = run.appearance_path if run is not None else None
     return _looks({} if path is None or not path.exists() else _read(path, _document(path), "held_out"))
 

@@ -111,7 +111,7 @@ def read(run: Run) -> dict[str, Any] | None:
 
 
 def length_unit_of(run: Run, scene: Scene) -> float:
-    """Length unit of the run's training. Runs of earlier versions, and scenes that record none, have the extent.
+    """Length unit of the run's training. Without a recorded unit, as in runs of earlier versions, the extent.
 
     Raises InputError like `read`.
     """
