@@ -289,10 +289,10 @@ class TrainConfig:
     checkpoint_every: int = 1000
     """Steps between checkpoints; 0 writes only one, at the end or at an interruption."""
     eval_at: tuple[int, ...] = ()
-    """Steps at which the held-out views are evaluated, besides the last."""
+    """Steps at which the held-out views are evaluated, in addition to the last."""
     stages_every: int = 100
-    """Steps between measurements of the time of each stage for the report. Such a step is slower, as it waits for the
-    device after every stage. Only steps that metrics.jsonl records are measured, and always the last. 0 measures
+    """Steps between measurements of the time of each stage for the report. Such a step is slower, because it waits for
+    the device after every stage. Only steps that metrics.jsonl records are measured, and always the last. 0 measures
     none."""
     report: bool = True
     """Write report.html at the end."""

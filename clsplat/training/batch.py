@@ -88,7 +88,7 @@ class Losses:
 
 @dataclass(frozen=True, eq=False)
 class _AddedView(GradientStep):
-    """A view whose gradients are added to the sums over the views. In its model the sums come second.
+    """A view whose gradients are added to the sums over the views. Its model is the parameters and the sums.
 
     shown: (n,), nonzero for Gaussians that any view shows; None if Adam does not need it.
     own: by each view's place, the gradients with respect to the parameters of its parts.
@@ -229,7 +229,7 @@ class Replica:
         return ViewOutcome(arrays, gradients, view.run((parameters,), here, StepProbe(), room, reads_loss=True), own)
 
     def _host(self, place: int, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> NDArray[Any]:
-        """Host memory that is reused from step to step, as fresh pages would cost as much time as the copy."""
+        """Host memory that is reused from step to step: fresh pages would cost as much time as the copy."""
         held = self._room.get((place, name))
         if held is None or held.shape != shape:
             held = self._room[place, name] = np.empty(shape, dtype)

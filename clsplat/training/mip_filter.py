@@ -38,7 +38,7 @@ class MipFilter(Component):
         return SAMPLING_GAUSSIAN_BYTES if self._on else 0
 
     def is_due(self, step: int, views: int) -> bool:
-        """True if the limits have to be computed before a step of `views` views, the last of which is number `step`."""
+        """True if the limits have to be computed before a step of `views` views that ends with view number `step`."""
         return self._on and (self._least is None or (step - 1) % SAMPLING_LIMIT_INTERVAL_STEPS < views)
 
     def before_step(self, gaussians: AnyGaussians) -> None:

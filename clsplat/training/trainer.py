@@ -465,7 +465,7 @@ class Trainer:
                 self._note()
             self._rearrange(self.strategy.before_step(self._state(step)))
         if steps:
-            self.mark = None  # the strategy may also have drawn random numbers
+            self.mark = None  # rows may have moved, and random numbers may have been drawn
 
     def _state(self, step: int | None = None) -> ModelState:
         model, statistics, step = self.parameters, self.statistics.named(), step or self.step

@@ -43,7 +43,7 @@ VIEW_PULL_WEIGHT, NEIGHBOUR_PULL_WEIGHT = 0.02, 0.7
 
 The first pulls the gains of each photograph. The second pulls the part that gains of neighbouring photographs have in
 common. Without it neighbours may all become slightly too bright, where no other photograph shows a dark surface. Gains
-without points are not pulled, as the pull would hold them at the mean.
+without points are not pulled, because the pull would hold them at the mean.
 """
 
 GAIN_RATE_END_FRACTION = 0.001
@@ -123,8 +123,8 @@ class GainsOfAll(Appearance):
 
     @cached_property
     def _gains(self) -> Gains:
-        """Initial gains, unless a checkpoint has been loaded. Computed on first use, as sampling the photographs takes
-        time."""
+        """Initial gains, unless a checkpoint has been loaded. Computed on first use, because sampling the photographs
+        takes time."""
         scene = self._scene
         curve = CODED_OCTAVES_PER_LIGHT_OCTAVE if photos_space(view.path for view in scene.views) == SRGB else 1.0
         by_exif = curve * np.nan_to_num(_from_mean(self._told, self._told))

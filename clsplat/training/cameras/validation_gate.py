@@ -81,8 +81,8 @@ def drift(given: Sequence[Camera], refined: Sequence[Camera], length_unit: float
 
     A camera's residual is the root of (angle^2 + (distance/length_unit)^2), with the angle in radians. Squared
     residuals have Huber weights with the median residual as the bound, so that a few outliers have little influence.
-    The rotation fits positions and axes together (Kabsch 1976), as cameras may lie on a line or in one point. The scale
-    is Umeyama's (1991), from the positions.
+    The rotation fits positions and axes together (Kabsch 1976), because cameras may lie on a line or in one point. The
+    scale is Umeyama's (1991), from the positions.
     """
     old, new = (np.array([camera.rotation for camera in cameras]) for cameras in (given, refined))
     at, to = (np.array([camera.position for camera in cameras]) / length_unit for cameras in (given, refined))

@@ -25,7 +25,7 @@ from clsplat.training.density.adaptive import draw_offsets, is_due, long_halves
 MAX_GAUSSIANS_PER_PLACE = 51
 """Maximum number of Gaussians that together replace one Gaussian."""
 MAX_SHARED_OPACITY = 1 - 1e-7
-"""Upper limit of opacities in computations, as above it a float32 logit has no precision left."""
+"""Upper limit of opacities in computations, because above it a float32 logit has no precision left."""
 MIN_DRAWN_OPACITY = 1 / 255
 """Opacity up to which a Gaussian is invisible in every picture."""
 SCORE_ALL_RULES = MarkRules(gradient=-inf, large=-inf)

@@ -52,7 +52,7 @@ def lost(stage: str, broken: NDArray[np.bool_], refused: NDArray[np.bool_]) -> N
 
 
 def finite_or_zero(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Copy with zeros in place of non-finite values. It repairs moments, as zero is their initial value."""
+    """Copy with zeros in place of non-finite values. It repairs moments, because zero is their initial value."""
     return np.where(np.isfinite(values), values, np.float32(0))
 
 

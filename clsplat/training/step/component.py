@@ -38,7 +38,7 @@ class Component:
         return 0
 
     def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002
-        """True if `before_step` has work before a step of `views` views, the last of which is number `step`."""
+        """True if `before_step` has work before a step of `views` views that ends with view number `step`."""
         return False
 
     def before_step(self, gaussians: AnyGaussians) -> None:
@@ -56,7 +56,7 @@ class Component:
         """Change the parameters after Adam's step."""
 
     def rows_moved(self) -> None:
-        """Forget data about individual rows, as rows have moved."""
+        """Forget data about individual rows, because rows have moved."""
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a checkpoint, by name."""

@@ -2,8 +2,8 @@
 """A folder of decoded photographs: a file for each photograph and size, read back to the same pixels.
 
 A file has a header and the pixels. The header has the shape, the type, a key and a checksum of header and pixels. The
-key is a digest of everything that the pixels depend on, and also names the file. Files are read and not mapped, as a
-file that is cut short while it is mapped would end the process (docs/decisions/0045-photographs-by-the-slice.md).
+key is a digest of everything that the pixels depend on, and also names the file. Files are read and not mapped, because
+a file that is cut short while it is mapped would end the process (docs/decisions/0045-photographs-by-the-slice.md).
 """
 
 from __future__ import annotations

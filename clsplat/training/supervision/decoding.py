@@ -62,7 +62,7 @@ class Decoder:
         return max(int(camera.width / factor), 1), max(int(camera.height / factor), 1)
 
     def pixels(self, index: int, factor: float, *, keeps: bool) -> dict[float, NDArray[Any]]:
-        """Pixels (H, W, C) of view `index`, by factor: 1/factor of the view's size.
+        """Map from `factor`, a divisor of the view's size, to the pixels (H, W, C) of view `index` at that size.
 
         keeps: also return the sizes that the training needs later, if the file has to be decoded.
         Raises PhotographError.
@@ -116,7 +116,7 @@ class Decoder:
         )
 
     def working(self) -> int:
-        """Approximate upper limit of the bytes that decoding a photograph needs besides the result."""
+        """Approximate upper limit of the bytes that decoding a photograph needs in addition to the result."""
         return max(
             view.lens.width
             * view.lens.height

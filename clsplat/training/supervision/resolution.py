@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Size of the pictures in each training step: small at first, as there is no fine detail to fit yet. Policy only: no
-device."""
+"""Size of the pictures in each training step: small at first, because there is no fine detail to fit yet. Policy only:
+no device."""
 
 from __future__ import annotations
 
