@@ -28,7 +28,7 @@ SCENE_RECORD_FILE_NAME = "scene.json"
 MAX_SCENE_RECORD_BYTES = 256 << 20
 """Size limit of scene.json in bytes, enough for some hundred thousand views."""
 CAMERA_RELATIVE_TOLERANCE = 1e-6
-"""Relative difference up to which camera parameters count as equal, as another version may round differently."""
+"""Relative difference up to which camera parameters count as equal: another version may round differently."""
 _EXPECTED_SCENE_RECORD = "the record of a run's scene"
 
 

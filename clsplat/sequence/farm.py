@@ -153,8 +153,8 @@ def render_on_farm(
 def _results(client: Any, tasks: Sequence[Task], job: WorkerJob, video: VideoWriter | None = None) -> Iterator[Result]:
     """Results of `render_frame`, in the order in which frames finish.
 
-    Only a window of tasks is submitted at a time, as a job may have a million. For a video the window begins with the
-    frame to encode next, since frames that finish early wait here.
+    Only a window of tasks is submitted at a time, because a job may have a million. For a video the window begins with
+    the frame to encode next, since frames that finish early wait here.
     """
     from distributed import CancelledError, KilledWorker, as_completed
 
@@ -227,7 +227,7 @@ def _telling_of_no_workers(client: Any, scheduler: str | None) -> Iterator[None]
 
 
 def dask_setup(_: Any) -> None:
-    """Ignore Ctrl-C in a local worker, as the terminal also sends it to the job. Dask calls this in the worker."""
+    """Ignore Ctrl-C in a local worker, because the terminal also sends it to the job. Dask calls this in the worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 

@@ -55,7 +55,7 @@ class Sharing:
         return "ours"
 
     def _hold(self) -> None:
-        """Update the claims while the job runs, as a frame may take hours."""
+        """Update the claims while the job runs, because a frame may take hours."""
         while not self._closed.wait(CLAIM_HEARTBEAT_SECONDS):
             with self._changing:
                 for claimed in self._claims.values():

@@ -290,8 +290,8 @@ def warp_of(task: Task, pictures: PictureConfig) -> Warp | None:
 
 
 def straight_camera(task: Task, pictures: PictureConfig) -> Camera:
-    """Camera of the rendered picture: `picture_camera`, or for a warped picture the straight window that it is sampled
-    from."""
+    """Camera of the rendered picture: `picture_camera`, or the straight window from which a warped picture is
+    sampled."""
     camera, warp = picture_camera(task, pictures), warp_of(task, pictures)
     return camera if warp is None else warp.of_window(camera)[1] or camera
 
@@ -337,7 +337,7 @@ def plain(value: Any) -> Any:
     """Convert a value to JSON types.
 
     A dataclass becomes its differences from the defaults, so that adding a setting later does not change digests.
-    Floats have 12 digits, as processors differ in the last ones.
+    Floats have 12 digits, because processors differ in the last ones.
     """
     if is_dataclass(value) and not isinstance(value, type):
         changes = {}

@@ -190,7 +190,7 @@ def _skipped(task: Task, options: RenderOptions) -> Future[Result]:
 
 
 def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter | None) -> Iterator[Record]:
-    """Records of frames as their files are completed; for a video in the order of the tasks, as the frames are
+    """Records of frames as their files are completed; for a video in the order of the tasks, when the frames are
     added."""
     if video is None:
         for record, _ in results:

@@ -124,8 +124,7 @@ def _without_strays(frames: Sequence[Frame], source: Path) -> tuple[list[Camera]
 def photographed(path: Path, size: tuple[int | None, int | None] = (None, None)) -> list[PosedImage]:
     """The photographs' own cameras, with their lenses, from a COLMAP model or a transforms.json.
 
-    Raises InputError for another source of cameras, for panoramas, which no pinhole shows, and in the cases of
-    `read_shot`.
+    Raises InputError for another source of cameras, for panoramas, which no pinhole shows, and like `read_shot`.
     """
     images: list[PosedImage] | None = None
     if path.is_dir():

@@ -99,7 +99,7 @@ class KeyedTrack:
     def reach(self) -> tuple[float, float] | None:
         """Frames of the first and the last key that move the model, None if nothing moves it.
 
-        Infinite if values are held, as such a model is never extrapolated.
+        Infinite if values are held, because such a model is never extrapolated.
         """
         if self.held:
             return -math.inf, math.inf

@@ -82,7 +82,7 @@ def write_images(path: Path, count: int, images: Iterable[ModelImage]) -> None:
 
 
 def write_points(path: Path, points: ModelPoints) -> None:
-    """Write points3D.bin. Errors are 0, as the observations are exact."""
+    """Write points3D.bin. Errors are 0, because the observations are exact."""
     pairs = np.stack([points.images, points.observations], axis=1).astype("<u4")
     layout = struct.Struct("<Q3d3BdQ")
     with atomic_writer(path) as file:

@@ -101,7 +101,7 @@ Row = tuple[str, int, Float64, Float64, Float64]
 
 
 def _straight(count: int, generator: np.random.Generator) -> list[Row]:
-    """Cameras that look down, on lines along x that are flown to and fro."""
+    """Cameras that look down, on lines along x that are flown back and forth."""
     lines, rows = max(1, round(math.sqrt(count))), []
     for index, (x, y, line) in enumerate(_over_block(count, lines)):
         place = np.array([x, y, STRAIGHT_FLIGHT_METRES]) + generator.normal(0, 0.6, 3)
