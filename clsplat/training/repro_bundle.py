@@ -233,22 +233,22 @@ class _Counts(StepProbe):
         self.counts: dict[str, int] = {}
 
     def forward(self, frame: ForwardPass) -> None:
-        """Count in the drawn splats, and in the image."""
+        """Count non-finite values of the drawn splats, and of the image."""
         drawn = frame.projected.tile_counts.get() > 0
         written = [column for column, name in enumerate(SPLAT) if name != "UNUSED"]
         self.counts["project"] = _wrong(frame.projected.splats.get()[drawn][:, written])
         self.counts["blend"] = _wrong(frame.blended.image.get()[self.seen])
 
     def loss(self, result: Loss) -> None:
-        """Count in the loss's gradient."""
+        """Count non-finite values of the loss's gradient."""
         self.counts["loss"] = _wrong(result.gradient.get()[self.seen])
 
     def pair_gradients(self, slots: Slots) -> None:
-        """Count in the gradients of pairs."""
+        """Count non-finite gradients of pairs."""
         self.counts["blend_grad"] = _wrong(slots.values.get())
 
     def before_rows(self, rows: StepRows) -> None:
-        """Count in the gradients of Gaussians."""
+        """Count non-finite gradients of Gaussians."""
         assert rows.gradients is not None, "replay asks for them"
         self.counts["project_grad"] = _wrong_in(rows.gradients)
 

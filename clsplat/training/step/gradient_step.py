@@ -85,8 +85,8 @@ class GradientStep:
     ) -> Loss:
         """Update the model (parameters, first and second moments) with a view.
 
-        gradients: arrays for the gradients of the rows on the device at once, if a probe or a part reads them. They are
-        zero before and after. The model has the same bits with and without them.
+        gradients: arrays for gradients of the rows that are on the device at the same time, if a probe or a part reads
+        them. They are zero before and after. The model has the same bits with and without them.
         reads_loss: True if the loss will be read.
         """
         rasterizer, work, camera = self.rasterizer, self.rasterizer.work, inputs.camera
@@ -230,7 +230,7 @@ class GradientStep:
 
 
 def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = False) -> DeviceGaussians:
-    """Arrays for a view's gradients of the rows that are on the device at once.
+    """Arrays for a view's gradients of the rows that are on the device at the same time.
 
     zero: fill them with zeros, as `GradientStep.run` requires.
     """

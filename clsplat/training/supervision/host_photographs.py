@@ -128,7 +128,7 @@ class HostPhotographs:
         images = self.decoder.pixels(index, factor, keeps=not self.bounded)
         with self._lock:
             for each, image in images.items():
-                if each <= self._factor or not self._factor:  # else the training has left this size meanwhile
+                if each <= self._factor or not self._factor:  # else the training no longer uses this size
                     self._keep((index, each), image)
             self._pending.pop(key, None)
         return images
