@@ -51,7 +51,7 @@ Each verb is a module of `clsplat.cli`, with a class NAMEVerb and a function `ru
 verb is called.
 """
 _VERB_MODULES = {"render": "render.verb"}
-"""Modules of the verbs that have separate folders."""
+"""Modules of the verbs that are in sub-folders."""
 
 
 def verb_module(name: str) -> Any:

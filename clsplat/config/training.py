@@ -123,9 +123,10 @@ class DensityConfig:
     growth: Growth = "paper"
     """paper: densify Gaussians over the threshold. budget: the number of Gaussians rises along a parabola to
     max-gaussians at density.stop, largest gradients first, whatever the threshold (Taming 3DGS). mcmc: Gaussians under
-    min-opacity move to the largest gradients, and noise moves nearly transparent ones (3DGS-MCMC). The number rises by
-    the same factor each time, to max-gaussians at density.stop. mcmc splits Gaussians along the longest axis, also when
-    it moves them, and has no clones and resets. Gaussians over max-screen-radius are also moved, from the start."""
+    min-opacity move to those with the largest gradients, and noise moves nearly transparent ones (3DGS-MCMC). The
+    number rises by the same factor each time, to max-gaussians at density.stop. mcmc splits Gaussians along the longest
+    axis, also when it moves them, and has no clones and resets. Gaussians over max-screen-radius are also moved, from
+    the start."""
     long_axis: bool = False
     """Split Gaussians, small or large, along their longest axis, into two halves on that axis (Improved-GS). No
     Gaussian is cloned then. Growth mcmc always splits like this."""

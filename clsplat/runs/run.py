@@ -75,7 +75,7 @@ class Run:
         check_output(path, resume=resume, overwrite=overwrite)
         path.mkdir(parents=True, exist_ok=True)
         with locked(path, "train"):
-            check_output(path, resume=resume, overwrite=overwrite)  # again, because another process may have made a run
+            check_output(path, resume=resume, overwrite=overwrite)  # check again: another process may have made a run
             if resume:
                 earlier = cls.open(path)
                 check_resumed(earlier, config)

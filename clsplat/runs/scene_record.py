@@ -77,7 +77,7 @@ def known_digests(record: dict[str, Any] | None) -> set[str]:
 
 
 def write(run: Run, scene: Scene) -> None:
-    """Write scene.json. Existing checkpoints stay valid: their scenes are listed as earlier ones."""
+    """Write scene.json. Checkpoints of an earlier scene stay valid, because the record lists earlier scenes."""
     record, there = record_of(scene, run.config.resolution), {scene_of(path) for _, path in run.checkpoints()}
     earlier = known_digests(read(run)) | {digest for digest in there if digest}
     record["earlier"] = sorted(earlier - {digest_of(record)})

@@ -77,7 +77,7 @@ class _Held:
 
     def renderer_for(self, job: WorkerJob) -> FrameRenderer:
         if self.renderer is None or repr(job) != self.key:
-            self.key = self.renderer = None  # frees its memory before the next one allocates
+            self.key = self.renderer = None  # frees memory before the next renderer takes some
             cast = load_cast(Path(job.model))
             if cast.digest != job.digest:
                 raise InputError(f"{job.model}: has SHA-256 {cast.digest[:12]} on a worker, expected {job.digest[:12]}")

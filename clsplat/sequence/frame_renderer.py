@@ -43,7 +43,7 @@ from clsplat.sequence.task import (
 from clsplat.stages.holdout import HELD_PIXEL_BYTES, held_bytes
 
 TRANSFER_COMMANDS = ("read", "write", "fill")
-"""Names in a device's timing record that are transfers, not kernels."""
+"""Names of transfers in a device's timing record; other names are kernels."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ class FrameRenderer:
         draw, finish = pipeline.draw(frame)
         rows = self._rows(camera, held_bytes(cut(camera)) if cut else 0)
         if rows < camera.height and not task.is_video:
-            check_parts(camera, encoding, views)  # again: a deep holdout's memory depends on its number of surfaces
+            check_parts(camera, encoding, views)  # check again: a deep holdout's memory depends on its surfaces
             blanks: list[bool | None] = []
 
             def finished(strip: Camera, names: Collection[str]) -> Planes:

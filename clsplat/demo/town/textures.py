@@ -24,7 +24,7 @@ ASPHALT, PAVEMENT, GRASS, GRAVEL, SOIL, PAVING = range(14, 20)
 LEAVES, BARK, PLAIN = range(20, 22), 22, 23
 TEXTURE_COUNT = 24
 FACADE_METRES, ROOF_METRES, GROUND_METRES, LEAF_METRES = 12.0, 6.0, 8.0, 3.0
-"""Side of a texture on a surface. A facade has four windows and four storeys."""
+"""Lengths of a texture's side on facades, roofs, ground and leaves. A facade has four windows and four storeys."""
 SKY_ROWS, SKY_COLUMNS = 512, 2048
 HAZE_COLOUR: Final = np.array([0.50, 0.56, 0.63], np.float32)
 """Colour of the horizon, and of everything far away."""

@@ -154,10 +154,10 @@ class _Rays:
         self.distance = np.where(falls, ground, np.float32(np.inf))
         self.surfaces = np.where(falls, np.int32(GROUND_FACE), np.int32(SKY_FACE))
         x, y, z = (axis[:, :: max(axis.shape[1] - 1, 1), :: max(axis.shape[2] - 1, 1)] for axis in directions)
-        self._longest = float(np.sqrt((x**2 + y**2 + z**2).max()))  # the longest is at a corner of the picture
+        self._longest = float(np.sqrt((x**2 + y**2 + z**2).max()))  # the longest ray is at a corner
 
     def slices(self, part: _Part) -> Slices:
-        """Slices of the samples, rows and columns of these rays that a part of the picture covers."""
+        """Slices of samples, rows and columns: the part of these rays that is in a part of the picture."""
         rows = slice(max(part.top - self.first, 0), max(part.bottom - self.first, 0))
         return slice(None), rows, slice(part.left, part.right)
 
