@@ -69,8 +69,7 @@ def contributions(trainer: Trainer, seconds: float = CONTRIBUTION_SECONDS) -> di
     """Histogram of `largest_contributions`.
 
     `none` is the number of Gaussians that no view shows. `counts` are the numbers of other Gaussians in the bins
-    between `edges`, which are powers of ten of pixels. The first and last bin include all values beyond their outer
-    edge.
+    between `edges`, base-10 logarithms of pixels. The first and last bin include all values beyond their outer edge.
     Returns None if memory is limited, because the plan covers training alone.
     """
     if trainer.device.memory.limit is not None or isinstance(trainer.parameters, HostGaussians):

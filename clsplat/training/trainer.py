@@ -177,8 +177,8 @@ class Trainer:
         if not enough and not self._tight:
             self._tight = True
             warn(
-                f"{count:,} Gaussians leave photographs less than they need of --max-host-mem, which is exceeded from "
-                "here on; --density.max-gaussians limits their number"
+                f"--max-host-mem is exceeded from here on: {count:,} Gaussians leave too little of it for photographs; "
+                "--density.max-gaussians limits the number of Gaussians"
             )
         if batch is not None:
             batch.follow([plan(replica.device, REPLICA_ARRAYS_PER_PARAMETER) for replica in batch.replicas])
@@ -447,7 +447,7 @@ class Trainer:
         return np.array(background_colour(self.config.background), np.float32)
 
     def _raise_sh_degree(self) -> None:
-        """Raise the SH degree in use. Bands above it have no memory: their gradients, and so their steps, would be
+        """Raise the SH degree in use. Higher bands have no arrays yet: their gradients, and so their steps, would be
         zero."""
         every = self.config.sh_degree_every
         degree = min(self.step // every, self.config.sh_degree) if every > 0 else self.config.sh_degree
