@@ -76,7 +76,7 @@ def run(verb: BenchVerb, services: Services) -> int:
     device = services.require(services.open_device(verb.device.selector, limit, profile=True))
     most = int(device.cl_device.global_mem_size) // bench_stages.TRAINING_BYTES_PER_GAUSSIAN
     if verb.source is None and verb.gaussians > most:
-        raise InputError(f"--gaussians {verb.gaussians}: expected at most {most}, for which {device.name} has memory")
+        raise InputError(f"--gaussians {verb.gaussians}: expected at most {most}, the most that fit on {device.name}")
     if verb.source is None:
         subject = bench_subject.synthetic(verb.gaussians, *(size or (1024, 768)))
     else:

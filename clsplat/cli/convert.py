@@ -127,7 +127,7 @@ class ConvertVerb(Verb):
     drop_sh: Annotated[int | None, arg(metavar="DEGREE")] = None
     """Leave out spherical harmonics (view-dependent colour) above this degree, 0 to 3."""
     up: Annotated[Literal["y", "z"] | None, arg(metavar="y|z")] = None
-    """Up axis that a USD stage declares; y if not given. The model is not rotated: use --rotate for that."""
+    """Up axis to declare in a USD stage; y if not given. The model is not rotated: use --rotate for that."""
     spz_version: Annotated[Literal[2, 3, 4] | None, arg(metavar="2|3|4")] = None
     """Version of an SPZ file; 3 if not given. Version 4 is up to a tenth smaller, and the only one that PlayCanvas's
     engine reads. Spark, Babylon.js and older three.js refuse it. docs/formats.md lists the readers of each version."""
@@ -171,7 +171,7 @@ def run(verb: ConvertVerb, services: Services) -> int:
     save(verb.target, edited, comments=comments, progress=StageProgress(after=SILENT_WRITE_SECONDS), **options)
     if space != colour_space(verb.target):
         warn(f"{verb.target}: {target_format.name} cannot store the colour space, which is {space}")
-    read = load(verb.target, doubts=False)  # without warnings, as they were printed for the source already
+    read = load(verb.target, doubts=False)  # no warnings: they were printed for the source already
     if not isclose(read.near, edited.near, rel_tol=NEAR_PLANE_RELATIVE_TOLERANCE):
         warn(
             f"{verb.target}: {target_format.name} cannot store the near plane, which is {edited.near:.4g}; readers "
@@ -382,7 +382,7 @@ def _measured(
 ) -> SceneComparison:
     """PSNR in dB of the renders before and after conversion, with respect to the photographs and to each other.
 
-    The result has the values of each view and their means. For the converted model, cameras are transformed likewise.
+    The result has the values of each view and their means. The converted model is rendered with transformed cameras.
     """
     import numpy as np
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat demo`: the whole pipeline on a synthetic scene, or a town to try large scenes on."""
+"""`clsplat demo`: the whole pipeline on a synthetic scene, or a town as an example of a large scene."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from clsplat.progress import StageProgress
 class DemoVerb(Verb):
     """Make photographs of a small scene, recover their cameras, train, evaluate and render a turntable.
 
-    With --town, write a town with any number of photographs as a COLMAP scene instead, to try large scenes on.
+    With --town, write a large example scene instead: a town with any number of photographs, as a COLMAP scene.
     """
 
     groups: ClassVar[Groups] = (
@@ -52,9 +52,9 @@ class DemoVerb(Verb):
     """Cameras in the streets: perspective, fisheye (OPENCV_FISHEYE, 180 degrees across the picture) or panorama
     (EQUIRECTANGULAR, W x W/2 pixels)."""
     town_exposure: Annotated[float, arg(metavar="STOPS")] = TownConfig.exposure
-    """Largest change of exposure, in stops: it differs from flight to flight, and drifts along a flight."""
+    """Largest change of exposure, in stops. The exposure differs from flight to flight, and drifts along a flight."""
     town_cars: Annotated[int, arg(metavar="COUNT")] = TownConfig.cars
-    """Moving cars in each block, elsewhere in each photograph. Masks leave them out."""
+    """Moving cars in each block. Each photograph shows them in other places, and masks leave them out."""
     town_origin: Annotated[str, arg(metavar="X,Y,Z")] = "0,0,0"
     """World coordinates of the town's corner in metres, such as 500000,4650000,0, as in a survey."""
     town_pose_noise: Annotated[float, arg(metavar="METRES")] = TownConfig.pose_noise
@@ -66,7 +66,7 @@ class DemoVerb(Verb):
     """Replace an earlier town in the output folder."""
 
     def completed(self, given: Collection[str]) -> DemoVerb:
-        """The arguments. Raises InputError for flags of a town without --town, and of a training with it."""
+        """The arguments. Raises InputError for a town's flag without --town, and for a training's flag with --town."""
         others = ("iterations", "device") if self.town is not None else ("town_", "seed", "overwrite")
         if wrong := sorted(name for name in given if name.startswith(others)):
             flag = wrong[0].replace("_", "-")
@@ -79,7 +79,7 @@ class DemoVerb(Verb):
 
 
 def run(verb: DemoVerb, services: Services) -> int:
-    """Run the device's self-test, then the demo. Without a device write a town, if one is requested."""
+    """Run the device's self-test, then the demo. If a town is requested, only write the town, without a device."""
     if verb.town is not None:
         return _write_town(verb, services)
     TrainConfig(iterations=verb.iterations).check()

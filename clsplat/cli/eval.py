@@ -42,7 +42,7 @@ class EvalVerb(Verb):
     test_every: OptionalInt = None
     """Every n-th view in the order of names is held out and measured. If not given: the run's setting, else 8."""
     test_most: OptionalInt = None
-    """Maximum number of views that are held out like this, spread evenly; 0 for no maximum. If not given: the run's
+    """Maximum number of views that --test-every holds out, spread evenly; 0 for no maximum. If not given: the run's
     setting, else 200."""
     resolution: OptionalInt = None
     """Longest image side in pixels; 0 keeps the images' size up to 1600. If not given: the run's setting, else 0."""

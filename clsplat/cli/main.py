@@ -28,7 +28,7 @@ def main(arguments: Sequence[str] | None = None, services: Services | None = Non
     """Run one command line, by default `sys.argv`. Returns the exit status."""
     try:
         status = _run(list(sys.argv[1:] if arguments is None else arguments), services or Services())
-        sys.stdout.flush()  # here, since at exit the interpreter would print a traceback for a closed pipe
+        sys.stdout.flush()  # flush here: at exit the interpreter would print a traceback for a closed pipe
     except OSError as error:
         if not reader_has_gone(error):  # a closed pipe is no error, but a file that cannot be written is one
             tell(f"clsplat: error: standard output: {system_trouble(error)}")

@@ -32,7 +32,7 @@ VERBS = {
     "eval": "Measure a model on a scene's held-out views: PSNR, SSIM, and LPIPS if the extra is installed.",
     "render": "Render a model from the cameras of a file or along a path made from them, an image for each frame.",
     "stmaps": "Write the lenses of a scene's photographs as STMaps, to distort a render and to undistort a photograph.",
-    "thumbnail": "Draw one picture of a model: for a run, seen from among its photographs; for a file, of the whole "
+    "thumbnail": "Draw one picture of a model: for a run, seen from among its cameras; for a file, of the whole "
     "object or of a scene's most detailed part.",
     "view": "Look at a model in the browser: the device renders, the page shows it.",
     "report": "Write a run's report: one self-contained HTML file with curves, pictures, figures and settings.",
@@ -51,7 +51,7 @@ Each verb is a module of `clsplat.cli`, with a class NAMEVerb and a function `ru
 verb is called.
 """
 _VERB_MODULES = {"render": "render.verb"}
-"""Modules of the verbs that have separate folders."""
+"""Modules of the verbs that are in sub-folders."""
 
 
 def verb_module(name: str) -> Any:
@@ -172,7 +172,7 @@ def _wide() -> Iterator[None]:
 
 
 def _unboxed(report: str) -> str:
-    """Message of one of tyro's boxes in one line, without the frame and without the advice below a rule."""
+    """Text of a message that tyro has drawn in a box, in one line, without the frame and the advice below a rule."""
     words: list[str] = []
     # if standard output is not UTF-8, the box is drawn without box characters, and its first rule is below the title
     titled = "╭" in report

@@ -22,7 +22,7 @@ MIN_THUMBNAIL_SIDE_PX, MAX_THUMBNAIL_SIDE_PX = 16, 8192
 
 @dataclass(frozen=True)
 class ThumbnailVerb(Verb):
-    """Draw one picture of a model: for a run, seen from among its photographs; for a file, of the whole object or of a
+    """Draw one picture of a model: for a run, seen from among its cameras; for a file, of the whole object or of a
     scene's most detailed part.
 
     It is the first frame of `clsplat render MODEL --path turntable`.

@@ -59,8 +59,8 @@ class TrainVerb(Verb):
     """Limit of main memory for photographs and Gaussians together, such as 4GiB. Photographs beyond it are read from
     the cache (--cache), or decoded again. The result is the same. If not given: all photographs stay in memory."""
     cache: Annotated[str | None, arg(metavar="DIR|none")] = None
-    """Folder for decoded photographs, which stays, and which several trainings may share. none: no cache. If not given:
-    with --max-host-mem cache/ in the run's folder until the training has finished, else none."""
+    """Folder for decoded photographs. It stays after the training, and several trainings may share it. none: no cache.
+    If not given: with --max-host-mem cache/ in the run's folder until the training has finished, else none."""
     auto: Flag = False
     """Adapt settings to findings on the scene, such as --appearance exposure if the photographs' exposures differ.
     Settings given as flags stay. The findings are printed even without --auto."""
@@ -70,9 +70,9 @@ class TrainVerb(Verb):
     """Bundle of settings. exact and default are the same and approximate nothing. fast takes less than half of the
     time, and lost at most 0.3 dB of PSNR on the scenes used for tuning. Flags override it."""
     schedule: Schedule | None = None
-    """Bundle of learning rates and of the steps for scheduled actions. paper is made for 30,000 steps, short for
-    about 7000. high-rates is for about 7000 steps too, with higher rates than short. It pays off below about 60 steps
-    per photograph. Flags override it. If not given: paper, but short with --preset fast."""
+    """Learning rates, and the steps at which SH degrees rise and density control ends. paper is made for 30,000 steps,
+    short and high-rates for about 7000. high-rates has higher rates than short, and pays off below about 60 steps per
+    photograph. Flags override it. If not given: paper, but short with --preset fast."""
     passes: Annotated[int | None, arg(metavar="N")] = None
     """Passes through the training photographs. Sets --iterations to N times their number, and stretches or shortens the
     schedule in the same way: densification, SH degrees, opacity resets, warm-up sizes, learning rates and cooldown.
@@ -203,7 +203,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
 
 
 def _flags_of_machine(verb: TrainVerb) -> str:
-    """The given flags that are about the machine: the run does not keep them, so that --resume needs them again."""
+    """Given flags about the machine. --resume needs them again, because the run does not keep them."""
     given = {
         "--device": verb.device.selector,
         "--max-device-mem": verb.device.max_device_mem,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of channels. A row describes everything of a channel except its kernel's arithmetic (docs/channels.md)."""
+"""The table of channels. Each row describes a channel, except for its kernel's arithmetic (docs/channels.md)."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class Channel:
     names: names in a file, one for each float. EXR names follow the OpenEXR documentation ("Technical introduction",
     layers).
     kind: type of its values in a file. "colour" is half or float, as requested. "exact" is always float, as a half has
-    only 11 bits. "whole" is uint32 if the channel has a part of its own, else float.
-    part: its name in a file of several parts.
-    source: the device arrays that hold it. "image": from blend.cl. "features": from features.cl, blended by
+    only 11 bits. "whole" is uint32 if the channel has an EXR part of its own, else float.
+    part: name of its part in a multi-part EXR file.
+    source: the device arrays that hold its values. "image": from blend.cl. "features": from features.cl, blended by
     channels.cl. "depths": in the same array, after the features. "whole": in another array. "shares": blended like
     features, one for each object.
     kernel: its name in the kernels, which get a feature's offset as FEATURE_NAME.
     signs: factors from the kernel's values to the file's; empty if they are equal.
-    note: words of --help on it, and on the channels before it with the same words.
+    note: explanation for --help. Consecutive channels with the same note are listed together.
     """
 
     names: tuple[str, ...]
@@ -61,8 +61,8 @@ FRAME_CHANNELS: dict[str, Channel] = {
     "count": Channel(("count",), "whole", "count", "whole", "count", note="of Gaussians"),
     "id": Channel(("id",), "whole", "id", "whole", "index", note="of Gaussians"),
 }
-"""Every channel that `--channels` takes, in the order of a file and of the kernels' planes. In files the v of both
-motions points up; in docs/channels.md y points down."""
+"""Every channel that `--channels` takes, in the order of a file and of the kernels' planes. In files v of both motion
+channels points up; in docs/channels.md y points down."""
 
 CRYPTOMATTE_LAYERS = 3
 """Layers of a Cryptomatte, with two objects each."""

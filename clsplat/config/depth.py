@@ -9,7 +9,7 @@ from typing import Literal
 DepthSource = Literal["none", "points", "maps"]
 MapKind = Literal["metric", "relative"]
 DEPTH_WEIGHT_END_FRACTION = 0.01
-"""Fraction of the depth loss's weight that is left at the last step. It falls exponentially."""
+"""Fraction of the depth loss's weight that is left at the last step. The weight falls exponentially."""
 
 
 @dataclass(frozen=True)

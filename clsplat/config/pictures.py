@@ -17,9 +17,9 @@ from clsplat.errors import InputError
 Filter = Literal["box", "blackman-harris"]
 
 STRIP_PIXELS = 1 << 24
-"""Maximum number of pixels on the host at once, before filtering: about a gigabyte with every layer."""
+"""Maximum number of pixels that a strip of a picture has before filtering: about a gigabyte with every layer."""
 DEEP_STRIP_FLOATS = 1 << 24
-"""Maximum number of floats for the slices of a strip of a deep picture: 64 MiB."""
+"""Maximum number of floats in a strip of a deep picture, with all slices: 64 MiB."""
 DEEP_MERGE_FLOATS = 1 << 26
 """Maximum number of floats in memory at once while deep pictures are merged: 256 MiB."""
 SENSOR_WIDTH_MM = 36.0
@@ -56,8 +56,8 @@ class FramingConfig:
     """Samples of a pixel across and down. The frame is rendered this many times larger, and filtered down in linear
     light. 1 turns it off."""
     filter: Filter = "box"
-    """Filter from --supersample's samples to a pixel. box: the mean over the pixel. blackman-harris: a window three
-    pixels wide, which is smoother."""
+    """Filter that reduces --supersample's samples to a pixel. box: the mean over the pixel. blackman-harris: a window
+    three pixels wide, which is smoother."""
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value is invalid."""
@@ -234,8 +234,8 @@ class DeepConfig:
     """Slices of a deep EXR."""
 
     bins: int = 16
-    """Maximum number of slices by depth, which are the samples of a pixel. Each pixel places its slices at the
-    depths that contribute its light."""
+    """Maximum number of slices by depth, which are the samples of a pixel. Each pixel has its own slices, at the depths
+    that contribute its light."""
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value is invalid."""
@@ -259,7 +259,7 @@ class VideoConfig:
     crf: int = 18
     """Quality of an .mp4: 0 is the best, 51 the worst. 18 is about the lowest quality that shows no loss."""
     preset: str = "medium"
-    """Effort of the encoder for a smaller file, from ultrafast to veryslow."""
+    """Encoder preset, from ultrafast to veryslow. Slower presets make smaller files."""
     prores: ProRes = "hq"
     """ProRes of a .mov: 422, hq (422 HQ), or 4444, which may have alpha."""
 

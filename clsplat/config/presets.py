@@ -35,8 +35,8 @@ def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
     short: for runs of about 7000 steps, which the paper's rates leave unfinished. Colours, opacities and rotations
     learn faster, and SH degrees rise twice as fast. The means' rate reaches its minimum at the last step. Density
     control ends at five sevenths, and the last seventh is a cooldown (docs/decisions/0013-a-short-schedule.md).
-    high-rates: like short, but means, sizes, rotations and higher SH bands learn even faster and cool down further. SH
-    degrees rise every 300 steps, and mcmc has less noise relative to its rate (docs/decisions/0031-high-rates.md).
+    high-rates: like short, but with higher rates of means, sizes, rotations and higher SH bands, and a cooldown to
+    lower rates. SH degrees rise every 300 steps, and mcmc has less noise (docs/decisions/0031-high-rates.md).
     """
     if schedule == "paper":
         return TrainConfig(iterations=iterations)
@@ -97,8 +97,8 @@ def steps_made_for(preset: Preset, schedule: Schedule | None) -> int:
 def by_passes(config: TrainConfig, passes: int, photographs: int, given: Collection[str] = ()) -> TrainConfig:
     """The same schedule, stretched or shortened to `passes` passes through the training photographs.
 
-    All STEP_SETTINGS are multiplied by the same factor, so that a densification sees the same part of the photographs,
-    however many there are. A setting of at least 1 stays at least 1.
+    All STEP_SETTINGS are multiplied by the same factor, so that a densification sees the same fraction of the
+    photographs, whatever their number. A setting of at least 1 stays at least 1.
     given: names of settings that must not change.
     Raises InputError if `passes` is less than 1.
     """

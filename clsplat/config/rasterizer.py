@@ -11,7 +11,7 @@ from clsplat.config.checks import Rule, check_kinds, check_rules
 
 @dataclass(frozen=True)
 class RasterizerConfig:
-    """Approximations of the rasterizer. Each saves work and changes pictures, except for the defaults.
+    """Approximations of the rasterizer. Values other than the defaults save work and change pictures.
 
     sh-tolerance and sh-storage apply to frames of a model that stays on the device (render, eval), not to training.
     docs/performance.md has the error of each setting, and the time that it saves.
@@ -25,16 +25,16 @@ class RasterizerConfig:
     sh_tolerance: float = 0.0
     """Leave out a Gaussian's highest SH bands if no channel of its colour, 0 to 1, changes by more than this from any
     direction. 0 leaves out only bands that are zero (approximate above 0). Bands that no Gaussian needs are always left
-    out. Bands that only some need are left out if that removes at least half of all coefficients, as only then is it
-    faster."""
+    out. Bands that only some need are left out if that removes at least half of all coefficients; otherwise it saves no
+    time."""
     sh_storage: Literal["float", "half"] = "float"
     """Store the SH bands above 0 in 32 or in 16 bits. half takes half of the memory, and is approximate."""
     alpha_min: float = 1 / 255
     """Skip a Gaussian at a pixel where its alpha is less than this. Values above the default, 1/255 or one step of 8
     bits, are approximate."""
     transmittance_min: float = 1e-4
-    """Leave out a Gaussian that would reduce a pixel's transmittance to this or less, and end the pixel (approximate
-    above 1e-4)."""
+    """Stop at a pixel before the Gaussian that would reduce its transmittance to this or less (approximate above
+    1e-4)."""
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value is invalid."""
@@ -48,7 +48,7 @@ class RasterizerConfig:
         check_rules(self, "--rasterizer.", rules)
 
     def switches(self) -> BenchSwitches:
-        """This configuration with the switches of measurements added, which are on."""
+        """This configuration with the switches for measurements at their defaults."""
         return BenchSwitches(**vars(self))
 
 
@@ -60,8 +60,8 @@ class BenchSwitches(RasterizerConfig):
     """
 
     extent: Literal["opacity", "constant", "3sigma"] = "opacity"  # type: ignore[assignment]  # it allows one more value
-    """Reach of a Gaussian. opacity: until its alpha falls to alpha-min. constant: the reach of an opaque one, whatever
-    its opacity. 3sigma: three standard deviations, which cuts off visible parts of opaque Gaussians (approximate)."""
+    """Reach of a Gaussian. opacity: until its alpha falls to alpha-min. constant: as for an opaque Gaussian. 3sigma:
+    three standard deviations, which cuts off visible parts of opaque Gaussians (approximate)."""
     tile_test: Literal["ellipse", "box", "square"] = "ellipse"
     """Tiles of 16 x 16 pixels that list a Gaussian. ellipse: the tiles that its ellipse reaches, or its whole bounding
     box if that has at most 16 tiles. box: its whole bounding box. square: the tiles within the square of its longest
@@ -76,11 +76,11 @@ class BenchSwitches(RasterizerConfig):
     column_skip: bool = True
     """Visit only the vectors (pixels that are processed at once) of a row that a Gaussian's bounding box reaches."""
     early_stop: bool = True
-    """Leave a tile when all its pixels are opaque. If off, continue to its last Gaussian, without effect."""
+    """Leave a tile when all its pixels are opaque. If off, continue to its last Gaussian, which changes no pixel."""
     record_cells: bool = True
     """In a tile's gradient, visit only the cells of pixels to which a Gaussian contributes, as recorded by blending.
     If off, find the cells that the ellipse reaches once more."""
     frustum_cull: bool = True
-    """Leave out a Gaussian that reaches no tile of the image before computing its colour. If off, it gets a colour
+    """Before computing a Gaussian's colour, leave it out if it reaches no tile of the image. If off, it gets a colour
     and a place in the depth order, without effect. Gaussians that are not in front of the near plane have no
     projection, and are always left out."""

@@ -20,9 +20,9 @@ class StereoConfig:
     """Pairs of pictures, for the left and the right eye."""
 
     stereo: str = ""
-    """Render a frame for each eye: the eyes' distance in the scene's units, or stage for the two cameras of a USD stage
-    with stereoRole left and right. Writes two files if -o has {eye}, %V (left, right) or %v (l, r), else one EXR file
-    with a part for each eye. '' renders no pairs."""
+    """Distance of the eyes in the scene's units, to render a frame for each eye; or stage, for the two cameras of a USD
+    stage with stereoRole left and right. Writes two files if -o has {eye}, %V (left, right) or %v (l, r), else one EXR
+    file with a part for each eye. '' renders no pairs."""
     convergence: float | None = None
     """Depth along the camera's axis at which the pictures of both eyes coincide. The principal points are shifted; the
     cameras are not turned. If not given, the eyes look parallel."""

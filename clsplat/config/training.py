@@ -28,7 +28,7 @@ AppearanceKind = Literal["none", "exposure", "ppisp", "grid"]
 Photos = Literal["auto", "exact", "8bit"]
 
 MANY_PHOTOGRAPHS = 300
-"""Number of training photographs from which they are kept with 8 bits, and decoded while training runs."""
+"""With this many training photographs or more, auto keeps them with 8 bits, and decodes them while training runs."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ class OptimiserConfig:
     sh_rest_every: int = 1
     """Steps between updates of the higher SH bands (approximate above 1)."""
     cooldown: int = 0
-    """Number of final steps over which every learning rate falls exponentially, to the fraction cooldown-to of itself.
-    0: the rates do not fall."""
+    """Number of final steps over which every learning rate falls exponentially, to cooldown-to times its value. 0: the
+    rates do not fall."""
     cooldown_to: float = 0.1
     """Fraction of every learning rate that is left after the cooldown; more than 0, at most 1."""
     beta1: float = 0.9
@@ -100,8 +100,8 @@ class DensityConfig:
     """Mean screen-space gradient from which a Gaussian is densified (cloned or split), in units of half the image.
     Lower values make more Gaussians."""
     absolute_gradients: bool = False
-    """Sum the absolute values of the per-pixel gradients instead (AbsGS). gradient-threshold should then be about
-    8e-4."""
+    """Compare gradient-threshold with sums of absolute per-pixel gradients (AbsGS). gradient-threshold should then be
+    about 8e-4."""
     dense_fraction: float = 0.01
     """Largest scale of a Gaussian that is cloned, relative to the scene's length unit; larger ones are split."""
     split_factor: float = 1.6
@@ -118,27 +118,27 @@ class DensityConfig:
     opacity_reset_to: float = 0.01
     """Maximum opacity after a reset."""
     max_gaussians: int = 10_000_000
-    """Maximum number of Gaussians, at which cloning and splitting stop. Near the limit the Gaussians with the largest
-    gradients go first."""
+    """Maximum number of Gaussians, at which cloning and splitting stop. Near the limit, Gaussians with the largest
+    gradients are cloned and split first."""
     growth: Growth = "paper"
     """paper: densify Gaussians over the threshold. budget: the number of Gaussians rises along a parabola to
     max-gaussians at density.stop, largest gradients first, whatever the threshold (Taming 3DGS). mcmc: Gaussians under
-    min-opacity move to the largest gradients, and noise moves nearly transparent ones (3DGS-MCMC). The number rises by
-    the same factor each time, to max-gaussians at density.stop. mcmc splits Gaussians along the longest axis, also when
-    it moves them, and has no clones and resets. It applies max-screen-radius from the start, and moves those
-    Gaussians."""
+    min-opacity move to those with the largest gradients, and noise moves nearly transparent ones (3DGS-MCMC). The
+    number rises by the same factor each time, to max-gaussians at density.stop. mcmc splits Gaussians along the longest
+    axis, also when it moves them, and has no clones and resets. Gaussians over max-screen-radius are also moved, from
+    the start."""
     long_axis: bool = False
-    """Split Gaussians, small or large, along their longest axis, into two halves on that axis (Improved-GS). Nothing is
-    cloned then. Growth mcmc always splits like this."""
+    """Split Gaussians, small or large, along their longest axis, into two halves on that axis (Improved-GS). No
+    Gaussian is cloned then. Growth mcmc always splits like this."""
     spread: float = 1.0
     """With growth mcmc: random distance of a moved Gaussian from its target's mean, in standard deviations. 0 puts it
-    at the mean, as published. Applies only if more Gaussians have to move than have a gradient."""
+    at the mean, as published. Applies only if there are more Gaussians to move than Gaussians with a gradient."""
     noise_rate: float = 5e5
     """With growth mcmc: noise added to the means in each step, in multiples of their learning rate, for Gaussians of
     scale 1 in a scene of length unit 1. 0 adds none. The cooldown has no noise."""
     opacity_weight: float = 0.01
-    """With growth mcmc: weight in the loss of the opacities' sum over the Gaussians that the step's view shows, divided
-    by the number of all Gaussians."""
+    """With growth mcmc: weight of the opacities in the loss. They are summed over the Gaussians in the step's view, and
+    divided by the number of all Gaussians."""
     scale_weight: float = 0.01
     """With growth mcmc: like opacity-weight, but for scales relative to the scene's length unit."""
     min_contribution: float = 0.0
@@ -212,20 +212,20 @@ class TrainConfig:
     """Background behind the Gaussians and behind images with alpha. random: a new colour each step, and black in
     evaluations."""
     thinning: float = 0.0
-    """For few photographs (DropGaussian): fraction of the Gaussians, drawn at random, that the last step leaves out, 0
-    to 0.9. It rises from 0 at the first step. The other Gaussians are more opaque in that step. 0.2 is as published; 0
-    leaves none out."""
+    """Dropout for few photographs (DropGaussian): fraction of the Gaussians to leave out at random, 0 to 0.9. It rises
+    from 0 at the first step to this value at the last. In that step the other Gaussians are more opaque. 0.2 is as
+    published; 0 leaves none out."""
     penalty: float = 0.0
-    """Weight in the loss of the mean opacity and of the mean scale relative to the scene's length unit. Summed over the
-    Gaussians that the step's view shows. 0.02 helps against fog if there are few photographs. --density.growth mcmc has
-    weights of its own instead."""
+    """Weight in the loss of the mean opacity and of the mean scale relative to the scene's length unit. Only Gaussians
+    in the step's view add to these means. 0.02 helps against fog if there are few photographs. --density.growth mcmc
+    has weights of its own instead."""
     antialiased: bool = False
     """Train for pictures of any size (Mip-Splatting). A narrower low-pass filter preserves a Gaussian's light, and no
-    Gaussian is smaller than the photographs can show. The model is rendered the same way, and its file says it."""
+    Gaussian is smaller than the photographs can show. The model file records this, and renders do the same."""
     perspective: Perspective = "auto"
     """Projection of a Gaussian in pinhole pictures. plane: as an ellipse on the image plane (Kerbl et al.). rays: along
     the rays of the pixels, as for fisheyes and panoramas, which takes longer. auto: rays if the scene has fisheyes or
-    panoramas, so that all photographs share a projection. The model is rendered the same way, and its file says it."""
+    panoramas, so that all photographs share a projection. The model file records this, and renders do the same."""
     masks: MaskMeaning = "none"
     """Meaning of the photographs' masks, which are white where a pixel counts. ignore: the loss ignores black pixels,
     such as people. transparent: black pixels are empty, such as around an object on a turntable. none: masks are not
@@ -240,8 +240,8 @@ class TrainConfig:
     Used if masks or alpha mean transparent. Training's background is then random, and --background applies only to
     evaluations."""
     warmup: tuple[int, ...] = (250, 500)
-    """Steps after which the training resolution doubles. With two of them training starts at a quarter of the size,
-    with '' at the full size."""
+    """Steps after which the training resolution doubles. With two steps training starts at a quarter of the size, with
+    '' at the full size."""
     resolution: int = 0
     """Longest image side in pixels, in training and evaluation; 0 keeps the images' size up to 1600."""
     photos: Photos = "auto"
@@ -252,7 +252,7 @@ class TrainConfig:
     """Every n-th view by name is held out, including the first; 0 holds out none. A data set's own split takes
     precedence."""
     test_most: int = TEST_MOST
-    """Maximum number of views that test-every holds out, spread evenly over them; 0 for no maximum."""
+    """Maximum number of views that test-every holds out, which are then evenly spread; 0 for no maximum."""
     missing: Missing = "few"
     """Handling of pictures that the scene lists but that are missing. few: up to a tenth of them are left out, with a
     warning, and more are an error. skip: any number is left out. error: none may be missing. The held-out views stay
@@ -290,10 +290,10 @@ class TrainConfig:
     checkpoint_every: int = 1000
     """Steps between checkpoints; 0 writes only one, at the end or at an interruption."""
     eval_at: tuple[int, ...] = ()
-    """Steps at which the held-out views are evaluated, besides the last."""
+    """Steps at which the held-out views are evaluated, in addition to the last."""
     stages_every: int = 100
-    """Steps between measurements of the time of each stage for the report. Such a step is slower, as it waits for the
-    device after every stage. Only steps that metrics.jsonl records are measured, and always the last. 0 measures
+    """Steps between measurements of the time of each stage for the report. Such a step is slower, because it waits for
+    the device after every stage. Only steps that metrics.jsonl records are measured, and always the last. 0 measures
     none."""
     report: bool = True
     """Write report.html at the end."""
@@ -304,13 +304,13 @@ class TrainConfig:
     covers changes by place and brightness, such as in edited photographs. none: photographs are used unchanged."""
     appearance_rate: float = 2e-3
     """Learning rate of appearance, for base-2 logarithms of gains, or for coefficients of a grid. It is multiplied by
-    the root of the number of photographs. For gains, trainings of fewer than 10,000 steps raise it in proportion."""
+    the root of the number of photographs. For gains, a training of fewer than 10,000 steps raises it in proportion."""
     refine_poses: bool = False
     """Refine the poses of the training views, except two, with the model. refined/ in the run gets the cameras as a
     COLMAP model; eval.json gets the PSNR of held-out views after aligning them with the model. Not with batches."""
     pose_reach: float = 5.0
-    """Approximate limit of a refined pose's rotation over a training, in degrees. The limit of its movement is as many
-    57ths of the scene's length unit."""
+    """Approximate limit of a refined pose's rotation over a training, in degrees. The limit of its movement is this
+    angle in radians, times the scene's length unit."""
     refine_lenses: bool = False
     """Refine focal lengths and principal points with the model. Photographs with the same lens share them. refined/
     in the run gets them. For photographs without distortion; not with batches."""
@@ -319,7 +319,7 @@ class TrainConfig:
     the focal length."""
     refine_gate: float = 1.0
     """Tolerated loss of the held-out views' mean PSNR, in decibels. If the PSNR is below its best by more than this in
-    two measurements in a row, the cameras return to the best ones and are refined no more. At most 8 views are
+    two measurements in a row, training goes back to the best cameras and stops refining. At most 8 views are
     measured, when refinement begins and at every tenth of the training. Their poses are as given, or moved by the mean
     motion of the refined poses, whichever fits better. A warning at the end reports if aligning the views raises the
     PSNR by more than this. 0 turns both off. Without held-out views there is no measurement."""
@@ -416,7 +416,7 @@ class TrainConfig:
         return MaskUse(self.masks, self.alpha, self.invert_masks)
 
     def rounds_photos(self, photographs: int) -> bool:
-        """True if pixels are rounded to 8 bits, in a scene of so many training photographs."""
+        """True if pixels are rounded to 8 bits, in a scene with `photographs` training photographs."""
         return self.photos == "8bit" or (self.photos == "auto" and photographs >= MANY_PHOTOGRAPHS)
 
     @property

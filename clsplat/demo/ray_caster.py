@@ -9,7 +9,7 @@ Its light (sun with soft shadows, sky) is therefore baked into one texture per o
 A photo needs only the nearest hit and a texture look-up for each ray.
 
 In the world, z is up and units are metres. The scene is a paved floor inside a round wall. The wall hides the sky, for
-which there would be no initial points: training might place its Gaussians in front of another camera.
+which there would be no initial points: training might place the sky's Gaussians in front of another camera.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ class Wall(Surface):
         b = origin[..., 0] * direction[:, 0] + origin[..., 1] * direction[:, 1]
         c = origin[..., 0] ** 2 + origin[..., 1] ** 2 - np.float32(WALL_RADIUS_METRES**2)
         with np.errstate(divide="ignore", invalid="ignore"):
-            t = (-b + np.sqrt(np.maximum(b * b - a * c, 0))) / a  # from inside, the far root is the hit in front
+            t = (-b + np.sqrt(np.maximum(b * b - a * c, 0))) / a  # inside the wall, the larger root is in front
             z = origin[..., 2] + t * direction[:, 2]
         return np.where((t > 1e-3) & (z < WALL_HEIGHT_METRES) & (z > 0), t, np.inf).astype(np.float32)
 

@@ -22,7 +22,7 @@ MAX_LOG2_GAIN = 16.0
 MAX_CHANNEL_MIX = 0.25
 """Exclusive limit of the magnitude of a channel mix. Below it the matrix of any six mixes can be inverted."""
 KINDS_WITH_GAINS = ("exposure", "ppisp")
-"""Settings of --appearance whose files have gains, which a render can apply."""
+"""Values of --appearance whose files have gains, which a render can apply."""
 EXPECTED_APPEARANCE_FILE = "a file that clsplat train --appearance writes"
 
 MAX_CENTRE_PICTURE_SIZES = 100.0
@@ -31,8 +31,7 @@ MAX_CENTRE_PICTURE_SIZES = 100.0
 Row = Mapping[str, Any]
 """Entry of one photograph in appearance.json."""
 Look = Callable[[str, Image], Image]
-"""Function of a held-out photograph's name and a render (H, W, 3) that returns the render with that photograph's
-appearance."""
+"""Takes a held-out photograph's name and a render (H, W, 3). Returns the render with that photograph's appearance."""
 
 
 def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
@@ -75,14 +74,14 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
 
 
 def looks_of_run(run: Run | None) -> Look:
-    """`held_out_looks` of a run's appearance.json. Without this file the looks change nothing. Raises InputError."""
+    """The function of `held_out_looks` for a run; without appearance.json it changes nothing. Raises InputError."""
     path = run.appearance_path if run is not None else None
     return _looks({} if path is None or not path.exists() else _read(path, _document(path), "held_out"))
 
 
 def held_out_looks(record: Mapping[str, Any] | None) -> Look:
-    """Looks of held-out photographs from the content of an appearance.json. Photographs without an entry stay
-    unchanged."""
+    """Function that gives renders the appearance of held-out photographs, from the content of an appearance.json.
+    Renders of photographs without an entry stay unchanged."""
     return _looks(_rows_in(record, "held_out") if record is not None else {})
 
 
@@ -102,7 +101,7 @@ def _looks(rows: Mapping[str, Row]) -> Look:
 
 
 def unmixing(mixes: Float64) -> Float64:
-    """Matrix (3, 3) that removes the mixes (6,) from colours (docs/gradients.md, "Colours and vignettes")."""
+    """Matrix (3, 3) that undoes the channel mixes (6,) (docs/gradients.md, "Colours and vignettes")."""
     matrix = np.eye(3)
     for c, (next_share, last_share) in enumerate(mixes.reshape(3, 2)):
         matrix[c, c] += next_share + last_share

@@ -139,7 +139,7 @@ def scene_of(path: Path) -> str | None:
 class _Bounded:
     """File whose `read` is limited to the bytes that remain.
 
-    zipfile asks for the sizes that headers claim, and a plain `read` allocates all that is asked for.
+    zipfile asks for the sizes that headers claim, and a plain `read` allocates as many bytes as it is asked for.
     """
 
     def __init__(self, file: BinaryIO) -> None:

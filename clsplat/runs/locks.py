@@ -21,7 +21,7 @@ from clsplat.errors import InputError, warn
 from clsplat.files.documents import parse_json
 
 LOCK_FILE_NAME = ".clsplat-lock"
-"""Name of the file in the folder that is locked while a process writes there. The file names the process."""
+"""Name of the lock file in a run's folder. Its content names the process that writes there."""
 _LOCKED_BYTE_OFFSET = 1 << 30
 """Offset of the locked byte. Windows forbids other processes to read a locked byte, so it lies beyond the file's
 content."""
@@ -79,7 +79,7 @@ def _take(path: Path, folder: Path) -> IO[bytes]:
         with suppress(OSError):
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 return file
-        file.close()  # the previous holder has just removed this file, so another one has to be locked
+        file.close()  # the previous holder has just removed this file, so open a new one
 
 
 def try_lock(file: IO[bytes]) -> None:

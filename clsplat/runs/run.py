@@ -75,7 +75,7 @@ class Run:
         check_output(path, resume=resume, overwrite=overwrite)
         path.mkdir(parents=True, exist_ok=True)
         with locked(path, "train"):
-            check_output(path, resume=resume, overwrite=overwrite)  # again, as another process may have made a run
+            check_output(path, resume=resume, overwrite=overwrite)  # check again: another process may have made a run
             if resume:
                 earlier = cls.open(path)
                 check_resumed(earlier, config)
@@ -131,9 +131,9 @@ class Run:
     def model_record(self) -> dict[str, Any]:
         """The `step` and `seconds` of model.ply, if known.
 
-        They come from eval.json, which is written after the model. The last metrics may be later than the model, in a
-        run that was resumed and stopped.
-        An eval.json older than the model describes an earlier model, as after an interrupted evaluation.
+        They come from eval.json, which is written after the model. The last metrics may be of a later step, if the run
+        was resumed and then stopped.
+        An eval.json older than the model belongs to an earlier model, for example after an interrupted evaluation.
         In that case, or without a usable eval.json, the last record of metrics.jsonl is returned.
         """
         with suppress(OSError, ValueError, InputError):

@@ -28,7 +28,7 @@ SCENE_RECORD_FILE_NAME = "scene.json"
 MAX_SCENE_RECORD_BYTES = 256 << 20
 """Size limit of scene.json in bytes, enough for some hundred thousand views."""
 CAMERA_RELATIVE_TOLERANCE = 1e-6
-"""Relative difference up to which camera parameters count as equal, as another version may round differently."""
+"""Relative difference up to which camera parameters count as equal: another version may round differently."""
 _EXPECTED_SCENE_RECORD = "the record of a run's scene"
 
 
@@ -77,7 +77,7 @@ def known_digests(record: dict[str, Any] | None) -> set[str]:
 
 
 def write(run: Run, scene: Scene) -> None:
-    """Write scene.json. Existing checkpoints stay valid: their scenes are listed as earlier ones."""
+    """Write scene.json. Checkpoints of an earlier scene stay valid, because the record lists earlier scenes."""
     record, there = record_of(scene, run.config.resolution), {scene_of(path) for _, path in run.checkpoints()}
     earlier = known_digests(read(run)) | {digest for digest in there if digest}
     record["earlier"] = sorted(earlier - {digest_of(record)})
@@ -111,7 +111,7 @@ def read(run: Run) -> dict[str, Any] | None:
 
 
 def length_unit_of(run: Run, scene: Scene) -> float:
-    """Length unit of the run's training. Runs of earlier versions, and scenes that record none, have the extent.
+    """Length unit of the run's training. Without a recorded unit, as in runs of earlier versions, the extent.
 
     Raises InputError like `read`.
     """
@@ -139,7 +139,7 @@ def own_cameras(run: Run | None) -> list[Camera]:
 def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
     """Short descriptions of the differences between a run's recorded scene and the scene as it is now.
 
-    With another --resolution, different sizes and replacement files of another size are not differences.
+    If --resolution has changed, new sizes do not count, nor changed photographs that come from another file.
     """
     was, new, resized = earlier["views"], now["views"], earlier["resolution"] != now["resolution"]
     held_out = "held out in one and not in the other"

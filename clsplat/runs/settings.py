@@ -48,13 +48,13 @@ RETIRED_SETTINGS |= {
     "train.density.views_agree": 1,
     "train.frequency_steps": 0,
 }
-"""Settings of earlier versions, each with the value that switched it off."""
+"""Removed settings of earlier versions, each with the value that switched it off."""
 _ADDED_SETTINGS: dict[str, tuple[str, Any]] = {
     "train.test_most": ("test_every", 0),
     "train.photos": ("test_every", "exact"),
 }
-"""Settings that runs of earlier versions lack. Each has a setting that these runs have, and the value that stands for
-what these versions did."""
+"""Settings that config.toml files of earlier versions lack, each with a setting that those files have, and the value
+that keeps the behaviour of those versions."""
 _RETIRED_VALUES = {("train.rasterizer.extent", "constant")}
 """Retired values of current settings. The default replaces them."""
 
@@ -64,7 +64,7 @@ def config_text(config: TrainConfig, scene: Path | None) -> str:
     document: dict[str, Any] = {"clsplat": package_version()}
     if scene is not None:
         document["scene"] = str(scene)
-    document["train"] = json.loads(json.dumps(asdict(config), default=lambda number: number.item()))  # no NumPy
+    document["train"] = json.loads(json.dumps(asdict(config), default=lambda number: number.item()))  # NumPy to Python
     return tomli_w.dumps(document)
 
 

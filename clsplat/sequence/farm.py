@@ -41,11 +41,11 @@ NO_WORKERS_WARNING_SECONDS = 10.0
 
 @dataclass(frozen=True)
 class WorkerJob:
-    """Everything that a worker has to load.
+    """Settings of a job, with all that a worker has to load.
 
     model: absolute path of the model, or of the shot file.
     digest: SHA-256 of its content (`JobModels.digest`).
-    placed: the tasks contain placements of the models.
+    placed: True if the tasks contain placements of the models.
     version: version of clsplat.
     """
 
@@ -77,7 +77,7 @@ class _Held:
 
     def renderer_for(self, job: WorkerJob) -> FrameRenderer:
         if self.renderer is None or repr(job) != self.key:
-            self.key = self.renderer = None  # frees its memory before the next one allocates
+            self.key = self.renderer = None  # frees memory before the next renderer takes some
             cast = load_cast(Path(job.model))
             if cast.digest != job.digest:
                 raise InputError(f"{job.model}: has SHA-256 {cast.digest[:12]} on a worker, expected {job.digest[:12]}")
@@ -101,7 +101,7 @@ _WORKER_RENDERER = _Held()
 
 
 def render_frame(task: Task, job: WorkerJob) -> Result | Failure:
-    """Render a frame in a worker and write its file, unless a worker that was lost since has finished it.
+    """Render a frame in a worker and write its file, unless another worker, now lost, has finished it already.
 
     A frame of a video is returned to the process that encodes the video.
     """
@@ -128,13 +128,13 @@ def render_on_farm(
     workers: int | None = None,
     video: VideoWriter | None = None,
 ) -> None:
-    """Render the frames on the cluster of the scheduler at that address, or on a new local one with `workers`
-    processes.
+    """Render the frames on the cluster of the scheduler at the address `scheduler`, or on a new local cluster with
+    `workers` processes.
 
     Frames of a video are encoded in this process.
     on_done: as in `workers.run_tasks`.
     Frames of a lost worker are rendered again by others. Raises InputError if there is no such cluster. Raises
-    ClsplatError for a frame that cannot be rendered, or that has cost more workers than Dask allows.
+    ClsplatError for a frame that cannot be rendered, or whose workers were lost more often than Dask allows.
     """
     if not tasks:
         return
@@ -153,8 +153,8 @@ def render_on_farm(
 def _results(client: Any, tasks: Sequence[Task], job: WorkerJob, video: VideoWriter | None = None) -> Iterator[Result]:
     """Results of `render_frame`, in the order in which frames finish.
 
-    Only a window of tasks is submitted at a time, as a job may have a million. For a video the window begins with the
-    frame to encode next, since frames that finish early wait here.
+    Only a window of tasks is submitted at a time, because a job may have a million. For a video the window begins with
+    the frame to encode next, since frames that finish early wait here.
     """
     from distributed import CancelledError, KilledWorker, as_completed
 
@@ -227,7 +227,7 @@ def _telling_of_no_workers(client: Any, scheduler: str | None) -> Iterator[None]
 
 
 def dask_setup(_: Any) -> None:
-    """Ignore Ctrl-C in a local worker, as the terminal also sends it to the job. Dask calls this in the worker."""
+    """Ignore Ctrl-C in a local worker, because the terminal also sends it to the job. Dask calls this in the worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 

@@ -112,8 +112,8 @@ def frames_there(tasks: Sequence[Task], options: RenderOptions, video: VideoConf
 
 
 def _state(task: Task, options: RenderOptions) -> Literal["told", "untold", "changed", "missing"]:
-    """State of a frame's file: complete, with its settings recorded or not; of another model or settings; or missing,
-    damaged or of another kind."""
+    """State of a frame's file. told, untold: complete, and its settings are recorded or not. changed: of another model
+    or settings. missing: not there, damaged, or of another kind."""
     wanted = _identity(task, options)
     if _is_whole(task, options, wanted):
         return "untold" if attribute(task.path, SETTINGS_DIGEST_ATTRIBUTE) is None else "told"
@@ -145,13 +145,13 @@ def check_foreign(tasks: Sequence[Task]) -> None:
 
 
 def _at_once(tasks: Sequence[Task], look: Callable[[Task], T]) -> list[T]:
-    """Results of a function of each task's file; several files are read at once."""
+    """Call `look` with each task, in several threads, and return the results in the order of the tasks."""
     with ThreadPoolExecutor(MAX_FILE_THREADS) as pool:
         return list(pool.map(look, tasks))
 
 
 def stamp(path: Path) -> tuple[int, ...] | None:
-    """A mark that tells a file from another that replaces it; None if there is no file."""
+    """Inode, modification time and size of a file, by which a replacement is noticed; None if there is no file."""
     try:
         status = path.stat()
     except OSError:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames shared by jobs that run at the same time. A job checks each frame again before it starts it, and claims it by
-a file next to it."""
+"""Frames shared by jobs that run at the same time. Before a job renders a frame, it checks the frame's file again, and
+claims the frame by a file next to it."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Sharing:
         return "ours"
 
     def _hold(self) -> None:
-        """Update the claims while the job runs, as a frame may take hours."""
+        """Update the claims while the job runs, because a frame may take hours."""
         while not self._closed.wait(CLAIM_HEARTBEAT_SECONDS):
             with self._changing:
                 for claimed in self._claims.values():
@@ -63,7 +63,7 @@ class Sharing:
                         os.utime(claimed)  # not Path.touch, which would create a missing file again
 
     def end(self, task: Task) -> None:
-        """Release a frame whose file is complete, or will not be."""
+        """Release a frame, whether its file has been completed or not."""
         with self._changing:
             claimed = self._claims.pop(task.key, None)
         if claimed is not None:
@@ -125,7 +125,7 @@ class FrameQueue:
             warn(f"--skip-existing: another process renders {task.path}, which is still missing; waiting for it")
 
     def end(self, task: Task) -> None:
-        """Release a frame whose file is complete, or will not be."""
+        """Release a frame, whether its file has been completed or not."""
         if self._sharing is not None:
             self._sharing.end(task)
 

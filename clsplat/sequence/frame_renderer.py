@@ -43,7 +43,7 @@ from clsplat.sequence.task import (
 from clsplat.stages.holdout import HELD_PIXEL_BYTES, held_bytes
 
 TRANSFER_COMMANDS = ("read", "write", "fill")
-"""Names in a device's timing record that are transfers, not kernels."""
+"""Names of transfers in a device's timing record; other names are kernels."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class FrameRenderer:
                     check_parts(camera, self.options.encoding, views=len(task.views))
 
     def __call__(self, task: Task) -> RenderedFrame:
-        """Render a frame. Raises ClsplatError if it cannot be rendered or, for a frame in strips, not be written."""
+        """Render a frame. Raises ClsplatError if it cannot be rendered or, in strips, cannot be written."""
         device = self._renderer.device
         if not device.profile:
             return self._pair(task)
@@ -155,7 +155,7 @@ class FrameRenderer:
         draw, finish = pipeline.draw(frame)
         rows = self._rows(camera, held_bytes(cut(camera)) if cut else 0)
         if rows < camera.height and not task.is_video:
-            check_parts(camera, encoding, views)  # again: a deep holdout's memory depends on its number of surfaces
+            check_parts(camera, encoding, views)  # check again: a deep holdout's memory depends on its surfaces
             blanks: list[bool | None] = []
 
             def finished(strip: Camera, names: Collection[str]) -> Planes:
@@ -171,10 +171,10 @@ class FrameRenderer:
         return RenderedFrame(planes, time.monotonic() - start, finish, Measured(blank))
 
     def _placed(self, task: Task) -> tuple[Callable[[float], Gaussians], tuple[Gaussians | None, Gaussians | None]]:
-        """A function from a time in frames from the frame to the models, merged; and the models at the targets of
-        motion.
+        """Function that returns all models merged at a time; and the models one frame later and one frame earlier.
 
-        These are for motion and backward motion, None if nothing moves or the channel is not requested.
+        Times are in frames from the frame. The later and earlier models serve the channels motion and backward. They
+        are None if nothing moves or the channel is not requested.
         """
         ensemble, middle = self._ensemble, sampling_of(task, self.options.pictures).middle
         if (placed := task.placed) is None:
@@ -193,12 +193,12 @@ class FrameRenderer:
         device = self._renderer.device
         if require(device, RAY_STAGES) is not device:  # too late to change the kernel shape
             raise DriverError(
-                f"{device.name}: the driver failed in the shape {device.shape.label}; another works, call again"
+                f"{device.name}: the driver failed in the shape {device.shape.label}; another shape works, call again"
             )
         self._rays_tested = True
 
     def _rows(self, camera: Camera, planes: int) -> int:
-        """Rows of the strips that the camera's picture is rendered in, its height if it needs no strips.
+        """Number of rows of a strip of the camera's picture; the picture's height if it needs no strips.
 
         planes: bytes per pixel for a holdout.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Holdouts of a job's frames: one file for each, named by a pattern as the pictures are."""
+"""Holdouts of a job's frames: a file for each frame, named by a pattern like the pictures."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from clsplat.shots.stereo import for_eye
 def held_out(tasks: Sequence[Task], pattern: str, config: HoldoutConfig) -> list[Task]:
     """The tasks with their holdouts.
 
-    A pattern without a field for the number serves all frames, and one without a field for the eye both eyes. Warns
-    about depths in half floats. Raises InputError for a missing file, and for one whose header is not a holdout's.
+    Without a field for the number in the pattern all frames share a holdout, and without a field for the eye both eyes.
+    Warns about depths in half floats. Raises InputError for a missing file, and for a file without a holdout's header.
     """
     check_pattern(for_eye(pattern, tasks[0].eye))
     coarse: dict[Path, bool] = {}

@@ -25,7 +25,7 @@ from clsplat.shots.shot_file import KeyedTrack, Volume, Within, is_layout, read_
 from clsplat.shots.usd_models import read_stage
 
 Known = dict[Placement | State, Placement | State]
-"""Placements that are stored already, by themselves: equal ones are stored once."""
+"""Cache of placements, each under itself as the key, so that equal placements are stored once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +60,12 @@ class JobModels:
 
     @property
     def one(self) -> Gaussians:
-        """The model that is used as it is."""
+        """The single model, if models are not placed."""
         return self.still[0]
 
     @property
     def still(self) -> tuple[Gaussians, ...]:
-        """The models that do not change over time, so all that are not a `ModelSeries`."""
+        """The models that do not change over time: all except `ModelSeries`."""
         return tuple(model for model in self.models if not isinstance(model, ModelSeries))
 
     @property
@@ -80,7 +80,7 @@ class JobModels:
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """Rising frame numbers for which models that change have files."""
+        """Frame numbers, rising, for which changing models have files."""
         return tuple(sorted({number for files in self.numbered for number in files}))
 
     def state(self, frame: float) -> State | None:
@@ -103,7 +103,7 @@ class JobModels:
         return placed
 
     def _seen(self, task: Task, pictures: PictureConfig, times: Sequence[float], known: Known) -> Task:
-        """A view with placements of the models."""
+        """The task of one view, with placements of the models."""
         model = kind_of(self.models[0])
         if self.tracks is None:
             return task.seen_by(model, dict.fromkeys(times, model.near))
@@ -121,7 +121,7 @@ class JobModels:
         return replace(seen, placed=states, files=self._files_of(states.values()))
 
     def _files_of(self, states: Iterable[State]) -> tuple[Path, ...]:
-        """Files from which models that change are read for these states. Their samples are registered as expected."""
+        """Files of the changing models that these states need. Announces the states' samples to the models."""
         found: dict[Path, None] = {}
         for state in states:
             for index, placement in enumerate(state):

@@ -108,7 +108,7 @@ class Task:
     number, name: as in `shots.Frame`.
     camera: camera of the whole frame, in its final size.
     path: path of the file.
-    after, earlier: cameras that motion and backward motion lead to, of the same size; None unless requested.
+    after, earlier: cameras of the next and the previous frame, for motion channels, of the same size; or None.
     stretch: cameras while the shutter is open, None for a static camera.
     before: state of the file when the job began (`finished_frames.stamp`).
     sampling: shutter and lens of this frame; None means the job's.
@@ -266,8 +266,8 @@ class RenderOptions:
 
 
 def picture_camera(task: Task, pictures: PictureConfig) -> Camera:
-    """Camera of the written picture: its size, its window, and the middle of the shutter. For a warped picture only
-    size and window count.
+    """Camera of the written picture: its size, its window, and the middle of the shutter. Of a warped picture's camera
+    only size and window are used.
 
     Raises InputError for a region outside the frame.
     """
@@ -284,34 +284,34 @@ def lens_of(task: Task, pictures: PictureConfig) -> Places | None:
 
 
 def warp_of(task: Task, pictures: PictureConfig) -> Warp | None:
-    """The warp of the picture, None for a straight one."""
+    """The warp of the picture, None without distortion."""
     lens = lens_of(task, pictures)
     return None if lens is None else Warp(lens, task.at(sampling_of(task, pictures).middle))
 
 
 def straight_camera(task: Task, pictures: PictureConfig) -> Camera:
-    """Camera of the rendered picture: `picture_camera`, or for a warped picture the straight window that it is sampled
-    from."""
+    """Camera of the rendered picture: `picture_camera`, or the straight window from which a warped picture is
+    sampled."""
     camera, warp = picture_camera(task, pictures), warp_of(task, pictures)
     return camera if warp is None else warp.of_window(camera)[1] or camera
 
 
 def camera_after(task: Task, pictures: PictureConfig) -> Camera | None:
-    """Camera of the whole frame that motion leads to: one frame after the middle of the shutter."""
+    """Camera of the whole frame for the channel motion: one frame after the middle of the shutter."""
     middle = sampling_of(task, pictures).middle
     still = middle == 0 or task.after is None or isinstance(task.stretch, Moments)
     return task.after if still else task.at(middle + 1)
 
 
 def camera_before(task: Task, pictures: PictureConfig) -> Camera | None:
-    """Camera of the whole frame that backward motion leads to: one frame before the middle of the shutter."""
+    """Camera of the whole frame for the channel backward: one frame before the middle of the shutter."""
     middle = sampling_of(task, pictures).middle
     still = middle == 0 or task.earlier is None or isinstance(task.stretch, Moments)
     return task.earlier if still else task.at(middle - 1)
 
 
 def end_before(task: Task, time: float, pictures: PictureConfig) -> float | None:
-    """The time from which the camera at another time is extrapolated, both in frames from the frame.
+    """Time from which the camera at `time` is extrapolated. Both times are in frames from the frame.
 
     None if the shot's source defines the camera at that time, and for a shot of one frame. A stage defines its camera
     while the shutter is open; motion is extrapolated from the shutter's middle.
@@ -325,8 +325,8 @@ def end_before(task: Task, time: float, pictures: PictureConfig) -> float | None
 
 
 def model_times(task: Task, pictures: PictureConfig, channels: Collection[str]) -> list[float]:
-    """Times at which the models of a frame are evaluated, in frames from it: the shutter's middle, its samples, and the
-    targets of motion."""
+    """Times at which the models of a frame are evaluated, in frames from it: the shutter's middle, its samples, and one
+    frame later or earlier for motion channels."""
     sampling = sampling_of(task, pictures)
     times = [sampling.middle, *(sample_moments(sampling) if sampling.moves else ())]
     times += [sampling.middle + by for name, by in (("motion", 1), ("backward", -1)) if name in channels]
@@ -337,7 +337,7 @@ def plain(value: Any) -> Any:
     """Convert a value to JSON types.
 
     A dataclass becomes its differences from the defaults, so that adding a setting later does not change digests.
-    Floats have 12 digits, as processors differ in the last ones.
+    Floats have 12 digits, because processors differ in the last ones.
     """
     if is_dataclass(value) and not isinstance(value, type):
         changes = {}
@@ -362,7 +362,7 @@ def digest_of(*parts: Any) -> str:
 
 
 def settings_digest(task: Task, options: RenderOptions) -> str:
-    """Digest of everything but the model files that a frame depends on.
+    """Digest of everything that a frame depends on, except the model files.
 
     Includes cameras, channels, encoding, pictures, rasterizer, the content of its holdout, and the models' placements.
     For models with one file per frame, it includes the content of these files.

@@ -128,7 +128,7 @@ def run_tasks(
     video: VideoWriter | None = None,
     sharing: Sharing | None = None,
 ) -> None:
-    """Render the frames and write them meanwhile, or add them to the video.
+    """Render the frames, and at the same time write them or add them to the video.
 
     Each renderer has a thread, which takes the next free frame.
     sharing: claims of frames, if other jobs may render some of these frames meanwhile; their frames are awaited at the
@@ -168,7 +168,7 @@ def run_tasks(
             devices.submit(render, renderer).add_done_callback(tell_failure)
         for record in encoded(tasks, (finished.get().result() for _ in tasks), video):
             if video is not None:
-                room.release()  # frames begin in order, so that the frame the video waits for has had room
+                room.release()  # frames start in order, so that the next frame of the video already holds a place
             on_done(record)
     except KeyboardInterrupt:
         abandon()  # a thread may wait for a driver that hangs
@@ -183,14 +183,14 @@ def run_tasks(
 
 
 def _skipped(task: Task, options: RenderOptions) -> Future[Result]:
-    """The result of a frame that is there already."""
+    """The result of a frame that an earlier job has finished."""
     outcome: Future[Result] = Future()
     outcome.set_result((record_of(task, options, skipped=True), None))
     return outcome
 
 
 def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter | None) -> Iterator[Record]:
-    """Records of frames as their files are completed; for a video in the order of the tasks, as the frames are
+    """Records of frames as their files are completed; for a video in the order of the tasks, when the frames are
     added."""
     if video is None:
         for record, _ in results:

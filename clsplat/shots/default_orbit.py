@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Default cameras for a model without camera files.
 
-An orbit follows from where the Gaussians are and how much detail they show. If a run has recorded the
-photographs' own cameras, a path can go among those instead.
+The cameras are computed from the Gaussians' positions and detail. If a run has recorded its photographs' cameras, a
+path can go among those cameras instead.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ORBIT_FOV_RADIANS = math.radians(40.0)
 SUBJECT_SAMPLE_SIZE = 100_000
 """Number of Gaussians that are sampled to locate a model. A larger sample moves its centre by less than a pixel."""
 MIN_GAUSSIANS_FOR_STRAYS = 100
-"""Smallest number of Gaussians in a model of which some may be treated as strays."""
+"""In a model of at least this many Gaussians the outermost ones are treated as strays."""
 BALL_SHRINK_FACTOR = 0.9
 """Ratio of successive ball radii in the search for the most detailed region."""
 REGION_DETAIL_FRACTION = 0.35
@@ -36,12 +36,12 @@ MAX_SCENE_REGION_RADIUS_RATIO = 0.2
 """Radius of the most detailed region, relative to the model's, up to which the model is a scene around an object.
 Models of a single object have at least 0.3; a room with a table in the middle has 0.05."""
 MIN_DETAIL_SIZE_QUANTILE, MIN_DETAIL_SIZE_RATIO = 0.02, 1e-4
-"""Sizes below which a Gaussian shows no more detail: this quantile of all sizes, and this fraction of the model's
-radius. Some files have Gaussians of size 0."""
+"""Sizes below which smaller Gaussians do not show more detail: this quantile of all sizes, and this fraction of the
+model's radius. Some files have Gaussians of size 0."""
 SCENE_RADIUS_MARGIN = 1.3
 """Radius of the part of a scene that is shown, relative to the radius of its most detailed region."""
 ORBIT_FRAMING_MARGIN = 1.1
-"""Radius that a picture shows, relative to the subject's radius, since strays lie beyond the subject."""
+"""Radius that a picture shows, relative to the subject's radius: a margin for strays."""
 RING_ELEVATIONS_RADIANS = (math.radians(20.0), math.radians(5.0), math.radians(40.0))
 """Elevations of the camera rings, in radians. A turntable follows the first ring; a spiral rises and sinks between the
 other two."""
@@ -62,7 +62,7 @@ def parse_up(text: str) -> tuple[float, float, float]:
     most = max(abs(x), abs(y), abs(z))
     if not (0 < most < math.inf and math.isfinite(x + y + z)):
         raise expected
-    x, y, z = x / most, y / most, z / most  # keeps the squares in range
+    x, y, z = x / most, y / most, z / most  # so that the squares neither overflow nor underflow
     length = math.hypot(x, y, z)
     return x / length, y / length, z / length
 

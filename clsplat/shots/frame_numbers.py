@@ -77,7 +77,7 @@ def path_of(pattern: str, frame: int, name: str) -> Path:
         width = match["printed"] or match["padded"] or match["houdini"] or match["angled"]
         return f"{frame:0{int(width or len(match['digits'] or ''))}d}"
 
-    # a single pass, as a name may contain # or %
+    # a single pass, because a name may contain # or %
     return Path(FRAME_FIELD_PATTERN.sub(fill, pattern))
 
 

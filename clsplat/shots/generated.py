@@ -70,8 +70,8 @@ def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """A closed path of `frames` cameras around the scene cameras' focus point, with the first camera's intrinsics.
 
     The path keeps the cameras' median distance and height, and begins near the first camera. If the cameras surround
-    the focus point, the path makes one full turn. If they leave a wide gap, it swings to and fro over the arc that they
-    cover, since no camera has seen the rest. Raises ValueError for no cameras or no frames.
+    the focus point, the path makes one full turn. If they leave a wide gap, it swings back and forth over the arc that
+    they cover, since no camera has seen the rest. Raises ValueError for no cameras or no frames.
     """
     _check("turntable", cameras, frames)
     ring = _ring(cameras)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of a shot near a frame in time: the next and the previous frame's, and those while the shutter is open."""
+"""Cameras of a shot near a frame in time: of the next and the previous frame, and while the shutter is open."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ its tangent."""
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Cameras of one frame at several times, evaluated in advance for processes that do not have the shot's source.
+    """Cameras of one frame at several times, evaluated in advance for processes that cannot read the shot's source.
 
     first: the camera at the first time.
     times: (T,), rising, in frames relative to the frame.
@@ -69,9 +69,9 @@ def _values(camera: Camera) -> Float64:
 
 
 def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, sampling: SamplingConfig) -> Moments | None:
-    """Cameras of a shot that has `moment`, while the shutter of the frame `number` is open; None if it never is.
+    """Cameras while the shutter of the frame `number` is open; None without `moment`, or for a shutter of (0, 0).
 
-    They are the cameras of the frame's samples, and those at the times in between at which the source has values.
+    They are at the times of the frame's samples, and at the source's own times in between.
     """
     if shot.moment is None or sampling.shutter == (0.0, 0.0):
         return None
@@ -86,9 +86,9 @@ def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, samplin
 def targets(
     shot: Shot, resize: Callable[[Camera], Camera], index: int, middle: float, *, motion: bool, backward: bool
 ) -> tuple[Camera | None, Camera | None]:
-    """Cameras that motion and backward motion of the frame at this index lead to, None unless requested.
+    """Cameras of the next and the previous frame, which the motion channels point to; None unless requested.
 
-    They are one frame after and before it; for a shot that has `moment`, after and before the middle of the shutter.
+    They are one frame from the frame at this index; for a shot that has `moment`, from the middle of its shutter.
     """
     if shot.moment is not None:
         time = shot.frames[index].number + middle
@@ -155,13 +155,13 @@ def stretches(
     motion: bool = False,
     backward: bool = False,
 ) -> Callable[[int], Shot | None]:
-    """A function from a frame's number to the part of the shot that its shutter covers, None if nothing can move.
+    """Function from a frame's number to the part of the shot while its shutter is open; None if nothing can move.
 
     opens, closes: times at which the shutter opens and closes, in frames relative to the frame.
     motion, backward: also cover the middle of the next frame's shutter, or of the previous frame's.
     The part's frame numbers count from the given frame. Before its first and after its last frame, the shot is
-    extrapolated, as for motion. Raises InputError if the frames' pictures differ in size or projection, as one moving
-    camera cannot make them.
+    extrapolated, as for motion. Raises InputError if the frames' pictures differ in size or projection, because a
+    moving camera has only one of each.
     """
     middle = 0.5 * (opens + closes)
     opens = min(opens, middle - 1) if backward else opens

@@ -124,8 +124,7 @@ def _without_strays(frames: Sequence[Frame], source: Path) -> tuple[list[Camera]
 def photographed(path: Path, size: tuple[int | None, int | None] = (None, None)) -> list[PosedImage]:
     """The photographs' own cameras, with their lenses, from a COLMAP model or a transforms.json.
 
-    Raises InputError for another source of cameras, for panoramas, which no pinhole shows, and in the cases of
-    `read_shot`.
+    Raises InputError for another source of cameras, for panoramas, which no pinhole shows, and like `read_shot`.
     """
     images: list[PosedImage] | None = None
     if path.is_dir():
@@ -176,7 +175,7 @@ def shot_around(
 
 
 def check_around(path: str | None, *, among_own: bool = False) -> str:
-    """The name of a path around a model, or among the photographs' own cameras, after a check.
+    """Check the name of a path around a model, or among the photographs' own cameras, and return it.
 
     Raises InputError for None, and for a path that needs --cameras.
     """

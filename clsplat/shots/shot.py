@@ -68,7 +68,7 @@ class Shot:
         return [frame.camera for frame in self.frames]
 
     def standing(self, numbers: Sequence[int]) -> Shot:
-        """The camera of a single-frame shot, repeated at the frames of these numbers. Other shots are returned
+        """The shot with its only frame repeated at these frame numbers. A shot of several frames is returned
         unchanged."""
         if len(self.frames) != 1 or not numbers:
             return self
@@ -77,7 +77,7 @@ class Shot:
         )
 
     def only(self, text: str) -> Shot:
-        """The frames of the shot that `text`, such as 1-100:2, lists. Adds a warning if it lists other frames too.
+        """The frames of the shot that `text`, such as 1-100:2, lists. Adds a warning if the shot lacks some of them.
 
         Raises InputError for a text that `parse_frames` refuses, and if the shot has none of the listed frames.
         """

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shot files, clsplat's own JSON (docs/shot.md) for several models and how each moves; also the parser of
-`--transform`."""
+"""Shot files, clsplat's own JSON format for several moving models (docs/shot.md), and the parser of `--transform`."""
 
 from __future__ import annotations
 
@@ -50,7 +49,7 @@ _TRANSFORM_STEPS: dict[str, tuple[int, Callable[[list[float]], Float64]]] = {
     "rotate": (3, edit.turning),
     "scale": (1, lambda values: edit.scaling(values[0])),
 }
-"""Steps of --transform: how many numbers each takes, and a function from these to its matrix."""
+"""Steps of --transform, each with its number of values and the function that makes a matrix from them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +62,7 @@ class AnimatedProperty:
     def at(self, frame: float, *, held: bool) -> Float64:
         """Value (d,) at a frame, interpolated linearly between keys.
 
-        held: instead take the value of the latest key; before the first key, the first key's.
+        held: True to take the value of the latest key instead; before the first key, the first key's value.
         """
         if held:
             return np.asarray(self.values[max(int(np.searchsorted(self.frames, frame, side="right")) - 1, 0)])
@@ -76,7 +75,7 @@ class KeyedTrack:
 
     where: prefix of error messages.
     channels: the given properties, by name.
-    held: values stay the same from key to key. Otherwise they are interpolated linearly, and matrices by scale,
+    held: True if values stay the same from key to key. Otherwise they are interpolated linearly, and matrices by scale,
       rotation and translation.
     """
 
@@ -100,7 +99,7 @@ class KeyedTrack:
     def reach(self) -> tuple[float, float] | None:
         """Frames of the first and the last key that move the model, None if nothing moves it.
 
-        Infinite if values are held, as such a model is never extrapolated.
+        Infinite if values are held, because such a model is never extrapolated.
         """
         if self.held:
             return -math.inf, math.inf

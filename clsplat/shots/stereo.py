@@ -40,7 +40,7 @@ def seen_by(camera: Camera, eye: Eye, distance: float, convergence: float = math
 
 
 def shot_of(shot: Shot, eye: Eye, distance: float, convergence: float = math.inf) -> Shot:
-    """The shot as the eye sees it. Raises InputError in the cases of `seen_by`."""
+    """The shot as the eye sees it. Raises InputError like `seen_by`."""
 
     def seen(camera: Camera) -> Camera:
         return seen_by(camera, eye, distance, convergence)
@@ -54,7 +54,7 @@ def pair_of_stage(path: Path, prim: str | None = None) -> tuple[str, str]:
     """Paths of a USD stage's left and right camera (stereoRole), which are children of the same prim.
 
     prim: path or name of that prim or of one of the cameras, to choose one of several pairs.
-    Raises InputError if there is no such pair or more than one, and in the cases of `usd.read_usd`.
+    Raises InputError if there is no such pair or more than one, and like `usd.read_usd`.
     """
     survive(path, "clsplat.shots.stereo:pair_here", prim=prim)
     return pair_here(path, prim)

@@ -16,7 +16,7 @@ from clsplat.camera import Camera
 COLMAP_UP = (0.0, -1.0, 0.0)
 """Up direction in the world of a level photograph: COLMAP's y axis points down."""
 MAX_AZIMUTH_GAP_RADIANS = np.deg2rad(100.0)
-"""Widest azimuth gap between cameras, in radians, that a turntable crosses. At wider gaps it swings to and fro."""
+"""Widest azimuth gap between cameras, in radians, that a turntable crosses. At wider gaps it swings back and forth."""
 
 
 def look_at(position: Float64, target: Float64, up: Float64) -> tuple[Float64, Float64]:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training step, the training loop, and recovery from trouble."""
+"""The training step, the training loop, and recovery from non-finite values and failures."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A step of several views, on one device or several: gradients are summed in the order of the views, then Adam's step.
+"""A step of several views, on one device or several. Gradients are summed in the order of the views; then Adam steps.
 
 The first device has the model. Each further device has a thread and a copy of the parameters, and returns the results
 of its views. Neither the speed nor the number of devices changes a bit of the result.
@@ -88,10 +88,10 @@ class Losses:
 
 @dataclass(frozen=True, eq=False)
 class _AddedView(GradientStep):
-    """A view whose gradients are added to the sums over the views. The sums are the second member of its model.
+    """A view whose gradients are added to the sums over the views. Its model is the parameters and the sums.
 
     shown: (n,), nonzero for Gaussians that any view shows; None if Adam does not need it.
-    own: for the place of each view, the gradients with respect to the parameters of its parts.
+    own: by each view's place, the gradients with respect to the parameters of its parts.
     noise: noise that the step adds after its last view.
     """
 
@@ -104,7 +104,7 @@ class _AddedView(GradientStep):
         self.own[inputs.place] = own
 
     def update(self, rows: StepRows) -> None:
-        """Add the rows' gradients to the sums. If kernels are only tried in the sandbox, try those that follow too."""
+        """Add the rows' gradients to the sums. In a sandbox trial, also try the kernels that follow."""
         assert rows.gradients is not None, "the batch asks for them"
         parameters, sums = rows.model
         shown = None if self.shown is None else self.shown.rows(rows.start, rows.stop)
@@ -229,7 +229,7 @@ class Replica:
         return ViewOutcome(arrays, gradients, view.run((parameters,), here, StepProbe(), room, reads_loss=True), own)
 
     def _host(self, place: int, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> NDArray[Any]:
-        """Memory on the host, the same from step to step, as fresh pages would cost as much time as the copy."""
+        """Host memory that is reused from step to step: fresh pages would cost as much time as the copy."""
         held = self._room.get((place, name))
         if held is None or held.shape != shape:
             held = self._room[place, name] = np.empty(shape, dtype)
@@ -250,8 +250,8 @@ class Batch:
         devices = (rasterizer.device, *further)
         if len({device.queue.int_ptr for device in devices}) < len(devices):
             raise InputError(
-                f"several devices to train on: got {', '.join(device.name for device in devices)}, of which two "
-                "share a queue and kernels; open each device on its own, because each gets a thread"
+                f"several devices to train on: got {', '.join(device.name for device in devices)}; two of them share a "
+                "queue and kernels; open each device on its own, because each gets a thread"
             )
         self.rasterizer, self.photographs, self.config = rasterizer, photographs, config
         self.replicas = [Replica(device, config, photographs) for device in further]
@@ -386,7 +386,7 @@ class Batch:
         return step.run(model, inputs, probes(inputs, step), gradients, reads_loss=True)
 
     def _take(self, sums: AnyGaussians, outcome: ViewOutcome, step: _AddedView, probe: StepProbe) -> Loss:
-        """Add a view's results from another device. They take the memory that a view on this device would use."""
+        """Add a view's results from another device, in the memory that a view on this device would use."""
         device, work = step.device, self.rasterizer.work
         probe.loss(outcome.loss)
         for start, stop, (part,) in parts(work, sums, keep=True):

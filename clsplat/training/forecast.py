@@ -23,10 +23,10 @@ The prior is a factor times a power of the initial number of Gaussians. Five sce
 GROWTH_RAMP = (0.35, 0.55, 0.75, 0.9)
 """Growth of the first densifications, as fractions of the peak: split Gaussians have to accumulate gradients first."""
 PEAK_DENSIFICATIONS = 3
-"""Number of densifications at the peak that follow the ramp."""
+"""Number of densifications after the ramp in which the growth stays at its peak."""
 GROWTH_DECAY_STEPS, GROWTH_FLOOR_FRACTION = 1100.0, 0.2
-"""Steps in which the growth decays to 1/e, and the fraction of the peak that it decays to: Gaussians that are small
-enough fall below the threshold."""
+"""Time constant in steps of the growth's exponential decay, and the fraction of the peak that it decays to: Gaussians
+that are small enough fall below the threshold."""
 RECENT_DENSIFICATIONS = 4
 """Number of latest densifications that predict the next ones."""
 PRIOR_GROWTH_WEIGHT = 0.5
@@ -36,7 +36,7 @@ PRIOR_COSTS = np.array([8000.0, 0.6, 1.2, 80_000.0])
 PRIOR_COST_WEIGHT_SECONDS = 0.03
 """Weight of the prior costs: they count as much as this many measured seconds."""
 OUTLIER_FACTOR = 4.0
-"""Reports that took this many times their usual time tell nothing about the next ones: a kernel was built."""
+"""Reports that took over this many times their usual time are left out of the prediction: a kernel was built."""
 PACE_WINDOW_SECONDS = 60.0
 """Seconds of recent steps that give the machine's current speed."""
 
@@ -52,9 +52,9 @@ class TimedStep(Protocol):
 class Span(NamedTuple):
     """Steps of one size and number of Gaussians.
 
-    factor: of the size (`Sizes`).
-    reads: photographs that are read.
-    seconds: of a span that has passed.
+    factor: divisor of the photographs' width and height (`Sizes`).
+    reads: number of photographs that are read.
+    seconds: duration, if the steps are done.
     """
 
     factor: float
@@ -68,7 +68,7 @@ class Forecast:
     """Seconds until the end of a training. Call `see` with each report, in order.
 
     photographs: number of photographs to train on. Each is read when it is first seen, for all sizes.
-    pixels: of a photograph at full size.
+    pixels: number of pixels of a photograph at full size.
     """
 
     def __init__(self, config: TrainConfig, photographs: int, pixels: float) -> None:
@@ -79,12 +79,12 @@ class Forecast:
         self.spans: list[Span] = []
         """Steps between two reports."""
         self.amounts: list[tuple[float, ...]] = []
-        """Amounts of these spans."""
+        """For each of these spans, the result of `_amounts`."""
         self.added: list[tuple[int, int]] = []
         """Step of each densification, and the number of Gaussians that it added."""
 
     def see(self, report: TimedStep) -> None:
-        """Take a report."""
+        """Record a report."""
         step, count, seconds = report.step, report.gaussians, report.seconds
         if self.last is None or step <= self.last[0]:  # after a return to a checkpoint
             self.begun, self.last = self.begun or (step, count), (step, count, seconds)
@@ -108,7 +108,7 @@ class Forecast:
         return pace * float(sum(span.steps * (cost @ np.array(self._amounts(span))) for span in ahead))
 
     def _reads(self, before: int, step: int) -> float:
-        """Number of photographs that the steps after `before` up to `step` read: those not yet seen.
+        """Number of photographs that the steps after `before` up to `step` read. A photograph is read at its first use.
 
         Each epoch shows every photograph once, in a random order, and a training may resume in the middle of one.
         """
@@ -116,7 +116,7 @@ class Forecast:
         begin = self.begun[0] - 1
         epoch = self.photographs / self.config.batch
         epoch_end = math.ceil(begin / epoch) * epoch
-        unseen = 1 - (epoch_end - begin) / epoch  # in the epoch after that
+        unseen = 1 - (epoch_end - begin) / epoch  # fraction of the photographs that only the next epoch reads
 
         def read(until: int) -> float:
             return min(until, epoch_end) - begin + unseen * min(max(until - epoch_end, 0), epoch)
@@ -158,11 +158,11 @@ class Forecast:
         return added / (PRIOR_GROWTH_WEIGHT + sum(_course(self.config.density, step, peak) for step, _ in taken)), peak
 
     def _amounts(self, span: Span) -> tuple[float, ...]:
-        """Factors (4,) of the costs in a step: 1, pixels, Gaussians, photographs read."""
+        """Amounts (4,) that the cost of a step is made of: 1, pixels, Gaussians, photographs read."""
         return 1.0, self.pixels / span.factor**2, span.gaussians, span.reads / span.steps
 
     def _cost(self) -> tuple[Float64, float]:
-        """Seconds of a step by its parts (4,), and the factor by which recent steps took longer."""
+        """Seconds per unit of each of the `_amounts` (4,), and the factor by which recent steps took longer."""
         spans = self.spans[1:] or self.spans  # the first span includes building kernels
         parts = np.array(self.amounts[-len(spans) :])
         steps, seconds = np.array([(span.steps, span.seconds) for span in spans]).T

@@ -28,7 +28,7 @@ NO_CACHE = "none"
 
 
 def model_bytes(config: TrainConfig) -> int:
-    """Bytes of a Gaussian's parameters, moments and statistics, and with a batch of its gradients and their sums."""
+    """Bytes per Gaussian: parameters, moments and statistics, and with a batch also gradients and their sums."""
     arrays = MODELS if config.batch == 1 else OWNER_ARRAYS_PER_PARAMETER
     return arrays * 4 * floats_of((config.sh_degree + 1) ** 2) + gaussian_bytes(contributions=False)
 
@@ -46,7 +46,7 @@ class HostMemory:
 
     @classmethod
     def chosen(cls, max_host_mem: str | int | None, cache: str | Path | None, run: Run | None) -> HostMemory:
-        """Main memory by the arguments of `clsplat.train`. Raises InputError.
+        """Main memory as the arguments of `clsplat.train` set it. Raises InputError.
 
         cache: a folder, "none", or None for the run's folder if there is a limit.
         """

@@ -57,8 +57,8 @@ Trainings that differ only in the seed differ by as much (docs/quality.md).
 
 
 Between = Callable[[Trainer, Callable[[], bool]], None]
-"""Function called before each step, with the trainer and a predicate. It should return once the predicate is True,
-after Ctrl-C."""
+"""Function called before each step, with the trainer and a predicate. The predicate becomes True after Ctrl-C, and the
+function should then return."""
 
 
 @dataclass(frozen=True)
@@ -144,9 +144,9 @@ class TrainingSession:
     def rescue(self) -> str:
         """Write a checkpoint of the state at the start of the step, if that is intact.
 
-        It is for failed or interrupted trials of kernels, and for photographs that cannot be read.
+        Called after a failed or interrupted trial of kernels, and for a photograph that cannot be read.
 
-        Returns the end of a sentence that reports it, or "".
+        Returns the end of an error message, which names the checkpoint, or "".
         """
         if self.run is None or not self.trainer.step_back():
             return ""

@@ -22,7 +22,7 @@ SAMPLING_LIMIT_INTERVAL_STEPS = 100
 
 
 class MipFilter(Component):
-    """Lower limits of the scales in training, from the cameras of its pictures at full size. Inactive unless the
+    """Lower limits of the Gaussians' scales, from the training cameras at full picture size. Inactive unless the
     settings ask for antialiasing."""
 
     def __init__(self, config: TrainConfig, device: Device, work: Workspace, cameras: Sequence[Camera]) -> None:
@@ -38,7 +38,7 @@ class MipFilter(Component):
         return SAMPLING_GAUSSIAN_BYTES if self._on else 0
 
     def is_due(self, step: int, views: int) -> bool:
-        """True if the limits have to be computed before the `views` steps that end with this one."""
+        """True if the limits have to be computed before a step of `views` views that ends with view number `step`."""
         return self._on and (self._least is None or (step - 1) % SAMPLING_LIMIT_INTERVAL_STEPS < views)
 
     def before_step(self, gaussians: AnyGaussians) -> None:

@@ -26,7 +26,7 @@ def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None) -> S
     """Scene with its length unit, start points and known depths; `scene` itself if it has them already.
 
     resumed: the run that continues, which keeps its length unit.
-    Raises InputError for points, depths or cameras to refine with which training would fail.
+    Raises InputError if training with its points, depths or refined cameras would fail.
     """
     unit = scene_record.length_unit_of(resumed, scene) if resumed else scene.unit or length_unit_of(scene)
     if unit != scene.unit:

@@ -101,7 +101,7 @@ class StepRecord(TypedDict):
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """One training step.
+    """A training step with everything that a replay needs.
 
     models: parameters and moments by group.
     """
@@ -176,7 +176,7 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
 
 
 def _unmarked(models: dict[str, HostGaussians]) -> dict[str, HostGaussians]:
-    """The models, with moments that mark a refused step set back to their earlier values, as far as these are known."""
+    """The models, with zeros in place of non-finite moments, which may mark a refused step."""
     for kind in ("first", "second"):
         arrays = {g: HostArray(finite_or_zero(array.values)) for g, array in models[kind].arrays.items()}
         models[kind] = replace(models[kind], arrays=arrays)
@@ -233,29 +233,29 @@ class _Counts(StepProbe):
         self.counts: dict[str, int] = {}
 
     def forward(self, frame: ForwardPass) -> None:
-        """Count in the drawn splats, and in the image."""
+        """Count non-finite values of the drawn splats, and of the image."""
         drawn = frame.projected.tile_counts.get() > 0
         written = [column for column, name in enumerate(SPLAT) if name != "UNUSED"]
         self.counts["project"] = _wrong(frame.projected.splats.get()[drawn][:, written])
         self.counts["blend"] = _wrong(frame.blended.image.get()[self.seen])
 
     def loss(self, result: Loss) -> None:
-        """Count in the loss's gradient."""
+        """Count non-finite values of the loss's gradient."""
         self.counts["loss"] = _wrong(result.gradient.get()[self.seen])
 
     def pair_gradients(self, slots: Slots) -> None:
-        """Count in the gradients of pairs."""
+        """Count non-finite gradients of pairs."""
         self.counts["blend_grad"] = _wrong(slots.values.get())
 
     def before_rows(self, rows: StepRows) -> None:
-        """Count in the gradients of Gaussians."""
+        """Count non-finite gradients of Gaussians."""
         assert rows.gradients is not None, "replay asks for them"
         self.counts["project_grad"] = _wrong_in(rows.gradients)
 
 
 def replay(bundle: Bundle, device: Device) -> dict[str, int]:
-    """Repeat the step. Returns the number of non-finite values after each stage, and of the steps that `adam`
-    refuses."""
+    """Repeat the step. Returns the number of non-finite values after each stage, and of array elements that
+    `adam` refuses to step."""
     config, record = bundle.config, bundle.record
     rasterizer = Rasterizer(device, config.rasterizer, antialiased=config.antialiased)
     probe = _Counts(bundle.inputs.camera)

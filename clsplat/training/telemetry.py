@@ -31,7 +31,7 @@ REPORTED_PACKAGES = ("numpy", "pyopencl", "OpenImageIO", "scipy", "scikit-image"
 CONTRIBUTION_SECONDS = 1.0
 """Seconds for sampling training views for contributions, counted from the end of the first view."""
 CONTRIBUTION_BIN_EDGES = tuple(float(edge) for edge in np.round(np.arange(-3.0, 5.01, 0.2), 1))
-"""Edges of the bins of contributions, as powers of ten of pixels."""
+"""Edges of the bins of contributions, as base-10 logarithms of pixels."""
 
 
 def session(device: Device, step: int) -> dict[str, Any]:
@@ -69,9 +69,8 @@ def contributions(trainer: Trainer, seconds: float = CONTRIBUTION_SECONDS) -> di
     """Histogram of `largest_contributions`.
 
     `none` is the number of Gaussians that no view shows. `counts` are the numbers of other Gaussians in the bins
-    between `edges`, which are powers of ten of pixels. The first and last bin include all values beyond their outer
-    edge.
-    Returns None if memory is limited, as the plan covers training alone.
+    between `edges`, base-10 logarithms of pixels. The first and last bin include all values beyond their outer edge.
+    Returns None if memory is limited, because the plan covers training alone.
     """
     if trainer.device.memory.limit is not None or isinstance(trainer.parameters, HostGaussians):
         return None

@@ -113,7 +113,7 @@ class Trainer:
         self.given = initial
         self.monitor = NonFiniteMonitor(self.rasterizer.readback, [view.name for view in self.views])
         self.pending = SpeculativeSteps(device, self.monitor, self._begin_again)
-        self.pending.on &= self.batch is None and not config.refines  # a batch reads losses, and refinement gradients
+        self.pending.on &= self.batch is None and not config.refines  # batches read losses, refinement reads gradients
         self._start()
 
     def _start(self) -> None:
@@ -177,8 +177,8 @@ class Trainer:
         if not enough and not self._tight:
             self._tight = True
             warn(
-                f"{count:,} Gaussians leave photographs less than they need of --max-host-mem, which is exceeded from "
-                "here on; --density.max-gaussians limits their number"
+                f"--max-host-mem is exceeded from here on: {count:,} Gaussians leave too little of it for photographs; "
+                "--density.max-gaussians limits the number of Gaussians"
             )
         if batch is not None:
             batch.follow([plan(replica.device, REPLICA_ARRAYS_PER_PARAMETER) for replica in batch.replicas])
@@ -255,7 +255,7 @@ class Trainer:
         return result
 
     def _next_photographs(self) -> list[tuple[int, float]]:
-        """Views of the next steps and their factors, in the order of their use, until the end of the epoch."""
+        """Views of the next steps and their size divisors, in the order of their use, until the end of the epoch."""
         batch, ahead = self.config.batch, self.queue[: -1 - reading_threads() - self.config.batch : -1]
         return [(view, self.sizes.factor(self.step + (1 + place // batch) * batch)) for place, view in enumerate(ahead)]
 
@@ -274,7 +274,7 @@ class Trainer:
         return inputs
 
     def _gradient_step(self) -> GradientStep:
-        """The step, with exact counts."""
+        """The step, with an exact count of pairs."""
         rates = self.rates()
         return GradientStep(
             self.device,
@@ -313,7 +313,7 @@ class Trainer:
         self.mend()
 
     def settle(self) -> None:
-        """Wait until all steps are known to be complete, or repeat them (`SpeculativeSteps`)."""
+        """Wait for all launched steps, and repeat the incomplete ones (`SpeculativeSteps`)."""
         self.pending.settle()
 
     def _pixels(self, view: int) -> NDArray[Any]:
@@ -390,8 +390,8 @@ class Trainer:
     def step_back(self) -> bool:
         """After an error, return to the last point at which a checkpoint was possible.
 
-        That is before the current step or, once its density control is done, after that. Returns False if the state
-        there is lost.
+        That point is before the current step, or after the step's density control if that is done. Returns False if the
+        state there is lost.
         """
         mark = self.mark
         if mark is None:
@@ -447,7 +447,7 @@ class Trainer:
         return np.array(background_colour(self.config.background), np.float32)
 
     def _raise_sh_degree(self) -> None:
-        """Raise the SH degree in use. Bands above it have no memory: their gradients, and so their steps, would be
+        """Raise the SH degree in use. Higher bands have no arrays yet: their gradients, and so their steps, would be
         zero."""
         every = self.config.sh_degree_every
         degree = min(self.step // every, self.config.sh_degree) if every > 0 else self.config.sh_degree
@@ -465,7 +465,7 @@ class Trainer:
                 self._note()
             self._rearrange(self.strategy.before_step(self._state(step)))
         if steps:
-            self.mark = None  # the strategy may also have drawn random numbers
+            self.mark = None  # rows may have moved, and random numbers may have been drawn
 
     def _state(self, step: int | None = None) -> ModelState:
         model, statistics, step = self.parameters, self.statistics.named(), step or self.step
@@ -499,7 +499,7 @@ class Trainer:
             self.batch.close()
 
     def local(self, camera: Camera) -> Camera:
-        """Camera in the coordinates of the model in training, from one in world coordinates: see `Gaussians.local`."""
+        """Camera in the coordinates of the model in training, from a camera in the world: see `Gaussians.local`."""
         return camera.from_origin(self.origin).before(self.near).along_rays(self.by_rays)
 
     def camera(self, view: int, width: int, height: int) -> Camera:

@@ -260,7 +260,7 @@ def test_the_noise_of_a_batch_is_tried_before_anything_changes(
 def test_a_device_that_is_there_twice_is_refused(scene: Scene, default_device: Device) -> None:
     """Two threads would set arguments of the same kernels; a limit makes no other device of it."""
     for twin in (default_device, default_device.with_memory_limit(2**30)):
-        with pytest.raises(InputError, match="of which two share a queue and kernels; open each device on its own"):
+        with pytest.raises(InputError, match="two of them share a queue and kernels; open each device on its own"):
             train(scene, TWO, device=[default_device, twin])
 
 

@@ -17,7 +17,7 @@ from clsplat.rotations import quaternion_of
 from clsplat.scenes.dataset import Lens, models
 
 UNKNOWN_POINT = np.uint64(2**64 - 1)
-"""Point of an observation that belongs to no track."""
+"""Point number of an observation that belongs to no track."""
 _OBSERVATION = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
 _COUNT = struct.Struct("<Q")
 
@@ -29,7 +29,7 @@ class ModelImage:
     camera: number of its camera, from 1.
     rotation, translation: (3, 3) and (3,) float64, `cam_from_world`.
     pixels: (n, 2) float64, its observations.
-    points: (n,) uint64, numbers of the points; UNKNOWN_POINT for none.
+    points: (n,) uint64, number of the point of each observation; UNKNOWN_POINT for none.
     """
 
     name: str
@@ -46,7 +46,7 @@ class ModelPoints:
 
     places: (n, 3) float64, world coordinates.
     colours: (n, 3) uint8.
-    tracks: (n + 1,), where each point's observations begin in the two next arrays.
+    tracks: (n + 1,), index of each point's first observation in the next two arrays; last, their length.
     images: numbers of the images that show it, from 1.
     observations: the observation's index in that image.
     """
@@ -82,7 +82,7 @@ def write_images(path: Path, count: int, images: Iterable[ModelImage]) -> None:
 
 
 def write_points(path: Path, points: ModelPoints) -> None:
-    """Write points3D.bin. Errors are 0, as the observations are exact."""
+    """Write points3D.bin. Errors are 0, because the observations are exact."""
     pairs = np.stack([points.images, points.observations], axis=1).astype("<u4")
     layout = struct.Struct("<Q3d3BdQ")
     with atomic_writer(path) as file:

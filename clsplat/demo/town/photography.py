@@ -31,7 +31,7 @@ from clsplat.demo.town.view_rays import SAMPLES, world_rays
 from clsplat.demo.town.visibility import Caster, Sight, blocks_in_sight
 
 BAND_PIXELS = 1 << 16
-"""Pixels that are cast at once, which bounds the memory."""
+"""Number of pixels whose rays are cast at once, which limits the memory."""
 POINT_METRES = 130.0
 """Distance up to which points are observed."""
 FREE_METRES = 9.0
@@ -44,9 +44,9 @@ TONE = np.float32(1 / 1.6)
 class Observations:
     """Points that a photograph shows.
 
-    blocks: (n, 2) int32, numbers of the points' blocks.
-    points: (n,) int32, their numbers in the block.
-    pixels: (n, 2) float64, exact.
+    blocks: (n, 2) int32, indices of the points' blocks.
+    points: (n,) int32, indices of the points in their blocks.
+    pixels: (n, 2) float64, exact positions in the photograph.
     colours: (n, 3) uint8, of the pixels.
     """
 
@@ -137,7 +137,7 @@ def _moving_cars(config: TownConfig, photograph: TownPhotograph) -> CityBlock:
 
 
 class _Candidates:
-    """Points in front of a photograph's camera, some of which solids may hide."""
+    """Points in front of a photograph's camera. Solids may hide some of them."""
 
     def __init__(self, caster: Caster, blocks: int) -> None:
         camera, position = caster.camera, caster.position
@@ -169,7 +169,7 @@ class _Candidates:
         self._seen = np.zeros(len(rows), np.bool_)
 
     def see(self, surfaces: NDArray[np.int32], first: int, last: int) -> None:
-        """Note which points the rows from `first` to `last` show: those whose surface the nearest ray meets."""
+        """Mark the points that the rows from `first` to `last` show: those whose surface the nearest ray meets."""
         y = self._pixels[:, 1]
         rows = np.flatnonzero((y >= first) & (y < last))
         x, y = self._pixels[rows].T
@@ -186,6 +186,6 @@ class _Candidates:
 
 
 def _away(block: CityBlock, position: Float64) -> Float64:
-    """Way (2,) from a position to the nearest place of a block's ground."""
+    """Horizontal vector (2,) to a position from the nearest point of a block's ground."""
     low = block.corner[:2]
     return np.asarray(position[:2] - np.clip(position[:2], low, low + BLOCK_METRES))

@@ -17,9 +17,9 @@ MAX_PHOTOS_PER_BLOCK = 1000
 MIN_TOWN_PHOTO_SIDE, MAX_TOWN_PHOTO_SIDE = 16, 8192
 """Limits of a photograph's width and height in pixels."""
 CAR_SLOTS = 28
-"""Places of moving cars in a block: seven in each direction of its two streets."""
+"""Number of places for moving cars in a block: seven in each direction of its two streets."""
 MAX_TOWN_ORIGIN_METRES = 1e8
-"""Float64 has steps of 15 nanometres there."""
+"""Largest coordinate of the town's corner. At this distance, float64 has steps of 15 nanometres."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class TownConfig:
         return self.rig == "panorama"
 
     def check(self) -> None:
-        """Raise InputError, which names the flag, for a value without sense."""
+        """Raise InputError, which names the flag, for an invalid value."""
         sides = f"1 to {MAX_TOWN_SIDE} blocks a side, such as 3x2"
         size = f"{MIN_TOWN_PHOTO_SIDE} to {MAX_TOWN_PHOTO_SIDE} pixels a side, such as 640x400"
         shorter, longer = min(self.width, self.height), max(self.width, self.height)
@@ -92,7 +92,7 @@ class TownConfig:
 
 
 def two_numbers(flag: str, text: str, example: str) -> tuple[int, int]:
-    """The numbers of a text such as 3x2. Raises InputError, which names the flag."""
+    """Parse two numbers from a text such as 3x2. Raises InputError, which names the flag."""
     match = re.fullmatch(r"\s*(\d{1,9})\s*[xX]\s*(\d{1,9})\s*", text)
     if match is None:
         raise InputError(f"--{flag} {text}: expected two whole numbers, such as {example}")
@@ -100,7 +100,7 @@ def two_numbers(flag: str, text: str, example: str) -> tuple[int, int]:
 
 
 def three_numbers(flag: str, text: str) -> tuple[float, float, float]:
-    """The coordinates of a text such as 500000,4650000,0. Raises InputError, which names the flag."""
+    """Parse coordinates from a text such as 500000,4650000,0. Raises InputError, which names the flag."""
     try:
         x, y, z = map(float, text.split(","))
     except ValueError:

@@ -29,7 +29,7 @@ from clsplat.demo.town.visibility import SIGHT_METRES
 HAZE_METRES = 150.0
 """Distance at which haze begins."""
 SLANT_BLUR = np.float32(0.7)
-"""Exponent with which a surface seen at a slant gets a coarser mip level."""
+"""A surface seen at a slant has a mip level coarser by this times log2(1 / cosine of the slant)."""
 LOT_COVERS: Final = np.array([paint.GRASS] * 9 + [paint.SOIL] * 3 + [paint.GRAVEL] * 2 + [paint.PAVING] * 2, np.int32)
 GROUND_DENSITY = np.float32(np.log2(TEXTURE_SIDE / GROUND_METRES))
 
@@ -37,7 +37,7 @@ GROUND_DENSITY = np.float32(np.log2(TEXTURE_SIDE / GROUND_METRES))
 class Shader:
     """Shades the rays of one photograph.
 
-    blocks: blocks whose solids are numbered through from `starts`, as by the `Caster`.
+    blocks, starts: the photograph's blocks, and the number of each block's first solid, as in `Caster`.
     """
 
     def __init__(
@@ -50,8 +50,8 @@ class Shader:
     def colours(self, directions: Float32, surfaces: NDArray[np.int32]) -> Float32:
         """Linear colours (n, 3) of rays.
 
-        directions: (n, 3), as of `world_rays`.
-        surfaces: (n,), as of `Sight`.
+        directions: (n, 3), as from `world_rays`.
+        surfaces: (n,), as in `Sight`.
         """
         result = np.empty((len(surfaces), 3), np.float32)
         for surface, shade in ((SKY_FACE, self.textures.sky), (GROUND_FACE, self._ground)):
@@ -70,9 +70,9 @@ class Shader:
         return result
 
     def _faces(self, surfaces: NDArray[np.int32]) -> tuple[NDArray[np.int64], Float32, Bool]:
-        """Row for each surface, the rows of the table of faces that are seen, and whether each belongs to a ball.
+        """Table of the seen faces: for each surface the index of its row (n,), the rows, and a mask of the balls' rows.
 
-        The rows are in metres from the camera. U and V of balls are their centres and radii.
+        Faces are in metres from the camera. In the row of a ball, its centre and radius take the place of the plane.
         """
         seen = np.zeros(self.starts[-1] * FACES_PER_SOLID, np.bool_)
         seen[surfaces] = True
@@ -203,7 +203,7 @@ def _hazy(colours: Float32, distance: Float32) -> Float32:
 
 
 def _to_street(place: Float32) -> Float32:
-    """Distance from the middle of the nearest street across one axis. place: in [0, BLOCK_METRES)."""
+    """Distance from the middle of the nearest street, along one axis. place: in [0, BLOCK_METRES)."""
     return np.asarray(np.minimum(place, np.float32(BLOCK_METRES) - place))
 
 
@@ -218,7 +218,7 @@ def _cube_coordinates(normals: Float32, radius: Float32) -> tuple[Float32, Float
 
 
 def _mark_streets(colours: Float32, fx: Float32, fy: Float32, width: Float32) -> None:
-    """Paint kerbs, dashes and zebra crossings, in place. width: (n,), of a pixel on the ground in metres."""
+    """Paint kerbs, dashes and zebra crossings, in place. width: (n,), width of a pixel on the ground, in metres."""
     away_x, away_y = _to_street(fx), _to_street(fy)
     near, far = np.minimum(away_x, away_y), np.maximum(away_x, away_y)
     along = np.where(away_x < away_y, fy, fx)

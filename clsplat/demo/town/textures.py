@@ -24,7 +24,7 @@ ASPHALT, PAVEMENT, GRASS, GRAVEL, SOIL, PAVING = range(14, 20)
 LEAVES, BARK, PLAIN = range(20, 22), 22, 23
 TEXTURE_COUNT = 24
 FACADE_METRES, ROOF_METRES, GROUND_METRES, LEAF_METRES = 12.0, 6.0, 8.0, 3.0
-"""Side of a texture on a surface. A facade has four windows and four storeys."""
+"""Lengths of a texture's side on facades, roofs, ground and leaves. A facade has four windows and four storeys."""
 SKY_ROWS, SKY_COLUMNS = 512, 2048
 HAZE_COLOUR: Final = np.array([0.50, 0.56, 0.63], np.float32)
 """Colour of the horizon, and of everything far away."""
@@ -49,7 +49,7 @@ class Brush:
     def rough(self, wavelength: float, falloff: float = 1.2, stretch: float = 1.0) -> Pixels:
         """Periodic noise with a mean of 0 and a standard deviation of 1: white noise, filtered by frequency.
 
-        wavelength: longest wavelength, as a part of the texture.
+        wavelength: longest wavelength, as a fraction of the texture's side.
         falloff: exponent of the amplitude's decline with the frequency.
         stretch: ratio of wavelengths along columns and rows.
         """
@@ -209,7 +209,7 @@ def _plain(_: int, brush: Brush) -> Pixels:
 
 
 def _packed(image: Pixels) -> NDArray[np.uint32]:
-    """Red, green and blue in [0, 1] as the bytes of a number, (h, w)."""
+    """Pack red, green and blue in [0, 1] into the bytes of a number, (h, w)."""
     levels = np.zeros((*image.shape[:2], 4), np.uint8)
     levels[..., :3] = np.rint(np.clip(image, 0, 1) * 255)
     return levels.view(np.uint32)[..., 0]
@@ -246,8 +246,8 @@ class Textures:
         """Trilinear look-up, (n, 3) in [0, 1].
 
         texture: (n,), index of the texture.
-        u, v: (n,), places in textures' sides, to the right and up; they may have any value.
-        level: (n,), mip level: the base 2 logarithm of texels to a pixel.
+        u, v: (n,), texture coordinates to the right and up, in sides of the texture; they may have any value.
+        level: (n,), mip level: the base 2 logarithm of texels per pixel.
         """
         level = np.clip(level, 0, TEXTURE_LEVELS - 1.001)
         coarse = level.astype(np.int32)
@@ -301,7 +301,7 @@ def _baked_sky(brush: Brush) -> Pixels:
     rise = np.clip(elevation / 60, 0, 1)[..., None] ** 0.6
     image = (HAZE_COLOUR * 1.25 * (1 - rise) + zenith * rise) * np.ones((1, SKY_COLUMNS, 1), np.float32)
     clouds = np.clip(np.tile(brush.rough(0.4, 1.5), (1, SKY_COLUMNS // TEXTURE_SIDE)) - 0.1, 0, 1)[..., None]
-    share = np.clip(elevation / 12 - 0.4, 0, 1) * np.clip((78 - elevation) / 30, 0, 1)  # none meet at the zenith
+    share = np.clip(elevation / 12 - 0.4, 0, 1) * np.clip((78 - elevation) / 30, 0, 1)  # no clouds at the zenith
     image += 0.8 * clouds * share[..., None] * (0.86 - image)
     rock = np.tile(brush.rough(0.2, 1.0), (1, SKY_COLUMNS // TEXTURE_SIDE))[..., None]
     for layer, (height, tint) in enumerate(((5.0, 0.55), (3.2, 0.8))):
@@ -319,5 +319,5 @@ def _baked_sky(brush: Brush) -> Pixels:
 
 @lru_cache(maxsize=2)
 def textures(seed: int) -> Textures:
-    """The textures of a seed, kept for the next photographs."""
+    """The textures of a seed, cached."""
     return Textures(seed)

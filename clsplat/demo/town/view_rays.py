@@ -13,17 +13,17 @@ from clsplat.camera import Camera
 from clsplat.cameras.model import CameraModel
 
 SAMPLES = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
-"""Places x, y of a pixel's rays from its centre."""
+"""Offsets x, y of a pixel's rays from its centre, in pixels."""
 NEAR_METRES = 0.05
 _ANGLES = 1 << 16
 _CIRCLE = 32
-"""Directions of the edge of a cone around a ball, from which its part of the picture follows."""
+"""Number of directions on the edge of a cone around a ball. They bound its part of the picture."""
 Planes = tuple[Float32, Float32, Float32]
 LensKey = tuple[CameraModel, int, int, float, float, float, float, tuple[float, ...]]
 
 
 def lens_key(camera: Camera) -> LensKey:
-    """The camera without its pose, to keep its rays."""
+    """The camera without its pose, as the key under which its rays are cached."""
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     return (camera.model, camera.width, camera.height, *intrinsics, camera.radial)
 
@@ -54,7 +54,7 @@ def world_rays(
 ) -> tuple[Float32, Float32, Float32]:
     """Directions x, y, z along the world's axes, (places, rows, columns) each, of the rows from `first` to `last`.
 
-    Those of a perspective camera have a depth of 1, the others a length of 1.
+    Directions of a perspective camera have a depth of 1, other directions a length of 1.
     """
     local = _local_rays(lens_key(camera), first, last, places)
     rotation = camera.rotation.astype(np.float32)
@@ -63,10 +63,10 @@ def world_rays(
 
 
 def rectangles(camera: Camera, low: Float64, high: Float64) -> NDArray[np.int32]:
-    """Parts of the picture outside which boxes are not seen: (n, 4), first and last row, first and last column.
+    """Rectangles (n, 4) of the picture that contain boxes: first row, end row, first column, end column.
 
-    Rows and columns end before the last. A box that is not seen has an empty part. In a panorama columns may lie beyond
-    the edges, where the picture repeats.
+    The ends are exclusive. The rectangle of a box that is not seen is empty. In a panorama columns may lie beyond the
+    edges, where the picture repeats.
     low, high: (n, 3), corners of the boxes, from the camera's centre along the world's axes.
     """
     if camera.is_pinhole:
@@ -160,7 +160,7 @@ def _fisheye_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
     x = camera.cx + camera.fx * radius * edge[..., 0] / level
     y = camera.cy + camera.fy * radius * edge[..., 1] / level
     bounds = np.stack([x.min(axis=1), x.max(axis=1), y.min(axis=1), y.max(axis=1)], axis=1)
-    whole = theta + angle >= np.pi  # the cone has the direction backwards, around which the picture ends
+    whole = theta + angle >= np.pi  # the cone contains the backward direction, which is the picture's whole edge
     bounds[whole] = (-1e9, 1e9, -1e9, 1e9)
     return bounds
 
@@ -168,7 +168,7 @@ def _fisheye_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
 def _fisheye_radius(radial: tuple[float, ...], theta: Float64) -> Float64:
     """Distances from the picture's centre, in focal lengths, of angles from the axis: (18) of docs/cameras.md.
 
-    The town's fisheye rises up to 180 degrees, so that its picture ends nowhere.
+    With the town's coefficients they increase up to 180 degrees, so that every direction has a place in the picture.
     """
     square, series = theta * theta, np.zeros_like(theta)
     for coefficient in reversed(radial):

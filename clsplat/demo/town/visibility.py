@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The nearest surface of each ray: the solids of the blocks around a camera, cast one by one from near to far.
 
-Only the rays of the screen rectangle of a solid are cast. A solid, or a whole block, is passed over if all rays of its
-rectangle have met something nearer.
+Only the rays of a solid's screen rectangle are cast. A solid, or a whole block, is skipped if all rays of its rectangle
+have met something nearer.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ def blocks_in_sight(seed: int, camera: Camera) -> list[CityBlock]:
 class Sight:
     """The surfaces that the rays of some rows of a picture meet.
 
-    directions: three arrays (4, rows, columns), as of `world_rays`.
+    directions: three arrays (4, rows, columns), as from `world_rays`.
     surfaces: (4, rows, columns) int32, FACES_PER_SOLID times the number of the solid plus the face, GROUND_FACE or
-        SKY_FACE. Solids of all blocks are numbered through.
+    SKY_FACE. Solids are numbered across all blocks.
     """
 
     directions: tuple[Float32, Float32, Float32]
@@ -68,9 +68,9 @@ Slices = tuple[slice, slice, slice]
 class _Part(NamedTuple):
     """A part of the picture that a box may cover. A box that crosses the edge of a panorama has two.
 
-    box: its number.
-    near: its distance in metres.
-    top, bottom, left, right: first and last row, first and last column; the last do not belong to it.
+    box: number of the box.
+    near: distance of the box in metres.
+    top, bottom, left, right: rows from `top` and columns from `left`, up to but without `bottom` and `right`.
     """
 
     box: int
@@ -84,7 +84,7 @@ class _Part(NamedTuple):
 class Caster:
     """Casts the rays of one photograph against blocks.
 
-    The solids of all `blocks` are numbered through: `starts` has the number of each block's first solid.
+    Solids are numbered across all `blocks`: `starts` has the number of each block's first solid.
     """
 
     def __init__(self, camera: Camera, blocks: Sequence[CityBlock]) -> None:
@@ -112,7 +112,7 @@ class Caster:
         return Sight(directions, rays.surfaces)
 
     def _solids_of(self, index: int) -> list[_Part]:
-        """The parts of a block's solids, from near to far."""
+        """Parts of the picture that a block's solids may cover, from near to far."""
         if index not in self._inner:
             block = self.blocks[index]
             low, high = (corner + (block.corner - self.position) for corner in block.solids.bounds())
@@ -121,7 +121,7 @@ class Caster:
 
 
 def _placed(camera: Camera, low: Float64, high: Float64) -> list[_Part]:
-    """The parts of the picture of boxes, from near to far. low, high: as for `rectangles`."""
+    """Parts of the picture that boxes may cover, from near to far. low, high: as for `rectangles`."""
     bounds, near = rectangles(camera, low, high), _nearest(low, high)
     width, wraps = camera.width, camera.model.wraps
     order = np.argsort(near, kind="stable")
@@ -154,21 +154,21 @@ class _Rays:
         self.distance = np.where(falls, ground, np.float32(np.inf))
         self.surfaces = np.where(falls, np.int32(GROUND_FACE), np.int32(SKY_FACE))
         x, y, z = (axis[:, :: max(axis.shape[1] - 1, 1), :: max(axis.shape[2] - 1, 1)] for axis in directions)
-        self._longest = float(np.sqrt((x**2 + y**2 + z**2).max()))  # a picture's corners have the longest
+        self._longest = float(np.sqrt((x**2 + y**2 + z**2).max()))  # the longest ray is at a corner
 
     def slices(self, part: _Part) -> Slices:
-        """The samples, rows and columns of a part of the picture among these rays."""
+        """Slices of samples, rows and columns: the part of these rays that is in a part of the picture."""
         rows = slice(max(part.top - self.first, 0), max(part.bottom - self.first, 0))
         return slice(None), rows, slice(part.left, part.right)
 
     def is_open(self, part: _Part) -> bool:
-        """True if a ray of a part of the picture goes on to the distance of its box."""
+        """True if a ray of a part of the picture has met nothing nearer than the part's box."""
         if part.bottom <= self.first or part.top >= self.first + self.distance.shape[1]:
             return False
         return bool(self.distance[self.slices(part)].max() * self._longest > part.near)
 
     def cast(self, block: CityBlock, solid: int, number: int, part: Slices) -> None:
-        """Cast the rays of a part against a solid. number: that of the solid in the picture."""
+        """Cast the rays of a part against a solid. number: number of the solid across all blocks."""
         solids = block.solids
         centre = (self.position - block.corner - solids.centres[solid]).astype(np.float32)
         half, kind = solids.halves[solid].astype(np.float32), int(solids.kinds[solid])
@@ -234,7 +234,7 @@ class _Rays:
             self._meet(part, hit, enter, face)
 
     def _turned(self, part: Slices, turn: Float32) -> tuple[Float32, Float32, Float32]:
-        """Reciprocals of the directions along a solid's own x and y, and the directions along its y."""
+        """Reciprocals of the directions along a solid's own x and y axes, and the directions along its y axis."""
         x, y = self.x[part], self.y[part]
         if turn[1] == 0:
             return self.over_x[part], self.over_y[part], y

@@ -45,7 +45,7 @@ EXACT_POSES_FOLDER = "exact"
 MAX_TOWN_WORKERS = 8
 """Largest number of threads if none is given. More would wait for the interpreter's lock, and take more memory."""
 MIN_TRACK_LENGTH = 2
-"""Photographs that must show a point of the scene."""
+"""Smallest number of photographs that show a point of the scene."""
 
 
 def write_town(
@@ -62,9 +62,9 @@ def write_town(
     Equal settings give equal bytes, and a larger town has the photographs of a smaller one.
 
     overwrite: replace an earlier town.
-    workers: threads; one for each core, up to MAX_TOWN_WORKERS, if None. They change no bytes.
+    workers: number of threads, which changes no bytes; None for one per core, up to MAX_TOWN_WORKERS.
     progress: function that is called with a text and the completed fraction.
-    Raises InputError for settings without sense and for a folder that must not be replaced, and ClsplatError if a file
+    Raises InputError for invalid settings and for a folder that must not be replaced, and ClsplatError if a file
     cannot be written. After KeyboardInterrupt no files remain.
     """
     config.check()
@@ -158,7 +158,7 @@ def _noise(config: TownConfig, shot: TownPhotograph) -> Float64:
 
 
 def _image(config: TownConfig, shot: TownPhotograph, air: Lens, error: Float64) -> ModelImage:
-    """A photograph without observations, whose written position is wrong by `error` (3,). air: lens of the flights."""
+    """A photograph without observations, with an error (3,) in its written position. air: lens of the flights."""
     rotation = shot.camera.rotation
     position = shot.camera.position + np.array(config.origin) + error
     none = np.zeros((0, 2)), np.zeros(0, np.uint64)
@@ -195,7 +195,7 @@ def _tracks(config: TownConfig, seen: Sequence[Observations]) -> tuple[ModelPoin
 
 
 def _places(config: TownConfig, points: NDArray[np.int32]) -> Float64:
-    """World coordinates (n, 3) of points, each given by its block's two numbers and its own, sorted by block."""
+    """World coordinates (n, 3). points: (n, 3), two indices of a block and an index in the block, sorted by block."""
     places = np.empty((len(points), 3))
     steps = np.flatnonzero((points[1:, :2] != points[:-1, :2]).any(axis=1)) + 1
     for rows in np.split(np.arange(len(points)), steps):

@@ -36,7 +36,7 @@ def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), pri
     """Read the frames of a stage's camera, from the stage's start to its end time code. Without these, the frames span
     the time samples.
 
-    The frame rate is the stage's timeCodesPerSecond, for which USD takes framesPerSecond if only that is authored. Each
+    The frame rate is the stage's timeCodesPerSecond; USD uses framesPerSecond if only that is authored. Each
     frame has the shutter and the lens of its time code. `Shot.moment` gives the camera at any time, with USD's own
     interpolation between samples. `Shot.unapplied` names authored settings that are not applied. USD's warnings become
     the shot's warnings.

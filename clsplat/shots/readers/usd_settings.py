@@ -43,7 +43,7 @@ class Settings:
     unapplied: tuple[str, ...] = ()
 
     def aspect(self, aperture: tuple[float, float]) -> float:
-        """Ratio of width to height, in pixels, for a picture of which only one side is given."""
+        """Ratio of width to height, in pixels, of a picture with only one given side."""
         if self.resolution is not None:
             return self.resolution[0] / self.resolution[1]
         pixels = 1.0 if self.policy == "adjustPixelAspectRatio" else self.pixel_aspect

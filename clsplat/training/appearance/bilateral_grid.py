@@ -64,7 +64,7 @@ class ViewGrid(ViewPart):
     ) -> DeviceArray:
         """Convert `gradient`, in place, to the gradient with respect to the image. Return the gradient of the grid.
 
-        `update` uses the result; its kernels are tried here in the sandbox, before anything changes.
+        The kernels of `update`, which uses the result, are tried here in the sandbox, before anything changes.
         """
         of_view = (self.grids, self.view, image, gradient)
         by_grid = grid_gradient(self.device, work, *of_view, *size, VARIATION_WEIGHT, self.place)
@@ -95,7 +95,7 @@ class GridsOfAll(Appearance):
 
     @property
     def pixel_bytes(self) -> int:
-        """Bytes on the device per pixel of the largest picture. The bytes of the grids are divided over its pixels."""
+        """Bytes on the device per pixel of the largest picture. They include a share of the grids' bytes."""
         return device_bytes(self._count, [(view.camera.width, view.camera.height) for view in self._scene.views])
 
     def of_views(self, views: Sequence[int], step: int) -> list[ViewGrid]:

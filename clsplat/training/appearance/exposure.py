@@ -29,21 +29,21 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
 
 CODED_OCTAVES_PER_LIGHT_OCTAVE = 1 / 2.2
-"""Approximate octaves of a coded colour value per octave of light.
+"""Octaves by which a stored colour value changes per octave of light, approximately.
 
 Initial gains come from the colours of points. If points give none, they come from EXIF exposures in octaves, multiplied
 by this number.
 """
 
 START_GAIN_STEP_OCTAVES = 2.0**-10
-"""Gains from points are rounded to multiples of this, in octaves, to be equal in spite of different orders of sums."""
+"""Gains from points are rounded to multiples of this, in octaves, so that they do not depend on the order of sums."""
 
 VIEW_PULL_WEIGHT, NEIGHBOUR_PULL_WEIGHT = 0.02, 0.7
-"""Weights of the pulls towards the gains from points, as fractions of the distance in octaves, in the loss's gradient.
+"""Weights of two terms of the loss's gradient that pull gains towards the gains from points, per octave of distance.
 
-The first pulls the gains of each photograph. The second pulls the part of them that neighbouring photographs have in
-common: neighbours may all become slightly too bright where they alone show a dark surface, but gains from points do
-not. Gains that are not from points are not pulled, as the pull would hold them at the mean.
+The first pulls the gains of each photograph. The second pulls the part that gains of neighbouring photographs have in
+common. Without it neighbours may all become slightly too bright, where no other photograph shows a dark surface. Gains
+without points are not pulled, because the pull would hold them at the mean.
 """
 
 GAIN_RATE_END_FRACTION = 0.001
@@ -89,7 +89,7 @@ class ViewGains(ViewPart):
     def gradient(
         self, work: Workspace, image: DeviceArray, gradient: DeviceArray, size: tuple[int, int]
     ) -> DeviceArray:
-        """Sums for `update`, whose kernels are tried here in the sandbox, before anything changes."""
+        """Sums that `update` needs. The kernels of `update` are tried here in the sandbox, before anything changes."""
         columns = gain_gradient(self.device, work, image, gradient, size[1], self.place)
         if self.step == 1:
             with only_tried(self.device):
@@ -103,7 +103,7 @@ class ViewGains(ViewPart):
 
 
 def _from_mean(told: Sequence[float | None], of: Sequence[float | None]) -> NDArray[np.float64]:
-    """Exposures `told` from EXIF, relative to the mean of the known exposures in `of`; NaN where unknown."""
+    """Exposures from EXIF (`told`), relative to the mean of the known exposures in `of`; NaN where unknown."""
     known = [value for value in of if value is not None]
     return np.array([np.nan if value is None or not known else value - np.mean(known) for value in told], np.float64)
 
@@ -123,8 +123,8 @@ class GainsOfAll(Appearance):
 
     @cached_property
     def _gains(self) -> Gains:
-        """Initial gains, unless a checkpoint has been loaded. Computed on first use, as sampling the photographs takes
-        time."""
+        """Initial gains, unless a checkpoint has been loaded. Computed on first use, because sampling the photographs
+        takes time."""
         scene = self._scene
         curve = CODED_OCTAVES_PER_LIGHT_OCTAVE if photos_space(view.path for view in scene.views) == SRGB else 1.0
         by_exif = curve * np.nan_to_num(_from_mean(self._told, self._told))

@@ -76,7 +76,7 @@ class ViewColours(ViewPart):
     def gradient(
         self, work: Workspace, image: DeviceArray, gradient: DeviceArray, size: tuple[int, int]
     ) -> DeviceArray:
-        """Sums for `update`, whose kernels are tried here in the sandbox, before anything changes."""
+        """Sums that `update` needs. The kernels of `update` are tried here in the sandbox, before anything changes."""
         columns = camera_gradient(self.device, work, self.taken, image, gradient, *size, self.place)
         if self.step == 1:
             with only_tried(self.device):

@@ -23,8 +23,8 @@ can change by about 2 octaves."""
 def rate_at(config: TrainConfig, step: int, views: int, *, ends: float, hastens: bool = True) -> float:
     """Learning rate of step number `step`.
 
-    views: number of photographs. Each has a gradient in only one of this many steps, so its Adam steps shrink by the
-    root of this number.
+    views: number of photographs. A photograph has a gradient in only one of this many steps, so its Adam steps shrink
+    by the root of this number, and the rate is multiplied by the root.
     ends: fraction of the rate that is left at the last step.
     hastens: True to raise the rate in a short training, so that gains can change by as much as in a long one.
     """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Photographs with nearby cameras, and the part of their gains that they have in common.
 
-The pictures hardly determine that part, so `exposure` pulls it to its initial value.
+The pictures hardly determine the common part, so `exposure` pulls it to its initial value.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ NEIGHBOUR_DISTANCE_LIMIT = 2.5
 """Distance at which cameras stop being neighbours.
 
 It combines two distances: between centres, relative to their median distance from the middle, and between unit viewing
-directions. At a quarter of the limit about half of the weight is left. Over about that distance a colour of SH degree 3
-can vary with the direction.
+directions. A neighbour at a quarter of the limit has about half of the weight. A colour of SH degree 3 can vary with
+the direction over about that distance.
 """
 MAX_MEAN_NEIGHBOURS = 256
 """Maximum mean number of neighbours of a camera, including itself. The distance limit is reduced if there would be
 more."""
 NEIGHBOUR_WEIGHT_STEP = 2.0**-20
-"""Step to which weights are rounded, so that they are equal on processors that round differently."""
+"""Weights are rounded to multiples of this, so that they are equal on processors that round differently."""
 
 
 def places(cameras: Sequence[Camera]) -> Float64:
-    """Points (n, 6) whose distances `NEIGHBOUR_DISTANCE_LIMIT` limits. Centres that differ only by rounding
-    coincide."""
+    """Centres and viewing directions of cameras as points (n, 6), to measure distances between. Centres that differ
+    only by rounding coincide."""
     centres = np.array([camera.position for camera in cameras])
     apart = centres - np.median(centres, axis=0)
     extent = float(np.median(np.linalg.norm(apart, axis=1)))

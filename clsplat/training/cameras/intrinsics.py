@@ -19,7 +19,7 @@ from clsplat.scenes.scene import View
 from clsplat.training.cameras.poses import checked_arrays, descend, fallen, first_step
 
 LENS_PARAMETERS = 3
-"""Parameters of a lens: the common change of ln fx and ln fy, and of cx and cy in focal lengths."""
+"""Number of parameters of a lens: a common change of ln fx and ln fy, and changes of cx and cy in focal lengths."""
 
 
 class RefinedLenses:

@@ -50,7 +50,7 @@ def first_step(config: TrainConfig) -> int:
 def checked_arrays(
     own: Mapping[str, NDArray[Any]], arrays: Mapping[str, NDArray[Any]], folder: str
 ) -> dict[str, NDArray[Any]]:
-    """Copies of a checkpoint's arrays, by name, for the arrays of `own` in this folder.
+    """Copies of a checkpoint's arrays with the names and shapes of `own`, keyed by name without the prefix `folder`.
 
     Raises ValueError if one is missing, or belongs to other views.
     """

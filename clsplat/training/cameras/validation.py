@@ -22,7 +22,7 @@ from clsplat.training.cameras.validation_gate import spread
 from clsplat.training.supervision.image_cache import ImageCache
 
 Draw = Callable[[Camera], NDArray[Any]]
-"""Image (H, W, 3) of the model over the background of evaluations, from a camera in world coordinates."""
+"""Function that renders an image (H, W, 3), over the background of evaluations, with a camera in world coordinates."""
 
 
 class ValidationViews:
@@ -41,7 +41,7 @@ class ValidationViews:
         A photograph counts if its mask keeps a pixel. If appearance is learnt, colours are fitted before the
         comparison.
 
-        look: function from a view to its appearance, as far as it is known.
+        look: function that gives a render the appearance of a view, if that is known.
         """
         found = []
         for index, camera in enumerate(cameras):

@@ -34,7 +34,7 @@ def steps_of(config: TrainConfig) -> tuple[int, ...]:
     """Steps after which cameras are validated, ascending: when refinement begins, and at every tenth of the training.
 
     Just after a densification, and for long after an opacity reset, the model is too bad to validate cameras with. A
-    measurement due then is made at the last step before, ahead of that change of the model.
+    measurement that is due then is made earlier, at the last step before the densification or reset.
     """
     density, first = config.density, first_step(config)
     settling = (density.opacity_reset_every or DensityConfig.opacity_reset_every) // RESET_SETTLING_DIVISOR
@@ -81,8 +81,8 @@ def drift(given: Sequence[Camera], refined: Sequence[Camera], length_unit: float
 
     A camera's residual is the root of (angle^2 + (distance/length_unit)^2), with the angle in radians. Squared
     residuals have Huber weights with the median residual as the bound, so that a few outliers have little influence.
-    The rotation fits positions and axes together (Kabsch 1976), as cameras may lie on a line or in one point. The scale
-    is Umeyama's (1991), from the positions.
+    The rotation fits positions and axes together (Kabsch 1976), because cameras may lie on a line or in one point. The
+    scale is Umeyama's (1991), from the positions.
     """
     old, new = (np.array([camera.rotation for camera in cameras]) for cameras in (given, refined))
     at, to = (np.array([camera.position for camera in cameras]) / length_unit for cameras in (given, refined))
@@ -124,7 +124,7 @@ class CameraGate:
 
     @property
     def best(self) -> tuple[int, float]:
-        """Step and dB of the best measurement before refinement ended; the first of equals."""
+        """Step and dB of the best measurement before refinement ended; the first one if several are equal."""
         known = [each for each in self.measured if self.ended is None or each[0] <= self.ended]
         return max(known, key=lambda each: each[1])
 

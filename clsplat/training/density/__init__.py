@@ -123,7 +123,7 @@ class Strategy:
         raise NotImplementedError
 
     def is_due(self, step: int) -> bool:
-        """True if `before_step` may have a plan after `step` steps. The model is repaired before it is asked."""
+        """True if `before_step` may have a plan after `step` steps. The model is repaired before `before_step` runs."""
         raise NotImplementedError
 
     def before_step(self, model: ModelState) -> RowPlan | None:

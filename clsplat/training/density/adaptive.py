@@ -87,7 +87,7 @@ def plan(config: DensityConfig, model: ModelState, *, sky: bool = False) -> RowP
     """Clone small and split large Gaussians with a large mean gradient. Prune Gaussians that are transparent, oversized
     or contribute little.
 
-    sky: True if some of the Gaussians are a sky, whose size follows the extent. All may then be as large.
+    sky: True if the model has sky Gaussians. The size limit then follows the extent, for all Gaussians.
     Retained Gaussians come first, in order. Clones and halves are fresh.
     """
     # Each rule compares like NumPy: a float32 array with a Python number, in float32.
@@ -137,7 +137,7 @@ def _pruning(config: DensityConfig, model: ModelState) -> MarkRules:
 def _cut_off(config: DensityConfig, model: ModelState, rules: MarkRules) -> tuple[float, int]:
     """Score and row of the weakest Gaussian that may still be cloned or split, for `MarkRules.cut_off`.
 
-    Scores are computed only if the cap may leave too little room for all Gaussians that pass the other rules.
+    Scores are computed only if max_gaussians may leave too little room for all Gaussians that pass the other rules.
     """
     room = config.max_gaussians - model.count
     if config.growth == "budget":
@@ -174,8 +174,8 @@ def draw_halves(config: DensityConfig, split: Mapping[str, Float32], *, rng: np.
 
 
 def long_halves(split: Mapping[str, Float32]) -> dict[str, Float32]:
-    """New means, log scales and opacities of all first halves, then of all second halves, on both sides of the mean
-    along the longest axis.
+    """New means, log scales and opacities of halves, which lie on both sides of the mean along the longest axis: all
+    first halves, then all second halves.
 
     docs/gradients.md, (102). split: the groups SPLIT_GROUPS and opacity_logits of the split Gaussians.
     """
@@ -200,7 +200,7 @@ def long_halves(split: Mapping[str, Float32]) -> dict[str, Float32]:
 def split_halves(
     config: DensityConfig, *, means: Float32, quaternions: Float32, log_scales: Float32, rng: np.random.Generator
 ) -> tuple[Float32, Float32]:
-    """Means and log scales of halves: drawn from their original Gaussian, and smaller. (m, 3), (m, 4), (m, 3)."""
+    """Means (m, 3) and log scales (m, 3) of halves, which are drawn from their original Gaussians and smaller."""
     offsets = draw_offsets(quaternions, log_scales, rng)
     smaller = log_scales - np.float32(np.log(config.split_factor))
     return (means + offsets).astype(np.float32), smaller.astype(np.float32)
@@ -212,7 +212,7 @@ def draw_offsets(quaternions: Float32 | Float64, log_scales: Float32 | Float64, 
 
 
 def rotated(quaternions: Float32 | Float64, offsets: Float64) -> Float64:
-    """Offsets (m, 3) along the axes of Gaussians, rotated by their quaternions (m, 4)."""
+    """Offsets (m, 3), turned by quaternions (m, 4) from the Gaussians' own axes to the world's."""
     q = quaternions.astype(np.float64)
     q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-300)  # a zero quaternion is not drawn
     w, axis = q[:, :1], q[:, 1:]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Density control as sampling: dead Gaussians move to live ones, the model grows to a given number, and noise explores.
+"""Density control as sampling: dead Gaussians move to live ones, the model grows to a given number, and noise is added.
 
 Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". The model grows by halving the Gaussians
 with the largest gradients, which is not as published (docs/decisions/0029-mcmc-grows-by-halves.md). Policy only: no
@@ -25,7 +25,7 @@ from clsplat.training.density.adaptive import draw_offsets, is_due, long_halves
 MAX_GAUSSIANS_PER_PLACE = 51
 """Maximum number of Gaussians that together replace one Gaussian."""
 MAX_SHARED_OPACITY = 1 - 1e-7
-"""Upper limit of opacities in computations, as above it a float32 logit has no precision left."""
+"""Upper limit of opacities in computations, because above it a float32 logit has no precision left."""
 MIN_DRAWN_OPACITY = 1 / 255
 """Opacity up to which a Gaussian is invisible in every picture."""
 SCORE_ALL_RULES = MarkRules(gradient=-inf, large=-inf)
@@ -124,14 +124,14 @@ class Mcmc(Strategy):
 
 
 def last_growth(config: DensityConfig) -> int:
-    """Step of the last growth, at which the cap is reached."""
+    """Step of the last growth, at which the number reaches max_gaussians."""
     return (config.stop - 1) // config.every * config.every
 
 
 def wanted(config: DensityConfig, step: int, count: int) -> int:
     """Number of Gaussians after this step's growth, from `count` before it.
 
-    The number grows by the same factor each time, so that the last growth reaches the cap.
+    The number grows by the same factor each time, so that the last growth reaches max_gaussians.
     """
     left = max(last_growth(config) - step, 0) // config.every + 1
     factor: float = (config.max_gaussians / count) ** (1 / left)

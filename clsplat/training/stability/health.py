@@ -52,7 +52,7 @@ def lost(stage: str, broken: NDArray[np.bool_], refused: NDArray[np.bool_]) -> N
 
 
 def finite_or_zero(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Copy with zeros in place of non-finite values. It repairs moments, as zero is their initial value."""
+    """Copy with zeros in place of non-finite values. It repairs moments, because zero is their initial value."""
     return np.where(np.isfinite(values), values, np.float32(0))
 
 
@@ -90,7 +90,7 @@ class Incident:
 
 @dataclass
 class RetryBudget:
-    """Count of recent trouble, and effects of earlier trouble on the training. Checkpoints contain it."""
+    """Recent troubled steps, and the effects of returns to checkpoints on the training. Checkpoints contain it."""
 
     troubled: list[int] = field(default_factory=list)
     rate_factor: float = 1.0

@@ -19,9 +19,9 @@ from clsplat.training.stability.health import Incident, RetryBudget
 
 @dataclass(frozen=True, eq=False)
 class LastStep:
-    """A step that is inspected if it turns out to have had trouble.
+    """A step that is kept, to inspect it if non-finite values are found after it.
 
-    sums: function that returns the sums of its loss, until the next step has a loss.
+    sums: function that returns the sums of its loss, valid until the next step has a loss.
     others: further views of the same step.
     """
 
@@ -55,7 +55,7 @@ class NonFiniteMonitor:
     names: names of the views.
     last: the current step, once it has its loss.
     incidents: incidents not reported yet.
-    retries: the count of trouble.
+    retries: counts of troubled steps and of returns to a checkpoint.
     """
 
     def __init__(self, readback: DeviceArray, names: Sequence[str]) -> None:
@@ -109,7 +109,7 @@ class NonFiniteMonitor:
         )
 
     def examine_all(self, arrays: Mapping[str, NDArray[np.float32]]) -> Repair | None:
-        """Repair, or None, after a check of every number, including numbers that `adam` has not visited.
+        """Check every number, also of Gaussians that `adam` has not visited. Returns the repair, or None.
 
         arrays: arrays by "parameters/means" and so on.
         """

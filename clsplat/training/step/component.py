@@ -38,11 +38,11 @@ class Component:
         return 0
 
     def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002
-        """True if `before_step` has work before the `views` steps that end with this one."""
+        """True if `before_step` has work before a step of `views` views that ends with view number `step`."""
         return False
 
     def before_step(self, gaussians: AnyGaussians) -> None:
-        """Do the work that is due. Doing it twice must have the effect of doing it once."""
+        """Do the work that is due. A second call must not change anything more."""
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
         """Views of a step, each with the component's part in it (`ViewPart`).
@@ -56,7 +56,7 @@ class Component:
         """Change the parameters after Adam's step."""
 
     def rows_moved(self) -> None:
-        """Forget data about individual rows, as rows have moved."""
+        """Forget data about individual rows, because rows have moved."""
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a checkpoint, by name."""

@@ -53,8 +53,8 @@ class GradientStep:
     """Forward, loss, backward and Adam of one view, on a device and in a rasterizer's memory.
 
     fields: the slot fields that the step fills.
-    turn: `turn` of `stages.loss.loss`.
-    room: `room` of `Rasterizer.forward`.
+    turn: number of the array for the loss's sums (`stages.loss.loss`).
+    room: capacity in pairs (`Rasterizer.forward`).
     explore: noise and penalties of the step.
     """
 
@@ -71,7 +71,7 @@ class GradientStep:
 
     @property
     def adam_step(self) -> AdamStep:
-        """Adam's step with this step's number."""
+        """Constants, number and learning rates of Adam's step."""
         return AdamStep(self.config.optimiser, self.step, self.rates)
 
     def run(
@@ -85,8 +85,8 @@ class GradientStep:
     ) -> Loss:
         """Update the model (parameters, first and second moments) with a view.
 
-        gradients: arrays for the gradients of the rows on the device at once, if a probe or a part reads them. They are
-        zero before and after, and do not change the bits of the model.
+        gradients: arrays for gradients of the rows that are on the device at the same time, if a probe or a part reads
+        them. They are zero before and after. The model has the same bits with and without them.
         reads_loss: True if the loss will be read.
         """
         rasterizer, work, camera = self.rasterizer, self.rasterizer.work, inputs.camera
@@ -195,7 +195,7 @@ class GradientStep:
     def replayed(
         self, of: object, key: tuple[object, ...], make: Callable[[], R], numbers: tuple[float, ...] = ()
     ) -> R:
-        """The result of `make`, through `Workspace.replayed` if the step is launched by capacity.
+        """The result of `make`, from a command buffer (`Workspace.replayed`) if the step is launched by capacity.
 
         A step with exact counts has new arrays each time, so its command buffer would never be reused.
         """
@@ -230,7 +230,7 @@ class GradientStep:
 
 
 def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = False) -> DeviceGaussians:
-    """Arrays for a view's gradients of the rows that are on the device at once.
+    """Arrays for a view's gradients of the rows that are on the device at the same time.
 
     zero: fill them with zeros, as `GradientStep.run` requires.
     """

@@ -23,7 +23,7 @@ class StepMonitor(StepProbe):
     control.
 
     number: number of views so far, including this one.
-    rehearsed: keys of the steps whose kernels were tried; this step's key is added.
+    tried: keys of the steps whose kernels were tried; this step's key is added.
     changes: function that is called before the model changes.
     """
 
@@ -43,12 +43,12 @@ class StepMonitor(StepProbe):
         self.pending.seen(frame)
 
     def loss(self, result: Loss) -> None:
-        """Remember the step, as it is inspected if it turns out to have had trouble."""
+        """Remember the step, to inspect it if non-finite values are found after it."""
         sums = result.copy or result.sums.get
         self.monitor.begin(LastStep(self.number, self.inputs.view, self.inputs.background, sums))
 
     def before_rows(self, rows: StepRows) -> None:
-        """Try every kernel that changes the state in the sandbox, before the first row changes: a driver may fail in
+        """Try in the sandbox every kernel that changes the state, before the first row changes: a driver may fail in
         any of them."""
         step, parameters = self.step, rows.parameters
         size = (parameters.count, parameters.coefficients)

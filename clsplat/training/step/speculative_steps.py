@@ -25,7 +25,7 @@ BY_CAPACITY_VARIABLE = "CLSPLAT_BY_CAPACITY"
 """Environment variable that decides if steps are launched by capacity. By default they are, except on CPUs."""
 
 Run = Callable[[int, PairCapacity | None], Loss]
-"""A function that runs one step. It takes the step's turn, and a capacity, or None to count the pairs first."""
+"""Runs one step. It takes the number of the loss's array of sums, and a capacity, or None to count the pairs first."""
 
 
 @dataclass(eq=False)
@@ -108,7 +108,7 @@ class SpeculativeSteps:
     def launch(self, run: Run, room: int, *, reads_loss: bool) -> Loss:
         """Run a step, by capacity unless `room` is 0, and then check the step before.
 
-        reads_loss: True to check this step too, as its loss will be read.
+        reads_loss: True to check this step too, because its loss will be read.
         """
         if not self.on:
             return run(0, None)
@@ -116,7 +116,7 @@ class SpeculativeSteps:
             self.settle()
         turn = self._turn = (
             self._turn + 1
-        ) % self.turns  # exact steps take turns too, as their loss is read a step later
+        ) % self.turns  # exact steps take turns too, because their loss is read a step later
         before, result = self._monitor.last, run(turn, PairCapacity(room, turn) if room else None)
         if not room:
             return result

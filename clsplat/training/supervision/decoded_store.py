@@ -2,8 +2,8 @@
 """A folder of decoded photographs: a file for each photograph and size, read back to the same pixels.
 
 A file has a header and the pixels. The header has the shape, the type, a key and a checksum of header and pixels. The
-key is a digest of everything that the pixels depend on, and also names the file. Files are read and not mapped, as a
-file that is cut short while it is mapped would end the process (docs/decisions/0045-photographs-by-the-slice.md).
+key is a digest of everything that the pixels depend on, and also names the file. Files are read and not mapped, because
+a file that is cut short while it is mapped would end the process (docs/decisions/0045-photographs-by-the-slice.md).
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ def key_of(parts: Sequence[object]) -> bytes:
 class DecodedStore:
     """A folder of decoded photographs, which several threads and processes may use at a time.
 
-    A damaged file counts as missing. If a file cannot be written, no further files are. Each kind of trouble is told
-    once, by `notes`.
+    A damaged file counts as missing. If writing a file fails, no further files are written. Each kind of trouble is
+    reported once, by `notes`.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -126,8 +126,8 @@ class DecodedStore:
             if self.writable:
                 self.writable = False
                 self._notes.append(
-                    f"{self.folder}: no decoded photographs can be written there ({reason}): those that are not in it "
-                    "are decoded each time"
+                    f"{self.folder}: no decoded photographs can be written there ({reason}): photographs that are not "
+                    "in it are decoded each time"
                 )
 
     def _damaged(self, path: Path, reason: str) -> None:
@@ -165,7 +165,7 @@ def remove_decoded(folder: Path) -> None:
 
 
 def _read(path: Path, key: bytes) -> NDArray[Any]:
-    """Pixels of a file. Raises OSError, and ValueError for a file that is not whole or not `key`'s."""
+    """Pixels of a file. Raises OSError, and ValueError for a file that is incomplete or has another key."""
     with open(path, "rb", buffering=0) as file:
         size = os.fstat(file.fileno()).st_size
         head = file.read(_HEADER_BYTES)
@@ -173,7 +173,7 @@ def _read(path: Path, key: bytes) -> NDArray[Any]:
             raise ValueError(f"it has only {len(head)} bytes")
         magic, version, kind, height, width, channels, own = _HEADER.unpack(head[: _HEADER.size])
         if (magic, version, own) != (_MAGIC, FORMAT_VERSION, key) or kind >= len(_TYPES):
-            raise ValueError("its header is of something else")
+            raise ValueError("its header has another format, version or key")
         wanted = height * width * channels * np.dtype(_TYPES[kind]).itemsize
         if size != _HEADER_BYTES + wanted:
             raise ValueError(f"it has {size:,} bytes, expected {_HEADER_BYTES + wanted:,}")

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 HDR_SUFFIXES = (".exr", ".hdr", ".tif", ".tiff")
 """Endings of files whose values may be outside 0 to 1, so that 8 bits may not hold them."""
 DECODING_PIXEL_BYTES, UNDISTORTING_PIXEL_BYTES = 40, 120
-"""Approximate peak of memory, in bytes for each pixel of the file, while a photograph is decoded and resized, and while
-it is undistorted too."""
+"""Approximate peak of memory, in bytes per pixel of the file: to decode and resize a photograph, and to undistort it
+too."""
 
 
 class PhotographError(InputError):
@@ -62,7 +62,7 @@ class Decoder:
         return max(int(camera.width / factor), 1), max(int(camera.height / factor), 1)
 
     def pixels(self, index: int, factor: float, *, keeps: bool) -> dict[float, NDArray[Any]]:
-        """Pixels (H, W, C) of view `index` at 1/factor of its size. The keys are factors.
+        """Map from `factor`, a divisor of the view's size, to the pixels (H, W, C) of view `index` at that size.
 
         keeps: also return the sizes that the training needs later, if the file has to be decoded.
         Raises PhotographError.
@@ -86,7 +86,7 @@ class Decoder:
                 sizes = [self.size(index, factor) for factor in factors]
                 images = view.load_sizes(sizes, reduce=self.rounds)
             finally:
-                view.check_unchanged()  # it may have been replaced meanwhile, which may be the reason of an error
+                view.check_unchanged()  # a file that was replaced may cause any error
         except InputError as error:
             raise PhotographError(str(error)) from None
         except OSError as error:
@@ -106,7 +106,7 @@ class Decoder:
         return key_of((files, stamps, asdict(view.lens), intrinsics, bent, view.upright, mask, self.rounds, size))
 
     def largest(self) -> int:
-        """Bytes of the largest view at its full size, at most."""
+        """Upper limit of the bytes of the largest view at full size."""
         return max(
             view.camera.width
             * view.camera.height
@@ -116,7 +116,7 @@ class Decoder:
         )
 
     def working(self) -> int:
-        """Approximate bytes that the decoding of a photograph needs besides the result, at most."""
+        """Approximate upper limit of the bytes that decoding a photograph needs in addition to the result."""
         return max(
             view.lens.width
             * view.lens.height

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels of the training views on the host: kept, bounded, and read ahead of the steps. Policy only: no device."""
+"""Pixels of the training views in main memory, within a limit, and read ahead of the steps. Policy only: no device."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Key = tuple[int, float]
 
 
 def reading_threads() -> int:
-    """Number of threads that read ahead, and of views that they read ahead."""
+    """Number of threads that read ahead, which is also the number of views that are read ahead."""
     return min(2 * (os.cpu_count() or 1), MAX_READING_THREADS)
 
 
@@ -30,8 +30,8 @@ class HostPhotographs:
     """Decoded photographs in main memory. Several threads may use it.
 
     Without a limit, every view that was used stays, with the sizes that the training needs later. With a limit, only
-    the current size is kept, of as many views as fit. The views that were used last go first: a pass through the
-    views needs them again last.
+    the current size is kept, of as many views as fit. The most recently used views are evicted first, because an epoch
+    needs them again last.
 
     at_once: number of views that a step uses.
     """
@@ -52,12 +52,12 @@ class HostPhotographs:
 
     @property
     def bounded(self) -> bool:
-        """True if photographs may have to leave the memory."""
+        """True if there is a limit, so that photographs may be evicted."""
         return self._room is not None
 
     @cached_property
     def least(self) -> int:
-        """Smallest limit in bytes: the views of a step, one that is read ahead, and the decoding of one."""
+        """Smallest limit in bytes: the views of a step, a view that is read ahead, and the memory to decode it."""
         return self._needed(1)
 
     @cached_property
@@ -128,7 +128,7 @@ class HostPhotographs:
         images = self.decoder.pixels(index, factor, keeps=not self.bounded)
         with self._lock:
             for each, image in images.items():
-                if each <= self._factor or not self._factor:  # else the training has left this size meanwhile
+                if each <= self._factor or not self._factor:  # else the training no longer uses this size
                     self._keep((index, each), image)
             self._pending.pop(key, None)
         return images
@@ -140,7 +140,7 @@ class HostPhotographs:
         self._evict()
 
     def _evict(self) -> None:
-        """Remove views beyond the limit, those that were used last first, but none that is used now or next."""
+        """Evict views beyond the limit, the most recently used first, but no view that is used now or next."""
         if self._room is None or self._bytes <= self._room:
             return
         for key in [key for key in reversed(self._held) if key not in self._wanted and key not in self._in_use]:
@@ -149,7 +149,7 @@ class HostPhotographs:
             self._bytes -= self._held.pop(key).nbytes
 
     def _enter(self, factor: float) -> None:
-        """Remove the sizes that are past, and with a limit all others, when the size changes."""
+        """When the size changes, evict the sizes used before, and with a limit all other sizes."""
         if factor == self._factor:
             return
         self._factor = factor

@@ -29,7 +29,7 @@ class ImageCache:
 
     Only device memory is bounded here; `host` bounds the host's.
 
-    host: the photographs on the host. By default all that a step has used stay there, as exact as they were resized.
+    host: the photographs on the host. By default all that a step has used stay there, without rounding to 8 bits.
     allowed: maximum number of bytes on the device.
     """
 
@@ -122,7 +122,7 @@ class ImageCache:
             self._uploads.begin((index, factor), image)
 
     def _enter(self, factor: float) -> None:
-        """Leave the device if the size changes."""
+        """Free the device's images if the size changes."""
         if factor != self._factor:
             self._factor = factor
             self._leave_device()

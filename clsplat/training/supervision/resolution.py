@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Size of the pictures in each training step: small at first, as there is no fine detail to fit yet. Policy only: no
-device."""
+"""Size of the pictures in each training step: small at first, because there is no fine detail to fit yet. Policy only:
+no device."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Sizes:
         return (*(factor for _, factor in self.until), 1.0)
 
     def factor(self, step: int) -> float:
-        """Divisor of the photographs' width and height at `step`, from 1."""
+        """Divisor of the photographs' width and height at step number `step`, which counts from 1."""
         return next((factor for last, factor in self.until if step <= last), 1.0)
 
 
