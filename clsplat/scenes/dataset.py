@@ -166,8 +166,8 @@ class Lens:
             return Lens(self.model, width, height, (float(width), float(height)))
         sx, sy = width / self.width, height / self.height
         named, _ = lens_models().get(self.model, (LensModel(self.model), None))
-        if named.with_two and abs(sx - sy) * max(self.width, self.height) > 1:
-            model, rest = named.with_two, named.with_two_coefficients
+        if named.two_focal_model and abs(sx - sy) * max(self.width, self.height) > 1:
+            model, rest = named.two_focal_model, named.two_focal_coefficients
             coefficients = [*self.params[3:], *[0.0] * rest][:rest]
             both = (self.params[0], *self.params[:3], *coefficients)
             return replace(self, model=model, params=both).resized(width, height)
