@@ -378,7 +378,7 @@ def test_info_counts_what_a_reader_leaves_out(model: Path, capsys: Capture) -> N
 
     spoilt(model, change)
     said = printed(capsys, ["info", model]).out
-    assert "300, 3 not finite, which are left out" in said
+    assert "300, 3 of them not finite and left out" in said
     assert "made by hand" in said
     assert "none.ply: no such file" in printed(capsys, ["info", model.with_name("none.ply")], status=2).err
     target = model.with_name("whole.ply")
