@@ -339,7 +339,7 @@ def test_a_kernel_that_is_not_known_is_drawn_as_an_ellipse(tmp_path: Path, kerne
     path.write_text(json.dumps(document))
     read, texts = told(path)
     assert only(texts).startswith(
-        f"primitive 0 of node 0 has the kernel {str(kernel)!r}, expected ellipse; it is drawn as one"
+        f"primitive 0 of node 0 has the kernel {str(kernel)!r}, expected ellipse; it is drawn as an ellipse"
     )
     assert_equal(read, wanted)
 
