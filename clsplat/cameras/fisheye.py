@@ -17,8 +17,8 @@ from clsplat.cameras.model import Intrinsics
 
 MIN_FISHEYE_SLOPE = 0.1
 """Smallest derivative of a fisheye's image radius with respect to the angle, relative to the derivative on the axis.
-From the angle where it is smaller, the projection folds over and the picture stays empty. Up to there, float32 suffices
-to compute a pixel's angle."""
+Where it is smaller, the picture counts as folded over and stays empty. Where it is larger, float32 suffices to compute
+a pixel's angle."""
 
 
 def radii(view: Intrinsics, theta: Float64) -> tuple[Float64, Float64, Float64]:

@@ -259,7 +259,7 @@ class Colours:
 
 
 def configuration_digest(source: str) -> str:
-    """SHA-256 digests of an OpenColorIO file and of the lookup tables that it names; the name of a built-in one."""
+    """SHA-256 digests of an OpenColorIO file and of the tables that it names; `source` itself if it is no file."""
     if not source or not is_file(source):
         return source
     patterns = _table_patterns(source, Path(source).stat().st_mtime_ns)

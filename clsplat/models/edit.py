@@ -133,7 +133,7 @@ def decompose(matrix: Float64, slack: float = _SIMILARITY_TOLERANCE) -> tuple[fl
     """Scale s, rotation Q (3, 3) and translation t (3,) of a similarity (4, 4).
 
     slack: largest allowed difference of Q^T Q from the identity.
-    Raises InputError if the matrix is not a similarity. The message is an object of "has".
+    Raises InputError if the matrix is not a similarity. Its message is written to follow "has".
     """
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"a transform of {matrix.shape}, expected 4 x 4 finite numbers")

@@ -46,7 +46,7 @@ class Placement:
         return np.vstack([np.array(self.matrix).reshape(3, 4), (0.0, 0.0, 0.0, 1.0)])
 
     def within(self, outer: Placement) -> Placement:
-        """This placement followed by that of an enclosing group, `outer`."""
+        """Placement in the shot's world of a model in a group, whose own placement is `outer`."""
         matrix = self.matrix
         if outer.matrix != IDENTITY_ROWS:
             matrix = rows_of(outer.transform @ self.transform)

@@ -37,7 +37,7 @@ MAX_COORDINATE = 1e30
 MIN_FOCAL_PER_SIDE = 1 / 20
 """Minimum plausible focal length, as a fraction of the longer side. A fisheye of 220 degrees has 1/4."""
 MIN_CENTRE_CHECK_SIDE_PX = 16
-"""Minimum shorter side in pixels. Only in smaller pictures may the principal point plausibly lie in the first pixel."""
+"""Minimum shorter side, in pixels, of pictures whose principal point is checked: it must not lie in the first pixel."""
 POINTS_PER_OCCLUSION_CELL = 16
 """Mean number of points in an occlusion cell.
 
@@ -199,7 +199,7 @@ class Lens:
         return np.asarray(self._camera().img_from_cam(np.ascontiguousarray(points, np.float64)))
 
     def cam_from_img(self, pixels: Float64) -> Float64:
-        """Intersect the rays of pixels (N, 2) with the plane z = 1, (N, 2); NaN for pixels without a ray."""
+        """Points (N, 2) where the rays of pixels (N, 2) meet the plane z = 1; NaN for pixels without a ray."""
         return np.asarray(self._camera().cam_from_img(np.ascontiguousarray(pixels, np.float64)))
 
     def _camera(self) -> pycolmap.Camera:
@@ -351,7 +351,7 @@ def occlusion_cell(camera: Camera, points: int) -> float:
 
 
 def nearest_around(rows: NDArray[np.int64], columns: NDArray[np.int64], depths: Float64, cell: float) -> Float64:
-    """For each point, the least depth among the points in its cell of `cell` x `cell` pixels, (N,)."""
+    """Least depth (N,) among the points in each point's cell of `cell` x `cell` pixels."""
     across, down = (columns // cell).astype(np.int64), (rows // cell).astype(np.int64)
     cells = down * (across.max(initial=0) + 1) + across
     nearest = np.full(cells.max(initial=0) + 1, np.inf)

@@ -112,7 +112,7 @@ class PlyHeader:
         return self.elements[: self.elements.index(self.vertex)]
 
     def start(self, index: int) -> int:
-        """Byte offset of the element `index` in a binary file. For the number of elements it is the end of the last."""
+        """Byte offset of the element `index` in a binary file; the end of the last element if there is none."""
         return self.size + sum(element.count * element.row_bytes for element in self.elements[:index])
 
     def row_type(self, element: Element) -> np.dtype[Any]:

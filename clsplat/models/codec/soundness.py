@@ -47,7 +47,7 @@ CLIPPED_OPACITY_SHARE = (1e-3, 0.02)
 """Largest distance of a clipped opacity from 1, and least fraction of clipped opacities in the output of a neural
 network. Logits do not cluster like that."""
 PERCENTAGE_MAXIMA = (40.0, 100.0)
-"""Range of the largest opacity in percent. Read as levels from 0 to 255, no opacity would exceed 0.4."""
+"""Range of the largest opacity in percent. If the values were levels from 0 to 255, no opacity would exceed 0.4."""
 ZERO_SCALE_LOG_LIMIT = float(np.log(values.MIN_SCALE)) + 1
 """Log scales below this stand for scales of 0, and do not show how the other scales are encoded."""
 LENGTH_SKEW_RATIO = 3.0
@@ -203,7 +203,7 @@ def _deactivated(gaussians: Gaussians, which: Activated, numbers: NDArray[np.int
             raise InputError(
                 f"{where}: opacities are whole numbers up to {most:g}, expected 0 to 1, or some over "
                 f"{PERCENTAGE_MAXIMA[0]:g}; "
-                "these may be percentages or levels of 255"
+                "these may be percentages or levels from 0 to 255"
             )
         opacity = logits / np.float32(white)
         near = (opacity >= -BYTE_LOGIT_ERROR) & (opacity <= 1 + BYTE_LOGIT_ERROR)

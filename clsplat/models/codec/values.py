@@ -41,7 +41,7 @@ UNIT_COLOUR_SHARE = 0.95
 """White is also taken to be 1 if at least this fraction of float colours is at most 1, however bright the others are.
 """
 UNIT_RANGE_TOLERANCE = 1e-3
-"""Tolerance, from rounding to half floats, of colours above white (relative) and of opacities outside 0 to 1."""
+"""Tolerance of colours above white (relative) and of opacities outside [0, 1], because of half floats and averages."""
 GAUSSIAN_ARRAY_NOUNS = ("a position", "a rotation", "a scale", "an opacity", "a colour")
 """Nouns for the arrays of `Gaussians`, for messages."""
 _MORTON_SPREAD_STEPS = (

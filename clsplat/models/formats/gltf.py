@@ -11,8 +11,8 @@ https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussi
   attribute, in clsplat's order and signs. The reader accepts normalised integers too. COLOR_0, linear as glTF requires,
   is for viewers that draw points.
 - Colour space: srgb_rec709_display by default, or lin_rec709_display for a model trained in linear light.
-- Compression: the draft KHR_gaussian_splatting_compression_spz_2 stores an SPZ file, version 2, in a buffer view. Such
-  files are read, and written on request.
+- Compression: the draft KHR_gaussian_splatting_compression_spz_2 stores an SPZ file, version 2, in a buffer view. When
+  unpacked, its values are in glTF's axes. Such files are read, and written on request.
 
 clsplat parses the container itself, a JSON object and arrays at offsets: glTF libraries load whole files and trust
 their contents.

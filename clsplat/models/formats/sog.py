@@ -9,8 +9,8 @@ whose meta.json has no version, is read as in https://github.com/playcanvas/spla
   axis.
 - quats: w x y z without the largest component, whose index plus 252 is in alpha; the others in steps of 1/180.
 - scales: indices into a codebook of 256 natural logs.
-- sh0: indices into a codebook of 256 values of SH coefficient 0. Alpha is the opacity in steps of 1/255. WebP may lose
-  the colours of pixels with alpha 0.
+- sh0: indices into a codebook of 256 values of SH coefficient 0. Alpha is the opacity in steps of 1/255. Gaussians of
+  opacity 0 lose their colours.
 - shN: a palette of up to 65,536 sets of coefficients, as indices into a third codebook; order and signs are clsplat's.
 - Version 1 has ranges in 255 steps instead of codebooks, and opacities as logits.
 """

@@ -61,7 +61,7 @@ COORDINATE_SYSTEM_SIGNS: tuple[Signs, ...] = (
 """Signs between clsplat's axes and those of each value of the coordinate system extension. Larger values have z up."""
 MAX_EXTENSION_BYTES = 1 << 20
 MAX_ZSTD_WINDOW_BYTES = 1 << 27
-"""Largest window in bytes that a Zstandard frame may require. It is Niantic's limit too."""
+"""Largest window in bytes that a Zstandard frame may require: the default limit of the Zstandard library."""
 COLOUR_STEPS_PER_UNIT = 0.15 * 255
 SQRT_HALF = 0.5**0.5
 

@@ -31,7 +31,7 @@ MAX_UNPACK_RATIO = 100
 The ratio of a PLY whose spherical harmonics are all 0 is about 5. A decompression bomb reaches deflate's limit, 1032.
 """
 ZIP_FILE_MAGIC = b"PK\x03\x04"
-"""First bytes of an archive that contains a file."""
+"""First bytes of an archive that is not empty."""
 MACOS_METADATA_FOLDER = "__MACOSX"
 ZIP_MEMBER_HEAD_BYTES = 16 << 20
 """Number of bytes at the beginning of a file that are searched for signs of Gaussians: all of a JSON or PLY header."""

@@ -35,10 +35,9 @@ twice as many are read."""
 VOID_LABEL = 255
 """Label of undefined pixels, as at the object borders in VOC and Cityscapes."""
 MAX_LABEL = 40
-"""Maximum of the other labels. Soft masks have larger values."""
+"""Largest label except VOID_LABEL. Soft masks have larger values."""
 MAX_LABEL_NOISE_RATIO = 0.01
-"""A mask whose area labelled 1 is smaller than this times its area labelled 255 is taken for black and white with
-noise."""
+"""A mask is black and white with noise if its area labelled 1 is under this fraction of its area labelled 255."""
 
 
 @dataclass(frozen=True)
