@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A town of any size, to try large scenes on: its blocks, its photographs by ray casting, and its COLMAP scene."""
+"""A synthetic town of any size, for tests of large scenes: its blocks, its ray-cast photographs, its COLMAP scene."""

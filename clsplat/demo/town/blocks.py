@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The blocks of the town's world, an endless grid. Each follows from the seed and its two numbers alone.
+"""The city blocks of the town, in an endless grid. The seed and a block's two indices determine the block.
 
-A block has its corner at the crossing of two streets. x and y are along the streets, and the ground is z = 0.
+A block's corner is at the crossing of two streets. x and y are along the streets, and the ground is z = 0.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from clsplat.demo.town.solids import SOLID_BALL, SOLID_ROOF, Builder, Cover, Sol
 
 BLOCK_METRES = 60.0
 CARRIAGEWAY_METRES, PAVEMENT_METRES = 5.0, 7.5
-"""Distances from the middle of a street to the ends of its carriageway and of its pavement."""
+"""Distances from the middle of a street to the edges of its carriageway and of its pavement."""
 LOT_METRES = (BLOCK_METRES - 2 * PAVEMENT_METRES) / 3
 PARKED_METRES, DRIVEN_METRES = 4.0, 1.7
 """Distances from the middle of a street to the lines of parked and of moving cars."""
 STOREY_METRES, WINDOW_METRES = 3.0, 3.0
 POINTS_PER_BLOCK = 1200
 GROUND_POINTS = 400
-"""Points of a block on its ground, of all its points."""
+"""Number of the POINTS_PER_BLOCK points that are on the ground."""
 MAX_HEIGHT_METRES, BLOCK_REACH_METRES = 20.0, 12.0
-"""Bounds of every block: its height, and how far its trees and cars are beyond its edges."""
+"""Upper bounds for every block: height of its solids, and distance of its trees and cars beyond its edges."""
 GROUND_FACE, SKY_FACE = -1, -2
-"""Numbers of surfaces that belong to no solid."""
+"""Surface numbers of the ground and the sky, which belong to no solid."""
 CAR_PAINTS: Final = np.array(
     [[0.8, 0.8, 0.8], [0.08, 0.08, 0.09], [0.5, 0.06, 0.05], [0.08, 0.16, 0.42], [0.4, 0.4, 0.4]]
 )
@@ -39,15 +39,15 @@ _BLOCKS_KEPT = 512
 
 @dataclass(eq=False)
 class CityBlock:
-    """A block of the world.
+    """A block of the town.
 
-    i, j: its numbers along x and y.
-    solids: in metres from its corner.
+    i, j: its indices along x and y.
+    solids: in metres from the block's corner.
     low, high: corners (3,) of a box around the solids.
-    points: (POINTS_PER_BLOCK, 3) float64 on its surfaces, in metres from its corner.
-    solid_of_point: (POINTS_PER_BLOCK,), the solid on which a point lies, or GROUND_FACE.
-    face_of_point: (POINTS_PER_BLOCK,), its face.
-    normals: (POINTS_PER_BLOCK, 3), outward.
+    points: (POINTS_PER_BLOCK, 3) float64, points on its surfaces, in metres from the block's corner.
+    solid_of_point: (POINTS_PER_BLOCK,), index of each point's solid, or GROUND_FACE.
+    face_of_point: (POINTS_PER_BLOCK,), index of each point's face in its solid.
+    normals: (POINTS_PER_BLOCK, 3), outward normals at the points.
     """
 
     i: int
@@ -68,7 +68,7 @@ class CityBlock:
 
 @lru_cache(maxsize=_BLOCKS_KEPT)
 def city_block(seed: int, i: int, j: int) -> CityBlock:
-    """Block (i, j) of a seed's world."""
+    """Block (i, j) of the town with this seed. Recent blocks are cached."""
     generator = block_generator(seed, 0, i, j)
     builder = Builder()
     kind = generator.choice(("houses", "flats", "park"), p=(0.6, 0.28, 0.12))
@@ -82,7 +82,7 @@ def city_block(seed: int, i: int, j: int) -> CityBlock:
 
 
 def block_generator(seed: int, purpose: int, i: int, j: int, *more: int) -> np.random.Generator:
-    """Random numbers of a block for one purpose. Blocks may have negative numbers."""
+    """Random generator of a block for one purpose. i and j may be negative."""
     return np.random.default_rng([seed, purpose, i & 0xFFFFFFFF, j & 0xFFFFFFFF, *more])
 
 
@@ -229,7 +229,7 @@ def _parked_cars(builder: Builder, generator: np.random.Generator) -> None:
 def _points(
     solids: Solids, generator: np.random.Generator
 ) -> tuple[Float64, NDArray[np.int64], NDArray[np.int64], Float64]:
-    """Points on the surfaces, their solids, faces and normals. Undersides have none."""
+    """Random points of a block (n, 3), and their solids, faces and normals. Undersides get no points."""
     ground = np.zeros((GROUND_POINTS, 3))
     ground[:, :2] = generator.uniform(0, BLOCK_METRES, (GROUND_POINTS, 2))
     count = POINTS_PER_BLOCK - GROUND_POINTS
@@ -241,7 +241,7 @@ def _points(
     areas[:, 5] = 4 * x * y
     areas[roofs] = np.stack([y * z, y * z, 0 * x, 0 * x, 0 * x, 0 * x, 2 * x * steep, 2 * x * steep], axis=1)[roofs]
     areas[balls] = 0
-    areas[balls, 0] = 2 * np.pi * x[balls] ** 2  # half of it: foliage has points enough
+    areas[balls, 0] = 2 * np.pi * x[balls] ** 2  # half of the sphere's area: foliage has enough points
     chosen = generator.choice(areas.size, count, p=(areas / areas.sum()).ravel())
     solid, face = chosen // 8, chosen % 8
     a, b = generator.uniform(-1, 1, (2, count))
@@ -272,8 +272,8 @@ def _on_roofs(
     local: Float64,
     normals: Float64,
 ) -> None:
-    """Move points of roofs to their gables and slopes, in place."""
-    share = (b + 1) / 2  # of the height
+    """Set the places `local` and `normals` of points on the gables and slopes of roofs, in place."""
+    share = (b + 1) / 2  # fraction of the roof's height
     gable = roof & (face < 2)
     local[gable, 1] = (a * (1 - share) * half[:, 1])[gable]
     local[gable, 2] = (share * half[:, 2])[gable]
@@ -284,6 +284,6 @@ def _on_roofs(
 
 
 def _on_sphere(a: Float64, b: Float64) -> Float64:
-    """Even directions (n, 3) from two even numbers in [-1, 1]."""
+    """Uniformly distributed directions (n, 3) from two uniform numbers in [-1, 1]."""
     level, angle = np.sqrt(1 - b**2), np.pi * a
     return np.stack([level * np.cos(angle), level * np.sin(angle), b], axis=1)

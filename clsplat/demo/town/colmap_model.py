@@ -17,7 +17,7 @@ from clsplat.rotations import quaternion_of
 from clsplat.scenes.dataset import Lens, models
 
 UNKNOWN_POINT = np.uint64(2**64 - 1)
-"""Point of an observation that belongs to no track."""
+"""Point number of an observation without a point."""
 _OBSERVATION = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
 _COUNT = struct.Struct("<Q")
 
@@ -28,8 +28,8 @@ class ModelImage:
 
     camera: number of its camera, from 1.
     rotation, translation: (3, 3) and (3,) float64, `cam_from_world`.
-    pixels: (n, 2) float64, its observations.
-    points: (n,) uint64, numbers of the points; UNKNOWN_POINT for none.
+    pixels: (n, 2) float64, positions of its observations.
+    points: (n,) uint64, numbers of the observed points; UNKNOWN_POINT for none.
     """
 
     name: str
@@ -46,9 +46,9 @@ class ModelPoints:
 
     places: (n, 3) float64, world coordinates.
     colours: (n, 3) uint8.
-    tracks: (n + 1,), where each point's observations begin in the two next arrays.
-    images: numbers of the images that show it, from 1.
-    observations: the observation's index in that image.
+    tracks: (n + 1,), index of each point's first observation in `images` and `observations`.
+    images: (m,), number of the image of each observation, from 1.
+    observations: (m,), index of each observation in its image.
     """
 
     places: Float64

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cameras of a block: flights over it, straight down and at a slant, and rows along its two streets.
+"""The cameras of a block: flights over it, with cameras straight down and oblique, and rows along its two streets.
 
-They follow from the seed, the block's numbers and the number of photographs of a block, but not from the town's size.
+The seed, the block's indices and the number of photographs per block determine them; the town's size does not.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from clsplat.scenes.dataset import Lens
 from clsplat.shots.viewpoints import look_at
 
 AIR_VIEW_RADIANS, STREET_VIEW_RADIANS = math.radians(62.0), math.radians(78.0)
-"""Angles of view across the longer side."""
+"""Angles of view across the longer side, of the flights and in the streets."""
 STRAIGHT_FLIGHT_METRES, SLANTED_FLIGHT_METRES, CAR_CAMERA_METRES = 55.0, 48.0, 2.4
-"""Heights of the cameras."""
+"""Heights of the cameras above the ground: straight down, oblique, and on a car."""
 SLANT_RADIANS = math.radians(40.0)
-"""Angle of the slanted flights' axes below the horizon."""
+"""Angle of the oblique cameras' axes below the horizon."""
 TOWN_FISHEYE_COEFFICIENTS = (-0.02, 0.0005, 0.0, 0.0)
 STRAIGHT_SHARE, STREET_SHARE = 0.3, 0.3
-"""Shares of a block's photographs. The others are slanted."""
+"""Fractions of a block's photographs that look straight down, and that are in the streets. The others are oblique."""
 DIRECTIONS: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]])
 _YAWS = (0.38, -0.38)
 
 
 @dataclass(frozen=True, eq=False)
 class TownPhotograph:
-    """A photograph before it is taken.
+    """A planned photograph.
 
-    name: path below the folder of pictures.
-    i, j, index: its block, and its number among the block's photographs.
-    camera: with its exact pose in the town's coordinates.
+    name: path relative to the folder of pictures.
+    i, j, index: indices of its block, and its index among the block's photographs.
+    camera: the camera, with its exact pose in the town's coordinates.
     lens: the camera's intrinsics, of a COLMAP model.
     gain: exposure, as a factor of the light.
     """
@@ -101,7 +101,7 @@ Row = tuple[str, int, Float64, Float64, Float64]
 
 
 def _straight(count: int, generator: np.random.Generator) -> list[Row]:
-    """Lines along x, to and fro, that look down."""
+    """Photographs that look down, along lines parallel to x in alternating directions."""
     lines, rows = max(1, round(math.sqrt(count))), []
     for index, (x, y, line) in enumerate(_over_block(count, lines)):
         place = np.array([x, y, STRAIGHT_FLIGHT_METRES]) + generator.normal(0, 0.6, 3)
@@ -112,7 +112,7 @@ def _straight(count: int, generator: np.random.Generator) -> list[Row]:
 
 
 def _slanted(count: int, generator: np.random.Generator) -> list[Row]:
-    """Four flights that look at the block from four sides."""
+    """Photographs of four oblique flights, which look in four directions."""
     rows, down = [], math.tan(SLANT_RADIANS)
     for side, forward in enumerate(DIRECTIONS):
         some = len(range(side, count, 4))
@@ -128,7 +128,7 @@ def _slanted(count: int, generator: np.random.Generator) -> list[Row]:
 
 
 def _street(count: int, generator: np.random.Generator) -> list[Row]:
-    """Rows along the block's two streets, both ways, on the right-hand side. Views to both sides take turns."""
+    """Photographs along the block's two streets, both ways, on the right-hand side, alternately to either side."""
     rows: list[Row] = []
     for street, begin in enumerate((0, count // 2)):
         some = (count // 2, count - count // 2)[street]
@@ -146,7 +146,7 @@ def _street(count: int, generator: np.random.Generator) -> list[Row]:
 
 
 def _over_block(count: int, lines: int) -> list[tuple[float, float, int]]:
-    """Places x, y over a block, evenly along lines, each with its line."""
+    """Positions over a block, evenly spaced along lines: x, y and the index of the line."""
     places = []
     for line in range(lines):
         some = len(range(line, count, lines))
@@ -161,7 +161,7 @@ def _upright(generator: np.random.Generator) -> Float64:
 
 
 def _gain(config: TownConfig, flight: int, i: int, j: int, index: int) -> float:
-    """Exposure of a photograph: one for each flight along a row of blocks, which drifts from block to block."""
+    """Exposure of a photograph. Each flight along a row of blocks has its own, which drifts from block to block."""
     if config.exposure == 0:
         return 1.0
     level, phase, speed = block_generator(config.seed, 4, 0, j, flight).uniform(-1, 1, 3)

@@ -31,11 +31,11 @@ from clsplat.demo.town.view_rays import SAMPLES, world_rays
 from clsplat.demo.town.visibility import Caster, Sight, blocks_in_sight
 
 BAND_PIXELS = 1 << 16
-"""Pixels that are cast at once, which bounds the memory."""
+"""Number of pixels that are cast at once. It bounds the memory."""
 POINT_METRES = 130.0
 """Distance up to which points are observed."""
 FREE_METRES = 9.0
-"""Distance from the camera within which there is no moving car."""
+"""Least distance of moving cars from the camera."""
 TONE = np.float32(1 / 1.6)
 """Exponent of the tone curve."""
 
@@ -44,10 +44,10 @@ TONE = np.float32(1 / 1.6)
 class Observations:
     """Points that a photograph shows.
 
-    blocks: (n, 2) int32, numbers of the points' blocks.
-    points: (n,) int32, their numbers in the block.
-    pixels: (n, 2) float64, exact.
-    colours: (n, 3) uint8, of the pixels.
+    blocks: (n, 2) int32, indices of the points' blocks.
+    points: (n,) int32, indices of the points in their blocks.
+    pixels: (n, 2) float64, exact positions in the picture.
+    colours: (n, 3) uint8, colours of the pixels.
     """
 
     blocks: NDArray[np.int32]
@@ -58,10 +58,11 @@ class Observations:
 
 @dataclass(eq=False)
 class TakenPhotograph:
-    """A photograph.
+    """A photograph of the town.
 
     pixels: (height, width, 3) float32 in [0, 1].
-    mask: (height, width), True for pixels that count; None without moving cars.
+    mask: (height, width), False for pixels of moving cars; None without moving cars.
+    seen: the observed points.
     """
 
     pixels: Float32
@@ -70,7 +71,7 @@ class TakenPhotograph:
 
 
 def take(config: TownConfig, photograph: TownPhotograph) -> TakenPhotograph:
-    """Take a photograph. Each pixel is the mean of four rays; it is shaded once if all meet the same surface."""
+    """Take a photograph. A pixel is the mean of four rays, but is shaded once if all four meet the same surface."""
     camera = photograph.camera
     blocks = blocks_in_sight(config.seed, camera)
     moving = len(blocks)
@@ -115,7 +116,7 @@ def _shaded(camera: Camera, shader: Shader, sight: Sight, first: int, last: int)
 
 
 def _moving_cars(config: TownConfig, photograph: TownPhotograph) -> CityBlock:
-    """The cars that pass while the photograph is taken, in the streets of its block and of the eight around it."""
+    """The moving cars in a photograph, as a block: in the streets of its block and of the eight blocks around it."""
     generator = block_generator(config.seed, 5, photograph.i, photograph.j, photograph.index)
     builder = Builder()
     corner = np.array([photograph.i, photograph.j]) * BLOCK_METRES
@@ -137,7 +138,7 @@ def _moving_cars(config: TownConfig, photograph: TownPhotograph) -> CityBlock:
 
 
 class _Candidates:
-    """Points in front of a photograph's camera, some of which solids may hide."""
+    """Points inside a photograph's frame. `see` finds those that no solid hides."""
 
     def __init__(self, caster: Caster, blocks: int) -> None:
         camera, position = caster.camera, caster.position
@@ -169,7 +170,7 @@ class _Candidates:
         self._seen = np.zeros(len(rows), np.bool_)
 
     def see(self, surfaces: NDArray[np.int32], first: int, last: int) -> None:
-        """Note which points the rows from `first` to `last` show: those whose surface the nearest ray meets."""
+        """Mark the visible points in the rows from `first` to `last`: those whose nearest ray meets their surface."""
         y = self._pixels[:, 1]
         rows = np.flatnonzero((y >= first) & (y < last))
         x, y = self._pixels[rows].T
@@ -178,7 +179,7 @@ class _Candidates:
         self._seen[rows] = surfaces[sample, row - first, column] == self._surfaces[rows]
 
     def observations(self, pixels: Float32, mask: Bool | None) -> Observations:
-        """The points that the photograph shows, outside masks."""
+        """The visible points outside the mask's excluded pixels."""
         column, row = np.floor(self._pixels).astype(np.int64).T
         seen = self._seen if mask is None else self._seen & mask[row, column]
         colours = np.rint(pixels[row[seen], column[seen]] * 255).astype(np.uint8)
@@ -186,6 +187,6 @@ class _Candidates:
 
 
 def _away(block: CityBlock, position: Float64) -> Float64:
-    """Way (2,) from a position to the nearest place of a block's ground."""
+    """Horizontal offset (2,) of a position from the nearest point of a block's ground."""
     low = block.corner[:2]
     return np.asarray(position[:2] - np.clip(position[:2], low, low + BLOCK_METRES))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The settings of a town, and the rules for them."""
+"""The settings of a town, and their checks."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ MAX_PHOTOS_PER_BLOCK = 1000
 MIN_TOWN_PHOTO_SIDE, MAX_TOWN_PHOTO_SIDE = 16, 8192
 """Limits of a photograph's width and height in pixels."""
 CAR_SLOTS = 28
-"""Places of moving cars in a block: seven in each direction of its two streets."""
+"""Number of places for moving cars in a block: seven in each direction of its two streets."""
 MAX_TOWN_ORIGIN_METRES = 1e8
-"""Float64 has steps of 15 nanometres there."""
+"""Largest coordinate of a town's origin. Float64 has steps of 15 nanometres there."""
 
 
 @dataclass(frozen=True)
 class TownConfig:
     """A town's settings.
 
-    columns, rows: number of photographed blocks along x and y. The world itself has no end.
+    columns, rows: number of photographed blocks along x and y. The town itself is endless.
     photos: number of photographs of each block.
     width, height: size of a photograph in pixels. A panorama has half its width as height.
-    seed: seed of the world, of the cameras and of all noise.
-    rig: cameras in the streets.
+    seed: seed of the town, of the cameras and of all noise.
+    rig: kind of the cameras in the streets.
     exposure: largest change of exposure between flights, in stops.
     cars: number of moving cars in each block.
     origin: world coordinates of the corner of block (0, 0), in metres.
-    pose_noise: standard deviation of the written camera positions along each axis, in metres.
+    pose_noise: standard deviation of the error of written camera positions, along each axis, in metres.
     """
 
     columns: int
@@ -60,7 +60,7 @@ class TownConfig:
         return self.rig == "panorama"
 
     def check(self) -> None:
-        """Raise InputError, which names the flag, for a value without sense."""
+        """Raise InputError, which names the flag, for a value out of range."""
         sides = f"1 to {MAX_TOWN_SIDE} blocks a side, such as 3x2"
         size = f"{MIN_TOWN_PHOTO_SIDE} to {MAX_TOWN_PHOTO_SIDE} pixels a side, such as 640x400"
         shorter, longer = min(self.width, self.height), max(self.width, self.height)
@@ -87,12 +87,12 @@ class TownConfig:
                 raise InputError(f"--{flag} {value}: expected {expected}")
 
     def record(self) -> dict[str, Any]:
-        """The settings, for JSON."""
+        """The settings as a JSON object."""
         return asdict(self) | {"origin": list(self.origin)}
 
 
 def two_numbers(flag: str, text: str, example: str) -> tuple[int, int]:
-    """The numbers of a text such as 3x2. Raises InputError, which names the flag."""
+    """Parse a text such as 3x2. Raises InputError, which names the flag."""
     match = re.fullmatch(r"\s*(\d{1,9})\s*[xX]\s*(\d{1,9})\s*", text)
     if match is None:
         raise InputError(f"--{flag} {text}: expected two whole numbers, such as {example}")
@@ -100,7 +100,7 @@ def two_numbers(flag: str, text: str, example: str) -> tuple[int, int]:
 
 
 def three_numbers(flag: str, text: str) -> tuple[float, float, float]:
-    """The coordinates of a text such as 500000,4650000,0. Raises InputError, which names the flag."""
+    """Parse coordinates such as 500000,4650000,0. Raises InputError, which names the flag."""
     try:
         x, y, z = map(float, text.split(","))
     except ValueError:

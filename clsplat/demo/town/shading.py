@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colours of the surfaces that rays of a photograph meet: textures, light and haze."""
+"""Shading of the rays of a photograph: textures, light and haze."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from clsplat.demo.town.visibility import SIGHT_METRES
 HAZE_METRES = 150.0
 """Distance at which haze begins."""
 SLANT_BLUR = np.float32(0.7)
-"""Exponent with which a surface seen at a slant gets a coarser mip level."""
+"""Exponent by which the mip level gets coarser on surfaces at a grazing angle."""
 LOT_COVERS: Final = np.array([paint.GRASS] * 9 + [paint.SOIL] * 3 + [paint.GRAVEL] * 2 + [paint.PAVING] * 2, np.int32)
 GROUND_DENSITY = np.float32(np.log2(TEXTURE_SIDE / GROUND_METRES))
 
@@ -37,7 +37,7 @@ GROUND_DENSITY = np.float32(np.log2(TEXTURE_SIDE / GROUND_METRES))
 class Shader:
     """Shades the rays of one photograph.
 
-    blocks: blocks whose solids are numbered through from `starts`, as by the `Caster`.
+    blocks, starts: the blocks in sight, and the number of each block's first solid, as in `Caster`.
     """
 
     def __init__(
@@ -50,8 +50,8 @@ class Shader:
     def colours(self, directions: Float32, surfaces: NDArray[np.int32]) -> Float32:
         """Linear colours (n, 3) of rays.
 
-        directions: (n, 3), as of `world_rays`.
-        surfaces: (n,), as of `Sight`.
+        directions: (n, 3), as from `world_rays`.
+        surfaces: (n,), surface that each ray meets, as in `Sight`.
         """
         result = np.empty((len(surfaces), 3), np.float32)
         for surface, shade in ((SKY_FACE, self.textures.sky), (GROUND_FACE, self._ground)):
@@ -70,9 +70,9 @@ class Shader:
         return result
 
     def _faces(self, surfaces: NDArray[np.int32]) -> tuple[NDArray[np.int64], Float32, Bool]:
-        """Row for each surface, the rows of the table of faces that are seen, and whether each belongs to a ball.
+        """Row (n,) of each surface in the table of visible faces, that table, and True for the rows of balls.
 
-        The rows are in metres from the camera. U and V of balls are their centres and radii.
+        Coordinates in the table are in metres from the camera. Rows of balls have centre and radius as their plane.
         """
         seen = np.zeros(self.starts[-1] * FACES_PER_SOLID, np.bool_)
         seen[surfaces] = True
@@ -153,7 +153,7 @@ class Shader:
         inner = np.minimum(_to_street(fx), _to_street(fy))
         lot_x, lot_y = ((place - PAVEMENT_METRES) * np.float32(1 / LOT_METRES) for place in (fx, fy))
         lot = np.clip(lot_x, 0, 2.5).astype(np.int64) + 3 * np.clip(lot_y, 0, 2.5).astype(np.int64)
-        far = np.abs(column) + np.abs(row) > 1e6  # towards the horizon, where haze hides all
+        far = np.abs(column) + np.abs(row) > 1e6  # near the horizon, where haze hides everything
         column, row = (
             np.where(far, 0, column).astype(np.int64) + first[0],
             np.where(far, 0, row).astype(np.int64) + first[1],
@@ -171,7 +171,7 @@ class Shader:
         return texture.astype(np.int32), tint
 
     def near_ground_seam(self, directions: Float32) -> Bool:
-        """True for rays (n,) to the ground within a pixel of the seam of two materials."""
+        """True (n,) for rays to the ground that meet it within a pixel of a seam between two materials."""
         x, y, z = directions.T
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             depth = np.float32(-self.position[2]) / z
@@ -203,7 +203,7 @@ def _hazy(colours: Float32, distance: Float32) -> Float32:
 
 
 def _to_street(place: Float32) -> Float32:
-    """Distance from the middle of the nearest street across one axis. place: in [0, BLOCK_METRES)."""
+    """Distance along one axis to the middle of the nearest street. place: in [0, BLOCK_METRES)."""
     return np.asarray(np.minimum(place, np.float32(BLOCK_METRES) - place))
 
 
@@ -218,7 +218,7 @@ def _cube_coordinates(normals: Float32, radius: Float32) -> tuple[Float32, Float
 
 
 def _mark_streets(colours: Float32, fx: Float32, fy: Float32, width: Float32) -> None:
-    """Paint kerbs, dashes and zebra crossings, in place. width: (n,), of a pixel on the ground in metres."""
+    """Paint kerbs, dashes and zebra crossings, in place. width: (n,), width of a pixel on the ground in metres."""
     away_x, away_y = _to_street(fx), _to_street(fy)
     near, far = np.minimum(away_x, away_y), np.maximum(away_x, away_y)
     along = np.where(away_x < away_y, fy, fx)
@@ -232,7 +232,7 @@ def _mark_streets(colours: Float32, fx: Float32, fy: Float32, width: Float32) ->
 
 
 def _band(place: Float32, middle: float, half: float, width: Float32) -> Float32:
-    """Share of a pixel of this width that lies within `half` of the middle."""
+    """Fraction (n,) of a pixel, of this width at `place`, that is within `half` of `middle`."""
     away = np.abs(place - np.float32(middle))
     low = np.maximum(away - width / 2, -half)
     return np.asarray(np.clip((np.minimum(away + width / 2, half) - low) / width, 0, 1))

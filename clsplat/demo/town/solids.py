@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Solids of which a block is built: boxes, gabled roofs and balls, with textured faces and points on them.
+"""The solids of a block: boxes, gabled roofs and balls, with textured faces.
 
-Each face is a row of numbers that is linear in a point, so that a picture needs one look-up for each pixel.
+A face's plane and texture coordinates are linear in the point, so a pixel needs one look-up in a table of faces.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from clsplat.demo.town.textures import TEXTURE_SIDE
 
 SOLID_BOX, SOLID_ROOF, SOLID_BALL = range(3)
 FACES_PER_SOLID = 8
-"""Rows of a solid in the table of faces. A box has the faces -x, +x, -y, +y, -z and +z. A roof has -x, +x and -z, and
-as the last two its slopes. A ball has the first alone."""
+"""Number of rows of a solid in the table of faces. A box uses the first six: -x, +x, -y, +y, -z and +z. A roof uses -x,
++x, -z, and the last two for its slopes. A ball uses the first."""
 FACE_VALUES = 18
-"""Numbers of a face, of a plane n p = d with texture coordinates u = U p + u0 and v = V p + v0:
+"""Number of values of a face. It is a plane n p = d with texture coordinates u = U p + u0 and v = V p + v0.
 
-n (3), d, U (3), u0, V (3), v0, red, green and blue of its light, texture, log2 of texels to a metre, darkness at the
-ground.
+The values are n (3), d, U (3), u0, V (3), v0, red, green and blue of its light, its texture's index, log2 of texels
+per metre, and the darkness at the ground (`Cover`).
 """
 PLANE_AT, U_AT, V_AT, LIGHT_AT, TEXTURE_AT, DENSITY_AT, DARKNESS_AT = 0, 4, 8, 12, 15, 16, 17
 BOUNCED_LIGHT = np.float32(0.11)
@@ -31,7 +31,7 @@ Triple = tuple[float, float, float]
 
 
 def light_on(normals: Float32) -> Float32:
-    """Light of sky, sun and ground on surfaces of these unit normals (n, 3), as (n, 3). Nothing casts a shadow."""
+    """Light (n, 3) of sky, sun and ground on surfaces with unit normals (n, 3), without shadows."""
     rise = normals[:, 2:]
     sun = np.maximum(normals @ SUN_DIRECTION, 0)[:, None]
     return np.asarray(
@@ -43,11 +43,11 @@ def light_on(normals: Float32) -> Float32:
 class Cover:
     """The surface of a face.
 
-    texture: its index.
+    texture: index of the texture.
     metres: length of a side of the texture.
     tint: factors of red, green and blue.
-    shift: offset of the texture, in sides.
-    darkness: share of the light that is missing at the ground.
+    shift: offset of the texture, as a fraction of its side.
+    darkness: fraction of the light that is missing at the ground.
     """
 
     texture: int
@@ -66,9 +66,10 @@ class Solids:
     """Solids in coordinates of their block, in metres, z up.
 
     kinds: (n,), SOLID_BOX, SOLID_ROOF or SOLID_BALL.
-    centres: (n, 3) float64. That of a roof is in the middle of its base.
-    halves: (n, 3) float64, half sizes along its own axes. A roof's last is its full height; its ridge is along x.
-    turns: (n, 2) float64, cosine and sine of the turn about z.
+    centres: (n, 3) float64. The centre of a roof is the middle of its base.
+    halves: (n, 3) float64, half sizes along the solid's own axes; but the third of a roof is its full height. The ridge
+        is along x.
+    turns: (n, 2) float64, cosine and sine of the rotation about z.
     faces: (n, FACES_PER_SOLID, FACE_VALUES) float64.
     """
 
@@ -94,7 +95,7 @@ class Solids:
 
 @dataclass(frozen=True)
 class _Row:
-    """A solid to be built: its sides, its top and its underside have a cover each."""
+    """A solid to be built, with covers for its sides and its top."""
 
     kind: int
     centre: tuple[float, float, float]
@@ -105,7 +106,7 @@ class _Row:
 
 
 class Builder:
-    """A builder of `Solids`, one by one. Centres and half sizes are in metres, turns in radians about z."""
+    """Collects solids one by one for `Solids`. Centres and half sizes are in metres, turns in radians about z."""
 
     def __init__(self) -> None:
         self._rows: list[_Row] = []
@@ -117,17 +118,17 @@ class Builder:
     def roof(self, base: Triple, half: Triple, slope: Cover, gable: Cover, turn: float = 0.0) -> None:
         """Add a roof with a ridge along x.
 
-        base: the middle of its base.
-        half: half its length and width, and its height.
+        base: middle of its base.
+        half: half of its length, half of its width, and its height.
         """
         self._rows.append(_Row(SOLID_ROOF, base, half, turn, gable, slope))
 
     def ball(self, centre: Triple, radius: float, cover: Cover) -> None:
-        """Add a ball. Its normals and texture coordinates follow from the place on it."""
+        """Add a ball. Its normals and texture coordinates are computed when it is shaded."""
         self._rows.append(_Row(SOLID_BALL, centre, (radius, radius, radius), 0.0, cover, cover))
 
     def build(self) -> Solids:
-        """The solids so far."""
+        """The solids added so far."""
         if not self._rows:
             return Solids()
         angles = np.array([row.turn for row in self._rows])
@@ -142,14 +143,14 @@ class Builder:
 
 
 def about_z(vectors: Float64, turns: Float64) -> Float64:
-    """Vectors (n, 3), turned about z. turns: (n, 2), cosines and sines."""
+    """Rotate vectors (n, 3) about z. turns: (n, 2), cosines and sines."""
     x, y, z = vectors.T
     c, s = turns.T
     return np.stack([c * x - s * y, s * x + c * y, z], axis=1)
 
 
 def slopes(halves: Float64, sign: float) -> tuple[Float64, Float64]:
-    """Normals of a slope of roofs, and the directions up it, (n, 3) each. sign: of the normals' y."""
+    """Normals of one slope of each roof, and directions up the slope, (n, 3) each. sign: sign of the normals' y."""
     steep = np.hypot(halves[:, 1], halves[:, 2])
     across, up, zero = halves[:, 2] / steep, halves[:, 1] / steep, np.zeros(len(halves))
     return np.stack([zero, sign * across, up], axis=1), np.stack([zero, -sign * up, across], axis=1)
@@ -188,11 +189,11 @@ def _faces(solids: Solids, sides: list[Cover], tops: list[Cover]) -> Float64:
 def _fill(
     rows: Float64, place: tuple[Float64, Float64, Float64], along: tuple[Float64, Float64], covers: Float64
 ) -> None:
-    """Fill the same face of all solids, in place.
+    """Fill one face of all solids in the table of faces, in place.
 
-    place: normals, points on the planes and the points where textures begin, (n, 3) each.
+    place: normals, points on the planes, and origins of the textures, (n, 3) each.
     along: directions to the right and up in the textures, (n, 3) each.
-    covers: (n, 8), numbers of the covers.
+    covers: (n, 8), `Cover.numbers` of each solid.
     """
     normals, at, begin = place
     metres, shifts = covers[:, 1], covers[:, 5:7]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Textures that all houses of a town share, with mip levels, and the sky with its ring of hills.
+"""The textures of a town, with mip levels, and the sky with its ring of hills.
 
-Each texture repeats in both directions. A face of a house chooses one, with an offset and a tint of its own, so that
-memory does not grow with the town.
+All houses share them, so memory does not grow with the town. Each texture repeats in both directions. A face has the
+index of a texture, an offset and a tint.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from clsplat.arrays import Float32
 
 TEXTURE_SIDE = 512
 TEXTURE_LEVELS = 10
-"""Mip levels, from TEXTURE_SIDE texels a side to one."""
+"""Number of mip levels, from TEXTURE_SIDE texels a side to one texel."""
 FACADES, ROOFS = range(9), range(9, 14)
 ASPHALT, PAVEMENT, GRASS, GRAVEL, SOIL, PAVING = range(14, 20)
 LEAVES, BARK, PLAIN = range(20, 22), 22, 23
 TEXTURE_COUNT = 24
 FACADE_METRES, ROOF_METRES, GROUND_METRES, LEAF_METRES = 12.0, 6.0, 8.0, 3.0
-"""Side of a texture on a surface. A facade has four windows and four storeys."""
+"""Length of a texture's side on a surface, in metres. A facade has four windows and four storeys."""
 SKY_ROWS, SKY_COLUMNS = 512, 2048
 HAZE_COLOUR: Final = np.array([0.50, 0.56, 0.63], np.float32)
 """Colour of the horizon, and of everything far away."""
@@ -36,9 +36,9 @@ _LEVEL_STARTS = np.concatenate([[0], np.cumsum(_LEVEL_SIDES**2)]).astype(np.int3
 
 
 class Brush:
-    """Random numbers and noise for one texture. The textures of a town share their noise, each at its own offset.
+    """Random numbers and noise for one texture. Textures of a town share noise fields, each at its own offset.
 
-    fields: noise by its parameters, filled as needed.
+    fields: the shared noise fields by their parameters, computed as needed.
     """
 
     def __init__(
@@ -49,8 +49,8 @@ class Brush:
     def rough(self, wavelength: float, falloff: float = 1.2, stretch: float = 1.0) -> Pixels:
         """Periodic noise with a mean of 0 and a standard deviation of 1: white noise, filtered by frequency.
 
-        wavelength: longest wavelength, as a part of the texture.
-        falloff: exponent of the amplitude's decline with the frequency.
+        wavelength: longest wavelength, as a fraction of the texture's side.
+        falloff: exponent by which the amplitude falls with the frequency.
         stretch: ratio of wavelengths along columns and rows.
         """
         key = wavelength, falloff, stretch
@@ -209,14 +209,14 @@ def _plain(_: int, brush: Brush) -> Pixels:
 
 
 def _packed(image: Pixels) -> NDArray[np.uint32]:
-    """Red, green and blue in [0, 1] as the bytes of a number, (h, w)."""
+    """Pack red, green and blue in [0, 1] as three bytes into an integer, (h, w)."""
     levels = np.zeros((*image.shape[:2], 4), np.uint8)
     levels[..., :3] = np.rint(np.clip(image, 0, 1) * 255)
     return levels.view(np.uint32)[..., 0]
 
 
 def _levels(image: Pixels) -> NDArray[np.uint32]:
-    """All mip levels of a texture in one row, from the finest. Each texel is the mean of four of the level before."""
+    """All mip levels of a texture in one row, finest first. A texel is the mean of four texels of the finer level."""
     rows = [_packed(image).ravel()]
     while len(image) > 1:
         image = 0.25 * (image[::2, ::2] + image[1::2, ::2] + image[::2, 1::2] + image[1::2, 1::2])
@@ -246,8 +246,8 @@ class Textures:
         """Trilinear look-up, (n, 3) in [0, 1].
 
         texture: (n,), index of the texture.
-        u, v: (n,), places in textures' sides, to the right and up; they may have any value.
-        level: (n,), mip level: the base 2 logarithm of texels to a pixel.
+        u, v: (n,), texture coordinates to the right and up, in sides of the texture; they may have any value.
+        level: (n,), mip level: log2 of the number of texels per pixel.
         """
         level = np.clip(level, 0, TEXTURE_LEVELS - 1.001)
         coarse = level.astype(np.int32)
@@ -319,5 +319,5 @@ def _baked_sky(brush: Brush) -> Pixels:
 
 @lru_cache(maxsize=2)
 def textures(seed: int) -> Textures:
-    """The textures of a seed, kept for the next photographs."""
+    """The textures of the town with this seed, cached."""
     return Textures(seed)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rays of a town photograph's pixels, and the parts of the picture that boxes may cover, for each projection."""
+"""Rays of a photograph's pixels, and screen rectangles of boxes, for each projection."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from clsplat.camera import Camera
 from clsplat.cameras.model import CameraModel
 
 SAMPLES = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
-"""Places x, y of a pixel's rays from its centre."""
+"""Offsets x, y of a pixel's four rays from its centre, in pixels."""
 NEAR_METRES = 0.05
 _ANGLES = 1 << 16
 _CIRCLE = 32
-"""Directions of the edge of a cone around a ball, from which its part of the picture follows."""
+"""Number of directions on the edge of a cone around a box, from which its screen rectangle is computed."""
 Planes = tuple[Float32, Float32, Float32]
 LensKey = tuple[CameraModel, int, int, float, float, float, float, tuple[float, ...]]
 
 
 def lens_key(camera: Camera) -> LensKey:
-    """The camera without its pose, to keep its rays."""
+    """The camera's values except its pose, as a cache key for its rays."""
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     return (camera.model, camera.width, camera.height, *intrinsics, camera.radial)
 
@@ -54,7 +54,7 @@ def world_rays(
 ) -> tuple[Float32, Float32, Float32]:
     """Directions x, y, z along the world's axes, (places, rows, columns) each, of the rows from `first` to `last`.
 
-    Those of a perspective camera have a depth of 1, the others a length of 1.
+    Rays of a perspective camera have depth 1, rays of other cameras length 1.
     """
     local = _local_rays(lens_key(camera), first, last, places)
     rotation = camera.rotation.astype(np.float32)
@@ -63,11 +63,11 @@ def world_rays(
 
 
 def rectangles(camera: Camera, low: Float64, high: Float64) -> NDArray[np.int32]:
-    """Parts of the picture outside which boxes are not seen: (n, 4), first and last row, first and last column.
+    """Screen rectangles of boxes, (n, 4): first row, end row, first column, end column. The ends are exclusive.
 
-    Rows and columns end before the last. A box that is not seen has an empty part. In a panorama columns may lie beyond
-    the edges, where the picture repeats.
-    low, high: (n, 3), corners of the boxes, from the camera's centre along the world's axes.
+    A rectangle contains all of its box. It is empty if the box is outside the frame. In a panorama, columns may lie
+    beyond the edges, where the picture repeats.
+    low, high: (n, 3), corners of the boxes relative to the camera's centre, along the world's axes.
     """
     if camera.is_pinhole:
         bounds = _flat_bounds(camera, low, high)
@@ -91,7 +91,7 @@ _EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).
 
 
 def _flat_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
-    """Left, right, top and bottom (n, 4) in pixels, of the parts of boxes in front of a perspective camera."""
+    """Left, right, top and bottom (n, 4), in pixels, of the parts of boxes in front of a perspective camera."""
     corners = np.where(_CORNERS, high[:, None], low[:, None]) @ camera.rotation.T
     begins, ends = corners[:, _EDGES[:, 0]], corners[:, _EDGES[:, 1]]
     rise = ends[..., 2] - begins[..., 2]
@@ -113,7 +113,7 @@ def _flat_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
 
 
 def _cones(low: Float64, high: Float64) -> tuple[Float64, Float64]:
-    """Middle (n, 3) of each box, and the angle (n,) of the cone around it as seen from the origin."""
+    """Cones from the origin around boxes: axis (n, 3), to the box's middle, and angle (n,) between axis and edge."""
     middle, radius = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2
     distance = np.linalg.norm(middle, axis=1)
     inside = distance <= radius * 1.001
@@ -160,15 +160,15 @@ def _fisheye_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
     x = camera.cx + camera.fx * radius * edge[..., 0] / level
     y = camera.cy + camera.fy * radius * edge[..., 1] / level
     bounds = np.stack([x.min(axis=1), x.max(axis=1), y.min(axis=1), y.max(axis=1)], axis=1)
-    whole = theta + angle >= np.pi  # the cone has the direction backwards, around which the picture ends
+    whole = theta + angle >= np.pi  # the cone contains the backward direction, around which the picture ends
     bounds[whole] = (-1e9, 1e9, -1e9, 1e9)
     return bounds
 
 
 def _fisheye_radius(radial: tuple[float, ...], theta: Float64) -> Float64:
-    """Distances from the picture's centre, in focal lengths, of angles from the axis: (18) of docs/cameras.md.
+    """Image radii, in focal lengths, at angles `theta` from the axis: eq. (18) of docs/cameras.md.
 
-    The town's fisheye rises up to 180 degrees, so that its picture ends nowhere.
+    The radius of the town's fisheye grows up to 180 degrees, so its picture has no edge.
     """
     square, series = theta * theta, np.zeros_like(theta)
     for coefficient in reversed(radial):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The nearest surface of each ray: the solids of the blocks around a camera, cast one by one from near to far.
 
-Only the rays of the screen rectangle of a solid are cast. A solid, or a whole block, is passed over if all rays of its
+Only the rays in the screen rectangle of a solid are cast. A solid or a whole block is skipped if all rays of its
 rectangle have met something nearer.
 """
 
@@ -29,11 +29,11 @@ from clsplat.demo.town.solids import FACES_PER_SOLID, SOLID_BALL, SOLID_BOX
 from clsplat.demo.town.view_rays import rectangles, world_rays
 
 SIGHT_METRES = 300.0
-"""Distance beyond which blocks are not cast: haze hides them."""
+"""Distance beyond which blocks are not cast, because haze hides them."""
 
 
 def blocks_in_sight(seed: int, camera: Camera) -> list[CityBlock]:
-    """Blocks within SIGHT_METRES of a camera that may be in its picture, the nearest first."""
+    """Blocks within SIGHT_METRES of a camera that may be in its picture, nearest first."""
     position, reach = camera.position, int(np.ceil(SIGHT_METRES / BLOCK_METRES))
     i, j = (int(np.floor(value / BLOCK_METRES)) for value in position[:2])
     around = np.arange(-reach, reach + 1)
@@ -53,9 +53,9 @@ def blocks_in_sight(seed: int, camera: Camera) -> list[CityBlock]:
 class Sight:
     """The surfaces that the rays of some rows of a picture meet.
 
-    directions: three arrays (4, rows, columns), as of `world_rays`.
-    surfaces: (4, rows, columns) int32, FACES_PER_SOLID times the number of the solid plus the face, GROUND_FACE or
-        SKY_FACE. Solids of all blocks are numbered through.
+    directions: three arrays (4, rows, columns), as from `world_rays`.
+    surfaces: (4, rows, columns) int32, FACES_PER_SOLID times the number of the solid plus the face; or GROUND_FACE or
+        SKY_FACE. Solids are numbered as in `Caster`.
     """
 
     directions: tuple[Float32, Float32, Float32]
@@ -66,11 +66,11 @@ Slices = tuple[slice, slice, slice]
 
 
 class _Part(NamedTuple):
-    """A part of the picture that a box may cover. A box that crosses the edge of a panorama has two.
+    """A screen rectangle of a box. A box that crosses the edge of a panorama has two.
 
-    box: its number.
-    near: its distance in metres.
-    top, bottom, left, right: first and last row, first and last column; the last do not belong to it.
+    box: index of the box.
+    near: distance of the box in metres.
+    top, bottom, left, right: first row, end row, first column, end column; the ends are exclusive.
     """
 
     box: int
@@ -84,7 +84,7 @@ class _Part(NamedTuple):
 class Caster:
     """Casts the rays of one photograph against blocks.
 
-    The solids of all `blocks` are numbered through: `starts` has the number of each block's first solid.
+    The solids of all `blocks` are numbered consecutively. `starts` has the number of each block's first solid.
     """
 
     def __init__(self, camera: Camera, blocks: Sequence[CityBlock]) -> None:
@@ -112,7 +112,7 @@ class Caster:
         return Sight(directions, rays.surfaces)
 
     def _solids_of(self, index: int) -> list[_Part]:
-        """The parts of a block's solids, from near to far."""
+        """Screen rectangles of a block's solids, nearest first."""
         if index not in self._inner:
             block = self.blocks[index]
             low, high = (corner + (block.corner - self.position) for corner in block.solids.bounds())
@@ -121,7 +121,7 @@ class Caster:
 
 
 def _placed(camera: Camera, low: Float64, high: Float64) -> list[_Part]:
-    """The parts of the picture of boxes, from near to far. low, high: as for `rectangles`."""
+    """Screen rectangles of boxes, nearest first. low, high: as for `rectangles`."""
     bounds, near = rectangles(camera, low, high), _nearest(low, high)
     width, wraps = camera.width, camera.model.wraps
     order = np.argsort(near, kind="stable")
@@ -137,7 +137,7 @@ def _placed(camera: Camera, low: Float64, high: Float64) -> list[_Part]:
 
 
 def _nearest(low: Float64, high: Float64) -> Float64:
-    """Distance (n,) of boxes from the origin."""
+    """Distances (n,) of boxes from the origin."""
     return np.asarray(np.linalg.norm(np.maximum(np.maximum(low, -high), 0), axis=1))
 
 
@@ -157,18 +157,18 @@ class _Rays:
         self._longest = float(np.sqrt((x**2 + y**2 + z**2).max()))  # a picture's corners have the longest
 
     def slices(self, part: _Part) -> Slices:
-        """The samples, rows and columns of a part of the picture among these rays."""
+        """Slices of samples, rows and columns that select the rays of a screen rectangle."""
         rows = slice(max(part.top - self.first, 0), max(part.bottom - self.first, 0))
         return slice(None), rows, slice(part.left, part.right)
 
     def is_open(self, part: _Part) -> bool:
-        """True if a ray of a part of the picture goes on to the distance of its box."""
+        """True unless all rays of a screen rectangle have met something nearer than its box."""
         if part.bottom <= self.first or part.top >= self.first + self.distance.shape[1]:
             return False
         return bool(self.distance[self.slices(part)].max() * self._longest > part.near)
 
     def cast(self, block: CityBlock, solid: int, number: int, part: Slices) -> None:
-        """Cast the rays of a part against a solid. number: that of the solid in the picture."""
+        """Cast the rays of a screen rectangle against a solid. number: number of the solid, as in `Caster`."""
         solids = block.solids
         centre = (self.position - block.corner - solids.centres[solid]).astype(np.float32)
         half, kind = solids.halves[solid].astype(np.float32), int(solids.kinds[solid])
@@ -234,7 +234,7 @@ class _Rays:
             self._meet(part, hit, enter, face)
 
     def _turned(self, part: Slices, turn: Float32) -> tuple[Float32, Float32, Float32]:
-        """Reciprocals of the directions along a solid's own x and y, and the directions along its y."""
+        """1 / x, 1 / y and y of the rays' directions, in the solid's own axes."""
         x, y = self.x[part], self.y[part]
         if turn[1] == 0:
             return self.over_x[part], self.over_y[part], y
@@ -251,7 +251,7 @@ class _Rays:
 
 
 def _slab(over: Float32, start: np.float32, half: np.float32) -> tuple[Float32, Float32]:
-    """Distances at which rays enter and leave the space between two planes at +-half from the origin."""
+    """Distances at which rays enter and leave the slab between two planes at +-half from the origin."""
     middle = over * -start
     reach = np.abs(over)
     reach *= half
