@@ -22,8 +22,8 @@ from clsplat.shots.stereo import for_eye
 def held_out(tasks: Sequence[Task], pattern: str, config: HoldoutConfig) -> list[Task]:
     """The tasks with their holdouts.
 
-    A pattern without a field for the number serves all frames, and one without a field for the eye both eyes. Warns
-    about depths in half floats. Raises InputError for a missing file, and for one whose header is not a holdout's.
+    A pattern without a field for the number names one file for all frames, and without a field for the eye one file for
+    both eyes. Warns about depths in half floats. Raises InputError for a missing file or one that is no holdout.
     """
     check_pattern(for_eye(pattern, tasks[0].eye))
     coarse: dict[Path, bool] = {}

@@ -25,7 +25,7 @@ from clsplat.shots.shot_file import KeyedTrack, Volume, Within, is_layout, read_
 from clsplat.shots.usd_models import read_stage
 
 Known = dict[Placement | State, Placement | State]
-"""Placements that are stored already, by themselves: equal ones are stored once."""
+"""Placements seen so far, each as key and value, so that equal placements become one object."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +60,12 @@ class JobModels:
 
     @property
     def one(self) -> Gaussians:
-        """The model that is used as it is."""
+        """The only model, if it has no placement."""
         return self.still[0]
 
     @property
     def still(self) -> tuple[Gaussians, ...]:
-        """The models that do not change over time, so all that are not a `ModelSeries`."""
+        """The models that do not change over time: all except each `ModelSeries`."""
         return tuple(model for model in self.models if not isinstance(model, ModelSeries))
 
     @property

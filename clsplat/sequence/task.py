@@ -108,7 +108,7 @@ class Task:
     number, name: as in `shots.Frame`.
     camera: camera of the whole frame, in its final size.
     path: path of the file.
-    after, earlier: cameras that motion and backward motion lead to, of the same size; None unless requested.
+    after, earlier: cameras one frame later and earlier, of the same size, for motion; None unless requested.
     stretch: cameras while the shutter is open, None for a static camera.
     before: state of the file when the job began (`finished_frames.stamp`).
     sampling: shutter and lens of this frame; None means the job's.
@@ -311,7 +311,7 @@ def camera_before(task: Task, pictures: PictureConfig) -> Camera | None:
 
 
 def end_before(task: Task, time: float, pictures: PictureConfig) -> float | None:
-    """The time from which the camera at another time is extrapolated, both in frames from the frame.
+    """Time of the shot's end from which the camera at `time` is extrapolated. Both are in frames relative to the frame.
 
     None if the shot's source defines the camera at that time, and for a shot of one frame. A stage defines its camera
     while the shutter is open; motion is extrapolated from the shutter's middle.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Default cameras for a model without camera files.
 
-An orbit follows from where the Gaussians are and how much detail they show. If a run has recorded the
-photographs' own cameras, a path can go among those instead.
+The orbit is computed from the positions and sizes of the Gaussians. If a run has recorded its photographs' cameras, a
+path can use these instead.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ ORBIT_FOV_RADIANS = math.radians(40.0)
 SUBJECT_SAMPLE_SIZE = 100_000
 """Number of Gaussians that are sampled to locate a model. A larger sample moves its centre by less than a pixel."""
 MIN_GAUSSIANS_FOR_STRAYS = 100
-"""Smallest number of Gaussians in a model of which some may be treated as strays."""
+"""Least number of Gaussians in a model from which strays are left out."""
 BALL_SHRINK_FACTOR = 0.9
 """Ratio of successive ball radii in the search for the most detailed region."""
 REGION_DETAIL_FRACTION = 0.35
 """Largest fraction of a model's detail that its most detailed region may hold."""
 MAX_SCENE_REGION_RADIUS_RATIO = 0.2
-"""Radius of the most detailed region, relative to the model's, up to which the model is a scene around an object.
-Models of a single object have at least 0.3; a room with a table in the middle has 0.05."""
+"""A model is a scene around an object if the radius of its most detailed region is at most this fraction of the model's
+radius. The fraction is at least 0.3 for a single object, and 0.05 for a room with a table in the middle."""
 MIN_DETAIL_SIZE_QUANTILE, MIN_DETAIL_SIZE_RATIO = 0.02, 1e-4
 """Sizes below which a Gaussian shows no more detail: this quantile of all sizes, and this fraction of the model's
 radius. Some files have Gaussians of size 0."""
 SCENE_RADIUS_MARGIN = 1.3
 """Radius of the part of a scene that is shown, relative to the radius of its most detailed region."""
 ORBIT_FRAMING_MARGIN = 1.1
-"""Radius that a picture shows, relative to the subject's radius, since strays lie beyond the subject."""
+"""Radius that a picture shows, as a multiple of the subject's radius. The margin is for strays around the subject."""
 RING_ELEVATIONS_RADIANS = (math.radians(20.0), math.radians(5.0), math.radians(40.0))
 """Elevations of the camera rings, in radians. A turntable follows the first ring; a spiral rises and sinks between the
 other two."""
@@ -72,9 +72,9 @@ def cameras_around(
     up: tuple[float, float, float] = COLMAP_UP,
     size: tuple[int | None, int | None] = (None, None),
 ) -> list[Camera]:
-    """Level pinhole cameras in three rings around a model, or around the most detailed region of a scene, facing its
-    centre.
+    """Level pinhole cameras in three rings around a model, or around the most detailed region of a scene.
 
+    They face its centre.
     up: up direction (3,), of any length but 0. With up along y, the first camera looks along z, as at a COLMAP scene.
     size: width and height in pixels; a side that is None follows from the other at the default aspect ratio.
     Raises InputError for a model without Gaussians.

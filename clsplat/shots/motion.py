@@ -86,9 +86,9 @@ def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, samplin
 def targets(
     shot: Shot, resize: Callable[[Camera], Camera], index: int, middle: float, *, motion: bool, backward: bool
 ) -> tuple[Camera | None, Camera | None]:
-    """Cameras that motion and backward motion of the frame at this index lead to, None unless requested.
+    """Cameras one frame after and one frame before a frame, for motion and backward motion; None unless requested.
 
-    They are one frame after and before it; for a shot that has `moment`, after and before the middle of the shutter.
+    For a shot with `moment`, they are one frame after and before the middle of the shutter.
     """
     if shot.moment is not None:
         time = shot.frames[index].number + middle
@@ -155,7 +155,7 @@ def stretches(
     motion: bool = False,
     backward: bool = False,
 ) -> Callable[[int], Shot | None]:
-    """A function from a frame's number to the part of the shot that its shutter covers, None if nothing can move.
+    """Function that returns the part of the shot that a frame's shutter covers; None if nothing can move.
 
     opens, closes: times at which the shutter opens and closes, in frames relative to the frame.
     motion, backward: also cover the middle of the next frame's shutter, or of the previous frame's.

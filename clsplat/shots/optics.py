@@ -56,7 +56,7 @@ class Optics:
 
 
 def settled(flags: SamplingConfig, optics: Optics | None, camera: Camera) -> SamplingConfig:
-    """Shutter and lens of a frame: settings of the flags, and settings of the stage that no flag gives.
+    """Shutter and lens of a frame: the flags' settings, and the stage's settings that no flag overrides.
 
     The lens size becomes an aperture radius, unless flags give the sensor width or the metres per unit.
     """

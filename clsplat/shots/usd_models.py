@@ -82,7 +82,7 @@ class StageModels:
 def read_stage(path: Path) -> StageModels | None:
     """Read the Gaussians of a stage. Raises InputError.
 
-    Returns None for a stage that is no more than a model: one layer, in which everything is visible and static.
+    Returns None for a stage that is only a model: a single layer, in which everything is visible and static.
     """
     survive(path, "clsplat.shots.usd_models:read_here")
     return read_here(path)
