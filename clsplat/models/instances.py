@@ -81,7 +81,7 @@ class Changing:
     inner: Track
 
     def at(self, frame: float) -> Placement:
-        """Placement of the inner track, for the series at the same frame."""
+        """Placement of the inner track, with `frame` as the frame of the series."""
         return replace(self.inner.at(frame), frame=float(frame))
 
     @property

@@ -26,7 +26,7 @@ from clsplat.images.alpha import associate, unassociate
 from clsplat.images.reading import downscale
 from clsplat.process import undisturbed
 
-with undisturbed():  # importing pycolmap reports Ctrl-C as "not installed"; its SIGTERM handler prints a stack trace
+with undisturbed():  # on Ctrl-C pycolmap's import says "not installed", and its SIGTERM handler prints a stack trace
     import pycolmap
 
 

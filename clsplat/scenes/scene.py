@@ -34,7 +34,7 @@ FileStamp = tuple[int, int]
 T = TypeVar("T")
 
 FAR_ORIGIN_RATIO = 64.0
-"""Distance of a scene from the world's origin, in scene sizes, from which means are stored relative to its middle.
+"""Least distance of a scene from the world's origin, in scene sizes, at which means are relative to the scene's middle.
 
 At this distance float32 resolves 64 * 2^-24 of the scene's size, or 1 % of a pixel if the scene is 2600 pixels wide.
 """

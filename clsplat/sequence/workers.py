@@ -42,7 +42,7 @@ from clsplat.sequence.task import (
 Result = tuple[Record, VideoPlanes | None]
 """Record of a frame, and for a frame of a video the planes to encode."""
 WRITE_QUEUE_BYTES = 1 << 30
-"""Target for the main memory of frames that wait to be written. Three frames are held in any case."""
+"""Target for the main memory of frames that wait to be written. At least three frames may wait."""
 ENCODING_COPIES = 3
 """Number of copies of a frame in memory while it is encoded: rendered, assembled, converted."""
 
@@ -131,10 +131,9 @@ def run_tasks(
     """Render the frames and write them meanwhile, or add them to the video.
 
     Each renderer has a thread, which takes the next free frame.
-    sharing: claims of frames, if other jobs may render some of these frames meanwhile; their frames are awaited at the
-    end.
-    on_done: called in this thread for each frame when its file is complete, not always in order. For a video it is
-    called in order, when the frame has been encoded. The first error of any thread is raised at the end of all threads.
+    sharing: claims of frames, if other jobs may render some of them meanwhile. Their frames are awaited at the end.
+    on_done: function that is called in this thread for each frame whose file is complete, in any order. For a video it
+    is called in order, when the frame has been encoded. The first error of any thread is raised after all have ended.
     """
     if not tasks:
         return
@@ -168,7 +167,7 @@ def run_tasks(
             devices.submit(render, renderer).add_done_callback(tell_failure)
         for record in encoded(tasks, (finished.get().result() for _ in tasks), video):
             if video is not None:
-                room.release()  # frames begin in order, so that the frame the video waits for has had room
+                room.release()  # frames begin in order, so the frame that the video needs next has had room
             on_done(record)
     except KeyboardInterrupt:
         abandon()  # a thread may wait for a driver that hangs

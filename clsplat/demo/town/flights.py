@@ -128,7 +128,7 @@ def _slanted(count: int, generator: np.random.Generator) -> list[Row]:
 
 
 def _street(count: int, generator: np.random.Generator) -> list[Row]:
-    """Photographs along the block's two streets, both ways, on the right-hand side, alternately to either side."""
+    """Photographs along the block's two streets, in both lanes. The cameras turn to either side by turns."""
     rows: list[Row] = []
     for street, begin in enumerate((0, count // 2)):
         some = (count // 2, count - count // 2)[street]

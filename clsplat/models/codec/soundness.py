@@ -44,8 +44,8 @@ Read as logits, such values would mean that no opacity is below 0.5 to 0.58, and
 Trained models reach 0.8 and more, except after short trainings.
 """
 CLIPPED_OPACITY_SHARE = (1e-3, 0.02)
-"""Largest distance of a clipped opacity from 1, and least fraction of clipped opacities in the output of a neural
-network. Logits do not cluster like that."""
+"""Values are opacities of a neural network, clipped at 1, if at least the second fraction of them is within the first
+distance of 1. Logits do not cluster there."""
 PERCENTAGE_MAXIMA = (40.0, 100.0)
 """Range of the largest opacity in percent. If the values were levels from 0 to 255, no opacity would exceed 0.4."""
 ZERO_SCALE_LOG_LIMIT = float(np.log(values.MIN_SCALE)) + 1

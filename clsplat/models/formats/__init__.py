@@ -129,7 +129,7 @@ def _named(path: Path) -> Format | None:
 
 
 def format_of_name(path: str | os.PathLike[str], *, writable: bool = False) -> Format:
-    """Format of the file's suffix. Raises InputError for an unknown one and, if `writable`, for a read-only format."""
+    """Format of the file's suffix. Raises InputError for an unknown suffix and, if `writable`, a read-only format."""
     named = _named(Path(path))
     known = " ".join(suffixes(writable=writable))
     if named is None:

@@ -71,16 +71,16 @@ are best with 64 to 85 pixels per Gaussian for 25 photographs of bonsai, and wit
 photographs of fox (docs/quality.md, Few photographs and Growth).
 """
 SUPPORTED_GAUSSIANS_PER_POINT = 1.5
-"""Number of Gaussians per point that few photographs support even if they have few pixels: in small photographs,
-neighbouring pixels differ more."""
+"""Number of Gaussians per point that few photographs support even if they are small. Neighbouring pixels of a small
+photograph differ more."""
 FEW_STEPS_PER_VIEW = 60
 """Steps per training photograph below which high learning rates give better models
 (docs/decisions/0031-high-rates.md)."""
 SHORT_TRAINING_STEPS = range(1000, 10_001)
 """Numbers of training steps for which high learning rates are recommended. Trainings of 2000 to 7000 were measured."""
 RECOMMENDED_PASSES = 30
-"""Passes through the training photographs that a training needs to learn what each of them shows. With fewer, the
-schedule is stretched; the paper's 30,000 steps are 30 passes through 1000 photographs."""
+"""Number of passes through the training photographs below which a longer schedule is recommended. The paper's 30,000
+steps are 30 passes through 1000 photographs."""
 BLUR_SHARPNESS_RATIO = 0.72
 """Sharpness, relative to the scene's median, below which a photograph counts as blurred.
 

@@ -401,7 +401,7 @@ def _middle(path: Path) -> bytes:
 
 
 def _stage(folder: str) -> int:
-    """Index of a folder's name in UNDISTORTION_FOLDERS; their number for any other name."""
+    """Index in UNDISTORTION_FOLDERS of a folder's name; len(UNDISTORTION_FOLDERS) for any other name."""
     return next(
         (stage for stage, known in enumerate(UNDISTORTION_FOLDERS) if folder.casefold() in known),
         len(UNDISTORTION_FOLDERS),

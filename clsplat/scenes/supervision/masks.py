@@ -364,8 +364,7 @@ def for_sfm(use: MaskUse) -> MaskUse | None:
 
 
 def after_sfm(use: MaskUse, folder: Path) -> MaskUse:
-    """Use of the masks in a folder that `clsplat.scenes.sfm.reconstruct` made: white pixels count, and alpha is
-    included."""
+    """Use of the masks that `clsplat.scenes.sfm.reconstruct` wrote: white pixels count, and alpha is included."""
     if not (folder / MASK_FOLDERS[0]).is_dir():
         return replace(use, masks="none", invert=False)
     meaning: MaskMeaning = "none" if use.alpha == "blend" else use.alpha
