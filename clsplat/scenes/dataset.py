@@ -180,7 +180,7 @@ class Lens:
         return replace(self, width=width, height=height, params=tuple(params))
 
     def refocused(self, log: float, x: float, y: float) -> Lens:
-        """Same lens, changed as `Camera.refocused` changes a camera."""
+        """Same lens with focal lengths times exp(log), and principal point shifted by x and y focal lengths."""
         camera, params = self._camera(), list(self.params)
         shift = (x * camera.focal_length_x, y * camera.focal_length_y)
         for index, by in zip(camera.principal_point_idxs(), shift, strict=True):

@@ -162,7 +162,7 @@ def _views(files: _SceneFiles, path: Path, resolution: int, test_views: tuple[in
 
 
 def _held_out(names: Sequence[str], every: int, most: int) -> Sequence[str]:
-    """Every n-th of the sorted names, at most `most` of them, spread evenly. None for `every` 0, all for `most` 0."""
+    """Every `every`-th of the sorted names, no name if that is 0. At most `most`, spread evenly; 0 for no maximum."""
     chosen = names[::every] if every > 0 else []
     if not 0 < most < len(chosen):
         return chosen
