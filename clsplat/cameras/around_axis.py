@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tangent planes of models whose image radius depends on the angle from the axis alone.
+"""Base class of camera models whose image radius depends on the angle from the axis alone.
 
 Equation numbers refer to docs/cameras.md.
 """
@@ -13,12 +13,13 @@ from clsplat.cameras.model import CameraModel, Intrinsics
 
 
 class AroundAxis(CameraModel):
-    """Footprints on tangent planes, from the four numbers of `angles_of_pixel`."""
+    """Computes footprints on tangent planes from `angles_of_pixel`."""
 
     def angles_of_pixel(self, view: Intrinsics, theta: Float64) -> tuple[Float64, Float64, Float64, Float64]:
-        """p, q, p', q': radians that fx pixels cover away from the axis and around it, and the derivatives in theta.
+        """p, q, and their derivatives with respect to theta, each (N,), as in eqs. (10) and (27).
 
-        theta: (N,), the angle from the axis.
+        fx pixels cover p radians in the direction away from the axis, and q radians around the axis.
+        theta: (N,), angle from the axis in radians.
         """
         raise NotImplementedError(self.projection)
 

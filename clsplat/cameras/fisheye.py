@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fisheyes: equidistant, and with coefficients.
+"""Fisheye cameras: equidistant, and with distortion coefficients.
 
 Equation numbers refer to docs/cameras.md.
 """
@@ -16,15 +16,15 @@ from clsplat.cameras.around_axis import AroundAxis
 from clsplat.cameras.model import Intrinsics
 
 MIN_FISHEYE_SLOPE = 0.1
-"""Smallest slope of a fisheye's radius over the angle, relative to the slope at the axis. Where the slope is smaller,
-the picture counts as folded over and stays empty. Where it is larger, float32 suffices to find a pixel's angle.
-"""
+"""Smallest derivative of a fisheye's image radius with respect to the angle, relative to the derivative on the axis.
+Where it is smaller, the picture counts as folded over and stays empty. Where it is larger, float32 suffices to compute
+a pixel's angle."""
 
 
 def radii(view: Intrinsics, theta: Float64) -> tuple[Float64, Float64, Float64]:
-    """Distances from the image's centre, in focal lengths, of rays at angles theta from a fisheye's axis: eq. (18).
+    """Image radii, in focal lengths, of rays at angles `theta` from a fisheye's axis: eq. (18).
 
-    Also returns the first and second derivatives with respect to theta.
+    Also returns the first and second derivatives with respect to theta. All arrays are (N,), angles in radians.
     """
     powers, factors = 2 * np.arange(5), np.array([1.0, *view.radial])
     series = theta[:, None] ** powers
@@ -39,7 +39,7 @@ class Fisheye(AroundAxis):
     flat = False
 
     def angles(self, view: Intrinsics, radius: Float64) -> Float64:  # noqa: ARG002
-        """Angles (N,) from the axis of pixels at distances `radius` (N,) from the image's centre, in focal lengths."""
+        """Angles (N,) from the axis, in radians, of pixels at image radii `radius` (N,), in focal lengths."""
         return radius
 
     def ndc_from_cam(self, view: Intrinsics, width: int, height: int) -> Float64 | None:  # noqa: ARG002
@@ -48,7 +48,7 @@ class Fisheye(AroundAxis):
     def rays_of(self, view: Intrinsics, a: Float64, b: Float64) -> tuple[Float64, Float64]:
         radius = np.hypot(a, b)
         theta = self.angles(view, radius)
-        # sin(theta) / theta, also on the axis; np.sinc(x) is sin(pi x) / (pi x)
+        # sin(theta) / radius, and 1 on the axis; np.sinc(x) is sin(pi x) / (pi x)
         ratio = np.sinc(theta / np.pi) * np.where(radius > 0, theta / np.where(radius > 0, radius, 1.0), 1.0)
         directions = np.stack([ratio * a, ratio * b, np.cos(theta)], axis=1)
         directions[radius > view.fold[1]] = np.nan
@@ -102,7 +102,7 @@ class BentFisheye(Fisheye):
         return 0.5 * (low + high)
 
     def shows(self, view: Intrinsics, points: Float64) -> Bool:
-        """True for points at smaller angles from the axis than the fold-over."""
+        """True for points whose angle from the axis is smaller than that of the fold-over."""
         return np.asarray(np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]) < view.fold[0])
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The base class of camera models, and the table entry of a lens.
+"""The base class of camera models, and the record of a lens model.
 
 Equation numbers refer to docs/cameras.md.
 """
@@ -17,7 +17,7 @@ from clsplat.arrays import Bool, Float64
 
 
 class Intrinsics(Protocol):
-    """The values of a `Camera` that its model reads."""
+    """The attributes of a `Camera` that a camera model reads."""
 
     @property
     def width(self) -> int: ...
@@ -48,16 +48,16 @@ class LensModel(NamedTuple):
 
     name: COLMAP's name, or clsplat's own if COLMAP does not have the lens.
     coefficients: number of distortion coefficients that `Camera.radial` takes.
-    with_two: for a model with one focal length, the model with two that can replace it; "" for none.
-    with_two_coefficients: number of coefficients of that replacement; the first are the coefficients of this model.
-    is_colmap: False for a lens that only clsplat has. The parameters of such a panorama are width and height, and of
-        other such lenses fx, fy, cx and cy.
+    two_focal_model: for a model with one focal length, the name of its equivalent with fx and fy; "" for none.
+    two_focal_coefficients: number of coefficients of that equivalent; the first are the coefficients of this model.
+    is_colmap: False for a lens that only clsplat has. Its parameters are fx, fy, cx and cy; for a panorama width and
+        height.
     """
 
     name: str
     coefficients: int = 0
-    with_two: str = ""
-    with_two_coefficients: int = 0
+    two_focal_model: str = ""
+    two_focal_coefficients: int = 0
     is_colmap: bool = True
 
 
@@ -65,7 +65,7 @@ class PlaneProjection(NamedTuple):
     """The linearised projection of points (N, 3) on an image plane.
 
     ratios: (N, 2), x/z and y/z as in the Jacobian, clamped.
-    unclamped: (N, 2), True if the ratio is not clamped, so that it follows the point.
+    unclamped: (N, 2), True if the ratio is not clamped, and so has a gradient.
     jacobian: (N, 2, 3).
     """
 
@@ -79,9 +79,9 @@ class CameraModel:
     """A camera model: a row of `clsplat.camera.CAMERA_MODELS`. Its kernels are a header of kernels/shared/camera/.
 
     projection: its name in `Camera.projection` and in camera files.
-    option: the field of `Camera` that selects it among the models of its projection; "" for the usual one.
+    option: the field of `Camera` that selects it among the models of its projection; "" for the default model.
     defines: build defines of its kernels. With RAYS a Gaussian is evaluated along the ray of each pixel.
-    lenses: lenses whose photographs it shows, as they are or undistorted.
+    lenses: lens models whose photographs it can render, distorted or undistorted.
     transforms: values of `camera_model` in a transforms.json.
     nerfstudio: values of `camera_type` in nerfstudio's camera paths.
     usd: values of a USD camera's `projection`.
@@ -100,27 +100,27 @@ class CameraModel:
     ewa: str = ""
 
     flat: ClassVar[bool] = True
-    """True if it has an image plane. Then near, far and the depths in files are z; otherwise they are distances."""
+    """True if it has an image plane. Near, far and the depths in files are then z, otherwise distances."""
     is_pinhole: ClassVar[bool] = False
     """True if the image is linear in x/z and y/z, as in an undistorted photograph."""
     parallel: ClassVar[bool] = False
-    """True if its rays are parallel: a focal length is pixels per world unit, and there is no angle of view."""
+    """True if its rays are parallel. Focal lengths are then in pixels per world unit, and there is no angle of view."""
     wraps: ClassVar[bool] = False
     """True for panoramas: the right edge continues at the left one, and nothing lies beyond the edges."""
     self_tested: ClassVar[bool] = True
-    """True if the self-test renders a picture with it; only for models along rays."""
+    """True if the self-test renders a picture with this model. It has an effect only on models with RAYS."""
     without_motion: ClassVar[str] = ""
-    """The reason why it has no channel `motion`, and the alternatives; "" if it has one."""
+    """For messages, if the model has no channel `motion`: its name, and the models that have one. Otherwise ""."""
     focal_keys: ClassVar[tuple[str, ...]] = ("fov_x", "fov_y")
     """Properties of a clsplat camera file that give a focal length, other than fx and fy."""
     whole_angles: ClassVar[tuple[float, float]] = (360.0, 180.0)
-    """For panoramas: degrees across and down of a whole picture."""
+    """For panoramas: horizontal and vertical angle of view of a full panorama, in degrees."""
 
     @property
     def along_rays(self) -> bool:
         """True if a Gaussian is evaluated along the ray of each pixel; Gaussians are then sorted by distance.
 
-        Otherwise a Gaussian is an ellipse on the image plane, and they are sorted by z.
+        Otherwise Gaussians are ellipses on the image plane, sorted by z.
         """
         return "RAYS" in self.defines
 
@@ -130,16 +130,16 @@ class CameraModel:
         return f"{'an' if self.projection[0] in 'aeiou' else 'a'} {self.projection}"
 
     def focal_length(self, fov: float, size: float) -> float:
-        """Pixels per unit of the projected coordinates if `size` pixels show the angle `fov` in radians: eq. (7).
+        """Focal length in pixels of a picture whose `size` pixels show the angle `fov`, in radians: eq. (7).
 
-        Raises ValueError for an angle that cannot be shown.
+        Raises ValueError for an angle that the model cannot show.
         """
         if not 0 < fov <= 2 * math.pi * (1 + 1e-12):
             raise ValueError(f"angle of view is {math.degrees(fov):g} degrees, expected more than 0 and at most 360")
         return size / fov
 
     def wide_focal(self, width: int) -> float:
-        """A focal length for the self-test: `width` pixels show most directions of the model."""
+        """Focal length in pixels for the self-test, with which `width` pixels show most directions of the model."""
         return 0.25 * width
 
     def fold(self, radial: tuple[float, float, float, float]) -> tuple[float, float]:  # noqa: ARG002
@@ -147,13 +147,13 @@ class CameraModel:
         return math.pi, math.pi
 
     def turn(self, view: Intrinsics) -> float:
-        """Width of a whole turn of a panorama in pixels; infinite for other models."""
+        """Width of 360 degrees of a panorama in pixels; infinite for other models."""
         return 2 * math.pi * view.fx if self.wraps else math.inf
 
     def wrapped(self, view: Intrinsics, u: Float64) -> Float64:
-        """Move u (N,) of a panorama by whole turns to within half a turn of the image's middle: eq. (6).
+        """Move u (N,) in pixels by multiples of `turn` to within half a turn of the image's middle: eq. (6).
 
-        In a panorama of a whole turn, every u is then in [0, width), for any cx.
+        In a panorama of 360 degrees, every u is then in [0, width), for any cx. Other models keep u.
         """
         if not self.wraps:
             return u
@@ -163,11 +163,11 @@ class CameraModel:
         return np.where(moved >= low + turn, low, moved)  # np.mod of a tiny negative number rounds up to `turn` itself
 
     def whole(self, width: int, height: int) -> tuple[float, float, float, float]:
-        """For panoramas: fx, fy, cx and cy of a picture that shows all directions once."""
+        """For panoramas: fx, fy, cx and cy of a full panorama of this size in pixels."""
         raise NotImplementedError(self.projection)
 
     def is_whole(self, view: Intrinsics) -> bool:  # noqa: ARG002
-        """True if the picture shows all directions once, by longitude and latitude, with the axis in the middle."""
+        """True for a full panorama: every direction once, by longitude and latitude, with the axis in the middle."""
         return False
 
     def ndc_from_cam(self, view: Intrinsics, width: int, height: int) -> Float64 | None:
@@ -178,7 +178,7 @@ class CameraModel:
         raise NotImplementedError(self.projection)
 
     def rays_of(self, view: Intrinsics, a: Float64, b: Float64) -> tuple[Float64, Float64]:
-        """Origins (N, 3) and unit directions (N, 3), in the camera's axes, of the rays of pixels. NaN without a ray.
+        """Origins and unit directions of the rays of pixels, (N, 3), in the camera's axes. NaN for a pixel without ray.
 
         a, b: (N,), distances of the pixels from the principal point in focal lengths.
         """
@@ -192,13 +192,13 @@ class CameraModel:
         raise NotImplementedError(self.projection)
 
     def shows(self, view: Intrinsics, points: Float64) -> Bool:  # noqa: ARG002
-        """For points (N, 3) in the camera's axes, True if a picture may show their direction, (N,)."""
+        """True (N,) for points (N, 3), in the camera's axes, whose direction a picture can show."""
         return np.ones(len(points), np.bool_)
 
     def pixel_widths(self, view: Intrinsics, points: Float64) -> Float64:
-        """Width (N,) in world units of a pixel at points (N, 3) in the camera's axes; infinite at unseen points.
+        """Width (N,) of a pixel in world units at points (N, 3) in the camera's axes: eq. (88) of docs/gradients.md.
 
-        Eq. (88) of docs/gradients.md.
+        Infinite for points outside the frame.
         """
         z, (low, high) = points[:, 2], view.frustum_limits
         with np.errstate(all="ignore"):
@@ -209,7 +209,7 @@ class CameraModel:
     # Methods for models that draw Gaussians on an image plane: those without the define RAYS.
 
     def divisors(self, z: Float64) -> Float64:
-        """Numbers (N,) by which x and y are divided in the projection, for points of depth z (N,)."""
+        """Divisors (N,) of x and y in the projection of points of depth z (N,)."""
         raise NotImplementedError(self.projection)
 
     def projected(self, view: Intrinsics, points: Float64) -> PlaneProjection:
@@ -225,18 +225,18 @@ class CameraModel:
     # Methods for models with RAYS, which draw Gaussians on planes tangent to the sphere of directions.
 
     def footprints(self, view: Intrinsics, directions: Float64) -> tuple[Float64, Float64, Float64]:
-        """Eqs. (9), (10): a tangent plane's axes right and down (N, 3), and a pixel's sides along u and v on it.
+        """Tangent planes at unit directions (N, 3), and the footprint of a pixel on each: eqs. (9), (10).
 
-        The sides are the columns of (N, 2, 2).
+        Returns the planes' axes right and down, each (N, 3), and the footprints (N, 2, 2). The columns of a footprint
+        are the pixel's sides along u and v.
         """
         raise NotImplementedError(self.projection)
 
     def low_pass_grad(self, view: Intrinsics, directions: Float64, gradients: Float64, low_pass: float) -> Float64:
-        """Eqs. (26) to (28), B: the gradient (N, 2) of the low-pass term with respect to the mean's direction.
+        """Gradient (N, 2) of the low-pass term with respect to the mean's direction: B of eqs. (26) to (28).
 
-        Its two numbers are for steps along the tangent plane's axes.
-
+        Its components are along the tangent plane's axes.
         gradients: (N, 2, 2), with respect to the covariance.
-        low_pass: variance in square pixels, which is added to the projected covariance.
+        low_pass: variance in square pixels that is added to the projected covariance.
         """
         raise NotImplementedError(self.projection)

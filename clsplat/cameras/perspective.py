@@ -78,7 +78,10 @@ class Perspective(CameraModel):
 
 
 class PerspectiveByRays(AroundAxis, Perspective):
-    """A pinhole camera that draws Gaussians along rays like a fisheye: eqs. (30), (31). Kernels: perspective_rays.h."""
+    """A pinhole camera that draws Gaussians along rays, as a fisheye does: eqs. (30), (31).
+
+    Kernels: perspective_rays.h.
+    """
 
     def angles_of_pixel(
         self,

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo, on a synthetic scene."""
+"""The demo: training on a synthetic scene."""

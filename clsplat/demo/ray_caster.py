@@ -4,9 +4,8 @@
 The demo and the tests of structure from motion need photos that are free of licences, have no known poses, and were
 not made by a splat renderer.
 
-The scene is diffuse, apart from a mild highlight on the two balls.
-Its light (sun with soft shadows, sky) is therefore baked into one texture per object.
-A photo needs only the nearest hit and a texture look-up for each ray.
+The scene is diffuse, apart from a mild highlight on the two balls. So its light (sun with soft shadows, sky) is baked
+into one texture per object, and a photo needs only the nearest hit and a texture look-up for each ray.
 
 In the world, z is up and units are metres. The scene is a paved floor inside a round wall. The wall hides the sky, for
 which there would be no initial points: training might place the sky's Gaussians in front of another camera.
@@ -64,7 +63,7 @@ class Noise:
             )
             total += np.float32(weight) * sample
             weight *= gain
-        # smoothing by the B-spline leaves about a third of the lattice's range: amplify
+        # the B-spline's smoothing leaves about a third of the lattice's range, so the sum is amplified
         return np.asarray(np.tanh(2.2 * total).astype(np.float32))
 
 
@@ -94,7 +93,7 @@ def dot(a: Float32, b: Float32) -> Float32:
 
 @dataclass
 class Surface(ABC):
-    """One object: its intersection with rays, its texture mapping and its baked colours.
+    """An object: its intersection with rays, its texture mapping and its baked colours.
 
     rows, columns: size of the texture in texels. A texel is about a pixel wide in the photos.
     """
@@ -327,7 +326,7 @@ def bake_surface(surface: Surface, suns: Float32, blockers: Sequence[Surface], n
     suns: (n, 3), directions to points of the sun's disc.
     """
     points, normals = surface.grid(surface.rows, surface.columns)
-    # soft shadows vary slowly: cast them on a grid four times coarser, then interpolate
+    # soft shadows vary slowly, so they are cast on a grid four times coarser, and interpolated
     rows, columns = surface.rows // 4, surface.columns // 4
     coarse_points, coarse_normals = surface.grid(rows, columns)
     start = coarse_points + 2e-3 * coarse_normals
@@ -431,7 +430,7 @@ def write_photos(
     surfaces = still_life()
     bake(surfaces, seed)
     views = cameras(count, width, height, seed)
-    # NumPy releases the interpreter lock in its loops: two threads nearly halve the time
+    # NumPy releases the interpreter lock in its loops, so two threads nearly halve the time
     with ThreadPoolExecutor(2) as pool:
         for index, image in enumerate(pool.map(partial(render, surfaces), views)):
             write_jpeg(folder / f"photo_{index:03d}.jpg", image)

@@ -40,13 +40,13 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
     Complete photos and cameras of an interrupted demo are reused.
     device: name of the device, as for `clsplat devices`.
     iterations: number of training steps.
-    Raises InputError if the folder holds other files, and the errors of the steps.
+    Raises InputError if the folder has other files. Errors of the steps are passed on.
     """
     output.mkdir(parents=True, exist_ok=True)
     with locked(output, "demo"):
         claim(output)
         start = time.monotonic()
-        # so that a wrong device name fails before minutes of work
+        # opened now, so that a wrong device name fails before minutes of work
         opened = open_device(device)
         report = StageProgress()
         scene_folder = make_scene(output, report)
@@ -76,8 +76,7 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
 
 
 def claim(output: Path) -> None:
-    """Mark a folder as created by the demo. Raises InputError if it is not marked and has folders that the demo would
-    replace."""
+    """Mark a folder as the demo's. Raises InputError if it is unmarked and has folders that the demo would replace."""
     if is_file(output / DEMO_MARKER_FILE_NAME):
         return
     existing = [name for name in DEMO_FOLDERS if (output / name).exists() or (output / name).is_symlink()]
@@ -103,6 +102,6 @@ def make_scene(output: Path, progress: Progress = no_progress) -> Path:
         raise InputError(f"{photos}: holds files that the demo did not create, expected a new folder")
     if existing != expected:
         write_photos(photos, count=DEMO_PHOTO_COUNT, progress=progress)
-    # the ray caster's lens has no distortion: photos need no resampling
+    # a model without distortion, like the ray caster's lens, so that photos are not resampled
     settings = sfm.SfmSettings(camera_model="SIMPLE_PINHOLE")
     return sfm.reconstruct(photos, scene, settings, overwrite=True, progress=progress)

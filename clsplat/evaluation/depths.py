@@ -37,7 +37,7 @@ def worst(records: Sequence[Mapping[str, Any]]) -> list[int]:
 
 
 def depth_picture(depth: NDArray[Any], alpha: NDArray[Any]) -> Float32:
-    """A picture (H, W, 3) of depths (H, W): near is white, far is dark, empty pixels are black."""
+    """A grey picture (H, W, 3) of depths (H, W): near is white, far is dark, pixels without a depth are black."""
     seen = alpha > MIN_DEPTH_PICTURE_ALPHA
     grey = np.zeros(depth.shape, np.float32)
     if seen.any():
@@ -48,11 +48,10 @@ def depth_picture(depth: NDArray[Any], alpha: NDArray[Any]) -> Float32:
 
 
 def coloured(gaussians: Gaussians, camera: Camera) -> Gaussians:
-    """Copy of the model in which each Gaussian's colour is a grey that encodes its depth. The DEPTH_GREY_QUANTILES of
-    the depths in front of the camera map to 0 and 1.
+    """Copy of the model in which each Gaussian's colour is a grey that encodes its depth.
 
-    Depths are measured along the camera's axis; for fisheyes and panoramas they are distances from the camera. A render
-    of this copy shows depth as its colour, with the same kernels as a normal frame.
+    The DEPTH_GREY_QUANTILES of the depths in front of the camera map to 0 and 1. Depths are z, or distances from the
+    camera for fisheyes and panoramas. A render of the copy shows depths, with the kernels of a normal frame.
     """
     offsets = gaussians.means + gaussians.origin - camera.position
     depths = camera.drawn_depths(offsets)
@@ -70,7 +69,7 @@ def keep_depths(
     records: Sequence[Mapping[str, Any]],
     folder: Path,
 ) -> None:
-    """Write the depth pictures as PNG with the views' names, and remove earlier depth pictures.
+    """Write the depth pictures as PNG files with the views' names. Remove earlier depth pictures in `folder`.
 
     render: function that returns a model's image (H, W, 3) over black, and its alpha (H, W).
     records: records of the views in eval.json, in the order of `views`.

@@ -25,7 +25,7 @@ from clsplat.scenes.scene import View
 class ViewScores(TypedDict):
     """Record of a held-out view in eval.json. Optional scores are present if they were measured.
 
-    counted: fraction of the pixels that count, if the view has a mask.
+    counted: fraction of the pixels that the view's mask keeps, if it has a mask.
     """
 
     name: str
@@ -44,9 +44,9 @@ _AVERAGED_SCORES: tuple[_AveragedScore, ...] = ("psnr", "psnr_corrected", "psnr_
 class Evaluation(TypedDict):
     """Content of eval.json.
 
-    step, gaussians, seconds: of the evaluated model (`EvaluatedModel`).
-    mean: mean over the views for each score's name; empty without views.
-    lpips_missing: the reason why LPIPS is missing, if it is.
+    step, gaussians, seconds: as in `EvaluatedModel`.
+    mean: mean of each score over the views, keyed by the score's name; empty without views.
+    lpips_missing: reason why LPIPS was not measured.
     """
 
     step: int | None
@@ -59,7 +59,7 @@ class Evaluation(TypedDict):
 
 @dataclass(frozen=True)
 class EvaluatedModel:
-    """The model that is measured: optimisation step and training time in seconds, if known, and number of Gaussians."""
+    """Step, number of Gaussians and training time in seconds of the evaluated model. None for an unknown value."""
 
     step: int | None
     gaussians: int
@@ -77,17 +77,17 @@ def evaluate(
     corrected: bool = False,
     aligned: Callable[[View], Image] | None = None,
 ) -> Evaluation:
-    """Measure every view. Returns the content of eval.json.
+    """Measure the render of every view against its photograph. Returns the content of eval.json.
 
     render: function that returns a view's float image (H, W, 3) over `background` (3,), at the size of `view.load()`.
     save_dir: folder for the renders, which are written as sRGB PNG with the views' names.
     model: description of the model, which is copied to the result.
-    space: colour space of renders and photographs, in which they are compared.
+    space: colour space of renders and photographs. They are compared in this space.
     corrected: also measure PSNR after an affine fit of colours.
-    aligned: function like `render`, but with the view's pose fitted to the model. PSNR of its images is also measured.
+    aligned: function like `render` that first fits the view's pose to the model. Its PSNR is also measured.
 
-    Masked pixels count in no score (`metrics.ssim`). Raises ClsplatError if a render is not finite. Raises InputError
-    that names the view if the view is too small. Also raises InputError for an unknown colour space.
+    Scores leave out the pixels that a mask excludes. Raises ClsplatError if a render is not finite. Raises InputError,
+    with the view's name, for a view that is too small for SSIM. Also raises InputError for an unknown colour space.
     """
     records: list[ViewScores] = []
     names = picture_names([view.name for view in views])
@@ -127,7 +127,7 @@ def _scores(
     """Record of one view in eval.json.
 
     image, truth: the view's render, and its photograph over the same background.
-    counts: (H, W), the pixels that count; None for all.
+    counts: mask (H, W), True for pixels that count; None for all.
     """
     try:
         record: ViewScores = {
@@ -150,9 +150,9 @@ def _scores(
 
 
 def photograph_of(view: View) -> tuple[Image, NDArray[np.bool_] | None]:
-    """A view's pixels, and the mask (H, W) of the pixels that count. The mask is None if the view has none.
+    """A view's pixels, and its mask (H, W): True for pixels that count. The mask is None if the view has none.
 
-    Raises InputError if no pixel counts.
+    Raises InputError if the mask excludes every pixel.
     """
     image = view.load_masked()
     if image.shape[2] < 5:
@@ -170,6 +170,6 @@ def picture_names(names: Sequence[str]) -> list[str]:
     ".png" is appended instead.
     """
     stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
-    keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]  # alike on all file systems
+    keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]  # the same names on all file systems
     uses = Counter(keys)
     return [(stem if uses[key] == 1 else name) + ".png" for stem, key, name in zip(stems, keys, names, strict=True)]

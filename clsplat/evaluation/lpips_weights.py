@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network weights of LPIPS: the path where torch expects them, and their download."""
+"""Download of the network weights of LPIPS to the path where torch expects them."""
 
 from __future__ import annotations
 
@@ -26,14 +26,13 @@ LPIPS_SERVER_SILENCE_SECONDS = 20.0
 
 
 def place() -> Path:
-    """Path where torch expects the file."""
+    """Path where torch expects the weights file."""
     home = os.environ.get("TORCH_HOME") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "torch"
     return Path(home).expanduser() / "hub" / "checkpoints" / VGG16_WEIGHTS_URL.rpartition("/")[2]
 
 
 def limit() -> float:
-    """Time limit of the download in seconds. Raises InputError if LPIPS_TIMEOUT_VARIABLE is not a number of at least
-    0."""
+    """Time limit of the download in seconds. Raises InputError if the user's limit is no number, or is negative."""
     text = os.environ.get(LPIPS_TIMEOUT_VARIABLE) or str(LPIPS_DOWNLOAD_SECONDS)
     try:
         seconds = float(text)
@@ -45,9 +44,9 @@ def limit() -> float:
 
 
 def fetch() -> None:
-    """Download the file if it is missing, with progress on standard error.
+    """Download the weights if the file is missing, with progress on standard error.
 
-    Raises ClsplatError, which says how to get the file.
+    Raises ClsplatError, whose message has a command that downloads the file.
     """
     path, seconds = place(), limit()
     if is_file(path):
@@ -73,7 +72,7 @@ def fetch() -> None:
 
 
 class _Transfer(threading.Thread):
-    """The download, with its progress."""
+    """Thread that downloads the weights. `fraction` is its progress, `trouble` the reason of a failure."""
 
     cancelled = False
     fraction: float | None = None
@@ -82,7 +81,7 @@ class _Transfer(threading.Thread):
     def run(self) -> None:
         try:
             self._fetch(place())
-        except Exception as error:  # noqa: BLE001  # any error is reported, and evaluation continues
+        except Exception as error:  # noqa: BLE001  # an evaluation reports any error and continues
             self.trouble = " ".join(str(error).split())[:100] or type(error).__name__
 
     def _fetch(self, path: Path) -> None:

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Similarity of a render to its photograph: PSNR, SSIM, and LPIPS if the optional extra is installed.
 
-Images are (H, W, 3), clamped to [0, 1] and compared in float64. Colour-corrected images are clamped to the photograph's
-brightest value.
+Images are (H, W, 3), clamped to [0, 1] and compared in float64. A mask `counts` (H, W) is True for pixels that count.
 """
 
 from __future__ import annotations
@@ -29,21 +28,16 @@ Image = NDArray[Any]
 
 
 def psnr(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> float:
-    """Peak signal-to-noise ratio in dB, at most 120.
-
-    counts: (H, W), the pixels that count.
-    Raises ValueError for images of different shapes.
-    """
+    """Peak signal-to-noise ratio in dB, at most 120. Raises ValueError for images of different shapes."""
     a, b = _pair(image, truth)
     squares = np.square(a - b) if counts is None else np.square(a - b)[counts]
     return float(-10 * np.log10(max(float(np.mean(squares)), MIN_SQUARED_ERROR)))
 
 
 def psnr_corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> float:
-    """PSNR of the image after `corrected`, with a peak of 1.
+    """PSNR in dB of the image after `corrected`, with a peak of 1.
 
-    Values are clamped to the range from 0 to the photograph's largest value, or to 1 if that is larger.
-    counts: (H, W), the pixels that count.
+    Both images are clamped to [0, most], where `most` is the photograph's largest value, but at least 1.
     """
     most = max(1.0, float(truth.max() if counts is None else truth[counts].max(initial=1.0)))
     fitted = corrected(image, truth, counts)
@@ -53,10 +47,7 @@ def psnr_corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None 
 
 
 def corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> Image:
-    """The image (H, W, 3) after the affine colour transform that fits it to the truth with least squared error.
-
-    counts: (H, W), the pixels that count.
-    """
+    """The image (H, W, 3) after an affine transform of its colours, fitted to `truth` by least squares."""
     colours, wanted = (np.asarray(each, np.float64).reshape(-1, 3) for each in (image, truth))
     known = np.hstack([colours, np.ones((len(colours), 1))])
     rows = slice(None) if counts is None else counts.ravel()
@@ -68,8 +59,7 @@ def corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None = Non
 def ssim(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> float:
     """Mean structural similarity of pixels and channels, with the 11x11 Gaussian window of Wang et al. 2004, sigma 1.5.
 
-    counts: (H, W), the pixels that count. Other pixels are black in both images, and the mean is over windows around
-    pixels that count.
+    Pixels outside the mask are black in both images. The mean is over the windows centred on pixels in the mask.
 
     Raises InputError for images smaller than the window, ValueError for images of different shapes.
     """
@@ -94,20 +84,20 @@ def ssim(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) ->
 
 
 def lpips(image: Image, truth: Image) -> float | None:
-    """LPIPS (VGG, as in the 3DGS paper), or None if it is not available; `lpips_missing` has the reason."""
+    """LPIPS (VGG, as in the 3DGS paper), or None if it is not available; `lpips_missing` returns the reason."""
     model = _lpips_model()
     return None if isinstance(model, str) else model(*_pair(image, truth))
 
 
 def lpips_missing() -> str | None:
-    """Short text with the reason why LPIPS is not available, or None if it is."""
+    """Reason why LPIPS is not available; None if it is available."""
     model = _lpips_model()
     return model if isinstance(model, str) else None
 
 
 @functools.cache
 def prepare_lpips() -> str | None:
-    """Prepare LPIPS without loading it: download the network's weights if they are missing.
+    """Download the weights of LPIPS's network if they are missing. Does not load the network.
 
     Returns None, or the reason why LPIPS cannot be used, with advice.
     """
@@ -123,7 +113,7 @@ def prepare_lpips() -> str | None:
 
 @functools.cache
 def _lpips_model() -> Callable[[Image, Image], float] | str:
-    """The metric as a function of two images, or the reason why it is not available."""
+    """LPIPS as a function of two images, or the reason why it is not available."""
     if reason := prepare_lpips():
         return reason
     try:
@@ -131,7 +121,7 @@ def _lpips_model() -> Callable[[Image, Image], float] | str:
             package: Any = import_module("lpips")
             torch: Any = import_module("torch")
             network = package.LPIPS(net="vgg", verbose=False).eval()
-    except Exception as error:  # noqa: BLE001  # no failure there may fail an evaluation
+    except Exception as error:  # noqa: BLE001  # an evaluation continues without LPIPS
         return f"its network could not be loaded ({' '.join(str(error).split())[:100]})"
 
     def measure(a: Image, b: Image) -> float:

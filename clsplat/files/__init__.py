@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files as such: atomic writes, locks, portable names, JSON."""
+"""Helpers for files: atomic writes, locks, portable names, JSON."""

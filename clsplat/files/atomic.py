@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are written completely or not at all, temporary names, and full disks."""
+"""Atomic writes of files, temporary names, and errors of full disks."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ ABANDONED_FILE_SECONDS = 600.0
 """Seconds without a write after which a temporary file from another machine counts as abandoned."""
 DISK_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT)
 DISK_PROBE_BYTES = 1 << 16
-"""Number of bytes that are written to find out whether a disk has room."""
+"""Size in bytes of the file that tests whether a disk has room."""
 WINDOWS_RETRY_SECONDS = 2.0
-"""Seconds during which an operation is tried again if another program has the file open, on Windows. A virus scanner or
+"""Seconds during which an operation is repeated on Windows while another program has the file open. A virus scanner or
 an indexer closes a new file within one second."""
 TEMPORARY_NAME = re.compile(rf"\.(.+)\.([0-9a-f]{{20}}){re.escape(TEMPORARY_SUFFIX)}", re.DOTALL)
 
@@ -41,15 +41,16 @@ def machine_mark() -> str:
 
 
 def temporary_name(target: Path) -> Path:
-    """A new name for a file beside `target`. The name has marks of this machine and process."""
+    """A new name for a temporary file beside `target`. The name identifies this machine and process."""
     token = f"{machine_mark()}{os.getpid():08x}{secrets.token_hex(4)}"
     return target.with_name(f".{target.name}.{token}{TEMPORARY_SUFFIX}")
 
 
 def is_abandoned(path: Path, token: str) -> bool:
-    """True if the process in the token of a temporary name has ended, or has not written for ABANDONED_FILE_SECONDS.
+    """True if the process that made a temporary file has ended.
 
-    token: marks of the machine and the process, from the file's name.
+    If that process is of another machine, or on Windows, True if the file is unchanged for ABANDONED_FILE_SECONDS.
+    token: the part of the file's name that identifies machine and process.
     """
     if token[:4] == machine_mark() and os.name == "posix":
         try:
@@ -63,12 +64,10 @@ def is_abandoned(path: Path, token: str) -> bool:
 
 
 def check_new(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:
-    """Raise InputError if a file must not be written at `path`.
+    """Check that a file may be written at `path`.
 
-    That is so if the file exists or is one of `sources`, unless `overwrite` is set. It is always so if the path is a
-    folder, or its folder does not exist.
-
-    sources: files from which the new file is made.
+    Raises InputError if the file exists and `overwrite` is not set, if `path` is a folder, or if its folder is missing.
+    sources: files from which the new file is made. The message says if `path` is one of them.
     """
     if path.is_dir():
         raise InputError(f"{path}: is a folder, expected the name of a file to write")
@@ -86,7 +85,7 @@ def check_new(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> N
 
 @contextmanager
 def atomic_name(path: str | os.PathLike[str], needs: int | None = None) -> Iterator[Path]:
-    """Context with a temporary name, whose file is renamed to `path` at the end of the block.
+    """Context manager that yields a temporary path, and renames its file to `path` at the end of the block.
 
     The temporary file is in the same folder, since a rename is atomic only within a file system. The folder must exist.
     A link at `path` is followed. On any exception, also KeyboardInterrupt, the temporary file is removed, and `path`
@@ -105,17 +104,17 @@ def atomic_name(path: str | os.PathLike[str], needs: int | None = None) -> Itera
         written = 0
         with suppress(OSError):
             written = temporary.stat().st_size
-            temporary.unlink()  # before the message is made, so that its free space includes this file's
+            temporary.unlink()  # before the message, which tells the free space
         names = (None, str(temporary), str(path))
         if isinstance(error, OSError) and error.errno and not isinstance(error, WriteError) and error.filename in names:
-            # The error names the temporary file, which users do not know, or, for a full disk, no file at all.
+            # The error names the temporary file, which users do not know, or no file if the disk is full.
             raise write_error(path, error, written, needs) from None
         raise
 
 
 @contextmanager
 def atomic_writer(path: str | os.PathLike[str], needs: int | None = None) -> Iterator[BinaryIO]:
-    """Context with an open binary file, which is flushed to the disk and then renamed as in `atomic_name`."""
+    """Context manager that yields a binary file to write. At the end it is flushed to disk and renamed to `path`."""
     # mode "x" instead of mkstemp, so that the file gets the permissions of the user's umask
     with atomic_name(path, needs) as temporary, open(temporary, "xb") as file:
         yield file
@@ -125,11 +124,10 @@ def atomic_writer(path: str | os.PathLike[str], needs: int | None = None) -> Ite
 
 
 def write_error(path: str | os.PathLike[str], error: OSError, written: int = 0, needs: int | None = None) -> WriteError:
-    """The system's error as a plain sentence about the file that was being written.
+    """WriteError that says why the file `path` could not be written; for a full disk, with the free and needed bytes.
 
-    For a full disk the sentence has the free space, and the size that the file needs.
-
-    written: bytes written so far, which stand for the size if it is unknown.
+    error: the system's error.
+    written: bytes written so far, which the message gives as a lower limit if `needs` is None.
     needs: size of the file in bytes, if it is known.
     """
     number, reason = error.errno or 0, reason_of(error)
@@ -147,7 +145,10 @@ def write_error(path: str | os.PathLike[str], error: OSError, written: int = 0, 
 
 
 def room_error(folder: Path) -> OSError | None:
-    """The error of an attempt to write to a folder; None if it succeeds. It is for libraries that report no reason."""
+    """Write a small test file to a folder and remove it. Returns the system's error, or None.
+
+    Use it after a library failed to write and reported no reason.
+    """
     probe = temporary_name(folder / "probe")
     try:
         with open(probe, "xb") as file:
@@ -168,10 +169,10 @@ _reserving = threading.Lock()
 
 @contextmanager
 def require_room(path: str | os.PathLike[str], needs: int) -> Iterator[None]:
-    """Context in which a library may write a file of at most `needs` bytes. Raises WriteError if the disk lacks room.
+    """Context manager that reserves `needs` bytes of disk space for a file. Raises WriteError if the disk has less.
 
-    It is for libraries that end the process, or report nothing, when the disk is full. Space that other threads have
-    reserved in this way counts as used.
+    Use it for libraries that crash or report nothing when the disk is full. Space reserved by other threads of this
+    process counts as used.
     """
     folder = Path(os.path.realpath(path)).parent
     try:
@@ -191,12 +192,12 @@ def require_room(path: str | os.PathLike[str], needs: int) -> Iterator[None]:
 
 @contextmanager
 def scratch_folder(needs: int) -> Iterator[Path]:
-    """Context with a temporary folder, for a library that writes files by name.
+    """Context manager that yields a temporary folder, for a library that writes files by name.
 
-    Raises WriteError if its disk lacks room for `needs` bytes, or becomes full while the library writes. Any exception
-    of the library except OSError may mean a full disk.
+    Raises WriteError if the disk has less than `needs` bytes, or becomes full while the library writes. After other
+    exceptions of the library, a test file shows if the disk is full.
     """
-    # errors are ignored: a library may still have its file open, which Windows does not remove
+    # cleanup errors are ignored: the library may still have a file open, which Windows does not remove
     with tempfile.TemporaryDirectory(prefix="clsplat-", ignore_cleanup_errors=True) as name:
         folder = Path(name)
         try:
@@ -215,18 +216,18 @@ def scratch_folder(needs: int) -> Iterator[Path]:
 
 
 def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write `data` as the whole content of `path`, as with `atomic_writer`."""
+    """Write a file atomically. `data` is its whole content."""
     with atomic_writer(path, len(data)) as file:
         file.write(data)
 
 
 def replace(source: Path, target: Path) -> None:
     """Rename a file or a folder. An existing file at the target is replaced. Raises OSError."""
-    _patiently(lambda: source.replace(target))
+    _retry_on_windows(lambda: source.replace(target))
 
 
 def move_into_place(work: Path, output: Path) -> None:
-    """Move the finished folder `work`/result to `output`. If that fails, an earlier folder there is restored.
+    """Move the finished folder `work`/result to `output`. If that fails, the earlier folder at `output` is restored.
 
     Raises OSError.
     """
@@ -243,11 +244,11 @@ def move_into_place(work: Path, output: Path) -> None:
 
 def remove(path: Path) -> None:
     """Remove a file if it exists. Raises OSError."""
-    _patiently(lambda: path.unlink(missing_ok=True))
+    _retry_on_windows(lambda: path.unlink(missing_ok=True))
 
 
-def _patiently(act: Callable[[], object], *, windows: bool = ON_WINDOWS) -> None:
-    """Call `act`. On Windows, repeat it for a while if another program has the file open."""
+def _retry_on_windows(act: Callable[[], object], *, windows: bool = ON_WINDOWS) -> None:
+    """Call `act`. On Windows, repeat it for WINDOWS_RETRY_SECONDS while another program has the file open."""
     until = time.monotonic() + WINDOWS_RETRY_SECONDS
     while True:
         try:
@@ -261,7 +262,7 @@ def _patiently(act: Callable[[], object], *, windows: bool = ON_WINDOWS) -> None
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make a rename survive a power cut, if the file system supports that (not on Windows, nor on some shares)."""
+    """Flush a folder to disk, so that a rename survives a power cut. Windows and some network shares cannot do this."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:

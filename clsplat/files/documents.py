@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading of files: existence, digests, JSON."""
+"""Reading of files: checks that they exist, digests, text, JSON."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from typing import Any, BinaryIO
 from clsplat.errors import InputError, WriteError, reason_of
 
 MAX_DOCUMENT_BYTES = 32 << 20
-"""Largest size of a JSON or TOML file in bytes. As Python objects its content takes up to 24 times as much memory."""
+"""Largest size of a JSON or TOML file in bytes. The parsed file takes up to 24 times as much memory."""
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"
 MAX_LFS_POINTER_BYTES = 1024
-"""The pointer file that Git LFS leaves in place of a file: its first bytes, and its largest size in bytes.
+"""First bytes, and largest size in bytes, of the pointer file that Git LFS leaves in place of a file.
 
 Specification: https://github.com/git-lfs/git-lfs/blob/main/docs/spec.md.
 """
@@ -31,7 +31,7 @@ def digest(path: str | os.PathLike[str]) -> str:
 
 
 def known_digest(path: Path) -> str:
-    """`digest`, kept until the file's modification time changes. Raises InputError for a file that is not there."""
+    """`digest` of a file, cached until its modification time changes. Raises InputError if the file is missing."""
     try:
         changed = path.stat().st_mtime_ns
     except OSError as error:
@@ -45,8 +45,7 @@ def _digest_at(path: Path, changed: int) -> str:  # noqa: ARG001  # a cache key:
 
 
 def short_digest(path: Path) -> str | None:
-    """BLAKE2b digest of the file's content, 16 bytes in hexadecimal, which is quicker than `digest`; None if there
-    is no file."""
+    """BLAKE2b digest of the file's content, 16 bytes in hexadecimal; None without a file. Quicker than `digest`."""
     return _digest(path, hashlib.blake2b(digest_size=16)) if is_file(path) else None
 
 
@@ -59,7 +58,7 @@ def _digest(path: str | os.PathLike[str], state: Any) -> str:
 
 
 def is_file(path: str | os.PathLike[str]) -> bool:
-    """True if there is a regular file. A name that no file can have gives False and no exception."""
+    """True if `path` is a regular file. False, and no exception, for a name that no file can have."""
     try:
         return stat.S_ISREG(Path(path).stat().st_mode)
     except (OSError, ValueError):
@@ -68,10 +67,10 @@ def is_file(path: str | os.PathLike[str]) -> bool:
 
 @contextmanager
 def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
-    """Open a file to read it.
+    """Context manager that opens a file to read.
 
-    Raises InputError if the file is missing, cannot be read, or is not a regular file: a folder, or a pipe, from which
-    nothing may ever come. Also raises it for the pointer of Git LFS in place of a file that was not fetched.
+    Raises InputError if the file is missing, cannot be read, or is no regular file. A pipe could block for ever. Also
+    raises InputError for a Git LFS pointer in place of a file that was not fetched.
 
     expected: text that follows "expected" in error messages.
     """
@@ -103,9 +102,9 @@ def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
 
 
 def read_document(path: Path, expected: str, limit: int = MAX_DOCUMENT_BYTES) -> str:
-    """The text of a file of at most `limit` bytes in UTF-8, without the byte order mark that editors on Windows write.
+    """The text of a UTF-8 file of at most `limit` bytes, without a byte order mark.
 
-    Raises InputError like `open_input`.
+    Raises InputError like `open_input`, and for a longer file or another encoding.
     """
     with open_input(path, expected) as file:
         data = file.read(limit + 1)
@@ -117,7 +116,7 @@ def read_document(path: Path, expected: str, limit: int = MAX_DOCUMENT_BYTES) ->
         raise InputError(f"{path}: is not text in UTF-8 (byte {error.start}), expected {expected}") from None
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result = dict(pairs)
     if len(result) < len(pairs):
         names = [name for name, _ in pairs]
@@ -129,9 +128,9 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def parse_json(text: str | bytes, *, once: bool = False) -> Any:
     """The value of a JSON text. Raises ValueError if it does not parse, or is nested too deeply.
 
-    once: also raise ValueError if an object has a key twice. Otherwise the last one counts.
+    once: also raise ValueError if an object has a key twice. Otherwise the key's last value counts.
     """
     try:
-        return json.loads(text, object_pairs_hook=_once if once else None)
+        return json.loads(text, object_pairs_hook=_unique_keys if once else None)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None

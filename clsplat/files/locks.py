@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Locks and claims by marker files: the process that creates the marker may work on the file beside it.
+"""Locks and claims by marker files: the process that creates the marker owns the file beside it.
 
-Locks of the operating system, for a run's folder, are in `clsplat.runs.locks`
-(docs/decisions/0040-three-libraries-not-taken.md compares the two).
+`clsplat.runs.locks` has locks of the operating system, for run folders.
+docs/decisions/0040-three-libraries-not-taken.md compares the two.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from clsplat.files.atomic import ABANDONED_FILE_SECONDS, TEMPORARY_NAME, is_aban
 from clsplat.files.names import ON_WINDOWS
 
 EMPTY_CLAIM_SECONDS = 20
-"""Seconds after which an empty claim is taken over."""
+"""Age in seconds at which a claim with an empty marker file counts as abandoned."""
 CLAIM_SUFFIX = ".clsplat-claim"
 _PROCESS_TOKEN = secrets.token_hex(4)
-"""Mark that distinguishes this process from others with the same number, earlier or on another machine."""
+"""Random digits that distinguish this process from others with the same process id, earlier or on another machine."""
 
 
 @contextmanager
 def briefly_locked(path: Path, seconds: float = 5.0) -> Iterator[None]:
-    """Context that only one thread of all processes can be in at a time. The file need not exist.
+    """Context manager that locks a file against other threads and processes. The file need not exist.
 
     The marker is FILE.lock beside the file. A lock of the operating system, as in `clsplat.runs.locks`, would not keep
-    the threads of one process apart, and homes on a network may not support it. A marker older than `seconds` is taken
-    to be from a process that was killed, and is removed. After waiting for twice `seconds` the caller goes on without
-    the lock. Raises OSError if the folder cannot be written.
+    the threads of one process apart, and network file systems may not support it. A marker older than `seconds` counts
+    as left by a killed process, and is removed. After twice `seconds` the caller goes on without the lock. Raises
+    OSError if the folder cannot be written.
     """
     lock, token = path.with_name(f"{path.name}.lock"), secrets.token_bytes(8)
     until = time.monotonic() + 2 * seconds
@@ -50,11 +50,11 @@ def briefly_locked(path: Path, seconds: float = 5.0) -> Iterator[None]:
 
 
 def claim(target: Path) -> Path | None:
-    """Claim `target` for this process, which is going to write it. Returns the marker file, for `give_back`; None if
-    another process has claimed the target.
+    """Claim the file `target`, which this process is going to write.
 
-    The marker's modification time has to be updated regularly: others take over a claim that was not updated for
-    ABANDONED_FILE_SECONDS seconds, or whose process has ended. Raises OSError if the folder cannot be written.
+    Returns the marker file, which `give_back` removes; None if another process has the claim. The caller updates the
+    marker's modification time regularly. Other processes take over a claim that is ABANDONED_FILE_SECONDS old, or whose
+    process has ended. Raises OSError if the folder cannot be written.
     """
     path = _claim_of(target)
     for _ in range(2):
@@ -64,7 +64,7 @@ def claim(target: Path) -> Path | None:
             if not _is_given_up(path):
                 return None
             path.unlink()
-        except (FileNotFoundError, PermissionError):  # meanwhile released, or taken over by another process
+        except (FileNotFoundError, PermissionError):  # another process has just removed or taken over the claim
             continue
     return None
 
@@ -80,9 +80,7 @@ def _is_given_up(claimed: Path) -> bool:
     token = claimed.read_text(encoding="ascii", errors="replace")
     if not token:  # the marker is being written now, or its process was killed while it wrote
         return age > EMPTY_CLAIM_SECONDS
-    if (
-        token[:12] == f"{machine_mark()}{os.getpid():08x}"
-    ):  # an earlier process that had the same number, as happens in containers
+    if token[:12] == f"{machine_mark()}{os.getpid():08x}":  # in a container an earlier process may have had this id
         return token[12:] != _PROCESS_TOKEN
     return is_abandoned(claimed, token)
 
@@ -112,9 +110,9 @@ def _take(lock: Path, token: bytes) -> bool:
 
 
 def abandoned(targets: Iterable[Path]) -> list[Path]:
-    """Temporary files and claims that are left over from writers of these files.
+    """Temporary files and claims of the `targets` whose process has ended.
 
-    Their process has ended, or they are from another machine and have not changed for ABANDONED_FILE_SECONDS seconds.
+    A file of a process on another machine counts if it has not changed for ABANDONED_FILE_SECONDS.
     """
     names: dict[Path, set[str]] = {}
     for target in targets:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""File systems that are reached over a network."""
+"""Detection of network file systems."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from contextlib import suppress
 from pathlib import Path
 
 MOUNTS = Path("/proc/mounts")
-"""Linux's list of mounted file systems. Other systems have none."""
+"""Linux's list of mounted file systems. Other systems do not have this file."""
 NETWORK_TYPES = ("nfs", "nfs4", "cifs", "smb3", "fuse.sshfs", "9p")
 
 
 def network_type(folder: Path) -> str:
-    """Type of the file system that `folder` is on, if it is reached over a network; else "", also if it is unknown."""
+    """Type of the network file system that contains `folder`; "" if the file system is local or unknown."""
     with suppress(OSError, ValueError):
         real = os.path.realpath(folder)
         found = ("", "")

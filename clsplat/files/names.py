@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""File names: which names an operating system refuses, and which spellings it takes for one file."""
+"""File names: names that an operating system refuses, and names that it treats as the same file."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from clsplat.errors import InputError
 
 ON_WINDOWS = os.name == "nt"
 CASE_INSENSITIVE_FILES = sys.platform in ("win32", "darwin")
-"""True if the system's usual file systems take A.png and a.png for one file, and likewise two Unicode forms of an
-accent."""
+"""True if the system's usual file systems treat A.png and a.png as one file, and two Unicode forms of an accent."""
 _FORBIDDEN_NAME_CHARACTERS = re.compile(r'[<>:"|?*\x00-\x1f]')
 _WINDOWS_DEVICE_NAME = re.compile(
     r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³]) *(\..*)?", re.IGNORECASE | re.DOTALL
@@ -22,7 +21,7 @@ _WINDOWS_DEVICE_NAME = re.compile(
 
 
 def name_trouble(name: str, *, windows: bool = ON_WINDOWS) -> str | None:
-    """The reason why no file below a folder can have this name, as the end of a sentence; None if one can.
+    """Reason why a file below a folder cannot have this name, as the end of a sentence; None if it can.
 
     name: path relative to the folder, with forward slashes.
     """
@@ -30,20 +29,20 @@ def name_trouble(name: str, *, windows: bool = ON_WINDOWS) -> str | None:
     if pure.anchor or ".." in pure.parts:
         return "leads out of the output folder"
     if not pure.name or "\0" in name:
-        return "is no name for a file"
+        return "is not a file name"
     if windows:
         for part in pure.parts:
             if character := _FORBIDDEN_NAME_CHARACTERS.search(part):
                 return f"has {character[0]!r} in it, which no file name on Windows may have"
             if _WINDOWS_DEVICE_NAME.fullmatch(part):
-                return f"is a name that Windows keeps for a device ({part})"
+                return f"is a name that Windows reserves for a device ({part})"
             if part[-1] in ". ":
-                return f"ends {part!r} with a dot or a space, which Windows drops"
+                return f"has {part!r} in it, which ends with a dot or a space; Windows drops that"
     return None
 
 
 def native_name(path: str | os.PathLike[str]) -> str:
-    """A file's name as text for a library that expects UTF-8 in any locale. Raises InputError."""
+    """A path as text, for a library that expects UTF-8 in any locale. Raises InputError if the path is not UTF-8."""
     try:
         return os.fsencode(path).decode("utf-8")
     except UnicodeError:
@@ -51,6 +50,6 @@ def native_name(path: str | os.PathLike[str]) -> str:
 
 
 def identity(path: PurePath, *, ignores_case: bool = CASE_INSENSITIVE_FILES) -> str:
-    """A text that is equal for two paths if the system takes them for one file. Links are not followed."""
+    """A key that is equal for two paths if the system treats them as the same file. Links are not followed."""
     text = str(path)
     return unicodedata.normalize("NFC", text).casefold() if ignores_case else text

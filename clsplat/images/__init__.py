@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels in files: images, the channels of a frame, colour spaces, video."""
+"""Reading and writing of images, frame channels, colour spaces and video."""

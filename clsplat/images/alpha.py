@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Alpha: straight and premultiplied colours, and compositing over a background."""
+"""Conversion between straight and premultiplied alpha, and compositing over a background."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Image = NDArray[Any]
 
 
 def background_colour(name: str) -> tuple[float, float, float]:
-    """Background colour of held-out views: white for "white", black for all other names, such as "random"."""
+    """Background colour (3,) for held-out views: white for "white", black for every other name, such as "random"."""
     return (1.0, 1.0, 1.0) if name == "white" else (0.0, 0.0, 0.0)
 
 
 def composite(image: Image, background: ArrayLike) -> Image:
-    """Image (H, W, 3) in floats over the colour `background` (3,). A fourth channel of the input is straight alpha."""
+    """Composite an image over the colour `background` (3,): float (H, W, 3). A fourth channel is straight alpha."""
     pixels: Image = image
     if np.issubdtype(image.dtype, np.integer):
         pixels = image.astype(np.float32) / np.iinfo(image.dtype).max

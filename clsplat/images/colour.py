@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colour spaces: of the model's training, of linear light, and of the written image.
+"""Conversion between the colour spaces of a job: the model's, a linear one, and that of the output files.
 
-Gaussians are blended in the space of the photographs, as they were trained. Operations that add light (filters,
-shutter, lens) work on linear values. Output goes through OpenColorIO, by default with the configuration built into
-OpenImageIO. The sRGB curve is computed here: OpenColorIO's fast approximation is off by up to 3e-4.
+Gaussians are blended in the colour space of their training photographs. Operations that add light (filters, shutter,
+lens) work on linear values. OpenColorIO converts the output, by default with the configuration built into OpenImageIO.
+This module computes the sRGB curve itself: OpenColorIO's fast approximation is off by up to 3e-4.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from clsplat.images.frame_files import VIDEO_SUFFIXES
 SRGB = "sRGB"
 """sRGB curve over Rec.709 primaries: the space of 8-bit photographs, and the default of models."""
 LINEAR = "lin_rec709"
-"""Rec.709 primaries without a curve."""
+"""Linear values with Rec.709 primaries."""
 BUILT_IN_OCIO_CONFIG = "ocio://studio-config-latest"
 
 _SPACE_COMMENT_PREFIX = "clsplat colorspace "
@@ -59,22 +59,22 @@ CHROMATICITIES: dict[str, tuple[float, ...]] = {
     "Linear Rec.2020": (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, *_D65),
     "Linear AdobeRGB": (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, *_D65),
 }
-"""x and y of red, green, blue and white of linear spaces, for EXR files.
+"""Chromaticities x and y of red, green, blue and white of linear spaces, for EXR files.
 
 AP1 and AP0 follow SMPTE ST 2065-1 and the Academy's S-2014-004, the others their own standards.
 """
 MAX_PLY_LINE_BYTES = 1 << 20
-"""Longest line of text in a PLY, in bytes."""
+"""Longest header line of a PLY in bytes."""
 _LINEAR_PHOTO_SUFFIXES = (".exr", ".hdr")
 
 
 def comment(space: str) -> str:
-    """Header line of a model file that records the colour space of its training."""
+    """Comment line of a model file that records the model's colour space."""
     return _SPACE_COMMENT_PREFIX + space
 
 
 def recorded_space(path: str | os.PathLike[str]) -> str:
-    """Colour space that a model file's header records; sRGB if it records none."""
+    """Colour space from a model file's header; sRGB if the header records none."""
     with open(path, "rb") as file:
         if file.readline(16).strip() != b"ply":
             return SRGB
@@ -89,13 +89,13 @@ def recorded_space(path: str | os.PathLike[str]) -> str:
 
 
 def photos_space(paths: Iterable[str | os.PathLike[str]]) -> str:
-    """Colour space of a model trained from these images: linear if all of them are float EXR or HDR files."""
+    """Colour space of a model trained on these photographs: linear if all are EXR or HDR files, otherwise sRGB."""
     endings = {Path(path).suffix.lower() for path in paths}
     return LINEAR if endings and endings <= set(_LINEAR_PHOTO_SUFFIXES) else SRGB
 
 
 def srgb_to_linear(values: Float32) -> Float32:
-    """Decode the sRGB curve (IEC 61966-2-1). It continues unchanged above 1, and with its linear segment below 0."""
+    """Decode the sRGB curve (IEC 61966-2-1). The curve also applies above 1, and its linear segment below 0."""
     curve = ((np.maximum(values, np.float32(0.04045)) + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
     return np.where(values > np.float32(0.04045), curve, values / np.float32(12.92)).astype(np.float32, copy=False)
 
@@ -108,7 +108,7 @@ def linear_to_srgb(values: Float32) -> Float32:
 
 
 def displayed(rgb: NDArray[Any], space: str) -> Float32:
-    """Convert (H, W, 3) from a model's space to sRGB within [0, 1], as PNG and JPEG files show it.
+    """Convert an image (H, W, 3) from a model's colour space to sRGB in [0, 1], for display or PNG and JPEG files.
 
     Raises InputError for an unknown space.
     """
@@ -118,21 +118,21 @@ def displayed(rgb: NDArray[Any], space: str) -> Float32:
 
 @lru_cache(maxsize=8)
 def _to_srgb(space: str, source: str) -> Colours:
-    """Colour spaces for showing a model's images on a display. Cached because a viewer shows many images."""
+    """Conversion from a model's colour space to sRGB. Cached because a viewer shows many images."""
     return Colours(ColourConfig(colorspace=SRGB, ocio_config=source), space)
 
 
 class Colours:
-    """Colour spaces of one job.
+    """The three colour spaces of a job, and conversions between them.
 
-    model, light, output: SRGB, LINEAR or names of the configuration; light is linear.
+    model, light, output: of the model, of linear operations, and of the files; SRGB, LINEAR or OpenColorIO names.
     """
 
     def __init__(self, config: ColourConfig | None = None, recorded: str = SRGB) -> None:
-        """Load the configuration and look up the spaces.
+        """Load the OpenColorIO configuration and look up the spaces.
 
         recorded: `recorded_space` of the model.
-        Raises InputError for a configuration that does not load, and, with similar names, for a space that it lacks.
+        Raises InputError if the configuration does not load, or lacks a space; the message lists similar names.
         """
         config = config or ColourConfig()
         self._source = config.ocio_config or os.environ.get("OCIO", "") or BUILT_IN_OCIO_CONFIG
@@ -147,11 +147,11 @@ class Colours:
             self._ocio_name(LINEAR)
 
     def is_linear(self, space: str) -> bool:
-        """True if this space of the job has no curve."""
+        """True if `space`, one of the job's, is linear."""
         return space == LINEAR or (space != SRGB and bool(self._config.isColorSpaceLinear(space)))
 
     def has_rec709(self, space: str) -> bool:
-        """True if this space of the job has Rec.709's primaries and white, whatever its curve."""
+        """True if `space`, one of the job's, has Rec.709's primaries and white point. Its curve does not matter."""
         if space in _SPACE_ALIASES:
             return True
         light = np.array([[[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]], np.float32)
@@ -160,10 +160,10 @@ class Colours:
         return bool(np.allclose(rest, 0, atol=2e-3) and np.allclose([*one, *colours[3]], colours[3, 0], atol=2e-3))
 
     def check_file(self, path: str) -> None:
-        """Raise InputError if a file of that name cannot hold the colours of the output.
+        """Check that a file of this name can store colours of the output space.
 
-        Integer formats cannot hold linear light. A video must be in Rec.709. Warns if an EXR file does not record the
-        chromaticities.
+        Raises InputError for linear colours in a format other than EXR, and for a video without Rec.709's primaries.
+        Warns if an EXR file would lack chromaticities.
         """
         extension = Path(path).suffix.lower()
         advice = "write .exr, or give --colorspace sRGB"
@@ -172,7 +172,7 @@ class Colours:
         if extension in VIDEO_SUFFIXES and not self.has_rec709(self.output):
             raise InputError(f"{path}: its colours would be {self.output}, expected sRGB's primaries; {advice}")
         if extension == ".exr" and self.is_linear(self.output) and self.output not in CHROMATICITIES:
-            warn(f"{path}: the chromaticities of {self.output} are not known here, and are not in the files")
+            warn(f"{path}: clsplat does not know the chromaticities of {self.output}, so the files do not have them")
 
     @cached_property
     def _config(self) -> Any:
@@ -210,10 +210,10 @@ class Colours:
         )
 
     def convert(self, rgb: Float32, alpha: Float32 | None, source: str, target: str) -> Float32:
-        """Convert rgb (H, W, 3) from one of the job's spaces to another. Nothing is clipped.
+        """Convert rgb (H, W, 3) from one of the job's spaces to another, without clipping.
 
-        alpha (H, W): rgb is premultiplied by it; None for opaque images. Curves apply to straight colours, so rgb is
-          divided by alpha first and multiplied afterwards. Where alpha is 0 the result is 0.
+        alpha (H, W): alpha by which rgb is premultiplied; None for opaque images. The conversion needs straight
+          colours, so it divides rgb by alpha and multiplies the result by it. Where alpha is 0 the result is 0.
         """
         if source == target:
             return rgb
@@ -239,14 +239,15 @@ class Colours:
         return np.asarray(red * matrix[0] + green * matrix[1] + blue * matrix[2], np.float32)
 
     def _matrix(self, source: str, target: str) -> Float32 | None:
-        """Matrix (3, 3) with a row for each source channel; None if the conversion is not a matrix.
+        """Matrix (3, 3) of a conversion, a row for each source channel; None if the conversion is not linear.
 
-        Every conversion by OpenImageIO loads the configuration anew, which takes longer than a frame.
+        With a matrix OpenImageIO need not convert each frame: each call loads the configuration again, which takes
+        longer than a frame.
         """
         light = np.array([[[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0], [4, -1, 2], [0.2, 0.01, 0.5]]], np.float32)
         colours = self._converted(light, source, target)
         matrix, sums = colours[0, :3], colours[0, 3:]
-        linear = np.allclose(light[0, 3:] @ matrix, sums, rtol=1e-5, atol=1e-5)  # atol: for values of up to 4
+        linear = np.allclose(light[0, 3:] @ matrix, sums, rtol=1e-5, atol=1e-5)  # atol suits values of up to 4
         return matrix if linear else None
 
     def _converted(self, rgb: Float32, source: str, target: str) -> Float32:
@@ -258,7 +259,7 @@ class Colours:
 
 
 def configuration_digest(source: str) -> str:
-    """SHA-256 of an OpenColorIO file and of the tables that it names; for any other configuration, its name."""
+    """SHA-256 digests of an OpenColorIO file and of the tables that it names; `source` itself if it is no file."""
     if not source or not is_file(source):
         return source
     patterns = _table_patterns(source, Path(source).stat().st_mtime_ns)
@@ -270,7 +271,7 @@ def configuration_digest(source: str) -> str:
 def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG001  # a cache key
     """Glob patterns of the files that a configuration's FileTransforms name, in the folders of its search_path.
 
-    Its variables, which are set elsewhere, match anything.
+    Environment variables in these names become "*".
     """
     text = Path(source).read_text("utf-8", "replace")
     listed = re.search(r"^search_path:([^\n]*(?:\n[ \t]*- [^\n]*)*)", text, re.MULTILINE)

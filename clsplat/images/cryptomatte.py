@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cryptomatte (Friedman and Jones 2015; specification 1.2.0, https://github.com/Psyop/Cryptomatte).
 
-Each pixel stores ids and coverages of the objects that cover most of it. The header maps names to ids.
+Each pixel stores the ids and coverages of the objects that cover the largest parts of it. The header maps names to ids.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ def murmur3(data: bytes, seed: int = 0) -> int:
 
 
 def id_bits(name: str) -> int:
-    """32 bits of a name's id; as a float it is neither denormal, infinite nor NaN."""
+    """Id of a name: 32 bits which, read as a float, are neither denormal, infinite nor NaN."""
     bits = murmur3(name.encode())
     return bits ^ (1 << 23) if bits >> 23 & 255 in (0, 255) else bits
 
 
 def header_of(layer: str, names: Sequence[str]) -> dict[str, str]:
-    """Header attributes: the layer's name, hash and conversion of the ids, and the manifest."""
+    """Header attributes of a layer: its name, the ids' hash and conversion, and the manifest (the id of each name)."""
     key = f"cryptomatte/{murmur3(layer.encode()):08x}"[: len("cryptomatte/") + 7]
     manifest = json.dumps({name: f"{id_bits(name):08x}" for name in names}, separators=(",", ":"))
     return {
@@ -57,10 +57,9 @@ def header_of(layer: str, names: Sequence[str]) -> dict[str, str]:
 
 
 def ranked(coverage: Float32, names: Sequence[str]) -> Float32:
-    """Rank coverage (H, W, objects) into (H, W, 4 CRYPTOMATTE_LAYERS): ids and coverages of each pixel's largest
-    objects, largest first.
+    """Ids and coverages (H, W, 4 CRYPTOMATTE_LAYERS) of the objects that cover most of each pixel, largest first.
 
-    Equal coverages keep the order of the names. Unused ranks are 0.
+    coverage: (H, W, objects). Equal coverages keep the order of `names`. Unused entries are 0.
     """
     kept = min(2 * CRYPTOMATTE_LAYERS, len(names))
     ids = np.array([id_bits(name) for name in names], np.uint32).view(np.float32)

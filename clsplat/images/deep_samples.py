@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of deep pixels, in whole rows, for OpenImageIO to write.
+"""Conversion of deep samples from arrays to OpenImageIO's deep data.
 
-From Python, OpenImageIO takes deep values one by one, which costs twenty times as much as a frame. Deep data that it
-reads itself comes as a whole. So the rows are written to an uncompressed deep EXR, whose layout is simple
-(https://openexr.com/en/latest/OpenEXRFileLayout.html). OpenImageIO reads it and writes the final file with its header
-and compression.
+OpenImageIO's Python interface sets deep values one by one, which takes twenty times as long as the frame. It reads a
+deep file at once. So this module writes the samples to an uncompressed deep EXR, whose layout is simple
+(https://openexr.com/en/latest/OpenEXRFileLayout.html). OpenImageIO reads that scratch file and writes the final file
+with its header and compression.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ _EXR_PIXEL_TYPES = {2: 1, 4: 2}
 
 
 def samples_bytes(pixels: int, most: int) -> int:
-    """Upper bound in bytes of `deep_data`'s scratch file, for pixels with `most` samples each."""
+    """Upper bound in bytes of `deep_data`'s scratch file, if each pixel has at most `most` samples."""
     return pixels * (4 + 24 * most) + 40 * pixels + (1 << 12)
 
 
 def deep_data(scratch: Path, counts: NDArray[np.int32], columns: dict[str, NDArray[Any]]) -> Any:
-    """OpenImageIO's deep data of rows of pixels.
+    """OpenImageIO's deep data of some rows of a frame.
 
-    scratch: path of the temporary file to write and read.
+    scratch: path of the scratch file to write and read.
     counts (H, W): number of samples of each pixel.
-    columns: halves or floats (samples,) of each channel: row by row, pixel by pixel, front to back.
-    Raises ClsplatError.
+    columns: half or float values (samples,) of each channel, ordered by row, pixel, and from front to back.
+    Raises ClsplatError if OpenImageIO cannot read the scratch file.
     """
     _write(scratch, counts, columns)
     source = oiio.ImageInput.open(native_name(scratch))

@@ -15,7 +15,7 @@ from clsplat.files.documents import open_input
 from clsplat.images.reading import MAX_IMAGE_PIXELS, error_of, image_size, one_line, open_image
 
 DEPTH_MAP_SUFFIXES = (".png", ".exr", ".tif", ".tiff", ".npy")
-"""Extensions of the depth maps that are searched for in a folder, in lower case."""
+"""Lower-case extensions of the depth maps that a folder search finds."""
 DEPTH_MAP_KINDS = "a depth map: PNG or TIFF of whole numbers, EXR, or NPY"
 
 
@@ -24,9 +24,9 @@ INTEGER_MAXIMA = {"uint8": 255, "uint16": 65535}
 
 
 def map_header(path: Path) -> tuple[int, int, bool]:
-    """Width and height of a depth map, and whether it stores integers.
+    """Width and height of a depth map, and True if it stores integers. Reads the header only.
 
-    Raises InputError like `read_map`, except for errors after the header.
+    Raises InputError like `read_map` for errors in the header.
     """
     if path.suffix.lower() == ".npy":
         array = _numpy(path)
@@ -40,8 +40,8 @@ def map_header(path: Path) -> tuple[int, int, bool]:
 def read_map(path: Path) -> Float32:
     """Values (H, W) of a depth map as stored; 8- and 16-bit integers are not scaled. Non-finite values become NaN.
 
-    If there are several channels, the one called Z or depth counts, else the first. Raises InputError with the file's
-    name if it is missing, damaged, or not a depth map.
+    Of several channels, reads the one called Z or depth, or else the first. Raises InputError with the file's name if
+    the file is missing, damaged, or not a depth map.
     """
     if path.suffix.lower() == ".npy":
         values = np.array(_numpy(path), np.float32)

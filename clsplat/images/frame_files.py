@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of rendered frames: channels in EXR, in one part or several, or a plain image.
+"""Writing of rendered frames: channels in an EXR of one part or several, or a plain image.
 
-Alpha is premultiplied in EXR, TIFF and DPX, straight in PNG. Matrices in the header are for row vectors, p_camera =
-p_world M, in the spaces of OpenEXR's standard attributes (ImfStandardAttributes.h).
+Alpha is premultiplied in EXR, TIFF and DPX, straight in PNG. Matrices in EXR headers are for row vectors, p_camera =
+p_world M, in the coordinate systems of OpenEXR's standard attributes (ImfStandardAttributes.h).
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from clsplat.images.writing import steps_of, write_spec
 
 MAX_HALF_FLOAT = np.float32(65504)
 _PNG_LEVEL, _PNG_FILTER = 1, 0x40
-"""PNG compression level, and the filter that predicts each pixel from the mean of left and upper neighbours.
+"""PNG compression level, and the filter that predicts each pixel from the mean of its left and upper neighbours.
 
-Together they take a fifth of the time of level 6 with the best of five filters for each row, for files at most a tenth
-larger. On a CPU device, level 6 can take longer than the frame.
+They take a fifth of the time of level 6 with the best of five filters for each row; files are at most a tenth larger.
+On a CPU device, level 6 can take longer than the frame.
 """
 _EXR_ZIP_LEVEL = 1
-"""Level of zip and zips compression: two thirds of the time of level 4, the default, for 2 to 7 % more bytes."""
+"""Level of zip and zips compression. It takes two thirds of the time of the default, 4, and 2 to 7 % more bytes."""
 _MAX_EXACT_FLOAT_INDEX = 2**24
 _DISK_BLOCK_BYTES = 1 << 12
 """Bytes in a disk block."""
@@ -48,11 +48,11 @@ VIDEO_SUFFIXES = (".mp4", ".mov")
 class FrameFileHeader:
     """Contents of a frame file other than pixels.
 
-    window: place of the image in the display window; None if they are the same.
+    window: place of the image in the display window; None if the image fills it.
     chromaticities: x and y of red, green, blue and white; empty if unknown.
     is_srgb: True if the colours are in sRGB.
-    typed: EXR attributes with OpenImageIO's names of their types.
-    view: left or right, for a stereo pair.
+    typed: EXR attributes, each with OpenImageIO's name of its type and its value.
+    view: "left" or "right" in a stereo pair, otherwise "".
     """
 
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
@@ -69,7 +69,7 @@ def camera_matrices(camera: Camera) -> dict[str, Float64]:
 
     Camera space has x right, y up and z along the view, a left-handed frame. In NDC, (0, 0) is the upper left corner of
     the display window and (1, 1) the lower right one. OpenEXR does not define z; here it is 0 at the near plane and 1
-    at infinity. For an orthographic camera it is 1 at the far plane, or grows by 1 per world unit if there is none.
+    at infinity. For an orthographic camera it is 1 at the far plane; without one it grows by 1 per world unit.
     """
     display = camera.window or camera
     projection = camera.model.ndc_from_cam(camera, display.width, display.height)
@@ -83,7 +83,7 @@ def camera_matrices(camera: Camera) -> dict[str, Float64]:
 
 
 def is_whole_panorama(camera: Camera) -> bool:
-    """True if the image shows all directions once, with straight ahead in the middle, as EXR's envmap requires."""
+    """True if the image is a full panorama with the camera's axis in the middle, as EXR's envmap requires."""
     return camera.window is None and camera.model.is_whole(camera)
 
 
@@ -98,7 +98,7 @@ def parse_channels(text: str) -> tuple[str, ...]:
 
 
 def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> None:
-    """Raise InputError if a file of that name cannot hold the channels. video: videos are allowed too."""
+    """Raise InputError if a file of this name cannot hold the channels. video: accept names of videos too."""
     extension, known = Path(path).suffix.lower(), (*FRAME_SUFFIXES, *VIDEO_SUFFIXES) if video else FRAME_SUFFIXES
     if extension not in known:
         raise InputError(f"{path}: has the extension {extension or 'none'!r}, expected one of {', '.join(known)}")
@@ -113,7 +113,7 @@ def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> 
 
 
 def check_target(path: Path, channels: Iterable[str]) -> None:
-    """Raise InputError like `check_format`, and for a folder that does not exist."""
+    """Raise InputError like `check_format`, and if the file's folder does not exist."""
     check_format(str(path), channels)
     if not path.parent.is_dir():
         raise InputError(f"{path.parent}: no such folder to write {path.name} to")
@@ -127,8 +127,8 @@ def write_channels(
 ) -> None:
     """Write a frame, atomically.
 
-    channels: arrays by name, (H, W) or (H, W, channels). rgb is over black, so it is premultiplied by alpha. In an
-      integer part the id -1, for no Gaussian, becomes 4294967295.
+    channels: arrays (H, W) or (H, W, channels) by channel name. rgb is over black, so it is premultiplied by alpha. In
+      an integer part the id -1, for no Gaussian, becomes 4294967295.
     Raises InputError and ClsplatError like `writing.write_image`.
     """
     write_views(path, [(channels, header or FrameFileHeader())], encoding)
@@ -137,7 +137,7 @@ def write_channels(
 def write_views(
     path: Path, views: Sequence[tuple[Mapping[str, NDArray[Any]], FrameFileHeader]], encoding: Encoding | None = None
 ) -> None:
-    """`write_channels` for several views in one EXR file. Each view has its own parts, named after it."""
+    """Write several views to one EXR file, like `write_channels`. Each view has its own parts, which carry its name."""
     encoding = encoding or Encoding()
     check_target(path, views[0][0])
     extension = path.suffix.lower()
@@ -154,9 +154,9 @@ def encoded(
     *,
     several: bool = False,
 ) -> list[tuple[NDArray[Any], Any]]:
-    """Pixels and OpenImageIO specification of each part of a file.
+    """Pixels and OpenImageIO specification of each part of a file, for one view.
 
-    several: True if the file has other views too, so that parts are named after their view.
+    several: True if the file has several views. Then the names of parts include the view.
     """
     channels = {name: channels[name] for name in WRITABLE_CHANNELS if name in channels}
     if extension != ".exr":
@@ -181,11 +181,11 @@ def is_whole(
 ) -> bool:
     """True if the file is complete and holds these channels as `write_channels` writes them.
 
-    Its size must be as given, its attributes must not differ from those given, and its last row must decode. If the
-    file contains a block of zeros, every row is decoded. A truncated file fails.
+    The image must have this size, none of these attributes with another value, and a last row that decodes. If the file
+    contains a disk block of zeros, every row must decode.
 
     deep: expect a deep image, whose channels are DEEP_CHANNELS.
-    views: number of views, each with these channels.
+    views: number of views; each must have these channels.
     """
     channels = [name for name in WRITABLE_CHANNELS if name in set(channels)]
     exr = path.suffix.lower() == ".exr"
@@ -193,10 +193,10 @@ def is_whole(
     if not path.is_file():
         return False
     try:
-        image_size(path)  # rejects a truncated PNG, for which libpng would print a message
+        image_size(path)  # rejects a truncated PNG before libpng prints a message about it
     except InputError:
         return False
-    holed = _has_hole(path)
+    every_row = _has_zero_block(path)
     with opened(path) as source:
         if source is None:
             return False
@@ -214,32 +214,32 @@ def is_whole(
                 return False
             if any(attribute_of(spec, key) not in (None, value) for key, value in (attributes or {}).items()):
                 return False
-            if not decodes(source, part, spec.height - 1) or (holed and not decodes(source, part, 0)):
+            if not decodes(source, part, spec.height - 1) or (every_row and not decodes(source, part, 0)):
                 return False
         return not source.seek_subimage(len(groups), 0)
 
 
-def _has_hole(path: Path) -> bool:
-    """True if a disk block of the file is all zeros, as after a crash before it was written."""
+def _has_zero_block(path: Path) -> bool:
+    """True if a disk block of the file has only zeros, as happens if the machine crashes before it writes the block."""
     empty = bytes(_DISK_BLOCK_BYTES)
     with open(path, "rb") as file:
         return any(empty in block for block in iter(lambda: file.read(_DISK_BLOCK_BYTES << 8), b""))
 
 
 def is_foreign(path: Path) -> bool:
-    """True if a file is an image that clsplat did not write."""
+    """True if a file is an image of another program than clsplat."""
     with opened(path) as source:
         return source is not None and "clsplat" not in str(source.spec().getattribute("Software"))
 
 
 def attribute(path: Path, name: str) -> Any:
-    """Attribute of a file's first part; None if it has none or is not an image."""
+    """Attribute `name` of a file's first part; None if the file lacks it or is not an image."""
     with opened(path) as source:
         return None if source is None else attribute_of(source.spec(), name)
 
 
 def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
-    """Channels of each part; channels of one part are adjacent in WRITABLE_CHANNELS."""
+    """Names of the channels of each part of a file with several parts. Assumes the order of WRITABLE_CHANNELS."""
     return [tuple(group) for _, group in groupby(names, lambda name: WRITABLE_CHANNELS[name].part)]
 
 
@@ -258,7 +258,7 @@ def _exr_part(
         for name, plane in zip(names, planes, strict=True):
             _check_floats(name, plane)
             for channel in range(plane.shape[2]):
-                if formats[at] == oiio.HALF:  # values beyond its range would become infinite
+                if formats[at] == oiio.HALF:  # larger values would become infinite
                     np.clip(plane[:, :, channel], -MAX_HALF_FLOAT, MAX_HALF_FLOAT, out=pixels[:, :, at])
                 else:
                     pixels[:, :, at] = plane[:, :, channel]
@@ -289,7 +289,7 @@ def _picture(
         planes = [unassociate(np.concatenate(planes, axis=2))]
     bits = 8 if extension in (".jpg", ".jpeg") else encoding.bits
     whole = steps_of(planes, bits)
-    if bits == 10:  # OpenImageIO truncates 16 bits to 10, so expand the 10 bits exactly
+    if bits == 10:  # OpenImageIO truncates 16 bits to 10, so this expands 10 to 16
         whole = (whole << 6) | (whole >> 4)
     spec = _spec(whole.shape, "RGBA", oiio.UINT8 if bits == 8 else oiio.UINT16, header)
     if extension in RECORD_TAGS and (text := record_text(header.attributes)):
@@ -309,7 +309,7 @@ def _picture(
 
 
 def deep_spec(width: int, height: int, encoding: Encoding, header: FrameFileHeader) -> Any:
-    """OpenImageIO's specification of a deep EXR: colours are half or float as in the encoding, depths float."""
+    """OpenImageIO's specification of a deep EXR. Colours are half or float as in the encoding, depths are float."""
     spec = _exr_spec((height, width, len(DEEP_CHANNELS)), DEEP_CHANNELS, [oiio.FLOAT], header)
     spec.deep = True
     spec.channelformats = (oiio.TypeDesc(encoding.depth),) * 4 + (oiio.TypeDesc("float"),) * 2
@@ -319,7 +319,7 @@ def deep_spec(width: int, height: int, encoding: Encoding, header: FrameFileHead
 
 
 def _exr_spec(shape: tuple[int, ...], names: Sequence[str], formats: Sequence[Any], header: FrameFileHeader) -> Any:
-    """OpenImageIO's specification of an EXR part; formats: one for each channel, or one for all."""
+    """OpenImageIO's specification of an EXR part. formats: one for each channel, or one for all channels."""
     several = len(set(formats)) > 1
     spec = _spec(shape, names, oiio.FLOAT if several else formats[0], header)
     if several:

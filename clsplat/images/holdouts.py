@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Holdouts: the surfaces of other elements in a frame, from a depth EXR or a deep EXR (docs/pictures.md)."""
+"""Holdouts: surfaces of CG elements in a frame, read from a depth EXR or a deep EXR (docs/pictures.md)."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from clsplat.images.reading import error_of, one_line, open_image
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Surfaces in the pixels of an image.
+    """The surfaces in each pixel of an image.
 
-    counts (H, W): int64, number of surfaces of each pixel. rows (S, 4): float32, HOLDOUT_SURFACE_FIELDS of all
-    surfaces, pixel by pixel; within a pixel the nearest front comes first.
+    counts (H, W): int64, number of surfaces of each pixel. rows (S, 4): float32, HOLDOUT_SURFACE_FIELDS of all S
+    surfaces, ordered by pixel and within a pixel by front depth.
     """
 
     counts: NDArray[np.int64]
@@ -34,14 +34,11 @@ class Surfaces:
 
     @property
     def dense(self) -> int:
-        """Average number of surfaces per pixel in the row that has the most, rounded up."""
+        """Mean number of surfaces per pixel in the image row with most surfaces, rounded up."""
         return int(np.ceil(self.counts.mean(axis=1).max(initial=0)))
 
     def taken(self, across: NDArray[np.int64], down: NDArray[np.int64]) -> Surfaces:
-        """Resample the surfaces: column x is column across[x] of this image, row y is row down[y].
-
-        Pixels outside this image have no surfaces.
-        """
+        """Resample: pixel (x, y) of the result has the surfaces of pixel (across[x], down[y]), if that is inside."""
         height, width = self.counts.shape
         if np.array_equal(across, np.arange(width)) and np.array_equal(down, np.arange(height)):
             return self
@@ -53,7 +50,7 @@ class Surfaces:
         return Surfaces(counts, self.rows[np.repeat(first, flat) + np.arange(flat.sum())])
 
     def scaled(self, factors: Float32) -> Surfaces:
-        """Multiply the depths of each pixel by its factor (H, W)."""
+        """Multiply the depths of each pixel by the pixel's factor in `factors` (H, W)."""
         by = np.repeat(factors.ravel(), self.counts.ravel())[:, None]
         return Surfaces(self.counts, (self.rows * np.concatenate([by, by, by**0, 1 / by], axis=1)).astype(np.float32))
 
@@ -63,7 +60,7 @@ class Holdout:
     """Holdout of a frame.
 
     surfaces: surfaces in the file's data window.
-    x, y: pixel of the frame where that window begins.
+    x, y: first pixel of the data window, in the frame.
     size: width and height of the frame.
     """
 
@@ -74,9 +71,9 @@ class Holdout:
 
 
 def check_holdout(path: Path, size: tuple[int, int], channel: str = "") -> bool:
-    """Check a file's header. Returns True if its depths are half floats.
+    """Check the header of a holdout file. Returns True if its depths are half floats.
 
-    Raises InputError if the header shows that the file cannot be the holdout of a frame of that size (width, height).
+    Raises InputError if the file cannot be a holdout of a frame of this size (width, height).
     """
     with _part(path, size, channel) as (source, _, places):
         spec = source.spec()
@@ -85,11 +82,11 @@ def check_holdout(path: Path, size: tuple[int, int], channel: str = "") -> bool:
 
 
 def read_holdout(path: Path, size: tuple[int, int], channel: str = "", *, inverse: bool = False) -> Holdout:
-    """Read the holdout of a frame of that size (width, height).
+    """Read the holdout of a frame of this size (width, height).
 
-    channel: name of the depth channel, Z if empty. A deep file has A too and may have ZBack; a flat file may have A.
-    inverse: the file stores 1 / depth.
-    Depths of 0 and infinity are no surface. Raises InputError like `check_holdout`, and for NaN, negative depths, and
+    channel: name of the depth channel; "" for Z. A flat file may also have A; a deep file has A and may have ZBack.
+    inverse: True if the file stores 1 / depth.
+    Depths of 0 and infinity mean no surface. Raises InputError like `check_holdout`, and for NaN, negative depths, and
     files that do not decode.
     """
     with _part(path, size, channel) as (source, part, places):
@@ -102,7 +99,7 @@ def read_holdout(path: Path, size: tuple[int, int], channel: str = "", *, invers
             counts = np.ones(shape[0] * shape[1], np.int64)
         origin = (spec.x - spec.full_x, spec.y - spec.full_y)
     begin, alpha, end = columns
-    assert begin is not None, "it is looked for by its name"
+    assert begin is not None, "`_part` requires the depth channel"
     name, end = channel or "Z", begin if end is None else end
     alpha = np.ones(len(begin), np.float32) if alpha is None else alpha
     for values, what in ((begin, name), (end, "ZBack"), (alpha, "A")):
@@ -117,8 +114,7 @@ def read_holdout(path: Path, size: tuple[int, int], channel: str = "", *, invers
 
 
 def surfaces_of(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Surfaces:
-    """Surfaces from front depths, back depths and alpha, (H, W, count) each. A front depth of 0 or infinity is no
-    surface."""
+    """Surfaces from front depths, back depths and alpha, each (H, W, count), without front depths of 0 or infinity."""
     counts = np.full(begin.shape[0] * begin.shape[1], begin.shape[2])
     return _surfaces(begin.ravel(), end.ravel(), alpha.ravel(), counts, begin.shape[:2])
 
@@ -126,7 +122,7 @@ def surfaces_of(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> 
 def _surfaces(
     begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any], counts: NDArray[np.int64], shape: tuple[int, ...]
 ) -> Surfaces:
-    """Surfaces from values stored pixel by pixel; counts: number of values of each pixel."""
+    """Surfaces from values (S,) that are ordered by pixel. counts (H W,): number of values of each pixel."""
     alpha = np.clip(alpha, 0, 1)
     shown = (begin > 0) & (begin < np.inf) & (alpha > 0)
     pixels = np.repeat(np.arange(len(counts)), counts)[shown]
@@ -139,8 +135,7 @@ def _surfaces(
 
 
 def _rows(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Float32:
-    """HOLDOUT_SURFACE_FIELDS of each surface. An opaque surface hides everything behind its front, so it gets no
-    length."""
+    """HOLDOUT_SURFACE_FIELDS of each surface. The back depth of an opaque surface is set to its front depth."""
     rows = np.zeros((len(begin), len(HOLDOUT_SURFACE_FIELDS)), np.float32)
     rows[:, 0], rows[:, 2] = begin, 1 - alpha
     rows[:, 1] = np.where((alpha < 1) & (end > begin), end, begin)
@@ -152,7 +147,7 @@ def _rows(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Float3
 
 @contextmanager
 def _part(path: Path, size: tuple[int, int], channel: str) -> Iterator[tuple[Any, int, list[int | None]]]:
-    """The file's input, the part with the depths, and channel indices of depths, alpha and back depths in it."""
+    """Context manager: OpenImageIO's input, the part with the depths, and its indices of depths, alpha, back depths."""
     if not is_file(path):
         raise InputError(f"{path}: no such holdout, expected a depth or deep EXR for each frame that is rendered")
     source = open_image(path)

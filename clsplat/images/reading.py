@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading and scaling images, through OpenImageIO.
+"""Reading of images with OpenImageIO, and their resampling.
 
 In memory an image is float32 (H, W, C), C = 3 (RGB) or 4 (RGBA), in the file's own colour space; nothing is linearised.
-Alpha is *straight* (unassociated) whatever the file stores. Files follow OpenImageIO: straight in PNG, premultiplied
-(associated) in EXR.
+Alpha in memory is always straight (unassociated). Files follow OpenImageIO: straight in PNG, premultiplied (associated)
+in EXR.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from clsplat.files.names import native_name
 from clsplat.images.alpha import associate, unassociate
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".hdr", ".tga", ".ppm", ".pgm")
-"""Lower-case extensions of images that a folder search finds. A named file may be anything OpenImageIO reads."""
+"""Lower-case extensions of images that a folder search finds. A file given by name may have any other."""
 
 T = TypeVar("T", bound=np.generic)
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_IMAGE_PIXELS = 1 << 28
 MAX_UNCHECKED_CHANNEL_VALUES, MAX_CHANNEL_VALUES_PER_BYTE = 48 << 20, 4096
-"""Channel values allowed for a file of any length, or for each byte of it, whichever is more.
+"""A file may decode to MAX_UNCHECKED_CHANNEL_VALUES, or to MAX_CHANNEL_VALUES_PER_BYTE for each of its bytes if more.
 
-No real image reaches them: deflate expands a byte to at most 1032 bytes.
+No real image has more: deflate expands a byte to at most 1032 bytes.
 """
 _DECODE_CHECK_ROWS = 64
 MAX_IMAGE_FILE_BYTES, MAX_UNSIGNED_IMAGE_BYTES = 1 << 30, 1 << 26
@@ -44,9 +44,9 @@ IMAGE_SIGNATURES = (
     *(PNG_SIGNATURE, b"\xff\xd8\xff", b"\x76\x2f\x31\x01", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"BM", b"#?"),
     *(b"SDPX", b"XPDS", b"RIFF", b"P1", b"P2", b"P3", b"P4", b"P5", b"P6", b"PF", b"Pf"),
 )
-"""First bytes that a file larger than MAX_UNSIGNED_IMAGE_BYTES must have: some decoders read the whole file even if it
-is not in their format."""
-# libjpeg's notes about data that it does not need; every other message means lost pixels
+"""First bytes, one of which a file over MAX_UNSIGNED_IMAGE_BYTES must have. Some decoders read a whole file before they
+find that it is not in their format."""
+# libjpeg's messages about superfluous data; every other message means lost pixels
 HARMLESS_DECODER_NOTES = ("extraneous bytes",)
 
 
@@ -55,7 +55,7 @@ COMPANION_PATTERN = (
     r"|edges?|silhouettes?|labels?)"
 )
 FOREGROUND_PATTERN = r"(?:fg|foreground)"
-"""Words in mask names that count only if a separator parts them from the photograph's name."""
+"""Words in names of masks that count only with a separator between them and the photograph's name."""
 _COMPANION_FOLDER = re.compile(rf"(?:\w+[_-])?{COMPANION_PATTERN}(?:[_-]\w+)?", re.IGNORECASE)
 _COMPANION_AFTER = re.compile(
     rf"(?:[._-]?{COMPANION_PATTERN}|[._-]{FOREGROUND_PATTERN})(?:[._-]?(?:\d+|vis|map|raw|image))*", re.IGNORECASE
@@ -69,12 +69,12 @@ _COLOUR_SUFFIX = re.compile(r"[._-](?:colou?r|rgba?|image|img)\Z", re.IGNORECASE
 def companions(paths: Iterable[Path], pictures: Iterable[Path], folder: Path) -> set[Path]:
     """Files among `paths` that accompany one of the pictures: masks, depths, normals and the like.
 
-    Words such as mask or depth in their names decide, in any case:
+    A file's name decides, by words such as mask or depth in upper or lower case. One of these must hold:
 
     - The word follows a picture's name (r_0_depth_0001.png) or precedes it (mask_r_0.png).
     - The word replaces "color" (frame-1.color.jpg, frame-1.depth.png).
-    - COLMAP's masks append .png to the picture's full name.
-    - The file is in a sub-folder of `folder` that is named by such a word.
+    - The name is a picture's full name with .png appended, as in COLMAP's masks.
+    - The file is in a sub-folder of `folder` whose name has such a word.
     """
     pictures = list(pictures)
 
@@ -107,15 +107,15 @@ def _goes_with(path: Path, names: set[str], stems: set[str]) -> bool:
 
 
 def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
-    """All images (by extension) under `folder`, sorted; sub-folders are searched if `deep`.
+    """Sorted paths of the images in `folder`, by extension. deep: search its sub-folders too.
 
-    Hidden files and folders and broken links are left out. Linked folders are followed, each folder once. Raises
-    InputError for a folder that cannot be read.
+    Hidden files and folders and broken links are left out. Links to folders are followed, but each folder is searched
+    once. Raises InputError for a folder that cannot be read.
     """
     paths: list[Path] = []
     seen: set[str] = set()
     for root, folders, files in os.walk(folder, followlinks=True, onerror=cannot_be_searched):
-        real = os.path.realpath(root)  # not the inode, which is 0 for every folder on some file systems of Windows
+        real = os.path.realpath(root)  # not the inode: some file systems of Windows give 0 for every folder
         if real in seen:
             folders.clear()
             continue
@@ -130,15 +130,15 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
 
 
 def cannot_be_searched(error: OSError) -> None:
-    """Raise InputError; handler for `os.walk`, which would skip a folder that it cannot read."""
+    """Raise InputError for a folder that cannot be read. A handler for `os.walk`, which by default skips the folder."""
     why = reason_of(error)
     raise InputError(f"{error.filename}: cannot be searched for pictures: {why}; make it readable or move it away")
 
 
 def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
-    """Width and height from the header, as `read_image` would return them, without decoding pixels.
+    """Width and height of `read_image`'s result, from the header alone.
 
-    Raises InputError for a missing file, one that is not an image, or a truncated PNG.
+    Raises InputError if the file is missing, is not an image, or is a truncated PNG.
     """
     source = open_image(path)
     spec = source.spec()
@@ -152,9 +152,9 @@ def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
 
 
 def stored_range(path: Path) -> tuple[int, bool]:
-    """Largest integer that the file's pixels can hold, 0 for floats, and whether its compression is lossless.
+    """Largest integer of the file's pixel type, 0 for floats; and True if its compression is lossless.
 
-    JPEG and the like keep the numbers only approximately. Raises InputError.
+    Raises InputError like `open_image`.
     """
     source = open_image(path)
     dtype, kind = np.dtype(str(source.spec().format)), source.format_name()
@@ -165,14 +165,14 @@ def stored_range(path: Path) -> tuple[int, bool]:
 def read_image(path: Path, *, orient: bool = True) -> Float32:
     """Read an image as float32 (H, W, 3), or (H, W, 4) with straight alpha.
 
-    Integers of 8 or 16 bits are scaled to [0, 1]; floats are kept, also beyond 1. Grey becomes RGB. An EXR gives R, G,
-    B and A of its whole display window; other channels are ignored.
+    Integers of 8 or 16 bits are scaled to [0, 1]; floats are kept, also above 1. Grey becomes RGB. An EXR gives R, G, B
+    and A of its whole display window, without other channels.
 
-    orient: apply the EXIF orientation, right for plain photographs. COLMAP (pycolmap 4.2.1) ignores it, and its
-      keypoints and camera sizes refer to the pixels as stored, so a COLMAP model's photographs are read without it.
+    orient: apply the EXIF orientation. Use False for photographs of a COLMAP model: COLMAP (pycolmap 4.2.1) ignores the
+      orientation, so its keypoints and camera sizes refer to the pixels as stored.
 
-    Raises InputError with the file and the decoder's reason if it is missing, not an image, damaged or truncated.
-    Raises it also for unsupported channels and non-finite values.
+    Raises InputError, with the decoder's reason, if the file is missing, not an image, damaged or truncated. Also
+    raises InputError for unsupported channels and non-finite values.
     """
     source = open_image(path)
     spec = source.spec()
@@ -199,11 +199,11 @@ def read_image(path: Path, *, orient: bool = True) -> Float32:
 
 
 def downscale(image: Float32, width: int, height: int) -> Float32:
-    """Resample (H, W, C) to (height, width, C): each new pixel is the mean of the area it covers.
+    """Resample an image (H, W, C) to (height, width, C): each new pixel is the mean of the area that it covers.
 
-    Areas are exact: a whole factor is a box filter, and pixel corners stay in place as in `Camera.resized`. An axis
-    that grows is interpolated linearly. Colour is premultiplied for the mean, so that transparent pixels do not bleed
-    in. Alpha is straight in input and output.
+    Fractions of pixels are weighted exactly, and the image's corners stay in place as in `Camera.resized`. An axis that
+    grows is interpolated linearly. The mean is of premultiplied colour, so that transparent pixels do not bleed in.
+    Alpha is straight in input and output.
     """
     if image.shape[:2] == (height, width):
         return image
@@ -218,7 +218,7 @@ def downscale(image: Float32, width: int, height: int) -> Float32:
 
 
 def turned(image: NDArray[T], orientation: int) -> NDArray[T]:
-    """Apply an EXIF orientation from 1 to 8: for 5 to 8 rows and columns are transposed, then axes are flipped."""
+    """Rotate and mirror an image (H, W, ...) by its EXIF orientation, 1 to 8."""
     if orientation >= 5:
         image = image.transpose(1, 0, 2)
     if orientation in (3, 4, 7, 8):
@@ -229,7 +229,7 @@ def turned(image: NDArray[T], orientation: int) -> NDArray[T]:
 
 
 def channels_of(spec: Any) -> list[str]:
-    """Names of the channels in upper case, one for each; a decoder's own list may be too short or too long."""
+    """Upper-case name of each channel. A decoder's list may be too long or too short: missing names become ""."""
     names = [name.upper() for name in spec.channelnames][: spec.nchannels]
     return names + [""] * (spec.nchannels - len(names))
 
@@ -237,8 +237,8 @@ def channels_of(spec: Any) -> list[str]:
 def alpha_of(spec: Any) -> int:
     """Index of the alpha channel, -1 for none.
 
-    A decoder's index may be outside the channels (OpenImageIO gives 4 for a GIF of 4 channels) or a colour channel.
-    Then the names decide.
+    A decoder's index may be too large (OpenImageIO gives 4 for a GIF of 4 channels), or be that of a colour channel. In
+    both cases the channel called A is used.
     """
     names, index = channels_of(spec), int(spec.alpha_channel)
     if 0 <= index < len(names) and names[index] not in ("R", "G", "B", "Y", "I"):
@@ -247,9 +247,9 @@ def alpha_of(spec: Any) -> int:
 
 
 def open_image(path: Path) -> Any:
-    """OpenImageIO's input of a file with a plausible header. Straight alpha stays straight if the format stores it so.
+    """Open an image and check its header. Returns OpenImageIO's input, which does not premultiply straight alpha.
 
-    Raises InputError.
+    Raises InputError if the file is missing, not an image, or has an implausible size.
     """
     if not is_file(path):
         raise InputError(f"{path}: no such image file")
@@ -272,15 +272,15 @@ def open_image(path: Path) -> Any:
         raise InputError(f"{path}: is {spec.width} x {spec.height} x {spec.depth} pixels, expected a flat picture")
     if max(shown) > MAX_IMAGE_PIXELS or floats > max(MAX_UNCHECKED_CHANNEL_VALUES, MAX_CHANNEL_VALUES_PER_BYTE * size):
         raise InputError(
-            f"{path}: says that it is {spec.width} x {spec.height} pixels of {spec.nchannels} channels, shown as "
-            f"{spec.full_width} x {spec.full_height}, in {size} bytes; is it damaged?"
+            f"{path}: says that it is {spec.width} x {spec.height} pixels of {spec.nchannels} channels, with a display "
+            f"window of {spec.full_width} x {spec.full_height}, in {size} bytes; is it damaged?"
         )
     return source
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """Context with OpenImageIO's input of a file, or None if it is not an image. Error messages are discarded."""
+    """Context manager that yields OpenImageIO's input of a file, or None if it is not an image. Discards errors."""
     source = oiio.ImageInput.open(native_name(path))
     try:
         yield source
@@ -291,8 +291,7 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def decodes(source: Any, part: int, first: int) -> bool:
-    """True if the rows of an input's part decode, starting at the image's row `first`. A few rows are read at a
-    time."""
+    """True if the rows of a part decode from the row `first` on. Reads _DECODE_CHECK_ROWS rows at a time."""
     spec = source.spec()
     for top in range(spec.y + first, spec.y + spec.height, _DECODE_CHECK_ROWS):
         place = (part, 0, top, min(top + _DECODE_CHECK_ROWS, spec.y + spec.height), 0, 0, spec.nchannels)
@@ -303,7 +302,7 @@ def decodes(source: Any, part: int, first: int) -> bool:
 
 
 def error_of(source: Any) -> str:
-    """OpenImageIO's message about the last error."""
+    """OpenImageIO's message of the last error."""
     try:
         return str(source.geterror())
     except UnicodeDecodeError:
@@ -334,7 +333,7 @@ def _as_rgb(path: Path, pixels: Float32, spec: Any) -> Float32:
 
 
 def _display_window(image: Float32, spec: Any) -> Float32:
-    """The whole display window of an EXR whose data window differs; 0 outside the data window."""
+    """The image extended or cropped from an EXR's data window to its display window; 0 outside the data window."""
     x, y = spec.x - spec.full_x, spec.y - spec.full_y
     width, height = spec.full_width, spec.full_height
     if (x, y, spec.width, spec.height) == (0, 0, width, height):
@@ -348,7 +347,7 @@ def _display_window(image: Float32, spec: Any) -> Float32:
 
 
 def _check_png_is_whole(path: Path) -> None:
-    """Raise InputError for a truncated file, before training starts and before libpng prints a message."""
+    """Raise InputError for a truncated PNG, before libpng prints a message about it."""
     if not png_is_whole(path):
         size = path.stat().st_size
         raise InputError(
@@ -357,7 +356,7 @@ def _check_png_is_whole(path: Path) -> None:
 
 
 def png_is_whole(path: Path) -> bool:
-    """True if the chunks of a PNG are complete up to the last one, IEND."""
+    """True if all chunks of a PNG are complete, up to the last chunk, IEND."""
     size = path.stat().st_size
     with open(path, "rb") as file:
         position = len(PNG_SIGNATURE) if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE else size

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""STMaps: images whose red and green give the source position of each pixel in another image.
+"""STMaps: images whose red and green values are the source position of each pixel in another image.
 
-Positions are fractions of that image's width and height from its lower left corner, as in Nuke. At pixel (x, y) from
-the top left, the identity is (x + 1/2) / width and 1 - (y + 1/2) / height.
+Positions are fractions of that image's width and height, from its lower left corner, as in Nuke. At pixel (x, y) from
+the top left corner, the identity map is (x + 1/2) / width and 1 - (y + 1/2) / height.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from clsplat.images.reading import error_of, one_line, open_image
 from clsplat.images.writing import write_spec
 
 HALF_FLOAT_SIDE_LIMIT_PX = 2048
-"""Image side in pixels from which a half float may be wrong by more than half a pixel."""
+"""Image side in pixels from which a position as half float may be off by more than half a pixel."""
 
 
 _ORIENTATION_CELLS_PER_SIDE = 32
-"""Number of cells along each side of a map whose orientation is tested."""
+"""Number of grid cells along each side of a map in the test whether it is an STMap (`_oriented_share`)."""
 _MIN_CELL_SINE = 0.05
-"""Smallest sine of the angle between a cell's mapped sides; for a grey image the two sides coincide."""
+"""Smallest sine of the angle between a cell's mapped sides at which the cell has an orientation."""
 _MIN_ORIENTED_SHARE = 0.7
-"""Least fraction of a map's cells that have the same orientation. In ordinary images about half do. The cells of a grey
-image have no orientation."""
+"""Least fraction of an STMap's cells that have the same orientation. In ordinary images about half do. The cells of a
+grey image have no orientation, because their mapped sides coincide."""
 
 
 @dataclass(frozen=True, eq=False)
 class StMap:
-    """STMap read from a file.
+    """STMap from a file.
 
-    values (H, W, 2): float32, across and up.
+    values (H, W, 2): float32, horizontal and vertical position.
     x, y: position of the map's first pixel in the frame; may be negative.
     width, height: size of the frame.
     digest: SHA-256 of the map's file.
@@ -59,7 +59,7 @@ class StMap:
     def at(self, x: Float64, y: Float64) -> Float64:
         """Values (h, w, 2) at positions x (w,), y (h,) of the frame, in pixels.
 
-        They are interpolated linearly between pixel centres, and extrapolated linearly beyond the outer ones.
+        They are interpolated linearly between pixel centres, and extrapolated linearly beyond the outermost centres.
         """
         rows, columns, _ = self.values.shape
 
@@ -76,27 +76,27 @@ class StMap:
         def line(row: np.ndarray) -> Float64:
             begin, end = (values[row[:, None], column[None, :]].astype(np.float64) for column in (left, right))
             mixed = begin + across * (end - begin)
-            return np.asarray(np.where(across == 0, begin, mixed))  # keeps non-finite values from spreading
+            return np.asarray(np.where(across == 0, begin, mixed))  # so that non-finite values do not spread
 
         upper, lower = line(above), line(below)
         return np.asarray(np.where(down == 0, upper, upper + down * (lower - upper)))
 
 
 def read_stmap(path: Path) -> StMap:
-    """Read an STMap; recent ones are cached.
+    """Read an STMap. The last two are cached.
 
-    Raises InputError for a file that is missing, not an image, of integers, or without two channels. Warns of half
-    floats, which are too coarse for positions in large images.
+    Raises InputError for a file that is missing, not an image, not of floats, or without two channels. Warns if a large
+    map has half floats, which are too coarse for its positions.
     """
     try:
         changed = path.stat().st_mtime_ns
     except OSError:
-        changed = 0  # opening it says why
+        changed = 0  # open_image reports the error
     return _read(path, changed)
 
 
 @lru_cache(maxsize=2)
-def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # read again if the file has changed
+def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # a cache key: a changed file is read again
     source = open_image(path)
     spec = source.spec()
     names = [name.upper() for name in spec.channelnames]
@@ -111,22 +111,22 @@ def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # read again if t
     if pixels is None:
         raise InputError(f"{path}: does not decode: {one_line(reason)}; expected an STMap")
     values = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)[:, :, channels]
-    if (share := _one_way(values)) < _MIN_ORIENTED_SHARE:
+    if (share := _oriented_share(values)) < _MIN_ORIENTED_SHARE:
         raise InputError(
-            f"{path}: looks like a picture: R and G have one orientation in {100 * share:.0f} % of its cells, "
-            "expected an STMap, whose R and G are neighbouring positions"
+            f"{path}: looks like a picture: R and G have the same orientation in {100 * share:.0f} % of its cells, "
+            "expected an STMap, whose R and G are positions"
         )
     if "half" in kinds and max(spec.full_width, spec.full_height) >= HALF_FLOAT_SIDE_LIMIT_PX:
-        warn(f"{path}: has half floats, which are pixels off at {spec.full_width}x{spec.full_height}; write floats")
+        warn(f"{path}: has half floats, too coarse for {spec.full_width}x{spec.full_height} pixels; write floats")
     place = (spec.x - spec.full_x, spec.y - spec.full_y, spec.full_width, spec.full_height)
     return StMap(np.ascontiguousarray(values), *place, digest(path))
 
 
-def _one_way(values: Float32) -> float:
-    """Fraction of a map's cells with the most common orientation, mirrored or not.
+def _oriented_share(values: Float32) -> float:
+    """Fraction of a map's grid cells that have the more common orientation: mirrored or not mirrored.
 
-    Only cells with finite and varying values count. The result is 1 for a map without numbers or too small to judge,
-    and 0 for a map that shows only a line or a point.
+    Only cells with finite and varying values count. The result is 1 for a map without finite values or too small to
+    judge, and 0 for a map whose positions lie on a line or in a point.
     """
     rows, columns = (np.arange(0, side, max(side // _ORIENTATION_CELLS_PER_SIDE, 1)) for side in values.shape[:2])
     if len(rows) < _ORIENTATION_CELLS_PER_SIDE // 2 or len(columns) < _ORIENTATION_CELLS_PER_SIDE // 2:
@@ -144,9 +144,10 @@ def _one_way(values: Float32) -> float:
 
 
 def write_stmap(path: Path, places: Float64, width: int, height: int) -> None:
-    """Write a map as a 32-bit float EXR, atomically: R, G, and a B of zeros, which compositors expect.
+    """Write an STMap as a 32-bit float EXR, atomically: R, G, and zeros as B, which compositors expect.
 
-    places (H, W, 2): x and y in pixels from the top left corner of an image of that width and height; NaN for none.
+    places (H, W, 2): source position of each pixel, in pixels from the source image's top left corner; NaN for none.
+    width, height: size of the source image in pixels.
     Raises ClsplatError if writing fails.
     """
     pixels = np.zeros((*places.shape[:2], 3), np.float32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Video writing, frame by frame: .mp4 (H.264) or .mov (ProRes), with PyAV (`pip install 'clsplat[video]'`)."""
+"""Writing of videos frame by frame: .mp4 (H.264) or .mov (ProRes), with PyAV (`pip install 'clsplat[video]'`)."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from clsplat.images.frame_files import VIDEO_SUFFIXES
 from clsplat.images.provenance import parse_record
 
 _BLUE_CHROMA_RANGE, _RED_CHROMA_RANGE = (np.float32(2 * (1 - REC709_LUMA_WEIGHTS[index])) for index in (2, 0))
-"""Full ranges of B - Y and R - Y."""
+"""Widths of the ranges of B - Y and R - Y (Rec.709), by which chroma is normalised."""
 
 
 VideoPlanes = NDArray[np.uint8] | tuple[NDArray[np.uint16], ...]
-"""Frame in the form that the encoder takes: the result of `frame_planes` or `prores_planes`."""
+"""A frame as the encoder takes it: the result of `frame_planes` or `prores_planes`."""
 _PRORES_PROFILES: dict[ProRes, str] = {"422": "standard", "hq": "hq", "4444": "4444"}
 """FFmpeg's names of the ProRes profiles."""
 
 
 def video_missing() -> str:
-    """One-line reason why no video can be written; '' if it can."""
+    """Reason, in one line, why this installation cannot write videos; '' if it can."""
     try:
         import av  # noqa: F401
     except ImportError:
@@ -44,22 +44,23 @@ def video_missing() -> str:
 
 
 MBTREE_MIN_SIDE_PX = 128
-"""Shorter side in pixels below which x264's macroblock tree is off. The tree saves a quarter of a larger video's bytes.
+"""Shorter side in pixels below which x264's macroblock tree (mbtree) is off, because it makes small videos vary.
 
-With the tree, up to 102 of 250 videos of 48x40 differed in their bytes on a busy machine, and none of 225 of 320x240.
+With the tree on a busy machine, up to 102 of 250 encodings of a 48x40 video differed, and none of 225 of a 320x240
+video. The tree saves a quarter of a larger video's bytes.
 """
 
 
 MAX_VIDEO_SIDE_PX = 16384
 """Largest side in pixels: x264's MAX_RESOLUTION."""
 MAX_VIDEO_MEGAPIXELS = 260
-"""Size of the largest frame, about: FFmpeg's av_image_check_size requires 8 (width + 128) (height + 128) < 2^31."""
+"""Approximate largest frame: FFmpeg's av_image_check_size requires 8 (width + 128) (height + 128) < 2^31."""
 
 
 def video_record(path: Path, frames: int | None = None) -> dict[str, str]:
-    """Record (`provenance`) of a video; empty if the file is not a video or has none.
+    """Provenance record of a video (`provenance`); empty if the file is not a video or has no record.
 
-    frames: if given, the result is empty also for an incomplete video or another number of frames.
+    frames: expected number of frames. The result is also empty if the video has another number or is incomplete.
     """
     import av
 
@@ -87,7 +88,7 @@ def check_video(path: Path) -> None:
 
 
 def check_codec(path: str, config: VideoConfig, channels: Collection[str]) -> None:
-    """Raise InputError for settings of the other codec, and for alpha if the codec has none."""
+    """Raise InputError for settings of a codec that `path` does not use, and for alpha if its codec has no alpha."""
     usual = VideoConfig()
     if Path(path).suffix.lower() == ".mp4":
         if config.prores != usual.prores:
@@ -112,12 +113,12 @@ def check_size(path: Path, width: int, height: int) -> None:
 
 
 def frame_planes(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """Planes (3 H / 2, W) for H.264: luma, and below it chroma at half the size, as PyAV takes them.
+    """Planes (3 H / 2, W) of a frame for H.264: luma, and below it chroma at half the size, as PyAV expects.
 
-    Sizes are rounded up to even numbers. Rec.709, limited range, chroma sited at the left as in H.264. FFmpeg's own
-    conversion is darker by one level.
+    H and W are rounded up to even numbers. Colours are Rec.709 in limited range, with chroma sited left as in H.264.
+    FFmpeg's own conversion is darker by one level.
 
-    image (H, W, 3): floats as displayed, clipped to [0, 1], NaN as 0, or uint8.
+    image (H, W, 3): display values as floats, clipped to [0, 1], NaN as 0; or as uint8.
     Raises ValueError for another shape.
     """
     pixels = np.asarray(image)
@@ -136,13 +137,13 @@ def frame_planes(image: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def prores_planes(image: NDArray[Any], alpha: NDArray[Any] | None, prores: ProRes) -> tuple[NDArray[np.uint16], ...]:
-    """Planes (H, W) for ProRes: luma, two of chroma, and alpha if given, in 10 bits.
+    """10-bit planes (H, W) of a frame for ProRes: luma, two planes of chroma, and alpha if it is given.
 
     Colours are Rec.709 in limited range, alpha is in full range. For 422 and hq, chroma has half the width and is sited
-    at the left, and the width is rounded up to an even number.
+    left, and the width is rounded up to an even number.
 
-    image (H, W, 3): floats as displayed, clipped to [0, 1], NaN as 0.
-    alpha (H, W): image is premultiplied by it; the file stores straight alpha.
+    image (H, W, 3): display values as floats, clipped to [0, 1], NaN as 0.
+    alpha (H, W): alpha by which `image` is premultiplied. The file stores straight alpha.
     """
     rgb = np.nan_to_num(np.asarray(image, np.float32))
     if alpha is not None:
@@ -161,18 +162,18 @@ def prores_planes(image: NDArray[Any], alpha: NDArray[Any] | None, prores: ProRe
 
 
 def _left_sited(chroma: NDArray[Any]) -> NDArray[Any]:
-    """Chroma (2, H, W / 2): half of the sample at the same position and a quarter of each neighbour."""
+    """Chroma at half the width (2, H, W / 2), sited left: weights 1/4, 1/2, 1/4 around every second sample."""
     left = np.concatenate([chroma[:, :, :1], chroma[:, :, 1:-1:2]], axis=2)
     return np.asarray(0.25 * (left + chroma[:, :, 1::2]) + 0.5 * chroma[:, :, 0::2])
 
 
 def planes_of(path: Path, image: NDArray[Any], alpha: NDArray[Any] | None, prores: ProRes) -> VideoPlanes:
-    """The frame in the form that the encoder for the video `path` takes."""
+    """A frame as the encoder of the video `path` takes it."""
     return prores_planes(image, alpha, prores) if path.suffix.lower() == ".mov" else frame_planes(image)
 
 
 def rate_of(fps: float) -> Fraction:
-    """Frame rate for a file; television rates given with two or three decimals become multiples of 1/1001."""
+    """Exact frame rate for a file. Rounded NTSC rates become exact: 23.976 and 23.98 become 24000/1001."""
     whole = round(fps * 1.001)
     ntsc = Fraction(1000 * whole, 1001)
     near = 5e-3 if whole % 24 == 0 or whole % 30 == 0 else 1e-4
@@ -183,11 +184,10 @@ def rate_of(fps: float) -> Fraction:
 
 @contextmanager
 def video_writer(path: Path, config: VideoConfig | None = None, comment: str = "") -> Iterator[VideoWriter]:
-    """Context with a writer of a video. The video replaces `path` if the block succeeds; after an exception `path`
-    stays as it was.
+    """Context manager that yields a writer of a video. If the block succeeds, the video replaces the file `path`.
 
     comment: provenance record for the header.
-    Raises InputError for another extension, a missing folder, no frames, or if PyAV is not installed.
+    Raises InputError for another extension, a missing folder, a video without frames, or if PyAV is not installed.
     """
     config = config or VideoConfig()
     config.check()
@@ -202,7 +202,7 @@ def video_writer(path: Path, config: VideoConfig | None = None, comment: str = "
 
 
 def _frame_of(planes: tuple[NDArray[np.uint16], ...], form: str) -> Any:
-    """PyAV frame of 16-bit planes."""
+    """PyAV frame from 16-bit planes. form: name of its pixel format."""
     import av
 
     height, width = planes[0].shape
@@ -211,16 +211,16 @@ def _frame_of(planes: tuple[NDArray[np.uint16], ...], form: str) -> Any:
         lines = np.zeros((values.shape[0], plane.line_size // 2), np.uint16)
         lines[:, : values.shape[1]] = values
         plane.update(lines)
-    # ProRes stores these in each frame's header too; the encoder takes them from the frame
+    # ProRes stores these in each frame's header; the encoder reads them from the frame
     frame.colorspace = frame.color_primaries = frame.color_trc = frame.color_range = 1
     return frame
 
 
 class VideoWriter:
-    """A video that is written frame by frame, in order.
+    """Writes a video frame by frame, in order.
 
-    H.264 has 8-bit 4:2:0 in Rec.709's limited range, which halves the colour's resolution. It has no odd sizes, so the
-    last column or row is repeated. ProRes has 10 bits, 4:2:2 or 4:4:4.
+    H.264 has 8 bits, 4:2:0, in Rec.709's limited range. Its sizes are even, so an odd last column or row is repeated.
+    ProRes has 10 bits, 4:2:2 or 4:4:4.
     """
 
     def __init__(self, path: Path, temporary: Path, config: VideoConfig, comment: str = "") -> None:
@@ -236,7 +236,7 @@ class VideoWriter:
         self.frames = 0
 
     def add(self, planes: VideoPlanes) -> None:
-        """Append a frame from `planes_of`; all frames have one size and kind.
+        """Append a frame from `planes_of`. All frames must have the same size and kind.
 
         Raises ClsplatError if writing fails, ValueError for a frame of another size.
         """
@@ -280,7 +280,7 @@ class VideoWriter:
             codec, form = "prores_ks", "yuv422p10le" if config.prores != "4444" else "yuv444p10le"
             form = "yuva444p10le" if alpha else form
         else:
-            # a fixed number of threads: the same bytes on every machine
+            # a fixed number of threads, so that every machine writes the same bytes
             parameters = "threads=4:sliced-threads=0" + (":mbtree=0" if min(width, height) < MBTREE_MIN_SIDE_PX else "")
             options = {"crf": str(config.crf), "preset": config.preset, "x264-params": parameters}
             codec, form = "libx264", "yuv420p"
@@ -288,7 +288,7 @@ class VideoWriter:
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, form
         context = self._stream.codec_context
         context.time_base = 1 / rate
-        # Rec.709's matrix, limited range, and the listed transfer that is closest to sRGB's
+        # Rec.709's matrix and transfer function, which is close to sRGB's, and limited range
         context.colorspace = context.color_primaries = context.color_trc = 1
         context.color_range = 1
 
@@ -306,7 +306,7 @@ class VideoWriter:
             raise ClsplatError(f"{self._path}: cannot be written: {reason}") from None
 
     def finish(self) -> None:
-        """Flush the encoder and the file to the disk. Raises InputError for a video of no frames."""
+        """Flush the encoder and the file to disk. Raises InputError for a video without frames."""
         if self.frames == 0:
             raise InputError(f"{self._path}: the video has no frames, expected at least one")
         with self._refusals():
@@ -318,5 +318,5 @@ class VideoWriter:
     def close(self) -> None:
         """Close the file, complete or not."""
         if self._container is not None:
-            with suppress(Exception):  # after success it is closed already; after a failure its error is not the cause
+            with suppress(Exception):  # already closed after success; after a failure this error is not the cause
                 self._container.close()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing image files, completely or not at all."""
+"""Atomic writing of image files."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ CHANNEL_NAMES_BY_COUNT = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")
 def write_image(path: Path, image: NDArray[Any]) -> None:
     """Write an image, atomically: 8-bit PNG or float EXR, by the extension.
 
-    image: (H, W) or (H, W, C), C = 1, 3 or 4, with straight alpha; uint8, or floats, which a PNG clips to [0, 1] and
-      rounds.
-    Raises InputError for another extension or a missing folder, ClsplatError if writing fails (disk full). After a
-    failure the previous file is intact, and no temporary file is left.
+    image: (H, W) or (H, W, C), C = 1, 3 or 4, with straight alpha; uint8 or floats. For a PNG, floats are clipped to
+      [0, 1] and rounded.
+    Raises InputError for another extension or a missing folder, ClsplatError if writing fails, as on a full disk. After
+    a failure an earlier file is intact, and no temporary file is left.
     """
     path = Path(path)
     extension = path.suffix.lower()
@@ -58,10 +58,9 @@ def write_image(path: Path, image: NDArray[Any]) -> None:
 
 
 def steps_of(planes: Sequence[NDArray[Any]], bits: int) -> NDArray[Any]:
-    """Channels side by side as integers: 0 to 1 become 0 to the maximum, NaN becomes 0.
+    """Interleave planes and quantise them to integers: [0, 1] becomes 0 to 2^bits - 1, NaN becomes 0.
 
-    Works on one channel at a time: the device returns planes, and a pass over interleaved channels takes several times
-    as long.
+    Works on one channel at a time, because a pass over interleaved channels takes several times as long.
     """
     height, width = planes[0].shape[:2]
     whole = np.empty((height, width, sum(plane.shape[2] for plane in planes)), np.uint8 if bits == 8 else np.uint16)
@@ -76,9 +75,10 @@ def steps_of(planes: Sequence[NDArray[Any]], bits: int) -> NDArray[Any]:
 
 
 def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], kind: str) -> None:
-    """Write a file of one or more parts, atomically: (H, W, C) each, with its OpenImageIO specification.
+    """Write an image file of one or more parts, atomically. Raises ClsplatError if writing fails.
 
-    Raises ClsplatError if writing fails.
+    parts, specs: pixels (H, W, C) and OpenImageIO specification of each part.
+    kind: the file's extension without the dot.
     """
 
     def steps(file: Any, name: str) -> Iterator[bool]:
@@ -90,10 +90,10 @@ def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], 
 
 
 def write_rows(path: Path, spec: Any, kind: str, pieces: Iterable[tuple[Any, int]]) -> None:
-    """Write a file of one part from the top, atomically, as its rows arrive.
+    """Write a file of one part atomically, row by row from the top.
 
-    pieces: pixels, or OpenImageIO's deep data, and their number of rows. While deep rows are written, the next are
-      requested.
+    pieces: pixels, or OpenImageIO's deep data, each with its number of rows. The next piece is requested while deep
+      rows are being written.
     Raises ClsplatError if writing fails.
     """
     reasons: list[str] = []
@@ -109,7 +109,7 @@ def write_rows(path: Path, spec: Any, kind: str, pieces: Iterable[tuple[Any, int
         def written(row: int, count: int, pixels: Any) -> bool:
             done = bool(file.write_deep_scanlines(row, row + count, 0, pixels))
             if not done:
-                reasons.append(file.geterror())  # OpenImageIO reports it to this thread only
+                reasons.append(file.geterror())  # OpenImageIO reports the error to this thread only
             return done
 
         with ThreadPoolExecutor(1) as pool:  # compression takes longer than rendering most frames
@@ -132,22 +132,22 @@ def _write(
     steps: Callable[[Any, str], Iterable[bool]],
     reasons: Sequence[str] = (),
 ) -> None:
-    """Write a file of these parts.
+    """Write a file with these parts.
 
-    steps: continues to write OpenImageIO's open file and yields the success of each call.
+    steps: function that writes pixels to OpenImageIO's open file, and yields True for each call that succeeds.
     reasons: messages of calls that failed in another thread.
     """
-    # libjpeg ends the process when it cannot write
+    # libjpeg ends the process if it cannot write
     most = jpeg_room(specs[0]) if kind in ("jpg", "jpeg") else 0
     with atomic_name(path) as temporary:
         file: Any = oiio.ImageOutput.create(kind)
         name = native_name(temporary)
         try:
             with require_room(path, most):
-                # all parts have to be declared when the file is opened
+                # OpenImageIO needs the specifications of all parts to open the file
                 opens = file.open(name, specs[0] if len(specs) == 1 else tuple(specs))
                 written = opens and all(steps(file, name)) and file.close()
-            # on a full disk the last bytes are lost without an error
+            # a full disk may lose the last bytes without an error
             if written and _is_whole(temporary, kind, len(specs)):
                 if kind == "dpx":
                     _without_name(temporary)
@@ -174,7 +174,7 @@ def _without_name(path: Path) -> None:
 
 
 def _is_whole(path: Path, kind: str, parts: int) -> bool:
-    """True if a written image has its end: the last chunk of a PNG, or the last row in other formats."""
+    """True if a written image is complete at its end: the last chunk of a PNG, or the last row in other formats."""
     if kind == "png":
         return png_is_whole(path)
     with opened(path) as source:
@@ -184,5 +184,5 @@ def _is_whole(path: Path, kind: str, parts: int) -> bool:
 
 
 def jpeg_room(spec: Any) -> int:
-    """Upper bound in bytes of a JPEG of that size."""
+    """Upper bound in bytes of a JPEG with this OpenImageIO specification."""
     return int(spec.width * spec.height * spec.nchannels * 5 // 4) + (1 << 16)

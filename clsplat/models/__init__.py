@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Model files, and edits of Gaussians that need no device."""
+"""Model files, and edits of Gaussians on the host."""

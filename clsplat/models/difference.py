@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Row-by-row error between a model and a copy that should equal it: the loss of a format."""
+"""Row-by-row errors of a model that was written to a format and read back."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ ERROR_UNITS = {
 def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
     """Largest and mean error of each attribute in ERROR_UNITS, over all Gaussians.
 
-    A position's error is a distance and a rotation's an angle; the others take the largest component. Scale errors
-    compare standard deviations and are fractions of the Gaussian's largest one, because formats clamp the thickness of
-    discs that are too thin to see. SH coefficients that only one model has count as 0 in the other.
+    The error of a position is a distance, that of a rotation an angle, otherwise that of the worst component. A scale
+    error is a fraction of the Gaussian's largest scale, because formats clamp the thickness of very thin discs. SH
+    coefficients that one model lacks count as 0.
 
     Raises ValueError for models of different sizes.
     """
@@ -58,8 +58,7 @@ def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
 
 
 def _scale_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:
-    """(n,) errors of log scales (n, 3), relative to the largest scale of each `a`, so that only large differences
-    overflow."""
+    """Errors (n,) of log scales `b` (n, 3) as scales, relative to the largest scale in each row of `a`."""
     largest = a.max(axis=1, keepdims=True).astype(np.float64)
     with np.errstate(over="ignore"):
         p, q = np.exp(a - largest), np.exp(b - largest)
@@ -67,7 +66,7 @@ def _scale_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:
 
 
 def _angles(a: NDArray[Any], b: NDArray[Any]) -> Float64:
-    """(n,) angles in degrees between the rotations, from the chord, which is accurate for small angles."""
+    """Angles (n,) in degrees between two rotations each, from the chord, which is accurate for small angles."""
     p, q = packing.unit_quaternions(a), packing.unit_quaternions(b)
     q *= np.where((p * q).sum(axis=1) < 0, -1, 1)[:, None]
     chord = np.linalg.norm(p - q, axis=1)
@@ -81,7 +80,7 @@ def _sh_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:
 
 
 def table(losses: dict[str, dict[str, float]]) -> str:
-    """Table of the errors as text, one line for each attribute."""
+    """The result of `errors` as text, with a line for each attribute."""
     names = {"position_relative": "", "sh": "SH"}
     lines = ["error      largest      mean"]
     for name, unit in ERROR_UNITS.items():

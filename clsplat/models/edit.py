@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Edits of a model that need no device: crop, transform, thin out, merge. Inputs are never changed in place.
+"""Edits of a model on the host: crop, transform, thin out, merge. Inputs are never changed in place.
 
 A similarity (4, 4) maps the world to a new one: x' = s Q x + t, where Q is a rotation, possibly with a reflection. A
 Gaussian N(m, R S S R^T) becomes N(s Q m + t, Q R s S s S R^T Q^T). Its colour f, a function of the view direction,
-becomes f(Q^T .). `transform_camera` moves a camera along, so that it sees the same image.
+becomes f(Q^T .). `transform_camera` transforms a camera in the same way, so that it sees the same image.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from clsplat.gaussians import Gaussians
 from clsplat.spherical_harmonics import SH_C0, sh_basis
 
 MAX_WORLD_OFFSET_SIZES = 64.0
-"""Distance, in standard deviations of a transformed model's means, up to which its origin is added to the means
+"""A transformed model's origin is added to its means if it is at most this many standard deviations of the means long
 (decision 0017)."""
 TRANSFORM_SCALE_LIMITS = (1e-12, 1e12)
 """Smallest and largest scale of a transform; beyond them float32 means would be 0 or infinite."""
 _INVISIBLE_LOGIT = -80.0
-"""Logit of an invisible opacity; exp(80) still fits float32."""
+"""Logit of a Gaussian that is never drawn; exp(80) still fits float32."""
 _SIMILARITY_TOLERANCE = 1e-6
-"""Largest difference of Q^T Q from the identity, for matrices typed with six digits or stored as float32."""
+"""Largest difference of Q^T Q from the identity. It allows matrices typed with six digits or stored as float32."""
 
 
 def take(gaussians: Gaussians, rows: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Gaussians:
@@ -37,32 +37,32 @@ def take(gaussians: Gaussians, rows: slice | NDArray[np.bool_] | NDArray[np.int6
 
 
 def in_box(gaussians: Gaussians, low: Sequence[float], high: Sequence[float]) -> NDArray[np.bool_]:
-    """Mask (n,) of the Gaussians whose mean is inside the box or on its faces; low, high (3,) in world coordinates."""
+    """Mask (n,), True for Gaussians whose mean is in a box or on its faces. low, high (3,): in world coordinates."""
     means = gaussians.means + gaussians.origin
     return np.asarray(((means >= low) & (means <= high)).all(axis=1))
 
 
 def in_sphere(gaussians: Gaussians, centre: Sequence[float], radius: float) -> NDArray[np.bool_]:
-    """Mask (n,) of the Gaussians whose mean is at most `radius` from the centre (3,) in world coordinates."""
+    """Mask (n,), True for Gaussians whose mean is at most `radius` from `centre` (3,), in world coordinates."""
     offsets = gaussians.means + (gaussians.origin - np.asarray(centre, np.float64))
     return np.asarray(np.linalg.norm(offsets, axis=1) <= radius)
 
 
 def opaque(gaussians: Gaussians, least: float) -> NDArray[np.bool_]:
-    """Mask (n,) of the Gaussians whose opacity is at least `least`."""
+    """Mask (n,), True for Gaussians whose opacity is at least `least`."""
     if least >= 1:
         return np.zeros(len(gaussians), np.bool_)
-    with np.errstate(divide="ignore"):  # log(0) = -inf: every Gaussian passes
+    with np.errstate(divide="ignore"):  # log(0) = -inf selects every Gaussian
         return np.asarray(gaussians.opacity_logits >= np.log(least) - np.log1p(-least))
 
 
 def drop_sh(gaussians: Gaussians, degree: int) -> Gaussians:
-    """Drop the SH bands above the degree. A model without such bands is unchanged."""
+    """Drop the SH bands above `degree`, if there are any."""
     return replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
 
 
 def without_empty_bands(gaussians: Gaussians) -> Gaussians:
-    """Drop the highest SH bands that are all zero; a lossy format would store other values for them."""
+    """Drop the highest SH bands if all their coefficients are 0. A lossy format would store other values for them."""
     degree = gaussians.sh_degree
     while degree and not gaussians.sh[:, degree**2 :].any():
         degree -= 1
@@ -83,7 +83,7 @@ def exposed(gaussians: Gaussians, gains: Sequence[float]) -> Gaussians:
 
 
 def graded(gaussians: Gaussians, linear: Float64, shift: Float64) -> Gaussians:
-    """Apply colour = linear colour + shift, (3, 3) and (3,), before colours are clamped at 0."""
+    """Change colours to linear @ colour + shift, before they are clamped at 0. linear (3, 3), shift (3,)."""
     sh = np.einsum("cd,nkd->nkc", linear, gaussians.sh.astype(np.float64))
     sh[:, 0] += (linear @ np.full(3, 0.5) + shift - 0.5) / SH_C0  # colour = 0.5 + C0 SH
     return replace(gaussians, sh=np.ascontiguousarray(sh, np.float32))
@@ -101,7 +101,7 @@ def faded(gaussians: Gaussians, factor: float) -> Gaussians:
 
 
 def merge(models: Sequence[Gaussians]) -> Gaussians:
-    """Concatenate models. Lower SH degrees are padded with zeros, and means become relative to the first origin.
+    """Concatenate models. Lower SH degrees are padded with zeros. Means become relative to the first model's origin.
 
     Raises InputError if only some of the models are antialiased, or only some are drawn along rays.
     """
@@ -133,14 +133,14 @@ def decompose(matrix: Float64, slack: float = _SIMILARITY_TOLERANCE) -> tuple[fl
     """Scale s, rotation Q (3, 3) and translation t (3,) of a similarity (4, 4).
 
     slack: largest allowed difference of Q^T Q from the identity.
-    Raises InputError, whose message continues "has", if the matrix is not a similarity.
+    Raises InputError if the matrix is not a similarity. Its message is written to follow "has".
     """
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"a transform of {matrix.shape}, expected 4 x 4 finite numbers")
     linear = matrix[:3, :3]
     scale = float(np.abs(np.linalg.det(linear)) ** (1 / 3))
     if not TRANSFORM_SCALE_LIMITS[0] < scale < TRANSFORM_SCALE_LIMITS[1] or not np.array_equal(matrix[3], (0, 0, 0, 1)):
-        raise InputError(f"a transform that cannot be undone (of scale {scale:g}) or whose last row is not 0 0 0 1")
+        raise InputError(f"a transform that is not invertible (scale {scale:g}) or whose last row is not 0 0 0 1")
     turn = linear / scale
     if (off := float(np.abs(turn.T @ turn - np.eye(3)).max())) > slack:
         raise InputError(
@@ -160,7 +160,7 @@ def transform(gaussians: Gaussians, matrix: Float64, slack: float = _SIMILARITY_
     upright = np.allclose(turn, np.eye(3), rtol=0, atol=1e-12)  # no rotation, up to float64 rounding
     linear = scale * turn
     origin = linear @ gaussians.origin + shift
-    with np.errstate(invalid="ignore"):  # non-finite values; their Gaussians are dropped later
+    with np.errstate(invalid="ignore"):  # Gaussians with non-finite values are dropped later
         means = gaussians.means.astype(np.float64) @ linear.T
         spread = float(means.std(axis=0).max())
         if np.isnan(spread) and (finite := np.isfinite(means).all(axis=1)).any():
@@ -186,8 +186,7 @@ def scaling(factor: float) -> Float64:
 
 
 def turning(degrees: Sequence[float]) -> Float64:
-    """Matrix (4, 4) that rotates the world about its x, then its y, then its z axis, by the right-hand rule; degrees
-    (3,)."""
+    """Matrix (4, 4) that rotates the world about x, then y, then z, by `degrees` (3,) and the right-hand rule."""
     from scipy.spatial.transform import Rotation
 
     matrix = np.eye(4)
@@ -203,18 +202,17 @@ def shifting(offset: Sequence[float]) -> Float64:
 
 
 def transform_camera(camera: Camera, matrix: Float64) -> Camera:
-    """Move a camera along with a model, so that it sees the same image. A reflection mirrors the camera's axes too."""
+    """Transform a camera like a model, so that it sees the same image. A reflection mirrors the camera's axes too."""
     scale, turn, shift = decompose(matrix)
     rotation = camera.rotation @ turn.T
     translation = scale * camera.translation - rotation @ shift
-    near = (
-        DEFAULT_NEAR_PLANE if camera.near == DEFAULT_NEAR_PLANE else scale * camera.near
-    )  # DEFAULT_NEAR_PLANE stands for the model's near plane, which scales too
+    # DEFAULT_NEAR_PLANE stands for the model's near plane, which `transform` scales
+    near = DEFAULT_NEAR_PLANE if camera.near == DEFAULT_NEAR_PLANE else scale * camera.near
     return replace(camera, rotation=rotation, translation=translation, near=near, far=scale * camera.far)
 
 
 def _turned(quaternions: Float32, turn: Float64) -> Float32:
-    """Quaternions w x y z of Q R, lengths unchanged. A reflection uses -Q, as R S S R^T does not depend on the sign."""
+    """Quaternions w x y z of the rotations Q R, lengths unchanged. For a reflection, -Q gives the same covariance."""
     from scipy.spatial.transform import Rotation
 
     proper = turn if np.linalg.det(turn) > 0 else -turn
@@ -225,7 +223,7 @@ def _turned(quaternions: Float32, turn: Float64) -> Float32:
 
 
 def rotate_sh(sh: Float32, turn: Float64) -> Float32:
-    """SH coefficients (n, K, 3) of the function turned by Q (3, 3), a rotation, possibly with a reflection."""
+    """Rotate SH coefficients (n, K, 3) by Q = `turn` (3, 3), a rotation, possibly with a reflection."""
     degree = round(sh.shape[1] ** 0.5) - 1
     turned = sh.copy()
     for band, matrix in enumerate(sh_rotations(turn, degree)[1:], start=1):
@@ -235,13 +233,13 @@ def rotate_sh(sh: Float32, turn: Float64) -> Float32:
 
 
 def sh_rotations(turn: Float64, degree: int) -> list[Float64]:
-    """Matrices (2 l + 1, 2 l + 1) of the bands l = 0 to `degree`, which rotate SH by Q = `turn`.
+    """Matrices (2 l + 1, 2 l + 1) that rotate the SH bands l = 0 to `degree` by Q = `turn`.
 
-    Each maps the coefficients of a function f(d) to the coefficients of f(Q^T d).
+    Each maps the coefficients c of a function f(d) to the coefficients c' of f(Q^T d).
 
-    Each band is closed under rotation (Wigner 1931), so enough directions d determine the coefficients c' of f(Q^T d):
-    B c' = B_Q c. Rows of B are the basis at d, rows of B_Q the basis at Q^T d. With many directions B has a condition
-    number near 1, and c' is exact to float64 rounding.
+    Each band is closed under rotation (Wigner 1931), so c' follows from values in enough directions d: B c' = B_Q c.
+    Rows of B are the basis at d, rows of B_Q the basis at Q^T d. With many directions B has a condition number near 1,
+    and c' is exact to float64 rounding.
     """
     at = np.arange(64) + 0.5  # Fibonacci points on the sphere
     z, angle = 1 - at / 32, np.pi * (1 + 5**0.5) * at

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Statistics of a model file. A PLY is read in blocks, and values may be non-finite."""
+"""Statistics of a model file, also of one with non-finite values. A PLY is read in blocks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from clsplat.models.formats import Format, resolve
 
 INFO_PERCENTILES = (0, 1, 50, 99, 100)
 MAX_FLOAT64_LOG = 709.0
-"""Largest log scale whose exponential fits float64."""
+"""Largest log scale whose scale fits float64."""
 
 
 class Bounds(TypedDict):
@@ -37,9 +37,9 @@ class Bounds(TypedDict):
 
 
 class ValueStatistics(TypedDict, total=False):
-    """Statistics of the finite Gaussians; empty if there are none.
+    """Statistics of the Gaussians with finite values; empty if there are none.
 
-    scale, opacity: values by the name of the percentile.
+    scale, opacity: percentiles, such as "p50", and their values.
     """
 
     bounds: Bounds
@@ -50,7 +50,8 @@ class ValueStatistics(TypedDict, total=False):
 class ModelStatistics(ValueStatistics):
     """Statistics of all Gaussians.
 
-    sh_degree_used: the highest band with a coefficient other than 0.
+    not_finite, zero_quaternions: numbers of Gaussians with non-finite values, and with a quaternion of 0.
+    sh_degree_used: the highest SH band with a coefficient other than 0.
     """
 
     gaussians: int
@@ -73,17 +74,17 @@ def model_info(path: Path) -> dict[str, Any]:
     result |= {"loses": form.loses} | form.describe(path)
     result |= _summary(blocks, path)
     result["colorspace"] = form.space(path)
-    result["loses"] = result.pop("loses")  # move it to the end
+    result["loses"] = result.pop("loses")  # the last key
     return result
 
 
 def size(path: Path, form: Format) -> int:
-    """Total size of the model's files in bytes."""
+    """Size in bytes of all files of a model."""
     return sum(file.stat().st_size for file in (path, *form.side_files(path)) if is_file(file))
 
 
 def _summary(blocks: Iterator[Gaussians], path: Path) -> ModelStatistics:
-    """Statistics over all blocks. Warns about doubtful values, as loading does.
+    """Statistics over all blocks. Warns about values that look wrongly encoded, like a load of the model.
 
     Means, log scales and opacity logits stay in memory for the percentiles: 28 bytes per Gaussian.
     """
@@ -136,7 +137,7 @@ def _percentiles(values: NDArray[Any]) -> dict[str, float]:
 
 
 def text(info: dict[str, Any]) -> str:
-    """Statistics as text, one line for each."""
+    """The result of `model_info` as text, with a line for each statistic."""
 
     def numbers(values: list[float]) -> str:
         return " ".join(f"{value:.6g}" for value in values)
@@ -147,7 +148,7 @@ def text(info: dict[str, Any]) -> str:
         ("format", ", ".join([info["format"], *details])),
         ("bytes", f"{info['bytes']:,}, {info['bytes'] / max(count, 1):.1f} a Gaussian"),
     ]
-    odd = f", {info['not_finite']:,} not finite, which are left out" if info["not_finite"] else ""
+    odd = f", {info['not_finite']:,} of them not finite and left out" if info["not_finite"] else ""
     odd += f", {info['zero_quaternions']:,} with a quaternion of 0, drawn unrotated" if info["zero_quaternions"] else ""
     lines.append(("Gaussians", f"{count:,}{odd}"))
     used = info["sh_degree_used"]

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models placed in a shot, merged into one model: position, opacity, colour and frame of each over time.
+"""Placement of several models in a shot, and their merging into one model for each frame.
 
-They are merged before rendering, so that their Gaussians sort and blend as in a single model.
+A placement has a transform, an opacity and a colour matrix, which may change over time. Models are merged before
+rendering, so that their Gaussians are sorted and blended together.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ IDENTITY_ROWS = tuple(np.eye(4)[:3].ravel().tolist())
 class Placement:
     """Placement of a model at one time.
 
-    matrix: first three rows of the (4, 4) matrix from the model's world to the shot's.
+    matrix: first three rows of the (4, 4) matrix from the model's world to the shot's, flattened.
     opacity: factor from 0 (hidden) to 1.
-    colour: a colour matrix with its offset column, (3, 4), row by row; empty if colours do not change.
-    frame: frame to take from a `ModelSeries`; None for a static model.
+    colour: colour matrix (3, 3) with an offset as fourth column, flattened; empty if colours do not change.
+    frame: the frame of a `ModelSeries` to use; None for a static model.
     """
 
     matrix: tuple[float, ...] = IDENTITY_ROWS
@@ -45,7 +46,7 @@ class Placement:
         return np.vstack([np.array(self.matrix).reshape(3, 4), (0.0, 0.0, 0.0, 1.0)])
 
     def within(self, outer: Placement) -> Placement:
-        """Placement in the world of an enclosing group, whose own placement is `outer`."""
+        """Placement in the shot's world of a model in a group, whose own placement is `outer`."""
         matrix = self.matrix
         if outer.matrix != IDENTITY_ROWS:
             matrix = rows_of(outer.transform @ self.transform)
@@ -70,17 +71,17 @@ class Track(Protocol):
 
     @property
     def reach(self) -> tuple[float, float] | None:
-        """First and last frame for which the source gives a placement; None for a static model."""
+        """First and last frame for which the track's source has data; None for a static placement."""
 
 
 @dataclass(frozen=True, eq=False)
 class Changing:
-    """`Track` of a model that changes over time: its placements have the frame of the Gaussians."""
+    """`Track` of a `ModelSeries`: the placements of `inner` with their `frame` set."""
 
     inner: Track
 
     def at(self, frame: float) -> Placement:
-        """Placement with the frame of the Gaussians."""
+        """Placement of the inner track, with `frame` as the frame of the series."""
         return replace(self.inner.at(frame), frame=float(frame))
 
     @property
@@ -95,8 +96,7 @@ def rows_of(matrix: Float64) -> tuple[float, ...]:
 
 
 def grade(gain: Float64, offset: Float64, saturation: float) -> tuple[float, ...]:
-    """Colour of a `Placement`: gain (3,), offset (3,), then saturation, as in ASC CDL without power. Empty for the
-    identity."""
+    """`Placement.colour` for gain (3,), offset (3,), then saturation, as in ASC CDL. Empty for the identity."""
     if (gain == 1).all() and (offset == 0).all() and saturation == 1:
         return ()
     spread = saturation * np.eye(3) + (1 - saturation) * np.array(REC709_LUMA_WEIGHTS)
@@ -104,7 +104,7 @@ def grade(gain: Float64, offset: Float64, saturation: float) -> tuple[float, ...
 
 
 def checked(placement: Placement, where: str) -> Placement:
-    """The placement itself. Raises InputError, prefixed with `where`, if its transform is not a similarity."""
+    """Return the placement. Raises InputError, prefixed with `where`, if its transform is not a similarity."""
     try:
         decompose(placement.transform, NODE_SIMILARITY_TOLERANCE)
     except InputError as error:
@@ -113,7 +113,7 @@ def checked(placement: Placement, where: str) -> Placement:
 
 
 def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
-    """Apply the placement to a model. Unchanged arrays keep their bits. Raises InputError like `edit.transform`."""
+    """Apply a placement to a model. Raises InputError like `edit.transform`."""
     moved = gaussians
     if placement.matrix != IDENTITY_ROWS:
         moved = transform(gaussians, placement.transform, NODE_SIMILARITY_TOLERANCE)
@@ -123,12 +123,12 @@ def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
     return faded(moved, placement.opacity)
 
 
-def gone_on(track: Track, frame: float, end: float) -> Placement:
-    """Placement of a track at a frame beyond `end`, the last or first frame of its reach. The track's motion is
-    continued there.
+def extrapolated(track: Track, frame: float, end: float) -> Placement:
+    """Placement of a track at a frame beyond `end`, the last or first frame of its reach.
+
     A fraction of a frame mirrors the motion just before the end. Each further whole frame repeats the last whole-frame
-    step. Cameras continue the same way (`shots.motion`). Opacity and colour come from the track itself. Raises
-    InputError for a transform that is no longer invertible.
+    step, as for cameras (`shots.motion`). Opacity and colour come from the track itself. Raises InputError for a
+    transform that is no longer invertible.
     """
     if (reach := track.reach) is None or reach[0] <= frame <= reach[1]:
         return track.at(frame)
@@ -138,7 +138,7 @@ def gone_on(track: Track, frame: float, end: float) -> Placement:
     for _ in range(steps):
         matrix = _step(now, track.at(end - way)) @ matrix
     rows = now.matrix if np.array_equal(matrix, now.transform) else rows_of(matrix)
-    return checked(replace(place, matrix=rows), f"a model that goes on beyond frame {end:g}")
+    return checked(replace(place, matrix=rows), f"a model that moves on beyond frame {end:g}")
 
 
 def _step(now: Placement, before: Placement) -> Float64:
@@ -154,12 +154,12 @@ def _step(now: Placement, before: Placement) -> Float64:
 
 
 def kind_of(model: Gaussians | ModelSeries) -> Gaussians:
-    """The model itself, or for a `ModelSeries` an empty model with the same rendering flags."""
+    """The model itself; for a `ModelSeries`, an empty model with its rendering flags and near plane."""
     return model.kind if isinstance(model, ModelSeries) else model
 
 
 def near_of(models: Sequence[Gaussians | ModelSeries], state: State) -> float:
-    """Smallest near plane of the models in this state, hidden models included."""
+    """Smallest near plane in world units of the models placed by `state`, hidden models included."""
     return min(
         model.near
         if placement.matrix == IDENTITY_ROWS
@@ -169,8 +169,8 @@ def near_of(models: Sequence[Gaussians | ModelSeries], state: State) -> float:
 
 
 class Ensemble:
-    """All models of a shot merged into one, for consecutive states; unchanged models are reused. Use it from one thread
-    only."""
+    """Merges the models of a shot for consecutive states, and reuses models whose placement is unchanged. Not
+    thread-safe."""
 
     def __init__(self, models: Sequence[Gaussians | ModelSeries]) -> None:
         self.models = tuple(models)
@@ -178,17 +178,17 @@ class Ensemble:
         self._last: tuple[State, Gaussians] | None = None
 
     def at(self, state: State) -> Gaussians:
-        """Models in this state, merged in order. Hidden models stay in, so that each Gaussian keeps its row.
+        """The models placed by `state` and merged in order. Hidden models are included, so each Gaussian keeps its row.
 
-        Asking for the same state again returns the same object.
+        The same state again returns the same object.
         """
         if self._last is None or self._last[0] != state:
-            self._last = None  # frees its memory before the next is allocated
+            self._last = None  # frees its memory before the next model is allocated
             self._last = state, merge([self._one(index, placement) for index, placement in enumerate(state)])
         return self._last[1]
 
     def moved(self, state: State, after: State) -> Gaussians | None:
-        """Gaussians of `state` with their means in the state `after`; None if nothing moves."""
+        """The merged model of `state`, but with the means of the state `after`; None if no model moves."""
         if [(now.matrix, now.frame) for now in state] == [(then.matrix, then.frame) for then in after]:
             return None
         moved = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Triangle meshes as volumes that select the Gaussians inside, from OBJ files and USD stages."""
+"""Triangle meshes from OBJ files and USD stages, as volumes that select the Gaussians inside."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from clsplat.files.documents import open_input
 from clsplat.models.formats.usd import USD_SUFFIXES, open_stage, readable, survive
 
 MAX_MESH_TRIANGLES = 100_000
-"""Largest number of triangles of a volume: each triangle is tested against every Gaussian in the bounding box."""
+"""Largest number of triangles of a mesh, because each is tested against every Gaussian in the bounding box."""
 MAX_MESH_POINTS = 1_000_000
-"""Largest number of points in a file; triangles need not use all points."""
+"""Largest number of points in a file, also of points that no triangle uses."""
 MAX_MESH_FILE_BYTES = 256 << 20
 _MAX_OBJ_LINE_BYTES = 1 << 16
 _MAX_POINT_TRIANGLE_PAIRS = 1 << 21
-"""Point-triangle pairs processed at once."""
+"""Number of point-triangle pairs processed at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +38,10 @@ class Mesh:
     corners: Float64
 
     def holds(self, points: Float64) -> NDArray[np.bool_]:
-        """Mask (n,) of the points (n, 3) inside the mesh.
+        """Mask (n,), True for points (n, 3) inside the mesh.
 
-        Inside means that the generalised winding number exceeds 1/2 in magnitude (Jacobson et al. 2013), so that small
-        holes and reversed orientation do not matter.
+        A point is inside if its generalised winding number exceeds 1/2 in magnitude (Jacobson et al. 2013). Small holes
+        and reversed orientation do not matter.
         """
         inside = np.zeros(len(points), np.bool_)
         low, high = self.corners.min(axis=(0, 1)), self.corners.max(axis=(0, 1))
@@ -49,11 +49,11 @@ class Mesh:
         rows = max(_MAX_POINT_TRIANGLE_PAIRS // len(self.corners), 1)
         for first in range(0, len(near), rows):
             chosen = near[first : first + rows]
-            inside[chosen] = np.abs(self._turns(points[chosen])) > 0.5
+            inside[chosen] = np.abs(self._winding_numbers(points[chosen])) > 0.5
         return inside
 
-    def _turns(self, points: Float64) -> Float64:
-        """Winding numbers (n,): solid angles of the triangles over the full sphere (Van Oosterom and Strackee 1983)."""
+    def _winding_numbers(self, points: Float64) -> Float64:
+        """Winding numbers (n,): solid angle of the triangles over 4 pi (Van Oosterom and Strackee 1983)."""
         a, b, c = (self.corners[None, :, k] - points[:, None] for k in range(3))
         la, lb, lc = (np.linalg.norm(side, axis=2) for side in (a, b, c))
         triple = np.einsum("ijk,ijk->ij", a, np.cross(b, c))
@@ -63,10 +63,10 @@ class Mesh:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read the mesh of an OBJ file, or all meshes of a USD stage at its start time, in the stage's world.
+    """Read the mesh of an OBJ file, or all meshes of a USD stage at its start time, in world coordinates.
 
-    Polygons become triangle fans. Raises InputError for another file type, an unreadable file, and for no triangles or
-    too many.
+    Polygons become triangle fans. Raises InputError for another file type, an unreadable file, and a mesh with no
+    triangles or too many.
     """
     extension = path.suffix.lower()
     if extension == ".obj":
@@ -111,7 +111,7 @@ def _of_obj(path: Path) -> Float64:
 
 
 def _check_counts(path: Path, points: int, triangles: int) -> None:
-    """Raise InputError if there are more triangles or points than the limits allow."""
+    """Raise InputError for more than MAX_MESH_TRIANGLES triangles or MAX_MESH_POINTS points."""
     if triangles > MAX_MESH_TRIANGLES:
         raise InputError(f"{path}: has {triangles:,} triangles or more, expected 1 to {MAX_MESH_TRIANGLES:,}")
     if points > MAX_MESH_POINTS:
@@ -119,10 +119,10 @@ def _check_counts(path: Path, points: int, triangles: int) -> None:
 
 
 def read_here(path: Path) -> Float64:
-    """Corners (T, 3, 3) of a stage as in `read_mesh`, read in this process; only for files that do not crash USD."""
+    """Corners (T, 3, 3) of all meshes of a USD stage, read in this process. A damaged file may crash it (`survive`)."""
     from pxr import UsdGeom, UsdUtils
 
-    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # swallows the diagnostics that USD would print
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # suppresses the messages that USD would print
     found = [np.empty((0, 3, 3))]
     stage = open_stage(path, path)
     with readable(path):
@@ -151,7 +151,7 @@ def _of_prim(path: Path, mesh: Any, time: float, world_from_mesh: Float64) -> Fl
 
 
 def _fans(path: Path, points: Float64, polygons: list[list[int]]) -> Float64:
-    """Corners (T, 3, 3) of the polygons, as triangle fans."""
+    """Corners (T, 3, 3) of polygons that are divided into triangle fans."""
     fans = [(own[0], one, next_one) for own in polygons for one, next_one in pairwise(own[1:])]
     if fans and not 0 <= min(map(min, fans)) <= max(map(max, fans)) < len(points):
         raise InputError(f"{path}: has faces with indices beyond its {len(points):,} points; is it damaged?")

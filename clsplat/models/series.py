@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models that change over time: a file for each frame or the time samples of a stage, interpolated between them."""
+"""Models that change over time: interpolation between samples, from a file per frame or a stage's time samples."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from clsplat.gaussians import Gaussians
 from clsplat.models.edit import take
 
 CACHED_SAMPLES_SINGLE, CACHED_SAMPLES_PAIR = 2, 3
-"""Number of cached samples after a request for one sample, or for two neighbours, including the next one to come."""
+"""Number of samples in memory after a request for one sample, or for two neighbours. One is the next sample."""
 MAX_TRACKED_CHANGE_RATIO = 0.25
-"""Largest ratio, between two samples, of the median change of a row to the median difference of two rows, for which
-each row counts as the same Gaussian in both samples.
+"""Largest ratio at which rows count as tracked, that is, as the same Gaussian in two samples. The ratio is the median
+change of a row between the samples over the median difference of two rows.
 
-Tested separately for means, scales and colours. Tracked models are at a few hundredths. Models trained separately are
-at about 1, for scales even if their Gaussians are sorted by position.
+Means, scales and colours are tested separately. The ratio is a few hundredths in tracked models. It is about 1 in
+models trained separately, for scales even if Gaussians are sorted by position.
 """
 TRACKING_TEST_ROWS = 10_000
-"""Number of evenly spread rows that this test compares."""
+"""Number of evenly spaced rows that the test of tracking compares."""
 
 
 class ModelSeries:
-    """Gaussians that change over time. Thread-safe.
+    """A model that changes over time, given by samples at some frames. Thread-safe.
 
-    At a sample's frame they are that sample. Between two samples they are interpolated, means linearly, if Gaussians
-    keep their rows; otherwise the nearer sample is used. Beyond the ends the end sample is used. Unless `held` is
-    set, its means continue their motion, which is mirrored at the end.
+    Between two samples Gaussians are interpolated, means linearly, if they keep their rows; otherwise the nearer sample
+    is used. Before the first and after the last sample, that sample is used. Unless `held` is set, its means continue
+    to move: their motion before the end is mirrored.
     """
 
     def __init__(
@@ -44,9 +44,9 @@ class ModelSeries:
         """Read the first sample.
 
         frames: frames of the samples, ascending.
-        read: reads the sample at an index; raises InputError.
+        read: function that reads the sample at an index; raises InputError.
         where: prefix of messages.
-        held: keep the means of the end samples beyond the ends.
+        held: keep the means of the first sample before it, and of the last sample after it.
         """
         self.frames, self.where, self.held = tuple(frames), where, held
         self._read = read
@@ -65,7 +65,7 @@ class ModelSeries:
         self._known[0].set_result(first)
 
     def at(self, frame: float) -> Gaussians:
-        """Gaussians at a frame. Raises InputError if a sample cannot be read, or is not drawn like the first."""
+        """Gaussians at a frame. Raises InputError if a sample cannot be read, or has other rendering flags."""
         with self._lock:
             inside = min(max(frame, self.frames[0]), self.frames[-1])
             if inside != frame and not self.held:
@@ -78,25 +78,28 @@ class ModelSeries:
             return between(self._sample(index), self._sample(index + 1), share)
 
     def moved(self, start: float, end: float) -> Gaussians:
-        """Gaussians at `start` with their means at `end`.
+        """Gaussians at the frame `start`, but with their means at the frame `end`.
 
-        If Gaussians do not keep their rows between the two frames, they keep their means, and a warning is given.
+        If Gaussians do not keep their rows between the two frames, means do not change, and a warning says so.
         """
         with self._lock:
             there = self.at(start)
             if not all(map(self._follows, self._sections(start, end))):
-                self._tell_of_no_motion()
+                self._warn_of_no_motion()
                 return there
             return replace(there, means=_means_from(self.at(end), there))
 
     def sources(self, frame: float) -> tuple[int, ...]:
-        """Indices of the samples that a frame depends on; reads none."""
+        """Indices of the samples that a frame depends on. Reads no sample."""
         return tuple(sorted({at for section in self._sections(frame, frame) for at in (section, section + 1)})) or (
             self._place(frame)[0],
         )
 
     def _sections(self, start: float, end: float) -> range:
-        """Intervals between samples that the frames depend on; interval i lies between samples i and i + 1."""
+        """Indices of the intervals that two frames and the motion between them depend on.
+
+        Interval i lies between the samples i and i + 1.
+        """
         (first, _), (last, share) = (self._place(frame) for frame in sorted((start, end)))
         low, high = first, last + (share > 0)
         if not self.held and len(self.frames) > 1:
@@ -105,7 +108,7 @@ class ModelSeries:
         return range(low, high)
 
     def _place(self, frame: float) -> tuple[int, float]:
-        """Last sample at or before a frame, clamped to the ends, and the fraction of the way to the next sample."""
+        """Index of the last sample at or before a frame, and the fraction of the way to the next sample."""
         frame = min(max(frame, self.frames[0]), self.frames[-1])
         index = bisect_right(self.frames, frame) - 1
         if index + 1 == len(self.frames):
@@ -120,20 +123,20 @@ class ModelSeries:
         return replace(now, means=(2 * now.means - _means_from(before, now)).astype(np.float32))
 
     def expect(self, frames: Sequence[float]) -> None:
-        """Announce the frames that will be requested, so that their samples are read ahead."""
+        """Announce frames that will be requested later, so that their samples are read ahead."""
         wanted = {index for frame in frames for index in self.sources(frame)}
         self._wanted = sorted({*self._wanted, *wanted})
 
     def _sample(self, index: int, most: int = CACHED_SAMPLES_PAIR) -> Gaussians:
-        """Get a sample from memory or its file, and start to read the next expected sample.
+        """Return a sample from memory or its file, and start to read the next announced sample.
 
-        most: number of samples to keep in memory; the least recently requested ones are dropped.
+        most: number of samples to keep in memory. The least recently requested samples are dropped.
         """
         future = self._future(index)
         self._known.move_to_end(index)
         later = self._wanted[bisect_right(self._wanted, index) :][:1]
         oldest = [other for other in self._known if other not in (index, *later)]
-        for other in oldest[: max(len({*self._known, *later}) - most, 0)]:  # frees memory before the next is allocated
+        for other in oldest[: max(len({*self._known, *later}) - most, 0)]:  # frees memory before the next is read
             del self._known[other]
         for other in later:
             self._future(other)
@@ -158,16 +161,16 @@ class ModelSeries:
         return sample if sample.near == self.kind.near else replace(sample, near=self.kind.near)
 
     def _follows(self, index: int) -> bool:
-        """True if Gaussians keep their rows from this sample to the next."""
+        """True if Gaussians keep their rows from the sample `index` to the next one."""
         if index not in self._follow:
             self._follow[index] = follows(self._sample(index), self._sample(index + 1))
         return self._follow[index]
 
-    def _tell_of_no_motion(self) -> None:
+    def _warn_of_no_motion(self) -> None:
         if not self._told:
             self._told = True
             warn(
-                f"{self.where}: Gaussians do not keep their numbers from frame to frame; motion channels have "
+                f"{self.where}: Gaussians do not keep their order from frame to frame; motion channels have "
                 "the camera's motion only"
             )
 
@@ -178,7 +181,7 @@ def _alike(model: Gaussians, what: str) -> str:
 
 
 def follows(before: Gaussians, after: Gaussians) -> bool:
-    """True if each row seems to be the same Gaussian in both models."""
+    """True if each row seems to be the same Gaussian in both models (MAX_TRACKED_CHANGE_RATIO)."""
     if len(before) != len(after) or before.sh.shape != after.sh.shape:
         return False
     step = max(len(before) // TRACKING_TEST_ROWS, 1)
@@ -197,7 +200,7 @@ def follows(before: Gaussians, after: Gaussians) -> bool:
 
 
 def between(before: Gaussians, after: Gaussians, share: float) -> Gaussians:
-    """Interpolate two models: means, log scales, logits and SH linearly, rotations by nlerp along the shorter arc.
+    """Interpolate two models: rotations by nlerp along the shorter arc, everything else linearly.
 
     share: fraction of the way from `before` to `after`.
     """

@@ -51,8 +51,8 @@ PARALLEL_MEAN_AXIS_LENGTH = 0.7
 Inverted poses of such cameras may converge by chance.
 """
 CENTRE_RATIO_TOLERANCE = 0.02
-"""Relative tolerance between cx / width and cy / height. If these agree away from 1/2, (cx, cy) is the centre of
-another size."""
+"""Relative tolerance between cx / width and cy / height. If these agree and are not 1/2, (cx, cy) is the centre of a
+picture of another size."""
 FACING_COSINE = np.cos(np.deg2rad(20.0))
 """Cosine of the maximum angle between the optical axis and a point that a camera faces."""
 MAX_EDGE_DISTORTION = 0.5

@@ -26,7 +26,7 @@ from clsplat.images.alpha import associate, unassociate
 from clsplat.images.reading import downscale
 from clsplat.process import undisturbed
 
-with undisturbed():  # importing pycolmap reports Ctrl-C as "not installed"; its SIGTERM handler prints a stack trace
+with undisturbed():  # on Ctrl-C pycolmap's import says "not installed", and its SIGTERM handler prints a stack trace
     import pycolmap
 
 
@@ -37,7 +37,7 @@ MAX_COORDINATE = 1e30
 MIN_FOCAL_PER_SIDE = 1 / 20
 """Minimum plausible focal length, as a fraction of the longer side. A fisheye of 220 degrees has 1/4."""
 MIN_CENTRE_CHECK_SIDE_PX = 16
-"""Minimum shorter side in pixels. Only in smaller pictures may the principal point plausibly lie in the first pixel."""
+"""Minimum shorter side, in pixels, of pictures whose principal point is checked: it must not lie in the first pixel."""
 POINTS_PER_OCCLUSION_CELL = 16
 """Mean number of points in an occlusion cell.
 
@@ -166,8 +166,8 @@ class Lens:
             return Lens(self.model, width, height, (float(width), float(height)))
         sx, sy = width / self.width, height / self.height
         named, _ = lens_models().get(self.model, (LensModel(self.model), None))
-        if named.with_two and abs(sx - sy) * max(self.width, self.height) > 1:
-            model, rest = named.with_two, named.with_two_coefficients
+        if named.two_focal_model and abs(sx - sy) * max(self.width, self.height) > 1:
+            model, rest = named.two_focal_model, named.two_focal_coefficients
             coefficients = [*self.params[3:], *[0.0] * rest][:rest]
             both = (self.params[0], *self.params[:3], *coefficients)
             return replace(self, model=model, params=both).resized(width, height)
@@ -180,7 +180,7 @@ class Lens:
         return replace(self, width=width, height=height, params=tuple(params))
 
     def refocused(self, log: float, x: float, y: float) -> Lens:
-        """Same lens, changed as `Camera.refocused` changes a camera."""
+        """Same lens with focal lengths times exp(log), and principal point shifted by x and y focal lengths."""
         camera, params = self._camera(), list(self.params)
         shift = (x * camera.focal_length_x, y * camera.focal_length_y)
         for index, by in zip(camera.principal_point_idxs(), shift, strict=True):
@@ -199,7 +199,7 @@ class Lens:
         return np.asarray(self._camera().img_from_cam(np.ascontiguousarray(points, np.float64)))
 
     def cam_from_img(self, pixels: Float64) -> Float64:
-        """Intersect the rays of pixels (N, 2) with the plane z = 1, (N, 2); NaN for pixels without a ray."""
+        """Points (N, 2) where the rays of pixels (N, 2) meet the plane z = 1; NaN for pixels without a ray."""
         return np.asarray(self._camera().cam_from_img(np.ascontiguousarray(pixels, np.float64)))
 
     def _camera(self) -> pycolmap.Camera:
@@ -351,7 +351,7 @@ def occlusion_cell(camera: Camera, points: int) -> float:
 
 
 def nearest_around(rows: NDArray[np.int64], columns: NDArray[np.int64], depths: Float64, cell: float) -> Float64:
-    """For each point, the least depth among the points in its cell of `cell` x `cell` pixels, (N,)."""
+    """Least depth (N,) among the points in each point's cell of `cell` x `cell` pixels."""
     across, down = (columns // cell).astype(np.int64), (rows // cell).astype(np.int64)
     cells = down * (across.max(initial=0) + 1) + across
     nearest = np.full(cells.max(initial=0) + 1, np.inf)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 DEPTH_FOLDERS = ("depths", "depth")
 """Names of the depth map folder, next to the photographs' folder or inside it."""
 MIN_DEPTH_FIT_POINTS = 10
-"""Minimum number of a photograph's points to which its relative depth map can be fitted."""
+"""Minimum number of points in a photograph for a fit of its relative depth map."""
 MIN_TRACKED_POINTS_IN_VIEW = 0.1
 """Minimum fraction of tracked points that the scene's cameras project into the photographs of their tracks.
 
@@ -124,10 +124,10 @@ def _check_shape(path: Path, width: int, height: int, lens: Lens) -> None:
 
 
 def _fitted(scene: Scene, known: dict[str, KnownDepth]) -> dict[str, KnownDepth]:
-    """Fit relative maps, whose values grow with nearness, to the points of their photographs. Scale and offset come
-    from medians.
+    """Fit relative maps, which have larger values for nearer points, to the points of their photographs.
 
-    Maps with few points, or with a scale far from the others, are left out; `with_depths` warns of them.
+    Scale and offset come from medians. Maps with few points, or with a scale far from the others, are left out;
+    `with_depths` warns of them.
     """
     points, fits = _tracked(scene, "--depth-maps relative"), {}
     for view in scene.train_views:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layouts of data sets: the kind of a folder, its pictures, and those that are held out or missing."""
+"""Detection of a data set's layout, and reading of its images, with their split and missing pictures."""
 
 from __future__ import annotations
 
@@ -159,8 +159,8 @@ def _warn_of_unlisted(present: Iterable[Path], data: DataSet, listed_in: Path, f
 def _held_out(data: DataSet, path: Path) -> list[PosedImage]:
     """Images with the split from a file of held-out names, if it exists.
 
-    Names are matched as loosely as those in a model (`photo_names.match`). Warns of names that match no picture. Raises
-    InputError if nothing is left to train on.
+    Names are matched like those in a model (`photo_names.match`). Warns of names that match no picture. Raises
+    InputError if no training picture is left.
     """
     path = next((each for each in path.parent.iterdir() if each.name.lower() == path.name), path)
     if not is_file(path):

@@ -32,9 +32,9 @@ from clsplat.scenes.supervision.masks import after_sfm, for_sfm, masks_of
 DEFAULT_MAX_SIDE_PX = 1600
 """Default maximum of the longest side in pixels."""
 MAX_ASPECT_RATIO_CHANGE = 1.5
-"""Maximum ratio between the aspect ratios of a picture and its camera. For 4:3 and 16:9 the ratio is 1.33.
+"""Largest ratio of the aspect ratios of a picture and its camera. For 4:3 and 16:9 the ratio is 1.33.
 
-A file with a larger ratio, or one that is rotated, is taken as another picture.
+A file with a larger ratio, or a rotated file, counts as another picture.
 """
 SIDE_ROUNDING_PX = 2.5
 """Maximum difference in pixels, at the camera's size, that rounding of the sides may cause."""
@@ -162,7 +162,7 @@ def _views(files: _SceneFiles, path: Path, resolution: int, test_views: tuple[in
 
 
 def _held_out(names: Sequence[str], every: int, most: int) -> Sequence[str]:
-    """Every n-th of the sorted names, at most `most` of them, spread evenly. None for `every` 0, all for `most` 0."""
+    """Every `every`-th of the sorted names, no name if that is 0. At most `most`, spread evenly; 0 for no maximum."""
     chosen = names[::every] if every > 0 else []
     if not 0 < most < len(chosen):
         return chosen

@@ -35,8 +35,8 @@ def strays(places: Float64, most: float, least: float = 0.0, middle: Float64 | N
     where a distance is more than OUTLIER_GAP_RATIO times the one before it. Places beyond it are outliers if they are
     more than OUTLIER_DISTANCE_RATIO times as far away as the last place before the gap.
     most: maximum fraction of outliers.
-    least: minimum of the distances to which others are compared, such as the distance of the points that the cameras
-        see. Without it, no place is an outlier if all places but a few coincide.
+    least: lower limit of the distances that others are compared with, such as the distance of the points that the
+        cameras see. If it is 0 and all places but a few coincide, no place is an outlier.
     """
     found = np.zeros(len(places), np.bool_)
     first = len(places) - int(most * len(places))  # number of nearest places, which cannot be outliers

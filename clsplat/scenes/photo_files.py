@@ -83,7 +83,7 @@ def find_pictures(
 def called(listed: str, exact: Path | None, file: Path | None, folder: Path) -> str:
     """Name of a picture in its scene: the listed name, with the file's extension if it has none.
 
-    If the file is in a different number of folders, it is the file's path below `folder`.
+    If the listed name and the file's path have different numbers of folders, it is the file's path below `folder`.
     """
     plain = listed if listed.isprintable() else slashed(legible(listed))
     if file is None or file == exact:
@@ -95,8 +95,7 @@ def called(listed: str, exact: Path | None, file: Path | None, folder: Path) -> 
 
 
 def by_name(folder: Path, present: Collection[Path], used: Sequence[Path]) -> dict[str, Path]:
-    """Pictures without companions, such as masks and depth maps, and without downscaled copies. The keys are paths
-    relative to `folder`."""
+    """Pictures by their path relative to `folder`. Leaves out companions, such as masks, and downscaled copies."""
     aside = companions(present, used, folder)
     copies = {path for path in {path.parent for path in present} if is_smaller_copy(path)}
     kept = (path for path in present if path not in aside and not copies.intersection(path.parents))

@@ -26,7 +26,7 @@ from clsplat.scenes.dataset import Lens, pixels_of, undistort
 from clsplat.scenes.outliers import stray_cameras
 from clsplat.scenes.supervision.depth_samples import KnownDepth
 from clsplat.scenes.supervision.masks import MASK_THRESHOLD, Mask
-from clsplat.scenes.thumbnail import Thumbnail, glance_at
+from clsplat.scenes.thumbnail import Thumbnail, thumbnail_of
 
 Split = Literal["train", "test"]
 FileStamp = tuple[int, int]
@@ -34,23 +34,23 @@ FileStamp = tuple[int, int]
 T = TypeVar("T")
 
 FAR_ORIGIN_RATIO = 64.0
-"""Distance of a scene from the world's origin, in scene sizes, from which means are stored relative to its middle.
+"""Least distance of a scene from the world's origin, in scene sizes, at which means are relative to the scene's middle.
 
 At this distance float32 resolves 64 * 2^-24 of the scene's size, or 1 % of a pixel if the scene is 2600 pixels wide.
 """
 MIN_POINTS_IN_FAR_VIEW, MIN_POINT_SPREAD_IN_FAR_VIEW = 10, 0.08
-"""Minimum number of points in the picture of a distant camera that is no outlier, and their minimum standard deviation
-as a fraction of the width or height.
+"""A distant camera is no outlier if its picture shows at least this many points, and their standard deviation is at
+least this fraction of the width or height.
 
 Such a picture shows the scene from further away, or another reconstructed part of it. Points all over the picture have
 a standard deviation of 0.29. The picture of an outlier shows no points, or has every point in one pixel.
 """
 MIN_FAR_GROUP_NEIGHBOURS = 2
-"""Minimum number of other cameras near a distant camera that form a group with it. Wrong poses are scattered."""
+"""In a scene without points, a distant camera is no outlier if at least this many other cameras are near it."""
 MAX_SAMPLED_PHOTOGRAPHS = 200
 """Maximum number of photographs that findings are based on, in scenes whose photographs are decoded later."""
 SAME_PLACE_TOLERANCE = 1e-12
-"""Distance between cameras, relative to their largest coordinate, up to which they count as in the same place."""
+"""Cameras are in one place if none is farther from their middle than this fraction of their largest coordinate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class View:
                 now = _stamp(path)
             except OSError as error:
                 raise InputError(
-                    f"{path}: could be read when the scene was loaded, now not: {reason_of(error)}"
+                    f"{path}: could be read when the scene was loaded, but not now: {reason_of(error)}"
                 ) from None
             if now != stamp:
                 raise InputError(f"{path}: has been changed or replaced since the scene was loaded")
@@ -123,7 +123,7 @@ class View:
         """Read like `load_masked` at several sizes, (width, height), and decode the file once.
 
         reduce: make each size from the picture at the camera's size, which is quicker than from the file. The result
-        differs by rounding. Pictures of which pixels are left out are always made from the file.
+        differs by rounding. Pictures with masked pixels are always made from the file.
         """
         image, counts = self._read(), None
         if self.mask is not None:
@@ -159,7 +159,7 @@ class View:
         image = self._read()
         if self.mask is not None:
             self.mask.applied(image, orient=self.upright)
-        return glance_at(image)
+        return thumbnail_of(image)
 
     def _read(self) -> Float32:
         image = read_image(self.path, orient=self.upright)
@@ -285,8 +285,8 @@ class Scene:
     def stray_cameras(self) -> frozenset[str]:
         """Names of the views whose cameras are outliers, far from the other cameras and from the points.
 
-        A view is no outlier if its picture shows points over a fair part. In scenes without points, it is no outlier if
-        other cameras are near it.
+        A camera is no outlier if its picture shows points in a fair part of its area. In scenes without points, it is
+        no outlier if other cameras are near it.
         """
         centres = np.stack([view.camera.position for view in self.views])
         middle = np.median(centres, axis=0)

@@ -44,13 +44,12 @@ def bases_of(images: Sequence[Named]) -> list[Path]:
 
 
 def beside(base: Path, names: Sequence[str]) -> Path | None:
-    """Folder inside the folder `base` or next to it that has one of these names, in any case. It may lie outside the
-    scene."""
+    """Folder in `base` or next to `base` with one of these names, in upper or lower case; None if there is none."""
     return next((at for parent in (base, base.parent) if (at := inside(parent, names)) is not None), None)
 
 
 def inside(parent: Path, names: Sequence[str]) -> Path | None:
-    """Folder inside `parent` that matches one of these lower-case names in any case, or None. Earlier names win."""
+    """Folder in `parent` with one of these lower-case names, in any case, or None. Earlier names are preferred."""
     for name in names:
         if (at := parent / name).is_dir():
             return at
@@ -82,9 +81,9 @@ def owned(
     numbered: match mask_0007.png to image_0007.png if no other match is found. The names of all files must differ only
         in their numbers, and so must those of all photographs.
 
-    Exact names are matched first. The remaining files may differ from a name in case, then in the photograph's
-    extension, then in folders, if exactly one photograph fits. Raises InputError for two files of one photograph. If
-    not `strict`, it does so only if both names are exact.
+    Exact names are matched first. In later steps a file may differ from a name in case, then also in the photograph's
+    extension, then also in folders, if it fits exactly one photograph. Raises InputError for two files of a photograph;
+    if not `strict`, only if both names are exact.
     """
     found: dict[str, Path] = {}
     passed = {path.resolve() for path in without}

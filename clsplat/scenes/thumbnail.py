@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float32
 
 THUMBNAIL_SIDE_PX = 96
-"""Maximum longer side in pixels. Findings concern large parts of a picture."""
+"""Maximum longer side in pixels. It suffices, because findings concern large parts of a picture."""
 SHARPNESS_SIDE_PX = 800
 """Longer side in pixels at which sharpness is measured. Blur that is invisible at this size is invisible in training
 too."""
@@ -34,7 +34,7 @@ class Thumbnail:
     sharpness: float
 
 
-def glance_at(image: Float32) -> Thumbnail:
+def thumbnail_of(image: Float32) -> Thumbnail:
     """Thumbnail of a picture (H, W, 3 or 4)."""
     middle = reduced(image[:, :, :3], SHARPNESS_SIDE_PX)
     transparent = float((image[:, :, 3] < 0.5).mean()) if image.shape[2] == 4 else 0.0

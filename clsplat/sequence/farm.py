@@ -32,7 +32,7 @@ from clsplat.version import package_version
 LOCAL_WORKER_THREADS = 2
 """Number of threads of a local worker: one frame is encoded while the next is rendered."""
 MAX_FRAMES_PER_WORKER = 3
-"""Largest number of frames that a worker holds at once, whatever its number of threads."""
+"""Largest number of frames that a worker has in memory at once, also if it has more threads."""
 SCHEDULER_TIMEOUT_SECONDS = 20
 """Seconds within which a scheduler has to answer."""
 NO_WORKERS_WARNING_SECONDS = 10.0

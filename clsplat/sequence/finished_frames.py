@@ -98,9 +98,9 @@ def frames_there(tasks: Sequence[Task], options: RenderOptions, video: VideoConf
     if tasks[0].is_video:
         return _video_there(tasks, options, video)
     states = dict(zip(tasks, _at_once(tasks, lambda task: _state(task, options)), strict=True))
-    if untold := [task.path for task, state in states.items() if state == "untold"]:
+    if unknown := [task.path for task, state in states.items() if state == "unrecorded"]:
         warn(
-            f"--skip-existing: {len(untold)} existing frames have no record of their settings, such as {untold[0]}; "
+            f"--skip-existing: {len(unknown)} existing frames have no record of their settings, such as {unknown[0]}; "
             "they are kept unchecked"
         )
     if changed := [task.path for task, state in states.items() if state == "changed"]:
@@ -108,7 +108,7 @@ def frames_there(tasks: Sequence[Task], options: RenderOptions, video: VideoConf
             f"--skip-existing: {len(changed)} of the frames that are there were made of another model, or with other "
             f"cameras or settings, such as {changed[0]}: they are rendered again"
         )
-    return {task.key for task, state in states.items() if state in ("told", "untold")}
+    return {task.key for task, state in states.items() if state in ("recorded", "unrecorded")}
 
 
 def _state(task: Task, options: RenderOptions) -> Literal["told", "untold", "changed", "missing"]:
@@ -116,7 +116,7 @@ def _state(task: Task, options: RenderOptions) -> Literal["told", "untold", "cha
     or settings. missing: not there, damaged, or of another kind."""
     wanted = _identity(task, options)
     if _is_whole(task, options, wanted):
-        return "untold" if attribute(task.path, SETTINGS_DIGEST_ATTRIBUTE) is None else "told"
+        return "unrecorded" if attribute(task.path, SETTINGS_DIGEST_ATTRIBUTE) is None else "recorded"
     found = {name: attribute(task.path, name) for name in (*IDENTITY_ATTRIBUTES, SETTINGS_DIGEST_ATTRIBUTE)}
     return "changed" if any(value not in (None, wanted.get(name)) for name, value in found.items()) else "missing"
 

@@ -15,7 +15,7 @@ from clsplat.files.documents import digest
 from clsplat.gaussians import Gaussians
 from clsplat.models.formats import colour_space, format_of
 from clsplat.models.formats.usd import USD_SUFFIXES
-from clsplat.models.instances import Changing, Ensemble, Placement, State, Track, gone_on, kind_of, near_of
+from clsplat.models.instances import Changing, Ensemble, Placement, State, Track, extrapolated, kind_of, near_of
 from clsplat.models.series import ModelSeries
 from clsplat.runs.run import model_file
 from clsplat.sequence.numbered import digest_of_name, is_sequence, open_sequence
@@ -113,7 +113,7 @@ class JobModels:
             if end is None:
                 state = [track.at(frame) for track in self.tracks]
             else:
-                state = [gone_on(track, frame, task.number + end) for track in self.tracks]
+                state = [extrapolated(track, frame, task.number + end) for track in self.tracks]
             kept = tuple(known.setdefault(placement, placement) for placement in state)
             states[time] = known.setdefault(kept, kept)  # type: ignore[arg-type, assignment]
         nears = {time: near_of(self.models, state) for time, state in states.items()}

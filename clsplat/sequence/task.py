@@ -384,7 +384,7 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     used = sampling if sampling.on else None
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
-    made += ("far",) if task.camera.far < inf else ()  # older frames of such a camera were not clipped at the far plane
+    made += ("far",) if task.camera.far < inf else ()  # differs from files made before the far plane clipped
     colour = replace(pictures.colour, ocio_config=configuration_digest(pictures.colour.ocio_config))
     if task.holdout is not None:
         made += ("holdout", known_digest(task.holdout), options.holdout)
@@ -401,8 +401,7 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
 
 
 def header(task: Task, options: RenderOptions, whole: Task | None = None) -> FrameFileHeader:
-    """Header of a frame's file: frame, model, version, settings, colour space, and the matrices of a camera that has
-    them.
+    """Header of a frame's file: frame, model, version, settings, colour space, and the camera's matrices, if any.
 
     An EXR file also gets its window, and an attribute that marks a whole panorama.
     whole: the file's task, if the file has other views too.

@@ -42,7 +42,7 @@ from clsplat.sequence.task import (
 Result = tuple[Record, VideoPlanes | None]
 """Record of a frame, and for a frame of a video the planes to encode."""
 WRITE_QUEUE_BYTES = 1 << 30
-"""Target for the main memory of frames that wait to be written. Three frames are held in any case."""
+"""Target for the main memory of frames that wait to be written. At least three frames may wait."""
 ENCODING_COPIES = 3
 """Number of copies of a frame in memory while it is encoded: rendered, assembled, converted."""
 
@@ -131,10 +131,9 @@ def run_tasks(
     """Render the frames, and at the same time write them or add them to the video.
 
     Each renderer has a thread, which takes the next free frame.
-    sharing: claims of frames, if other jobs may render some of these frames meanwhile; their frames are awaited at the
-    end.
-    on_done: called in this thread for each frame when its file is complete, not always in order. For a video it is
-    called in order, when the frame has been encoded. The first error of any thread is raised at the end of all threads.
+    sharing: claims of frames, if other jobs may render some of them meanwhile. Their frames are awaited at the end.
+    on_done: function that is called in this thread for each frame whose file is complete, in any order. For a video it
+    is called in order, when the frame has been encoded. The first error of any thread is raised after all have ended.
     """
     if not tasks:
         return

@@ -33,8 +33,8 @@ BALL_SHRINK_FACTOR = 0.9
 REGION_DETAIL_FRACTION = 0.35
 """Largest fraction of a model's detail that its most detailed region may hold."""
 MAX_SCENE_REGION_RADIUS_RATIO = 0.2
-"""Radius of the most detailed region, relative to the model's, up to which the model is a scene around an object.
-Models of a single object have at least 0.3; a room with a table in the middle has 0.05."""
+"""A model is a scene around an object if the radius of its most detailed region is at most this fraction of the model's
+radius. The fraction is at least 0.3 for a single object, and 0.05 for a room with a table in the middle."""
 MIN_DETAIL_SIZE_QUANTILE, MIN_DETAIL_SIZE_RATIO = 0.02, 1e-4
 """Sizes below which smaller Gaussians do not show more detail: this quantile of all sizes, and this fraction of the
 model's radius. Some files have Gaussians of size 0."""
@@ -72,9 +72,9 @@ def cameras_around(
     up: tuple[float, float, float] = COLMAP_UP,
     size: tuple[int | None, int | None] = (None, None),
 ) -> list[Camera]:
-    """Level pinhole cameras in three rings around a model, or around the most detailed region of a scene, facing its
-    centre.
+    """Level pinhole cameras in three rings around a model, or around the most detailed region of a scene.
 
+    They face its centre.
     up: up direction (3,), of any length but 0. With up along y, the first camera looks along z, as at a COLMAP scene.
     size: width and height in pixels; a side that is None follows from the other at the default aspect ratio.
     Raises InputError for a model without Gaussians.

@@ -122,7 +122,7 @@ def check_pattern(pattern: str) -> None:
 
 
 def output_paths(pattern: str, frames: Sequence[tuple[int, str]]) -> list[Path]:
-    """The file of each frame, given as (number, name).
+    """File paths of frames. frames: number and name of each frame.
 
     Raises InputError if two frames share a file, a file would leave the folder, or the pattern is invalid.
     """

@@ -181,8 +181,8 @@ def _smoothed(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def parabola_weights(reach: int) -> Float64:
-    """Weights (2 reach + 1,) of evenly spaced values that give the centre value of their least-squares parabola
-    (Savitzky and Golay 1964)."""
+    """Savitzky-Golay weights (2 reach + 1,): a weighted sum of evenly spaced values is the centre value of the parabola
+    fitted to them (1964)."""
     offsets = np.arange(-reach, reach + 1)
     scale = 3 / ((2 * reach + 3) * (2 * reach + 1) * (2 * reach - 1))
     return np.asarray(scale * (3 * reach * reach + 3 * reach - 1 - 5 * offsets**2))

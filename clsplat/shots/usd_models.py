@@ -82,7 +82,7 @@ class StageModels:
 def read_stage(path: Path) -> StageModels | None:
     """Read the Gaussians of a stage. Raises InputError.
 
-    Returns None for a stage that is no more than a model: one layer, in which everything is visible and static.
+    Returns None for a stage that is only a model: a single layer, in which everything is visible and static.
     """
     survive(path, "clsplat.shots.usd_models:read_here")
     return read_here(path)
@@ -115,7 +115,7 @@ def read_here(path: Path) -> StageModels | None:
             if own not in known:
                 known[own] = _model_of(path, stage, place.prim, space)
                 _add(sums, place.prim, time)
-            elif place.seat is not None:
+            elif place.instance is not None:
                 sums.update(f"again {list(known).index(own)}\n".encode())
         models = tuple(known[place.prim.GetPath()] for place in places)
         if any(isinstance(model, ModelSeries) for model in models):  # samples are not read yet: digest the files

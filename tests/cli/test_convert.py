@@ -318,7 +318,7 @@ def test_a_file_of_another_kind_than_its_name_says(made: str, name: str, model: 
     said = printed(capsys, ["info", wrong, "--json"])
     kind = formats.format_of(wrong).name
     assert json.loads(said.out)["format"] == kind
-    assert said.err == f"clsplat: warning: {wrong}: is {kind} by its content, whatever its name says\n"
+    assert said.err == f"clsplat: warning: {wrong}: is {kind} by its content, in spite of its name\n"
     assert len(formats.load(model)) == 300
 
 
@@ -378,7 +378,7 @@ def test_info_counts_what_a_reader_leaves_out(model: Path, capsys: Capture) -> N
 
     spoilt(model, change)
     said = printed(capsys, ["info", model]).out
-    assert "300, 3 not finite, which are left out" in said
+    assert "300, 3 of them not finite and left out" in said
     assert "made by hand" in said
     assert "none.ply: no such file" in printed(capsys, ["info", model.with_name("none.ply")], status=2).err
     target = model.with_name("whole.ply")
@@ -481,7 +481,7 @@ def test_what_mip_splatting_adds(model: Path, capsys: Capture) -> None:
     rows = np.frombuffer(data, np.uint8).reshape(300, -1)
     rows = np.concatenate([rows, np.full((300, 1), 0.1, "<f4").view(np.uint8)], axis=1)
     model.write_bytes(head + b"property float filter_3D\nend_header\n" + rows.tobytes())
-    with pytest.warns(UserWarning, match=r"model\.ply: filter_3D, mip-splatting's filter, is ignored; fuse it first"):
+    with pytest.warns(UserWarning, match=r"filter_3D, Mip-Splatting's filter, is ignored; fuse it into the scales"):
         assert len(Gaussians.load(model)) == 300
     assert told(capsys, "info", model)["ignored"] == ["filter_3D"]
 

@@ -115,13 +115,13 @@ def test_a_file_that_another_program_has_open_is_tried_again(monkeypatch: pytest
             raise left.pop()
 
     with pytest.raises(PermissionError):
-        atomic._patiently(act, windows=False)
+        atomic._retry_on_windows(act, windows=False)
     assert len(tries) == 1
-    atomic._patiently(act, windows=True)
+    atomic._retry_on_windows(act, windows=True)
     assert len(tries) == 4
     monkeypatch.setattr(atomic, "WINDOWS_RETRY_SECONDS", 0.05)
     never = raising(PermissionError(errno.EACCES, "in use"))
-    refuses("in use", atomic._patiently, never, windows=True, error=PermissionError)
+    refuses("in use", atomic._retry_on_windows, never, windows=True, error=PermissionError)
 
 
 def test_what_is_flushed_may_be_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

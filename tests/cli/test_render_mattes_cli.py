@@ -226,7 +226,7 @@ def test_skip_existing_sees_the_mattes(folder: Path, tmp_path: Path, capsys: Cap
         ("--channels semantic", "a.ply", "--channels semantic: expected --channels semantic and --ids-from together"),
         ("--channels rgb --ids-from x", "a.ply", "--ids-from x: expected --channels semantic"),
         ("--channels semantic --ids-from label", "a.ply", "a.ply: PLY has no property label, expected one of x, y"),
-        ("--channels semantic --ids-from opacity", "a.ply", "the property opacity holds other values than whole"),
+        ("--channels semantic --ids-from opacity", "a.ply", "the property opacity has values that are not whole"),
         ("--channels objects --compression dwaa", "a.ply", "--compression dwaa: changes the ids of --channels objects"),
         ("--channels rgb,alpha,objects --deep", "a.ply", "objects"),
     ],

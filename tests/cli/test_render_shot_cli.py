@@ -338,7 +338,7 @@ def test_wrong_shots_are_one_line(
     [
         ("1,2", "expected 16 numbers with commas, found '1,2'"),
         ("spin=1", "'spin' is not known, expected steps of translate, rotate, scale"),
-        ("scale=0", "a transform that cannot be undone"),
+        ("scale=0", "a transform that is not invertible"),
         ("rotate=1,2", "expected 3 numbers"),
         ("none.json", "no such file"),
     ],

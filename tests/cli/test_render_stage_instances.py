@@ -235,4 +235,4 @@ def test_wrong_instancers_are_one_line(tmp_path: Path, capsys: Capture) -> None:
     stage = new_stage(tmp_path, "none")
     with_model(stage, "/Forest/Tree")
     instancer(stage, "/Forest", ["/Forest/Tree"], [])
-    assert "has no ParticleField3DGaussianSplat in it that is drawn" in error_of(stage)
+    assert "has no ParticleField3DGaussianSplat that is drawn" in error_of(stage)

@@ -74,7 +74,7 @@ def test_levels_of_which_it_cannot_be_known(tmp_path: Path) -> None:
     path, model = tmp_path / "model.ply", lopsided(400, degree=0)
     model.opacity_logits = np.arange(400, dtype=np.float32) % 36
     model.save(path)
-    with pytest.raises(InputError, match=r"up to 35, expected .* these may be percentages or levels of 255$"):
+    with pytest.raises(InputError, match=r"up to 35, expected .* these may be percentages or levels from 0 to 255$"):
         formats.load(path, activated="opacities")
 
 
@@ -134,7 +134,7 @@ def test_info_counts_quaternions_of_0(tmp_path: Path, capsys: Capture) -> None:
     figures = model_info(path)
     assert (figures["not_finite"], figures["zero_quaternions"]) == (2, 1)
     said = printed(capsys, ["info", path]).out
-    assert "20, 2 not finite, which are left out, 1 with a quaternion of 0, drawn unrotated" in said
+    assert "20, 2 of them not finite and left out, 1 with a quaternion of 0, drawn unrotated" in said
     random_gaussians(20, 0).save(path)
     assert model_info(path)["zero_quaternions"] == 0
     assert "quaternion" not in printed(capsys, ["info", path]).out

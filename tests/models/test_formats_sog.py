@@ -296,7 +296,7 @@ def test_null_is_what_json_has_no_number_for(tmp_path: Path) -> None:
     flat = plain.log_scales == plain.log_scales[5, 2]
     users = flat.any(axis=1).sum()
     assert users < 30
-    read = warned(f"has null in place of 1 of 256 numbers, which {users} of 300 Gaussians use", formats.load, path)
+    read = warned(f"null in place of 1 of 256 numbers, which give {users} of 300 Gaussians", formats.load, path)
     wanted = np.where(flat, np.float32(np.log(packing.MIN_SCALE)), plain.log_scales)
     np.testing.assert_array_equal(read.log_scales, wanted)
     colour = int(np.abs(np.array(meta["sh0"]["codebook"]) - plain.sh[7, 0, 1]).argmin())

@@ -119,7 +119,7 @@ def test_moved_means() -> None:
         assert_same_bits(moved.means, made.at(end).means)
         assert_same_bits(moved.sh, made.at(start).sh)
     without = series(read=apart)
-    assert_same(warned("capture.####.ply: Gaussians do not keep their numbers", without.moved, 2, 3), apart(1))
+    assert_same(warned("capture.####.ply: Gaussians do not keep their order", without.moved, 2, 3), apart(1))
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # it is told once
         assert_same(without.moved(3, 4), apart(2))

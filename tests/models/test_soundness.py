@@ -322,7 +322,7 @@ def test_negative_scales_are_logs(tmp_path: Path, file: str, offset: float, monk
     read, texts = told(path)
     np.testing.assert_array_equal(read.log_scales, model.log_scales)
     assert len(texts) == 1
-    assert "have a negative one: all are read as logs of scales, though this format holds scales" in texts[0]
+    assert "have a negative one: all are read as logs of scales, although this format stores scales" in texts[0]
     few = np.exp(model.log_scales)
     few[7, 2] = -1
     with pytest.raises(InputError, match=r"Gaussian 7 has the scales .* -1, expected .* at least 0; 1 of 300 has"):
@@ -339,7 +339,7 @@ def test_a_kernel_that_is_not_known_is_drawn_as_an_ellipse(tmp_path: Path, kerne
     path.write_text(json.dumps(document))
     read, texts = told(path)
     assert only(texts).startswith(
-        f"primitive 0 of node 0 has the kernel {str(kernel)!r}, expected ellipse; it is drawn as one"
+        f"primitive 0 of node 0 has the kernel {str(kernel)!r}, expected ellipse; it is drawn as an ellipse"
     )
     assert_equal(read, wanted)
 

@@ -92,11 +92,11 @@ def test_what_is_wrong_with_the_model_names_the_archive(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("files", "message"),
     [
-        ({"1.ply": b"ply scale_0", "b/2.SPLAT": b"x"}, r"holds 2 model files \(1\.ply, b/2\.SPLAT\), expected one"),
-        ({f"{i}.ply": b"ply" for i in range(5)}, r"holds 5 model files \(0\.ply, 1\.ply, 2\.ply and 2 more\), exp"),
-        ({"readme.txt": b"x", "__MACOSX/._a.ply": b"x"}, "holds 0 model files, expected one"),
-        ({"a.zip": b"PK"}, "holds 0 model files, expected one"),
-        ({}, "holds 0 model files, expected one"),
+        ({"1.ply": b"ply scale_0", "b/2.SPLAT": b"x"}, r"contains 2 model files \(1\.ply, b/2\.SPLAT\), expected one"),
+        ({f"{i}.ply": b"ply" for i in range(5)}, r"contains 5 model files \(0\.ply, 1\.ply, 2\.ply and 2 more\), exp"),
+        ({"readme.txt": b"x", "__MACOSX/._a.ply": b"x"}, "contains 0 model files, expected one"),
+        ({"a.zip": b"PK"}, "contains 0 model files, expected one"),
+        ({}, "contains 0 model files, expected one"),
         ({"a.ply": b"not one"}, r"a\.ply: not a PLY file"),
         ({"a.splat": b""}, r"a\.splat: has 0 bytes"),
     ],
@@ -147,7 +147,7 @@ def test_the_files_of_an_archive_tell_what_it_is(tmp_path: Path, name: str) -> N
     path = tmp_path / "model.ply"
     formats.save(path, random_gaussians(3, 0))
     other = packed(tmp_path / name, {"a/model.ply": path.read_bytes(), "a/meta.json": b'{"title": "a scan"}'})
-    read = warned(rf"{name}: is zipped model by its content, whatever its name", formats.load, other)
+    read = warned(rf"{name}: is zipped model by its content, in spite of its name", formats.load, other)
     np.testing.assert_array_equal(read.means, formats.load(path).means)
     with no_warnings():
         np.testing.assert_array_equal(formats.load(other.rename(tmp_path / "m.ZIP")).means, formats.load(path).means)
@@ -167,8 +167,8 @@ def test_an_archive_of_sog_is_one_by_any_name(tmp_path: Path) -> None:
         with no_warnings():
             assert_equal(formats.load(packed(tmp_path / name, files)), wanted)
     empty = packed(tmp_path / "none.sog", {"readme.txt": b"x"})
-    refuses(r"has no meta\.json in it", formats.load, empty)
-    with pytest.raises(InputError, match=r"meta\.json has no means, expected that of a SOG model"):
+    refuses(r"does not contain meta\.json", formats.load, empty)
+    with pytest.raises(InputError, match=r"meta\.json has no key 'means', expected the meta\.json of a SOG model"):
         formats.load(packed(empty, {"meta.json": b'{"title": "a scan"}'}))
 
 
@@ -189,4 +189,4 @@ def test_files_without_gaussians_are_no_models(tmp_path: Path, name: str, beside
     with no_warnings():
         assert_equal(formats.load(archive), formats.load(path))
     both = packed(tmp_path / "two.zip", {f"{at}/{name}": path.read_bytes() for at in (7000, 30000)} | beside)
-    refuses(rf"holds 2 model files \(7000/{name}, 30000/{name}\)", formats.load, both)
+    refuses(rf"contains 2 model files \(7000/{name}, 30000/{name}\)", formats.load, both)

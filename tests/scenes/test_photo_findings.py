@@ -32,7 +32,7 @@ from clsplat.scenes.analysis.recommendations import (
 from clsplat.scenes.dataset import Lens
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene, View
-from clsplat.scenes.thumbnail import Thumbnail, glance_at, sharpness_of
+from clsplat.scenes.thumbnail import Thumbnail, sharpness_of, thumbnail_of
 
 ACROSS, DOWN = 96, 64
 
@@ -403,7 +403,7 @@ def test_auto_takes_what_answers(tmp_path: Path, capfd: Capture) -> None:
 def test_a_glance_is_small_and_true() -> None:
     image = np.zeros((640, 960, 4), np.float32)
     image[:, 480:] = 1
-    glance = glance_at(image)
+    glance = thumbnail_of(image)
     assert glance.pixels.shape == (64, 96, 3)
     assert (glance.pixels[:, :48] == 0).all()
     assert (glance.pixels[:, 48:] == 1).all()

@@ -22,7 +22,7 @@ from clsplat.config.pictures import PictureConfig, SamplingConfig
 from clsplat.images.frame_files import camera_matrices
 from clsplat.models import edit
 from clsplat.models.formats import usd
-from clsplat.models.instances import Placement, gone_on, rows_of
+from clsplat.models.instances import Placement, extrapolated, rows_of
 from clsplat.sequence.job_models import load_cast
 from clsplat.sequence.task import RenderOptions, Task, camera_after, camera_before, header, make_tasks, model_times
 from clsplat.shots import Shot, read_shot
@@ -135,12 +135,12 @@ def test_a_turntable_turns_on() -> None:
     track = KeyedTrack("here", {"matrix": AnimatedProperty(frames, rows)})
     for end, beyond in ((3, (3.25, 4, 4.5, 6)), (0, (-0.25, -1, -1.5, -3))):
         for frame in beyond:
-            np.testing.assert_allclose(gone_on(track, frame, end).transform, spinning(frame), atol=1e-12)
-    assert gone_on(track, 2.5, 2) == track.at(2.5)  # its keys say more
+            np.testing.assert_allclose(extrapolated(track, frame, end).transform, spinning(frame), atol=1e-12)
+    assert extrapolated(track, 2.5, 2) == track.at(2.5)  # its keys say more
     still = KeyedTrack("here", {"matrix": AnimatedProperty(np.array([0.0, 1.0]), rows[[5, 5]])})
-    assert gone_on(still, 7, 3) == Placement(rows_of(spinning(frames[5])))
+    assert extrapolated(still, 7, 3) == Placement(rows_of(spinning(frames[5])))
     held = replace(track, held=True)
-    assert gone_on(held, 3.5, 3) == held.at(3)
+    assert extrapolated(held, 3.5, 3) == held.at(3)
     both = Within(KeyedTrack("here", {"translate": AnimatedProperty(np.array([-2.0, 1.0]), np.zeros((2, 3)))}), track)
     assert (both.reach, Within(KeyedTrack(""), KeyedTrack("")).reach) == ((-2, 3), None)
 

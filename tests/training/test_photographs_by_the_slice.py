@@ -373,7 +373,7 @@ def replaced(path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (removed, "could be read when the scene was loaded, now not: there is no such file"),
+        (removed, "could be read when the scene was loaded, but not now: there is no such file"),
         pytest.param(cut, "has been changed or replaced since the scene was loaded", marks=pytest.mark.slow),
         pytest.param(replaced, "has been changed or replaced since the scene was loaded", marks=pytest.mark.slow),
     ],

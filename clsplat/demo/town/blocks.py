@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The city blocks of an endless grid. A block depends on the seed and its two indices alone.
 
-A block has its corner at the crossing of two streets. x and y are along the streets, and the ground is z = 0.
+A block's corner is at the crossing of two streets. x and y are along the streets, and the ground is z = 0.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _BLOCKS_KEPT = 512
 
 @dataclass(eq=False)
 class CityBlock:
-    """A block of the world.
+    """A block of the town.
 
     i, j: its indices along x and y.
     solids: its solids, in metres from its corner.

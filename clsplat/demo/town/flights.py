@@ -20,11 +20,11 @@ from clsplat.scenes.dataset import Lens
 from clsplat.shots.viewpoints import look_at
 
 AIR_VIEW_RADIANS, STREET_VIEW_RADIANS = math.radians(62.0), math.radians(78.0)
-"""Angles of view across the longer side."""
+"""Angles of view across the longer side, of the flights and in the streets."""
 STRAIGHT_FLIGHT_METRES, SLANTED_FLIGHT_METRES, CAR_CAMERA_METRES = 55.0, 48.0, 2.4
-"""Heights of the cameras."""
+"""Heights of the cameras above the ground: straight down, oblique, and on a car."""
 SLANT_RADIANS = math.radians(40.0)
-"""Angle of the slanted flights' axes below the horizon."""
+"""Angle of the oblique cameras' axes below the horizon."""
 TOWN_FISHEYE_COEFFICIENTS = (-0.02, 0.0005, 0.0, 0.0)
 STRAIGHT_SHARE, STREET_SHARE = 0.3, 0.3
 """Fractions of a block's photographs that look straight down, and that are taken in streets. The rest is slanted."""
@@ -112,7 +112,7 @@ def _straight(count: int, generator: np.random.Generator) -> list[Row]:
 
 
 def _slanted(count: int, generator: np.random.Generator) -> list[Row]:
-    """Four flights that look at the block from four sides."""
+    """Photographs of four oblique flights, which look in four directions."""
     rows, down = [], math.tan(SLANT_RADIANS)
     for side, forward in enumerate(DIRECTIONS):
         some = len(range(side, count, 4))

@@ -35,7 +35,7 @@ BAND_PIXELS = 1 << 16
 POINT_METRES = 130.0
 """Distance up to which points are observed."""
 FREE_METRES = 9.0
-"""Distance from the camera within which there is no moving car."""
+"""Least distance of moving cars from the camera."""
 TONE = np.float32(1 / 1.6)
 """Exponent of the tone curve."""
 
@@ -58,10 +58,11 @@ class Observations:
 
 @dataclass(eq=False)
 class TakenPhotograph:
-    """A photograph.
+    """A photograph of the town.
 
     pixels: (height, width, 3) float32 in [0, 1].
-    mask: (height, width), True for pixels that count; None without moving cars.
+    mask: (height, width), False for pixels of moving cars; None without moving cars.
+    seen: the observed points.
     """
 
     pixels: Float32
@@ -70,7 +71,7 @@ class TakenPhotograph:
 
 
 def take(config: TownConfig, photograph: TownPhotograph) -> TakenPhotograph:
-    """Take a photograph. Each pixel is the mean of four rays; it is shaded once if all meet the same surface."""
+    """Take a photograph. A pixel is the mean of four rays, but is shaded once if all four meet the same surface."""
     camera = photograph.camera
     blocks = blocks_in_sight(config.seed, camera)
     moving = len(blocks)
@@ -115,7 +116,7 @@ def _shaded(camera: Camera, shader: Shader, sight: Sight, first: int, last: int)
 
 
 def _moving_cars(config: TownConfig, photograph: TownPhotograph) -> CityBlock:
-    """The cars that pass while the photograph is taken, in the streets of its block and of the eight around it."""
+    """The moving cars in a photograph, as a block: in the streets of its block and of the eight blocks around it."""
     generator = block_generator(config.seed, 5, photograph.i, photograph.j, photograph.index)
     builder = Builder()
     corner = np.array([photograph.i, photograph.j]) * BLOCK_METRES
@@ -178,7 +179,7 @@ class _Candidates:
         self._seen[rows] = surfaces[sample, row - first, column] == self._surfaces[rows]
 
     def observations(self, pixels: Float32, mask: Bool | None) -> Observations:
-        """The points that the photograph shows, outside masks."""
+        """The visible points outside the mask's excluded pixels."""
         column, row = np.floor(self._pixels).astype(np.int64).T
         seen = self._seen if mask is None else self._seen & mask[row, column]
         colours = np.rint(pixels[row[seen], column[seen]] * 255).astype(np.uint8)

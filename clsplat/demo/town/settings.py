@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The settings of a town, and the rules for them."""
+"""The settings of a town, and their checks."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ MAX_TOWN_ORIGIN_METRES = 1e8
 class TownConfig:
     """A town's settings.
 
-    columns, rows: number of photographed blocks along x and y. The world itself has no end.
+    columns, rows: number of photographed blocks along x and y. The town itself is endless.
     photos: number of photographs of each block.
     width, height: size of a photograph in pixels. A panorama has half its width as height.
-    seed: seed of the world, of the cameras and of all noise.
-    rig: cameras in the streets.
+    seed: seed of the town, of the cameras and of all noise.
+    rig: kind of the cameras in the streets.
     exposure: largest change of exposure between flights, in stops.
     cars: number of moving cars in each block.
     origin: world coordinates of the corner of block (0, 0), in metres.
-    pose_noise: standard deviation of the written camera positions along each axis, in metres.
+    pose_noise: standard deviation of the error of written camera positions, along each axis, in metres.
     """
 
     columns: int
@@ -87,7 +87,7 @@ class TownConfig:
                 raise InputError(f"--{flag} {value}: expected {expected}")
 
     def record(self) -> dict[str, Any]:
-        """The settings, for JSON."""
+        """The settings as a JSON object."""
         return asdict(self) | {"origin": list(self.origin)}
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colours of the surfaces that rays of a photograph meet: textures, light and haze."""
+"""Shading of the rays of a photograph: textures, light and haze."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ class Shader:
         inner = np.minimum(_to_street(fx), _to_street(fy))
         lot_x, lot_y = ((place - PAVEMENT_METRES) * np.float32(1 / LOT_METRES) for place in (fx, fy))
         lot = np.clip(lot_x, 0, 2.5).astype(np.int64) + 3 * np.clip(lot_y, 0, 2.5).astype(np.int64)
-        far = np.abs(column) + np.abs(row) > 1e6  # towards the horizon, where haze hides all
+        far = np.abs(column) + np.abs(row) > 1e6  # near the horizon, where haze hides everything
         column, row = (
             np.where(far, 0, column).astype(np.int64) + first[0],
             np.where(far, 0, row).astype(np.int64) + first[1],
@@ -171,7 +171,7 @@ class Shader:
         return texture.astype(np.int32), tint
 
     def near_ground_seam(self, directions: Float32) -> Bool:
-        """True for rays (n,) to the ground within a pixel of the seam of two materials."""
+        """True (n,) for rays to the ground that meet it within a pixel of a seam between two materials."""
         x, y, z = directions.T
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             depth = np.float32(-self.position[2]) / z
@@ -232,7 +232,7 @@ def _mark_streets(colours: Float32, fx: Float32, fy: Float32, width: Float32) ->
 
 
 def _band(place: Float32, middle: float, half: float, width: Float32) -> Float32:
-    """Share of a pixel of this width that lies within `half` of the middle."""
+    """Fraction (n,) of a pixel, of this width at `place`, that is within `half` of `middle`."""
     away = np.abs(place - np.float32(middle))
     low = np.maximum(away - width / 2, -half)
     return np.asarray(np.clip((np.minimum(away + width / 2, half) - low) / width, 0, 1))

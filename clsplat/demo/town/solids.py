@@ -46,8 +46,8 @@ class Cover:
     texture: index of its texture.
     metres: length of a side of the texture.
     tint: factors of red, green and blue.
-    shift: offset of the texture, in sides.
-    darkness: share of the light that is missing at the ground.
+    shift: offset of the texture, as a fraction of its side.
+    darkness: fraction of the light that is missing at the ground.
     """
 
     texture: int
@@ -117,8 +117,8 @@ class Builder:
     def roof(self, base: Triple, half: Triple, slope: Cover, gable: Cover, turn: float = 0.0) -> None:
         """Add a roof with a ridge along x.
 
-        base: the middle of its base.
-        half: half its length and width, and its height.
+        base: middle of its base.
+        half: half of its length, half of its width, and its height.
         """
         self._rows.append(_Row(SOLID_ROOF, base, half, turn, gable, slope))
 
@@ -142,7 +142,7 @@ class Builder:
 
 
 def about_z(vectors: Float64, turns: Float64) -> Float64:
-    """Vectors (n, 3), turned about z. turns: (n, 2), cosines and sines."""
+    """Rotate vectors (n, 3) about z. turns: (n, 2), cosines and sines."""
     x, y, z = vectors.T
     c, s = turns.T
     return np.stack([c * x - s * y, s * x + c * y, z], axis=1)
@@ -188,9 +188,9 @@ def _faces(solids: Solids, sides: list[Cover], tops: list[Cover]) -> Float64:
 def _fill(
     rows: Float64, place: tuple[Float64, Float64, Float64], along: tuple[Float64, Float64], covers: Float64
 ) -> None:
-    """Fill the same face of all solids, in place.
+    """Fill one face of all solids in the table of faces, in place.
 
-    place: normals, points on the planes and the points where textures begin, (n, 3) each.
+    place: normals, points on the planes, and origins of the textures, (n, 3) each.
     along: directions to the right and up in the textures, (n, 3) each.
     covers: (n, 8), rows of `Cover.numbers`.
     """

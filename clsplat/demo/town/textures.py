@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Textures that all houses of a town share, with mip levels, and the sky with its ring of hills.
+"""The textures of a town, with mip levels, and the sky with its ring of hills.
 
-Each texture repeats in both directions. A face of a house chooses one, with an offset and a tint of its own, so that
-memory does not grow with the town.
+All houses share them, so memory does not grow with the town. Each texture repeats in both directions. A face has the
+index of a texture, an offset and a tint.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from clsplat.arrays import Float32
 
 TEXTURE_SIDE = 512
 TEXTURE_LEVELS = 10
-"""Mip levels, from TEXTURE_SIDE texels a side to one."""
+"""Number of mip levels, from TEXTURE_SIDE texels a side to one texel."""
 FACADES, ROOFS = range(9), range(9, 14)
 ASPHALT, PAVEMENT, GRASS, GRAVEL, SOIL, PAVING = range(14, 20)
 LEAVES, BARK, PLAIN = range(20, 22), 22, 23
@@ -36,9 +36,9 @@ _LEVEL_STARTS = np.concatenate([[0], np.cumsum(_LEVEL_SIDES**2)]).astype(np.int3
 
 
 class Brush:
-    """Random numbers and noise for one texture. The textures of a town share their noise, each at its own offset.
+    """Random numbers and noise for one texture. Textures of a town share noise fields, each at its own offset.
 
-    fields: noise by its parameters, filled as needed.
+    fields: the shared noise fields by their parameters, computed as needed.
     """
 
     def __init__(
@@ -216,7 +216,7 @@ def _packed(image: Pixels) -> NDArray[np.uint32]:
 
 
 def _levels(image: Pixels) -> NDArray[np.uint32]:
-    """All mip levels of a texture in one row, from the finest. Each texel is the mean of four of the level before."""
+    """All mip levels of a texture in one row, finest first. A texel is the mean of four texels of the finer level."""
     rows = [_packed(image).ravel()]
     while len(image) > 1:
         image = 0.25 * (image[::2, ::2] + image[1::2, ::2] + image[::2, 1::2] + image[1::2, 1::2])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rays of a town photograph's pixels, and the parts of the picture that boxes may cover, for each projection."""
+"""Rays of a photograph's pixels, and screen rectangles of boxes, for each projection."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ _EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).
 
 
 def _flat_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
-    """Left, right, top and bottom (n, 4) in pixels, of the parts of boxes in front of a perspective camera."""
+    """Left, right, top and bottom (n, 4), in pixels, of the parts of boxes in front of a perspective camera."""
     corners = np.where(_CORNERS, high[:, None], low[:, None]) @ camera.rotation.T
     begins, ends = corners[:, _EDGES[:, 0]], corners[:, _EDGES[:, 1]]
     rise = ends[..., 2] - begins[..., 2]
@@ -113,7 +113,7 @@ def _flat_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
 
 
 def _cones(low: Float64, high: Float64) -> tuple[Float64, Float64]:
-    """Middle (n, 3) of each box, and the angle (n,) of the cone around it as seen from the origin."""
+    """Cones from the origin around boxes: axis (n, 3), to the box's middle, and angle (n,) between axis and edge."""
     middle, radius = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2
     distance = np.linalg.norm(middle, axis=1)
     inside = distance <= radius * 1.001
@@ -166,7 +166,7 @@ def _fisheye_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
 
 
 def _fisheye_radius(radial: tuple[float, ...], theta: Float64) -> Float64:
-    """Distances from the picture's centre, in focal lengths, of angles from the axis: (18) of docs/cameras.md.
+    """Image radii, in focal lengths, at angles `theta` from the axis: eq. (18) of docs/cameras.md.
 
     With the town's coefficients they increase up to 180 degrees, so that every direction has a place in the picture.
     """

@@ -29,11 +29,11 @@ from clsplat.demo.town.solids import FACES_PER_SOLID, SOLID_BALL, SOLID_BOX
 from clsplat.demo.town.view_rays import rectangles, world_rays
 
 SIGHT_METRES = 300.0
-"""Distance beyond which blocks are not cast: haze hides them."""
+"""Distance beyond which blocks are not cast, because haze hides them."""
 
 
 def blocks_in_sight(seed: int, camera: Camera) -> list[CityBlock]:
-    """Blocks within SIGHT_METRES of a camera that may be in its picture, the nearest first."""
+    """Blocks within SIGHT_METRES of a camera that may be in its picture, nearest first."""
     position, reach = camera.position, int(np.ceil(SIGHT_METRES / BLOCK_METRES))
     i, j = (int(np.floor(value / BLOCK_METRES)) for value in position[:2])
     around = np.arange(-reach, reach + 1)
@@ -66,7 +66,7 @@ Slices = tuple[slice, slice, slice]
 
 
 class _Part(NamedTuple):
-    """A part of the picture that a box may cover. A box that crosses the edge of a panorama has two.
+    """A screen rectangle of a box. A box that crosses the edge of a panorama has two.
 
     box: number of the box.
     near: distance of the box in metres.
@@ -137,7 +137,7 @@ def _placed(camera: Camera, low: Float64, high: Float64) -> list[_Part]:
 
 
 def _nearest(low: Float64, high: Float64) -> Float64:
-    """Distance (n,) of boxes from the origin."""
+    """Distances (n,) of boxes from the origin."""
     return np.asarray(np.linalg.norm(np.maximum(np.maximum(low, -high), 0), axis=1))
 
 
@@ -251,7 +251,7 @@ class _Rays:
 
 
 def _slab(over: Float32, start: np.float32, half: np.float32) -> tuple[Float32, Float32]:
-    """Distances at which rays enter and leave the space between two planes at +-half from the origin."""
+    """Distances at which rays enter and leave the slab between two planes at +-half from the origin."""
     middle = over * -start
     reach = np.abs(over)
     reach *= half

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A town as a COLMAP scene: its photographs, masks, cameras and points with tracks."""
+"""Writing of a town as a COLMAP scene: photographs, masks, cameras, and points with tracks."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ from clsplat.progress import CountedFraction, Progress, no_progress
 from clsplat.scenes.dataset import Lens
 
 TOWN_RECORD_FILE = "town.json"
-"""File in a town's folder with its settings. It marks the folder as one that may be replaced."""
+"""File with the settings in a town's folder. A folder with this file may be replaced."""
 EXACT_POSES_FOLDER = "exact"
-"""Folder with the exact cameras, a COLMAP model without points, if the written ones are noisy."""
+"""Folder with the exact cameras, a COLMAP model without points. It is written if the scene's cameras are noisy."""
 MAX_TOWN_WORKERS = 8
-"""Largest number of threads if none is given. More would wait for the interpreter's lock, and take more memory."""
+"""Largest default number of threads. More would wait for the interpreter's lock, and take more memory."""
 MIN_TRACK_LENGTH = 2
 """Smallest number of photographs that show a point of the scene."""
 
@@ -58,8 +58,8 @@ def write_town(
 ) -> dict[str, Any]:
     """Write a town to the folder `output`. Returns its record, as in TOWN_RECORD_FILE.
 
-    The folder has `images/`, `masks/` with moving cars, and `sparse/0/`. It is created when all files are complete.
-    Equal settings give equal bytes, and a larger town has the photographs of a smaller one.
+    The folder has `images/`, `sparse/0/`, and `masks/` if there are moving cars. It is created when all files are
+    complete. Equal settings give equal bytes, and a larger town includes the photographs of a smaller one.
 
     overwrite: replace an earlier town.
     workers: number of threads, which changes no bytes; None for one per core, up to MAX_TOWN_WORKERS.
@@ -166,7 +166,7 @@ def _image(config: TownConfig, shot: TownPhotograph, air: Lens, error: Float64) 
 
 
 def _tracks(config: TownConfig, seen: Sequence[Observations]) -> tuple[ModelPoints, list[NDArray[np.uint64]]]:
-    """Points with their tracks, and for each photograph the numbers of its observations' points."""
+    """Points with their tracks, and for each photograph the point numbers (k,) of its observations."""
     lengths = np.array([len(each.points) for each in seen])
     rows = np.concatenate([np.column_stack([each.blocks, each.points]) for each in seen])
     known, inverse, counts = np.unique(rows, axis=0, return_inverse=True, return_counts=True)

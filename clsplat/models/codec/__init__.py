@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Values, axes and byte layouts that several model formats share."""
+"""Conversion of values, axes and byte layouts, for several model formats."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Words in file headers that tell if a model is antialiased, which means trained with Mip-Splatting's low-pass filter.
+"""Recognition of antialiased models, trained with Mip-Splatting's low-pass filter, by words in file headers.
 
-A header line counts if it is a key and a value and nothing else:
+A header line counts if it has only a key and a value:
 
 - `SplatRenderMode: mip` of Brush (https://github.com/ArthurBrussee/brush).
 - `antialiased 1` of Postshot.
@@ -10,9 +10,9 @@ A header line counts if it is a key and a value and nothing else:
 
 A colon, an equals sign or blanks separate key and value. Case, quotation marks, hyphens and underscores are ignored.
 The word `antialiased` alone counts too, and so does a command-line flag such as `--antialiasing` of the 3DGS authors'
-program. Ambiguous keys, such as `model`, which may hold the name of a scene, count only with an exact mode word. A
-sentence that mentions antialiasing decides nothing; it is reported in a warning unless it has a negation. Of several
-lines the last counts, since programs that rewrite a file append theirs.
+program. An ambiguous key, such as `model`, which may hold the name of a scene, counts only if its value is a mode word.
+A sentence that mentions antialiasing does not count; a warning reports it unless it has a negation. Of several lines
+the last counts, since programs that rewrite a file append their own.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _KEY_VALUE_LINE = re.compile(
     re.IGNORECASE,
 )
 _MIP_VALUE = re.compile(r"mip[-_ ]?\d+(\.\d+)?")
-"""`mip` with the strength of the low-pass filter, such as mip-0.1."""
+"""`mip` and the strength of the low-pass filter, such as mip-0.1."""
 _MENTIONS_ANTIALIASING = re.compile(rf"(?<![a-z0-9]){_ANTIALIAS_PATTERN}(?![a-z0-9])", re.IGNORECASE)
 _COMMAND_LINE_FLAG = re.compile(rf"(?:^|\s)--{_ANTIALIAS_PATTERN}(?=\s+--?[a-z]|\s*$)", re.IGNORECASE)
 _NEGATION = re.compile(r"\b(?:not|no|non|never|without)\b|n't\b", re.IGNORECASE)
@@ -59,7 +59,7 @@ def _plain(word: str) -> str:
 
 
 def _switch(word: str) -> bool | None:
-    """True or False for a word or number that means it, else None."""
+    """True or False if a word or number means it, otherwise None."""
     try:
         return {1.0: True, 0.0: False}.get(float(word))
     except ValueError:
@@ -67,7 +67,7 @@ def _switch(word: str) -> bool | None:
 
 
 def _meaning(key: str, value: object) -> bool | None:
-    """True, False, or None if the key and its value say nothing about antialiasing."""
+    """True if a key and its value mean antialiased, False if not antialiased, None if they mean neither."""
     key = _plain(key.rpartition(".")[2])  # as in pipeline.model.rasterize_mode
     word = str(value).strip().lower()
     mode = ANTIALIAS_MODE_WORDS.get(_plain(word))
@@ -81,7 +81,7 @@ def _meaning(key: str, value: object) -> bool | None:
 
 
 def of_line(line: str) -> bool | None:
-    """Meaning of a header comment: True, False, or None if it says nothing."""
+    """True if a header comment means antialiased, False if not antialiased, None if it means neither."""
     if _plain(line.strip("\"' ")) in _STANDALONE_WORDS or (
         _COMMAND_LINE_FLAG.search(line) and not _NEGATION.search(line)
     ):
@@ -90,13 +90,12 @@ def of_line(line: str) -> bool | None:
     return _meaning(*match.groups()) if match else None
 
 
-class Said:
-    """Antialiasing as stated in several places of a file.
+class AntialiasStatements:
+    """Statements about antialiasing in a file's header.
 
-    antialiased: the last statement.
-    contradiction: text of a warning, without the file's name; empty if all statements agree.
-    passed_over: text of a warning about the first text that mentions antialiasing but decides nothing; empty if another
-      text counts.
+    antialiased: the last statement; False without statements.
+    contradiction: warning, without the file's name, about statements that disagree; "" if all agree.
+    not_understood: warning about the first text that mentions antialiasing and does not count; "" if any text counts.
     """
 
     def __init__(self, places: Iterable[tuple[str, bool | None]]) -> None:
@@ -112,7 +111,7 @@ class Said:
         )
         unclear = (text for text, _ in places if _MENTIONS_ANTIALIASING.search(text) and not _NEGATION.search(text))
         text = None if said else next(unclear, None)
-        self.passed_over = (
+        self.not_understood = (
             f"says {text!r}, which is not understood: the model counts as not antialiased, expected words such as "
             "'antialiased 1'"
             if text is not None
@@ -121,16 +120,16 @@ class Said:
 
     @property
     def warning(self) -> str:
-        """Text of the warning to give, or an empty text."""
-        return self.contradiction or self.passed_over
+        """The warning, without the file's name; "" if there is none."""
+        return self.contradiction or self.not_understood
 
 
-def of_comments(comments: Iterable[str]) -> Said:
-    """Statements in the comments of a header, given without the word `comment`."""
-    return Said((line[:80], of_line(line)) for line in comments)
+def of_comments(comments: Iterable[str]) -> AntialiasStatements:
+    """Statements in a header's comments. The comments come without the word `comment`."""
+    return AntialiasStatements((line[:80], of_line(line)) for line in comments)
 
 
-def of_object(document: Mapping[str, Any]) -> Said:
-    """Statements in the keys of a JSON object."""
+def of_object(document: Mapping[str, Any]) -> AntialiasStatements:
+    """Statements in the keys and values of a JSON object."""
     pairs = ((key, value) for key, value in document.items() if isinstance(value, str | bool | int | float))
-    return Said((f"{key[:40]}: {str(value)[:40]}", _meaning(key, value)) for key, value in pairs)
+    return AntialiasStatements((f"{key[:40]}: {str(value)[:40]}", _meaning(key, value)) for key, value in pairs)

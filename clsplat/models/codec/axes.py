@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Axis conventions of the formats, conversion to and from ours, and node transforms."""
+"""Conversion between clsplat's axes and those of model formats, and transforms of scene nodes."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from clsplat.spherical_harmonics import sh_basis
 Signs = tuple[int, int, int]
 
 RUB_SIGNS: Signs = (1, -1, -1)
-"""Signs between our axes (x right, y down, z forward) and RUB (x right, y up, z backward): half a turn about x."""
+"""Signs between clsplat's axes (x right, y down, z forward) and RUB (x right, y up, z back): half a turn about x."""
 LUF_SIGNS: Signs = (-1, -1, 1)
-"""Signs between our axes and LUF (x left, y up, z forward): half a turn about z."""
+"""Signs between clsplat's axes and LUF (x left, y up, z forward): half a turn about z."""
 
 NODE_SIMILARITY_TOLERANCE = 1e-4
-"""Tolerated deviation of a node's axes from right angles and equal lengths: matrices are written with few digits."""
+"""Largest deviation of a node's axes from right angles and equal lengths. Files have matrices with few digits."""
 
 
 def sh_signs(signs: Signs) -> Float32:
-    """Factors (16,) of the SH coefficients when axes change sign."""
-    direction = np.array([[1.0, 2.0, 4.0]]) / 21**0.5  # no basis function is 0 there
+    """Factors (16,) of the SH coefficients for a change of the signs of axes."""
+    direction = np.array([[1.0, 2.0, 4.0]]) / 21**0.5  # a direction in which no basis function is 0
     return np.asarray(np.sign(sh_basis(direction, 3) * sh_basis(direction * signs, 3))[0], np.float32)
 
 
 def quaternion_signs(signs: Signs) -> Float32:
-    """Factors (4,) of quaternions w x y z when axes change sign.
+    """Factors (4,) of quaternions w x y z for a change of the signs of axes.
 
-    Both the world's and the Gaussian's axes change sign, so the result is a rotation even if an axis is mirrored. The
-    ellipsoid is exact.
+    The world's and the Gaussian's own axes change sign, so the result is a rotation even if an axis is mirrored. The
+    covariance is exact.
     """
     handedness = int(np.prod(signs))
     return np.array([1, *(handedness * sign for sign in signs)], np.float32)
 
 
 def flip(gaussians: Gaussians, signs: Signs) -> None:
-    """Change the signs of axes, in place and exactly."""
+    """Change the signs of a model's axes, in place and without rounding."""
     gaussians.means *= np.array(signs, np.float32)
     gaussians.quaternions *= quaternion_signs(signs)
     gaussians.sh *= sh_signs(signs)[: gaussians.sh.shape[1], None]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contents of a glTF file: its JSON, the nodes of its scene, and the arrays of its buffers as stored.
+"""Reading of a glTF file: its JSON, the nodes of its scene, and the arrays of its buffers as stored.
 
-Everything in the file is checked before use. A buffer is the .glb's own, a file in the same folder or below it, or a
+All values are checked before use. A buffer is in the .glb itself, in a file in the same folder or a sub-folder, or in a
 data: URI.
 """
 
@@ -28,7 +28,7 @@ from clsplat.files.documents import MAX_DOCUMENT_BYTES, open_input, parse_json, 
 GAUSSIAN_EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
 SPZ_EXTENSIONS = (SPZ_EXTENSION, "KHR_gaussian_splatting_compression_spz")
-"""Names of the SPZ extension; the draft's own example uses the second."""
+"""Names of the SPZ extension. The example in the draft of the specification uses the second."""
 SUPPORTED_EXTENSIONS = (GAUSSIAN_EXTENSION, *SPZ_EXTENSIONS, "KHR_mesh_quantization", "KHR_materials_unlit")
 GLTF_COLOR_SPACES = ("srgb_rec709_display", "lin_rec709_display")
 
@@ -36,20 +36,20 @@ GLB_JSON_CHUNK, GLB_BIN_CHUNK = 0x4E4F534A, 0x004E4942
 COMPONENT_DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 ACCESSOR_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 MAX_SCENE_NODES, MAX_GAUSSIAN_PRIMITIVES = 100_000, 4096
-"""Largest numbers of nodes in a scene, and of its primitives with Gaussians. A decompression bomb may repeat one mesh
-in many nodes."""
+"""Largest number of nodes, and of primitives with Gaussians, in a scene. A malicious file may repeat a mesh in many
+nodes."""
 
 Array = NDArray[Any]
 
 
 @dataclass
 class Asset:
-    """An opened glTF file: its JSON, and the buffers that were needed so far."""
+    """An opened glTF file: its JSON, and the buffers read so far."""
 
     path: Path
     document: dict[str, Any]
     binary: tuple[int, int] | None = None
-    """Offset and length of the .glb's own buffer in the file."""
+    """Offset and length in bytes of the buffer inside a .glb; None for a .gltf."""
     size: int = 0
     buffers: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
     total: int = 0
@@ -82,7 +82,7 @@ class Asset:
         return asset
 
     def item(self, kind: str, index: object) -> dict[str, Any]:
-        """Object at an index of one of the document's lists."""
+        """Object at an index of the document's list `kind`, such as "nodes"."""
         items = self.document.get(kind)
         if not isinstance(items, list) or not isinstance(index, int) or not 0 <= index < len(items):
             raise InputError(f"{self.path}: {kind} has no item {index!r}; is the file damaged?")
@@ -98,7 +98,7 @@ class Asset:
         return value
 
     def primitives(self) -> Iterator[tuple[str, NDArray[np.float64], dict[str, Any]]]:
-        """Yield the primitives of Gaussians in the default scene: name, matrix from node to world, and JSON object."""
+        """Yield name, world-from-node matrix (4, 4) and JSON object of each primitive with Gaussians in the scene."""
         nodes = self.document.get("nodes", [])
         if "scenes" in self.document:
             roots = self.item("scenes", self.document.get("scene", 0)).get("nodes", [])
@@ -149,7 +149,7 @@ class Asset:
         return result
 
     def accessor(self, index: object, width: int, semantic: str) -> Array:
-        """Values (count, width) of an accessor, as stored in the file."""
+        """Values (count, width) of an accessor, as stored in the file. semantic: the attribute's name, for messages."""
         said = self.item("accessors", index)
         kind = COMPONENT_DTYPES.get(self.integer(said, "componentType"))
         count, offset = self.integer(said, "count"), self.integer(said, "byteOffset", 0)
@@ -160,7 +160,7 @@ class Asset:
             expected = next(name for name, numbers in ACCESSOR_WIDTHS.items() if numbers == width)
             raise InputError(f"{self.path}: {semantic} has the type {str(said.get('type'))[:20]}, expected {expected}")
         if "sparse" in said or "bufferView" not in said:
-            raise InputError(f"{self.path}: {semantic} is sparse or has no values of its own, which is not supported")
+            raise InputError(f"{self.path}: {semantic} is sparse or has no buffer view, which is not supported")
         view = self.item("bufferViews", said["bufferView"])
         data = self.view(said["bufferView"])
         item = np.dtype(kind)
@@ -200,7 +200,7 @@ class Asset:
         return self.buffers[index]
 
     def outside(self, uri: str) -> NDArray[np.uint8]:
-        """Bytes of a data: URI, or of a file in the same folder or below it."""
+        """Bytes of a data: URI, or of a file in the same folder or a sub-folder."""
         if uri.startswith("data:"):
             try:
                 return np.frombuffer(base64.b64decode(uri.partition(";base64,")[2], validate=True), np.uint8)
@@ -212,7 +212,7 @@ class Asset:
             folder = Path(os.path.realpath(self.path)).parent
             file = Path(os.path.realpath(folder / name))
             inside = not parts.scheme and not parts.netloc and name and file.is_relative_to(folder)
-        except ValueError:  # a zero byte in the name, or brackets around an invalid address
+        except ValueError:  # the name has a zero byte, or an invalid address in brackets
             inside = False
         if not inside:
             raise InputError(f"{self.path}: has its buffer in {uri[:80]!r}, expected a file beside it")
@@ -222,7 +222,7 @@ class Asset:
 
 
 def sh_attributes(degree: int) -> list[str]:
-    """Attribute names of one degree's coefficients, in the order of `Gaussians.sh`."""
+    """Attribute names of the SH coefficients of one degree, in the order of `Gaussians.sh`."""
     return [f"{GAUSSIAN_EXTENSION}:SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
 
 
@@ -248,7 +248,7 @@ def _map(path: Path, start: int, size: int) -> NDArray[np.uint8]:
 
 
 def _chunks(file: BinaryIO, size: int, path: Path) -> tuple[bytes, tuple[int, int] | None]:
-    """JSON of a .glb, and offset and length of its buffer."""
+    """JSON of a .glb, and offset and length of its buffer; None without a buffer."""
     head = file.read(16)
     if len(head) < 16:
         raise InputError(f"{path}: truncated: has {size} bytes, expected a .glb")

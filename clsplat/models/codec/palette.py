@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Vector quantisation: codebooks of numbers and palettes of vectors. Deterministic."""
+"""Deterministic vector quantisation: codebooks of numbers and palettes of vectors."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ LLOYD_ITERATIONS = 20
 DISTANCE_TILE_ROWS = 64
 """Number of vectors, and of centres, in one block of the distance computation."""
 PRINCIPAL_AXIS_SAMPLES, POWER_ITERATIONS = 128, 30
-"""Sampled vectors, and power iterations, for the direction of largest variance."""
+"""Number of sampled vectors, and of power iterations, for the direction of largest variance."""
 
 
 def codebook(values: NDArray[np.float32], size: int = 256) -> Float32:
-    """Codebook (size,), ascending, with a small squared error when each value takes its nearest entry.
+    """Codebook (size,) in ascending order that approximates values by their nearest entry with a small squared error.
 
-    With more distinct values than entries, the initial entries are as dense as the cube root of the values' density.
-    That is optimal for many entries (Panter and Dite 1951). Lloyd iterations follow.
+    If there are more distinct values than entries, the density of the initial entries is the cube root of the values'
+    density. This is optimal for many entries (Panter and Dite 1951). Lloyd iterations improve them.
     """
     ordered = np.sort(values.ravel())
     distinct = np.unique(ordered) if len(ordered) <= CODEBOOK_SAMPLES else _thinned(ordered)
@@ -42,24 +42,24 @@ def codebook(values: NDArray[np.float32], size: int = 256) -> Float32:
 
 
 def _thinned(ordered: Float32) -> Float32:
-    """Evenly spaced samples of sorted values, both ends included."""
+    """At most CODEBOOK_SAMPLES evenly spaced samples of sorted values, with the first and the last value."""
     if len(ordered) <= CODEBOOK_SAMPLES:
         return ordered
     return ordered[np.linspace(0, len(ordered) - 1, CODEBOOK_SAMPLES).round().astype(np.int64)]
 
 
 def nearest(entries: NDArray[np.floating], values: NDArray[np.floating]) -> NDArray[np.intp]:
-    """Index of the nearest entry of each value, in the shape of `values`; entries ascend."""
+    """Index of each value's nearest entry, in the shape of `values`. The entries must ascend."""
     return np.searchsorted((entries[1:] + entries[:-1]) / 2, values)
 
 
 def palette(
     vectors: Float32, size: int, iterations: int = 10, progress: Callable[[float], None] = lambda part: None
 ) -> tuple[Float32, NDArray[np.int64]]:
-    """Palette of up to `size` vectors, and the index of each vector's entry: (n, d) -> (size, d), (n,).
+    """Palette (size, d) of vectors (n, d), and each vector's index (n,) in the palette.
 
-    Two-level k-means: clusters first, and in each a share of the palette that grows with its squared error. The cost is
-    n d sqrt(size) instead of n d size.
+    Two-level k-means: first into clusters, then each cluster into its share of the palette, which grows with its
+    squared error. The cost is n d sqrt(size) instead of n d size.
 
     progress: function that is called with the finished fraction.
     """
@@ -73,7 +73,7 @@ def palette(
     errors = np.array(
         [vectors[rows].var(axis=0, dtype=np.float64).sum() * len(rows) if len(rows) else 0 for rows in members]
     )
-    # a cluster's share is the geometric mean of its shares of vectors and of error, as the clusters have structure
+    # a cluster's share of the palette is the geometric mean of its shares of the vectors and of the squared error
     weights = np.sqrt(errors * [len(rows) for rows in members])
     shares = np.floor(weights / max(weights.sum(), 1e-30) * (size - coarse)).astype(np.int64) + 1
     centres, labels = [], np.empty(count, np.int64)
@@ -92,16 +92,15 @@ def palette(
 
 
 def _k_means(vectors: Float32, size: int, iterations: int) -> tuple[Float32, NDArray[np.int64]]:
-    """Lloyd iterations, on a sample if there are many vectors. The first centres lie along the direction of largest
-    variance.
+    """Centres (size, d) and each vector's nearest centre (n,), by Lloyd iterations; on a sample of many vectors.
 
-    A centre without vectors stays where it is.
+    The initial centres lie along the direction of largest variance. A centre without vectors stays unchanged.
     """
     if size <= 1 or not np.ptp(vectors, axis=0).any():
         return vectors.mean(axis=0, keepdims=True, dtype=np.float64).astype(np.float32), np.zeros(
             len(vectors), np.int64
         )
-    middle = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)  # float32 would lose digits far from 0
+    middle = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)  # centred, since float32 is coarse far from 0
     centred = vectors - middle
     sample = centred[:: max(1, len(vectors) // max(CODEBOOK_SAMPLES, 8 * size))]
     order = np.argsort(np.einsum("ij,j->i", sample, _direction(sample)), kind="stable")
@@ -120,7 +119,7 @@ def _k_means(vectors: Float32, size: int, iterations: int) -> tuple[Float32, NDA
 
 
 def _direction(vectors: Float32) -> Float32:
-    """Direction (d,) of the largest variance of vectors around 0, by power iteration; an approximation suffices."""
+    """Approximate direction (d,) in which vectors vary most around 0, by power iteration."""
     rows = vectors[:: max(1, len(vectors) // PRINCIPAL_AXIS_SAMPLES)][:PRINCIPAL_AXIS_SAMPLES]
     spread = (rows.T @ rows).astype(np.float64)
     axis = spread[np.diagonal(spread).argmax()]
@@ -130,10 +129,10 @@ def _direction(vectors: Float32) -> Float32:
 
 
 def _nearest_centres(vectors: Float32, centres: Float32) -> NDArray[np.int64]:
-    """Index of each vector's nearest centre: the least |c|^2 / 2 - v c, half the squared distance without |v|^2 / 2.
+    """Index of each vector's nearest centre, which has the smallest |c|^2 / 2 - v c = (|v - c|^2 - |v|^2) / 2.
 
-    The tiles are so small that the BLAS library does not split them among threads. Its threads would wait for each
-    other longer than they work; on a busy machine this took several times as long.
+    Tiles are so small that the BLAS library does not split them among threads. With threads, on a busy machine, this
+    took several times as long.
     """
     halves = np.float32(0.5) * np.einsum("ij,ij->i", centres, centres)
     columns = [

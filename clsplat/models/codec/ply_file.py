@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PLY files of any contents: the header, and the rows of the vertices.
+"""Reading of PLY files: the header, and the rows of the vertices.
 
 Format: http://paulbourke.net/dataformats/ply/. Comments that describe models are parsed with the header.
 ORIGIN_COMMENT, NEAR_PLANE_COMMENT and ALONG_RAYS_COMMENT are clsplat's own; many programs write comments about
@@ -28,15 +28,15 @@ from clsplat.models.codec.values import IO_BLOCK_ROWS
 
 MAX_PLY_HEADER_LINES = 10_000
 MAX_PLY_HEADER_BYTES = 1 << 24
-"""Largest size of the whole header in bytes, as it is held in memory."""
+"""Largest size of the header in bytes, because it is held in memory."""
 MAX_BLOCK_BYTES, MAX_BLOCK_WORDS = 1 << 26, 1 << 21
 MAX_NUMBER_TEXT_BYTES = 128
-"""Longest text of a number, in bytes. It bounds the array of a row, whose elements are all as wide as the longest."""
+"""Longest text of a number, in bytes. It bounds the memory of a row: NumPy makes all texts as wide as the longest."""
 
 _PLY_1_0_DTYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
           "double": "f8"}  # fmt: skip
 PLY_DTYPES = _PLY_1_0_DTYPES | {np.dtype(code).name: code for code in _PLY_1_0_DTYPES.values()}
-"""NumPy types by PLY name. Newer PLY names, such as float32, equal NumPy's."""
+"""NumPy types by PLY name. Newer PLY files use NumPy's names, such as float32."""
 PLY_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 _NAN_TEXT = re.compile(r"[-+]?(?:1\.#(?:[qs]?nan|ind)\d*|[qs]?nan(?:\(\w*\))?)", re.IGNORECASE)
@@ -45,14 +45,14 @@ _INFINITY_TEXT = re.compile(r"([-+]?)1\.#inf\d*", re.IGNORECASE)
 ORIGIN_COMMENT = ["comment", "clsplat", "origin"]
 NEAR_PLANE_COMMENT = ["comment", "clsplat", "near"]
 ANTIALIASED_COMMENT = ["comment", "SplatRenderMode:", "mip"]
-"""Comment of an antialiased model, in Brush's form, which other programs read and write too."""
+"""Comment of an antialiased model, as Brush and other programs write it."""
 ALONG_RAYS_COMMENT = ["comment", "clsplat", "rays"]
-"""Comment of a model that perspective cameras draw along rays."""
+"""Comment of a model that perspective cameras draw along rays (`Gaussians.by_rays`)."""
 
 
 @dataclass
 class Element:
-    """An element of the header.
+    """An element of a PLY header.
 
     properties: name and NumPy type of each property, without byte order. The type is "" for a list.
     """
@@ -63,7 +63,7 @@ class Element:
 
     @property
     def row_bytes(self) -> int:
-        """Bytes of a row, for an element without lists."""
+        """Bytes of a row. The element must have no lists."""
         return sum(np.dtype(code).itemsize for _, code in self.properties)
 
     @property
@@ -78,9 +78,8 @@ class PlyHeader:
     path: the file, for messages.
     format: "ascii" or a key of PLY_BYTE_ORDERS.
     size: the header's length in bytes, `end_header` included.
-    origin: origin of the means in the element `ply.LOCAL_MEANS_ELEMENT`, if the file has one.
-    near: near plane; the default if the file sets none.
-    by_rays: as in `Gaussians`.
+    origin: `Gaussians.origin`, for the means in the element `ply.LOCAL_MEANS_ELEMENT`; None if the file has none.
+    near, by_rays: as in `Gaussians`.
     """
 
     path: Path
@@ -93,8 +92,7 @@ class PlyHeader:
     by_rays: bool = False
 
     def is_antialiased(self) -> bool:
-        """True if the comments say that the model is antialiased (`codec.antialias`). Warns if they contradict each
-        other or are not understood."""
+        """True if the comments say that the model is antialiased (`codec.antialias`). Warns if they are unclear."""
         said = antialias.of_comments(self.comments)
         if said.warning:
             warn(f"{self.path}: {said.warning}")
@@ -102,7 +100,7 @@ class PlyHeader:
 
     @property
     def vertex(self) -> Element:
-        """The element of the Gaussians. Raises InputError if there is none."""
+        """The element `vertex`, which has the Gaussians. Raises InputError if there is none."""
         if vertices := [element for element in self.elements if element.name == "vertex"]:
             return vertices[0]
         names = examples(element.name for element in self.elements) or "none"
@@ -114,17 +112,17 @@ class PlyHeader:
         return self.elements[: self.elements.index(self.vertex)]
 
     def start(self, index: int) -> int:
-        """Byte offset of an element in a binary file; the offset of the end for the index after the last one."""
+        """Byte offset of the element `index` in a binary file; the end of the last element if there is none."""
         return self.size + sum(element.count * element.row_bytes for element in self.elements[:index])
 
     def row_type(self, element: Element) -> np.dtype[Any]:
-        """Packed dtype of one row of a binary file."""
+        """Packed dtype of a row of an element in a binary file."""
         order = PLY_BYTE_ORDERS[self.format]
         return np.dtype([(name, order + code) for name, code in element.properties])
 
 
 def _header_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
-    """Complete lines after the first. Raises InputError if the header exceeds its limits."""
+    """Complete lines of the header after the first. Raises InputError if the header exceeds its limits."""
     for _ in range(MAX_PLY_HEADER_LINES):
         line = file.readline(MAX_PLY_LINE_BYTES + 1)
         if len(line) > MAX_PLY_LINE_BYTES or file.tell() > MAX_PLY_HEADER_BYTES:
@@ -183,10 +181,10 @@ Block = dict[str, NDArray[Any]]
 
 
 def read_vertices(file: BinaryIO, header: PlyHeader, what: str) -> Iterator[Block]:
-    """Columns of the vertices by name, in blocks of rows.
+    """Yield the vertices in blocks of rows: the columns by name.
 
-    The file's length is checked before the first block, so that the caller may allocate `count` rows then. The check is
-    exact for binary files, and a lower bound for ascii files. Raises InputError.
+    The file's length is checked before the first block, so the caller may then allocate `count` rows. The check is
+    exact for a binary file; an ascii file must have at least two bytes per number. Raises InputError.
 
     what: noun for a vertex, for messages.
     """
@@ -222,7 +220,7 @@ def _binary_blocks(file: BinaryIO, header: PlyHeader, what: str) -> Iterator[Blo
 
 
 def _text_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
-    """Non-empty lines. Raises InputError for a line that is too long to be a row."""
+    """Lines that are not blank. Raises InputError for a line that is too long to be a row."""
     while line := file.readline(MAX_PLY_LINE_BYTES + 1):
         if len(line) > MAX_PLY_LINE_BYTES:
             raise InputError(f"{path}: has a line of more than {MAX_PLY_LINE_BYTES} bytes, expected rows of numbers")
@@ -230,8 +228,8 @@ def _text_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
             yield line
 
 
-def _spelt(words: list[bytes], where: str) -> list[float]:
-    """Numbers of a row whose non-finite values may be spelt as by Microsoft's C library.
+def _parse_row(words: list[bytes], where: str) -> list[float]:
+    """Numbers of a row that may have non-finite values as Microsoft's C library writes them, such as 1.#INF.
 
     Raises InputError, prefixed with `where`.
     """
@@ -246,9 +244,10 @@ def _spelt(words: list[bytes], where: str) -> list[float]:
 
 
 def _ascii_blocks(file: BinaryIO, header: PlyHeader, what: str) -> Iterator[Block]:
-    """Blocks of float64 columns. Each value of a row takes at least a character and a blank."""
+    """Yield blocks of float64 columns."""
     path, vertex = header.path, header.vertex
     lines = _text_lines(file, path)
+    # a value takes at least a character and a blank
     least, have = 2 * vertex.count * len(vertex.properties) - 1, os.fstat(file.fileno()).st_size - header.size
     too_many = have < least
     for element in header.before:
@@ -271,7 +270,7 @@ def _ascii_blocks(file: BinaryIO, header: PlyHeader, what: str) -> Iterator[Bloc
         try:
             table = np.array(rows, dtype="S").astype(np.float64).reshape(count, width)
         except ValueError:
-            table = np.array([_spelt(words, f"{path}: {what} {first + at}") for at, words in enumerate(rows)])
+            table = np.array([_parse_row(words, f"{path}: {what} {first + at}") for at, words in enumerate(rows)])
         yield {name: table[:, index] for index, (name, _) in enumerate(vertex.properties)}
     if header.elements[-1] is vertex and next(lines, None) is not None:
         warn(f"{path}: text after the last {what} is ignored")

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Repair or removal of invalid values in model files, and doubts about how valid values are encoded.
+"""Repair or removal of invalid values in model files, and warnings about valid values that look wrongly encoded.
 
-- Infinite values that stand for a number become that number. A log scale of -inf is a scale of 0; logits of -inf and
-  inf are opacities of 0 and 1. splat-transform writes flat and opaque Gaussians like this.
-- Quaternions of length 0 become w = 1, no rotation, as in formats with unit quaternions; the kernels would not draw
-  them. Other quaternions are normalised if their squared length leaves the range of float32.
+- Infinite logs and logits are replaced: a log scale of -inf is a scale of 0; logits of -inf and inf are opacities of
+  0 and 1. splat-transform writes flat and opaque Gaussians like this.
+- Quaternions of length 0, which the kernels do not draw, become the identity rotation. Other quaternions are normalised
+  if their squared length is outside the range of float32.
 - Gaussians with other non-finite values are left out.
 """
 
@@ -24,41 +24,41 @@ from clsplat.models.codec import values
 from clsplat.models.edit import take
 
 Activated = Literal["opacities", "scales", "both"]
-"""Values that a file stores after activation, instead of as logits or logs."""
+"""Values that a file stores as opacities instead of logits, or as scales instead of logs."""
 
 DRAWN_QUATERNION_SQUARES = (1e-29, 1e29)
-"""Range of the squared lengths of quaternions that are not normalised; project.cl accepts 1e-30 to 1e30."""
+"""Squared lengths of quaternions that are left as they are; project.cl accepts 1e-30 to 1e30."""
 MIN_GAUSSIANS_FOR_DOUBTS = 100
-"""Smallest number of Gaussians whose values show how they are encoded."""
+"""Least number of Gaussians from whose values the encoding can be guessed."""
 BYTE_LOGIT_ERROR = 0.02
 """Largest error of a logit between 0 and 1 after conversion to an 8-bit format."""
 LARGEST_USEFUL_LOGIT = 20.0
-"""Largest logit that is useful in float32. Values of 8-bit levels exceed it."""
+"""Largest logit that is useful in float32. Opacities as levels from 0 to 255 exceed it."""
 MAX_HANDMADE_LOGITS = 10
 """Largest number of distinct logits in a handmade model."""
 TRAINED_OPACITY_SPREAD = (0.35, 0.93)
-"""Limits for the opacities of a trained model: 1 % of them lie below the first, even after pruning, and the largest
-exceeds the second.
+"""Two bounds. In a trained model, 1 % of the opacities are below the first even after pruning, and the largest is above
+the second.
 
-If such values were logits, the model would be pruned to opacities of at least 0.5 to 0.58, and its largest opacity
-would be 0.717 to 0.735. Trained models have opacities over 0.8, or after short trainings lower ones.
+Read as logits, such values would mean that no opacity is below 0.5 to 0.58, and that the largest is 0.717 to 0.735.
+Trained models reach 0.8 and more, except after short trainings.
 """
 CLIPPED_OPACITY_SHARE = (1e-3, 0.02)
-"""Largest distance of clipped opacities from 1, and the least fraction of them in a network's output. Logits never
-cluster like that."""
+"""Values are opacities of a neural network, clipped at 1, if at least the second fraction of them is within the first
+distance of 1. Logits do not cluster there."""
 PERCENTAGE_MAXIMA = (40.0, 100.0)
-"""Range of the largest opacity in percent. If such values were levels of 255, no opacity would exceed 0.4."""
+"""Range of the largest opacity in percent. If the values were levels from 0 to 255, no opacity would exceed 0.4."""
 ZERO_SCALE_LOG_LIMIT = float(np.log(values.MIN_SCALE)) + 1
-"""Log scales below this come from scales of 0, which do not show how the others are encoded."""
+"""Log scales below this stand for scales of 0, and do not show how the other scales are encoded."""
 LENGTH_SKEW_RATIO = 3.0
-"""Ratio of the spread above the median to the spread below it, beyond which values are lengths and not logs.
+"""Ratio of the spread above the median to the spread below it, above which values are lengths and not logs.
 
-Lengths vary by a factor of e or more to both sides of the median, which gives a ratio of 10. Their logs spread evenly.
+Lengths vary by a factor of e or more on both sides of the median, which gives a ratio of 10. Their logs spread evenly.
 """
 
 
 def mend(gaussians: Gaussians) -> None:
-    """Replace infinite values that stand for a number, in place."""
+    """Replace the infinite logits and log scales that stand for finite values, in place."""
     logits, scales = gaussians.opacity_logits, gaussians.log_scales
     if not values.all_finite(logits):
         ends = values.logits(np.array([0.0, 1.0]))
@@ -68,7 +68,7 @@ def mend(gaussians: Gaussians) -> None:
 
 
 def finite_rows(gaussians: Gaussians) -> NDArray[np.bool_]:
-    """Mask (n,) of the Gaussians whose values are all finite."""
+    """Mask (n,), True for Gaussians whose values are all finite."""
     rows = np.ones(len(gaussians), bool)
     for array in gaussians.arrays().values():
         if not values.all_finite(array):
@@ -77,16 +77,16 @@ def finite_rows(gaussians: Gaussians) -> NDArray[np.bool_]:
 
 
 def without_turn(gaussians: Gaussians) -> NDArray[np.bool_]:
-    """Mask (n,) of the Gaussians with a quaternion of 0."""
+    """Mask (n,), True for Gaussians with a quaternion of 0."""
     return np.asarray(~gaussians.quaternions.any(axis=1))
 
 
 def sound(gaussians: Gaussians, where: Path | str, activated: Activated | None = None) -> Gaussians:
-    """Repair a model as the module describes, in place unless Gaussians are left out.
+    """Repair a model as the module's docstring says. Works in place unless Gaussians are left out.
 
-    activated: values that the file stores after activation; they become logits or logs.
+    activated: values to convert to logits or logs, because the file stores opacities or scales.
     where: prefix of messages.
-    Warns once for each kind of repair, with the Gaussians' numbers in the file. Raises InputError if no Gaussian is
+    Warns once for each kind of repair, with the Gaussians' indices in the file. Raises InputError if no Gaussian is
     left.
     """
     mend(gaussians)
@@ -129,16 +129,16 @@ def _turn(gaussians: Gaussians, numbers: NDArray[np.intp], count: int, where: Pa
 
 
 def doubts(logits: Float32, log_scales: Float32) -> list[str]:
-    """Warnings about finite values that look like opacities and scales instead of logits and logs.
+    """Warnings, without the file's name, about values that look like opacities or scales instead of logits or logs.
 
-    The texts do not name the file. Models of few Gaussians raise no doubts.
+    There are none for a model of fewer than MIN_GAUSSIANS_FOR_DOUBTS Gaussians.
     """
     if len(logits) < MIN_GAUSSIANS_FOR_DOUBTS:
         return []
     seen = {"opacities": _seen_opacities(logits), "scales": _seen_scales(log_scales)}
     which = "both" if all(seen.values()) else "".join(name for name, found in seen.items() if found)
     return [
-        f"{found} and are taken for {kind}; if they are {name} themselves, `clsplat convert --activated {which}` "
+        f"{found} and are read as {kind}; if they are {name}, `clsplat convert --activated {which}` "
         "writes a correct model"
         for (name, found), kind in zip(seen.items(), ("logits", "logs"), strict=True)
         if found
@@ -156,7 +156,7 @@ def _seen_opacities(logits: Float32) -> str:
 
 
 def _spread(opacities: Float32) -> bool:
-    """True if values from 0 to 1 are distributed like opacities, and not like the logits left in a pruned model."""
+    """True if values from 0 to 1 are distributed like opacities, and not like the logits of a pruned model."""
     if len(np.unique(opacities)) <= MAX_HANDMADE_LOGITS:
         return False
     reach = bool(np.percentile(opacities, 1) < TRAINED_OPACITY_SPREAD[0]) and bool(
@@ -166,7 +166,7 @@ def _spread(opacities: Float32) -> bool:
 
 
 def _white(logits: Float32) -> float:
-    """Value of full opacity: 1, or for whole numbers 100, 255 or more."""
+    """Value that stands for an opacity of 1: 1, or for whole numbers 100, 255 or more."""
     whole = (
         logits.max() > LARGEST_USEFUL_LOGIT
         and bool((logits == np.rint(logits)).all())
@@ -190,11 +190,11 @@ def _seen_scales(log_scales: Float32) -> str:
 
 
 def _deactivated(gaussians: Gaussians, which: Activated, numbers: NDArray[np.intp], where: Path | str) -> Gaussians:
-    """Replace opacities (up to 1, 100 or 255) or scales that were read as logits and logs by their logits and logs.
+    """Convert opacities (up to 1, 100 or 255) to logits, and scales to logs, in a model that stores them instead.
 
-    numbers: the Gaussians' numbers in the file.
-    Raises InputError, prefixed with `where`, for values that cannot be opacities or scales, and for levels with an
-    ambiguous maximum.
+    numbers: index of each Gaussian in the file.
+    Raises InputError, prefixed with `where`, for values that cannot be opacities or scales, and for whole numbers that
+    may be percentages or levels.
     """
     logits, log_scales = gaussians.opacity_logits, gaussians.log_scales
     if which in ("opacities", "both"):
@@ -203,7 +203,7 @@ def _deactivated(gaussians: Gaussians, which: Activated, numbers: NDArray[np.int
             raise InputError(
                 f"{where}: opacities are whole numbers up to {most:g}, expected 0 to 1, or some over "
                 f"{PERCENTAGE_MAXIMA[0]:g}; "
-                "these may be percentages or levels of 255"
+                "these may be percentages or levels from 0 to 255"
             )
         opacity = logits / np.float32(white)
         near = (opacity >= -BYTE_LOGIT_ERROR) & (opacity <= 1 + BYTE_LOGIT_ERROR)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Helpers of several formats: encoding in bytes, reading rows, spatial order, checks of file contents.
+"""Helpers for several formats: encoding in bytes, reading rows, spatial order, checks of file contents.
 
-Formats of bytes store colours as 0.5 + C0 times SH coefficient 0, and opacities from 0 to 1 (Kerbl et al. 2023).
+Byte formats store colours as 0.5 + C0 times SH coefficient 0, and opacities from 0 to 1 (Kerbl et al. 2023).
 """
 
 from __future__ import annotations
@@ -19,30 +19,29 @@ from clsplat.gaussians import Gaussians
 from clsplat.spherical_harmonics import SH_C0
 
 IO_BLOCK_ROWS = 1 << 15
-"""Number of rows that are read or written at once: whole chunks of the compressed PLY."""
+"""Number of rows that are read or written at once. It is a multiple of the chunk size of the compressed PLY."""
 MIN_SCALE = 2.0**-149
-"""Replacement for a scale of 0, whose log has to be finite: the smallest float32."""
+"""The smallest float32. It replaces a scale of 0, whose log would be infinite."""
 LOG_SCALES_MIN_NEGATIVE_SHARE = 0.01
-"""Fraction of Gaussians with a negative scale, at or above which all scales are taken for logs.
+"""Least fraction of Gaussians with a negative scale at which all scales of a file count as logs.
 
-In a model in metres nearly all logs are negative. A file of linear scales with a few damaged ones stays below it.
+Nearly all logs are negative if the unit is a metre. Linear scales are negative only in a few damaged Gaussians.
 """
 MAX_UNCHECKED_GAUSSIANS = 1 << 20
-"""Number of Gaussians that a compressed file of any length may have. A file may have more only if it has a byte for
-each.
+"""Number of Gaussians up to which a compressed file may have any length. Above it a file needs a byte per Gaussian.
 
-Real files meet this limit, since positions alone take several bytes each. A decompression bomb claims more.
+Every real file has more bytes than that, because positions take several bytes each. A decompression bomb has fewer.
 """
 OTHER_QUATERNION_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Row i: the components of a quaternion other than component i."""
 MORTON_BITS_PER_AXIS = 21
 MAX_FLOAT_HIGHLIGHT = 2.0
-"""Float colours up to this value have white at 1, unless all are whole numbers. Some may then be brighter than white.
-"""
+"""Largest float colour up to which white is taken to be 1, unless all colours are whole numbers."""
 UNIT_COLOUR_SHARE = 0.95
-"""Least fraction of float colours that are at most 1, if white is 1 and there are highlights."""
+"""White is also taken to be 1 if at least this fraction of float colours is at most 1, however bright the others are.
+"""
 UNIT_RANGE_TOLERANCE = 1e-3
-"""Relative tolerance of float colours above white and of opacities outside 0 to 1, for half floats and averages."""
+"""Tolerance of colours above white (relative) and of opacities outside [0, 1], because of half floats and averages."""
 GAUSSIAN_ARRAY_NOUNS = ("a position", "a rotation", "a scale", "an opacity", "a colour")
 """Nouns for the arrays of `Gaussians`, for messages."""
 _MORTON_SPREAD_STEPS = (
@@ -62,7 +61,7 @@ def empty(count: int, degree: int) -> Gaussians:
 
 
 def row_blocks(count: int, most: int = IO_BLOCK_ROWS) -> Iterator[slice]:
-    """Slices of the rows 0 to `count`, each of at most `most` rows."""
+    """Slices that divide the rows 0 to `count` into blocks of at most `most` rows."""
     return (slice(start, min(start + most, count)) for start in range(0, count, most))
 
 
@@ -72,28 +71,28 @@ def world_means(gaussians: Gaussians, rows: slice | NDArray[Any] = slice(None)) 
 
 
 def to_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
-    """Convert values from 0 to 1 to bytes from 0 to 255; values outside are clamped."""
+    """Convert values in [0, 1] to bytes 0 to 255; other values are clamped."""
     return np.asarray(np.clip(np.rint(values * 255), 0, 255).astype(np.uint8))
 
 
 def opacities(logits: Float32) -> Float64:
-    """Opacities from 0 to 1 of logits."""
-    with np.errstate(over="ignore"):  # exp of a large number: the opacity correctly becomes 0
+    """Opacities, 0 to 1, from logits."""
+    with np.errstate(over="ignore"):  # exp overflows for very negative logits; their opacity becomes 0
         values: Float64 = 1 / (1 + np.exp(-logits.astype(np.float64)))
     return values
 
 
 def logits(opacity: NDArray[Any]) -> Float32:
-    """Logits of opacities from 0 to 1. To stay finite, 0 and 1 move halfway to the nearest other float32."""
+    """Logits from opacities in [0, 1]. 0 and 1 move halfway to the next float32, so that their logits are finite."""
     p = np.clip(opacity.astype(np.float64), 2.0**-150, 1 - 2.0**-25)
     return (np.log(p) - np.log1p(-p)).astype(np.float32)
 
 
 def byte_logits() -> Float32:
-    """Logits (256,) of opacities in steps of 1/255.
+    """Logits (256,) of the opacities that bytes 0 to 255 encode.
 
-    The first and the last step are half as wide as the others. Their middles stand for them: the logits are finite and
-    round to the same byte.
+    Bytes 0 and 255 stand for half a step each. Their logits are those of its middle, which is finite and rounds to the
+    same byte.
     """
     steps = np.arange(256, dtype=np.float64)
     steps[0], steps[-1] = 0.25, 254.75
@@ -101,25 +100,25 @@ def byte_logits() -> Float32:
 
 
 def to_log_scales(gaussians: Gaussians, where: Path | str) -> None:
-    """`all_to_log_scales` for a model of one part."""
+    """`all_to_log_scales` for a file with one part."""
     all_to_log_scales([(where, gaussians)])
 
 
 def all_to_log_scales(parts: Sequence[tuple[Path | str, Gaussians]], writer: str = "") -> None:
-    """Replace the linear scales (standard deviations) of all parts by their logs, in place.
+    """Replace the linear scales (standard deviations) of all parts of a file by their logs, in place.
 
-    If the fraction LOG_SCALES_MIN_NEGATIVE_SHARE or more of all Gaussians has a negative scale, the scales of all parts
-    are logs already: they stay, and a warning says so. Files by splat-transform before 22 June 2026, and files after
-    the review draft of KHR_gaussian_splatting, have logs.
+    If at least LOG_SCALES_MIN_NEGATIVE_SHARE of all Gaussians have a negative scale, all scales are logs already. They
+    are kept, with a warning. Logs are in files by splat-transform before 22 June 2026, and in files after the review
+    draft of KHR_gaussian_splatting.
 
-    parts: prefix of messages and Gaussians of each part.
-    writer: a program that is known to write logs, negative or not.
-    Raises InputError for negative scales below that fraction.
+    parts: prefix of messages, and Gaussians, of each part.
+    writer: name of the writing program, if it is known to write logs; otherwise "".
+    Raises InputError if fewer Gaussians have a negative scale.
     """
     with np.errstate(invalid="ignore"):
         negative = [np.asarray((gaussians.log_scales < 0).any(axis=1)) for _, gaussians in parts]
     count, total = sum(int(rows.sum()) for rows in negative), sum(len(gaussians) for _, gaussians in parts)
-    logs = "read as logs of scales, though this format holds scales themselves"
+    logs = "read as logs of scales, although this format stores scales"
     if writer:
         warn(f"{parts[0][0]}: its scales are {logs}, as {writer} wrote them")
         return
@@ -139,15 +138,15 @@ def all_to_log_scales(parts: Sequence[tuple[Path | str, Gaussians]], writer: str
 
 
 def have(count: int) -> str:
-    """The verb "has" or "have" for a count."""
+    """The verb that agrees with a count: "has" or "have"."""
     return "has" if count == 1 else "have"
 
 
 def logits_of(opacity: NDArray[Any], where: Path | str, numbers: int | NDArray[np.intp] = 0) -> Float32:
-    """Logits of a file's opacities; NaN passes through.
+    """Logits from a file's opacities. NaN stays NaN.
 
-    numbers: the Gaussians' numbers in the file, or the number of the first.
-    Raises InputError for opacities outside [0, 1] by more than rounding.
+    numbers: index of each Gaussian in the file, or only of the first.
+    Raises InputError for opacities outside [0, 1] by more than UNIT_RANGE_TOLERANCE.
     """
     with np.errstate(invalid="ignore"):
         bad = (opacity < -UNIT_RANGE_TOLERANCE) | (opacity > 1 + UNIT_RANGE_TOLERANCE)
@@ -162,7 +161,7 @@ def logits_of(opacity: NDArray[Any], where: Path | str, numbers: int | NDArray[n
 
 
 def colours(dc: Float32) -> Float64:
-    """Colours from SH coefficients 0, which are the constant terms."""
+    """Colours from SH coefficients 0."""
     return 0.5 + SH_C0 * dc.astype(np.float64)
 
 
@@ -172,13 +171,13 @@ def coefficients(rgb: NDArray[Any]) -> Float64:
 
 
 def full_scale(levels: NDArray[Any]) -> float:
-    """Value of white in stored colours of any shape and numeric dtype, judged by the values.
+    """Value that stands for white in stored colours of any shape and numeric dtype, guessed from the values.
 
     - 8-bit integers: 255.
-    - Wider integers: 255 if the largest is at most that, as programs store bytes in them. Otherwise 65535, 2^31-1 or
+    - Wider integers: 255 if none is larger, because some programs store bytes in them. Otherwise 65535, 2^31-1 or
       2^32-1.
-    - Floats: 1 if the largest is at most 1, or at most MAX_FLOAT_HIGHLIGHT with fractions among them, or if nearly all
-      are at most 1. Otherwise 255 or 65535.
+    - Floats: 1 if none is larger than 1, or if some are fractions and either none is larger than MAX_FLOAT_HIGHLIGHT
+      or UNIT_COLOUR_SHARE of them are at most 1. Otherwise 255 or 65535.
 
     Non-finite values are ignored. Without values the result is 255 for integers, 1 for floats.
     """
@@ -200,17 +199,17 @@ def full_scale(levels: NDArray[Any]) -> float:
 
 
 def unit_quaternions(quaternions: NDArray[Any]) -> Float64:
-    """Quaternions (n, 4), w x y z, normalised; length 0 becomes no rotation."""
+    """Normalise quaternions (n, 4), w x y z. A quaternion of length 0 becomes the identity rotation."""
     q = quaternions.astype(np.float64)
     length = np.linalg.norm(q, axis=1, keepdims=True)
     return np.where(length > 0, q / np.where(length > 0, length, 1), (1.0, 0.0, 0.0, 0.0))
 
 
 def restore_largest(which: NDArray[Any], three: Float32) -> Float32:
-    """Unit quaternions (n, 4) from their three smaller components.
+    """Unit quaternions (n, 4) from three components each.
 
-    which (n,): index of the largest component, which was left out.
-    three (n, 3): the others in their order.
+    which (n,): index of the missing component, the largest.
+    three (n, 3): the other components in their order.
     """
     result = np.empty((len(three), 4), np.float32)
     largest = np.sqrt(np.maximum(1 - np.square(three).sum(axis=1), 0))
@@ -220,28 +219,31 @@ def restore_largest(which: NDArray[Any], three: Float32) -> Float32:
 
 
 def leave_out_largest(unit: Float64) -> tuple[NDArray[np.intp], Float64]:
-    """Inverse of `restore_largest`. A quaternion changes sign if its largest component is negative."""
+    """Index of the largest component of each unit quaternion (n, 4), and its three other components.
+
+    The inverse of `restore_largest`. A quaternion changes sign if its largest component is negative.
+    """
     which = np.abs(unit).argmax(axis=1)
     sign = np.where(np.take_along_axis(unit, which[:, None], axis=1) < 0, -1, 1)
     return which, np.take_along_axis(unit, OTHER_QUATERNION_COMPONENTS[which], axis=1) * sign
 
 
 def at_ends(between: NDArray[Any], low: NDArray[Any], high: NDArray[Any], part: NDArray[Any]) -> NDArray[Any]:
-    """Interpolate between bounds that may be infinite, for which plain arithmetic gives NaN.
+    """Correct an interpolation `between` whose bounds may be infinite, for which plain arithmetic gives NaN.
 
-    between: plain interpolation at the fraction `part`, 0 to 1, of the way from `low` to `high`.
-    If a bound is infinite, the ends are the bounds themselves, and all values between them are infinite.
+    between: low + part * (high - low), with `part` from 0 to 1.
+    If a bound is infinite, the result is `low` at 0, `high` at 1, and infinite between them.
     """
     finite = np.isfinite(low) & np.isfinite(high)
     if finite.all():
         return between
-    with np.errstate(invalid="ignore"):  # -inf + inf, which has no meaning
+    with np.errstate(invalid="ignore"):  # -inf + inf gives NaN
         ends = np.where(part == 0, low, np.where(part == 1, high, low + high))
     return np.where(finite, between, ends)
 
 
 def read_rows(file: BinaryIO, kind: np.dtype[Any], count: int, path: Path) -> NDArray[Any]:
-    """Read the next `count` records of a file whose size was checked. Raises InputError if it has shrunk since."""
+    """Read the next `count` records of a file. Raises InputError if the file has fewer."""
     data = file.read(count * kind.itemsize)
     if len(data) != count * kind.itemsize:
         raise InputError(f"{path}: truncated while it was read")
@@ -249,15 +251,16 @@ def read_rows(file: BinaryIO, kind: np.dtype[Any], count: int, path: Path) -> ND
 
 
 def all_finite(array: NDArray[Any]) -> bool:
-    """True if all values are finite, in a single pass: the float64 sum of finite float32 values is finite."""
-    with np.errstate(invalid="ignore"):  # -inf + inf
+    """True if all values of a float32 array are finite. Takes one pass: the float64 sum of finite values is finite."""
+    with np.errstate(invalid="ignore"):  # -inf + inf gives NaN
         return bool(np.isfinite(array.sum(dtype=np.float64)))
 
 
 def check_writable(path: Path, gaussians: Gaussians, *, least: int = 0) -> None:
-    """Raise ValueError for arrays that are not as `Gaussians` requires.
+    """Check a model before it is written to `path`.
 
-    Raises InputError for non-finite values, and for fewer than `least` Gaussians.
+    Raises ValueError for invalid arrays (`Gaussians.check`), InputError for non-finite values and for fewer than
+    `least` Gaussians.
     """
     gaussians.check()
     for name, array in zip(GAUSSIAN_ARRAY_NOUNS, gaussians.arrays().values(), strict=True):
@@ -269,7 +272,7 @@ def check_writable(path: Path, gaussians: Gaussians, *, least: int = 0) -> None:
 
 
 def require_count(path: Path, count: int, size: int) -> None:
-    """Raise InputError for a count that a compressed file of `size` bytes cannot have."""
+    """Raise InputError if a compressed file of `size` bytes cannot hold `count` Gaussians."""
     if count < 1:
         raise InputError(f"{path}: has {count} Gaussians, expected at least one")
     if count > max(MAX_UNCHECKED_GAUSSIANS, size):
@@ -277,9 +280,9 @@ def require_count(path: Path, count: int, size: int) -> None:
 
 
 def morton_order(means: Float32) -> NDArray[np.int64]:
-    """Row order (n,) along a Z-order curve through the bounding box of the means (n, 3) (Morton 1966).
+    """Indices (n,) that sort means (n, 3) along a Z-order curve through their bounding box (Morton 1966).
 
-    Neighbours in space stay close. Ties keep their order.
+    Neighbours in space get close indices. Ties keep their order.
     """
     low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
     cells = (1 << MORTON_BITS_PER_AXIS) - 1

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Model files: a module for each format, chosen by the file's suffix, or by its first bytes if they disagree.
+"""Model formats, a module for each. The file's suffix selects the format, unless its first bytes say otherwise.
 
 MODEL_FORMATS is the only place that lists the formats, one row each. The docstring of a format's module cites the
-specification and lists the format's conventions that differ from ours (docs/conventions.md).
+specification and lists the conventions that differ from clsplat's (docs/conventions.md).
 """
 
 from __future__ import annotations
@@ -33,28 +33,29 @@ FORMAT_HEAD_BYTES = 1 << 16
 MODEL_SIZE_SAMPLES = 10_000
 """Number of means that are sampled to estimate a model's size."""
 SMALL_MODEL_NEAR_PLANES = 10.0
-"""Model size, in default near planes, below which the default near plane is too far."""
+"""Size of a model, in multiples of the default near plane, below which that near plane would clip too much of it."""
 
 
 @dataclass(frozen=True)
 class Format:
-    """A row of the table.
+    """A model format: a row of MODEL_FORMATS.
 
     name: its name in messages.
-    suffixes: suffixes of its files in lower case; a suffix without a dot is a whole file name.
+    suffixes: lower-case suffixes of its files; a suffix without a dot is a whole file name.
     read(path): reads the Gaussians. Raises InputError, one line with the path, for a damaged file.
-    write(path, gaussians, **options): writes atomically; None for a read-only format.
-    recognises(head): True if the first bytes, at most FORMAT_HEAD_BYTES, are of the format; None without a signature.
+    write(path, gaussians, **options): writes a file atomically; None for a read-only format.
+    recognises(head): True if the first bytes of a file, up to FORMAT_HEAD_BYTES, show the format; None if it has no
+        signature.
     loses: short description of the information that the format does not keep.
     floats: True if it stores values as floats.
-    sh_degree: the highest degree that it holds.
+    sh_degree: the highest SH degree that it stores.
     describe(path): the format's part of `clsplat info`.
-    order(gaussians): (n,) index of the Gaussian in each row of a written file; None if the order is kept.
-    blocks(path): yields the Gaussians in world coordinates, some rows at a time; None if the file is read whole.
+    order(gaussians): index (n,) of the Gaussian in each row of a written file; None if the order is kept.
+    blocks(path): yields the Gaussians in world coordinates in blocks of rows; None if the file is read at once.
     side_files(path): the other files of the model at this path.
-    space(path): colour space of its colours.
-    marks: byte strings, of which a file with Gaussians has at least one near its beginning; empty if all files have
-    Gaussians.
+    space(path): the model's colour space.
+    marks: byte strings. A file with Gaussians has at least one of them near its beginning. Empty if every file of the
+        format has Gaussians.
     """
 
     name: str
@@ -77,7 +78,7 @@ class Format:
 ZIP_SUFFIX = ".zip"
 UNIT_QUATERNION_LOSS = "nothing but the quaternions' lengths and the logits of opacities next to 0 and 1"
 
-_ZIPPED_MODEL = zipped.Inside(
+_ZIPPED_MODEL = zipped.ZipReader(
     lambda path: is_model_name(path) and path.suffix.lower() != ZIP_SUFFIX,
     lambda path, head: _has_mark(path, head),  # noqa: PLW0108
     lambda path: resolve(path),  # noqa: PLW0108  # defined below the table
@@ -107,16 +108,16 @@ MODEL_FORMATS: tuple[Format, ...] = (
     Format("zipped model", (ZIP_SUFFIX,), _ZIPPED_MODEL.read, recognises=zipped.recognises, loses="not written here",
            describe=_ZIPPED_MODEL.describe, space=_ZIPPED_MODEL.space),
 )  # fmt: skip
-"""All formats. The first one that recognises a file's first bytes wins."""
+"""All formats. The first format that recognises a file's first bytes is used."""
 
 
 def suffixes(*, writable: bool = False) -> list[str]:
-    """Known suffixes, or only the suffixes of formats that can be written."""
+    """Suffixes of all formats, sorted. writable: only of formats that can be written."""
     return sorted(suffix for row in MODEL_FORMATS if row.write or not writable for suffix in row.suffixes)
 
 
 def _named(path: Path) -> Format | None:
-    """Format with the longest suffix that matches the name; None if none does."""
+    """Format whose suffix matches the file's name, the longest suffix first; None if none matches."""
     name = path.name.lower()
     fits = [
         (len(suffix), row)
@@ -128,27 +129,26 @@ def _named(path: Path) -> Format | None:
 
 
 def format_of_name(path: str | os.PathLike[str], *, writable: bool = False) -> Format:
-    """Format by the name alone. Raises InputError for an unknown suffix, or a read-only format if `writable`."""
+    """Format of the file's suffix. Raises InputError for an unknown suffix and, if `writable`, a read-only format."""
     named = _named(Path(path))
     known = " ".join(suffixes(writable=writable))
     if named is None:
-        raise InputError(f"{path}: does not end like a model file, expected one of {known}")
+        raise InputError(f"{path}: does not have the suffix of a model file, expected one of {known}")
     if writable and named.write is None:
         raise InputError(f"{path}: {named.name} is read only, expected one of {known}")
     return named
 
 
 def format_of(path: Path) -> Format:
-    """Format by the name, unless the first bytes belong to another format. Raises InputError, also if there is no such
-    file."""
+    """Format by the file's name, unless the first bytes belong to another format. Raises InputError."""
     named = _named(path)
     if named is not None and path.is_dir():  # the reader checks if a folder is valid
         return named
-    with open_input(path, f"a model file, its ending one of {' '.join(suffixes())}") as file:
+    with open_input(path, f"a model file with one of the suffixes {' '.join(suffixes())}") as file:
         head = file.read(FORMAT_HEAD_BYTES)
         if head.startswith(b"ply") and b"end_header" not in head:  # long comments push the properties further down
             head += file.read(MAX_PLY_HEADER_BYTES)
-    # a format without a signature yields to another format's signature, unless that is only the start of JSON
+    # a format without a signature yields to the signature of another format, except to the "{" of JSON
     fits = named and (named.recognises(head) if named.recognises else head.lstrip()[:1] == b"{")
     if head.startswith(zipped.ZIP_FILE_MAGIC) and (not fits or named is _row("SOG")):
         return _archive(path, named)
@@ -159,7 +159,8 @@ def format_of(path: Path) -> Format:
 def _archive(path: Path, named: Format | None) -> Format:
     """Format of a zip archive whose name is not that of a .zip or OpenUSD file.
 
-    It is SOG if one of its files is SOG's meta.json, or if it has SOG's suffix and contains no other model.
+    The format is SOG if the archive contains SOG's meta.json, or has SOG's suffix and contains no other model.
+    Otherwise it is a zipped model.
     """
     names = _ZIPPED_MODEL.names(path)
     is_sog = sog.SOG_META_FILE in names or (named is _row("SOG") and not names)
@@ -171,17 +172,17 @@ def _row(name: str) -> Format:
 
 
 def _has_mark(path: Path, head: bytes) -> bool:
-    """False for a file with a model's name whose beginning has no mark of its format."""
+    """True if a file has a model's name, and its first bytes have one of the format's `marks`."""
     named = _named(path)
     return named is not None and (not named.marks or any(mark in head for mark in named.marks))
 
 
 @contextmanager
 def unpacked(path: Path) -> Iterator[tuple[Path, Format]]:
-    """Context with a model's file and format; for a zipped model, the file unpacked from the archive, removed
-    afterwards.
+    """Context manager that yields a model's file and format.
 
-    Raises InputError like `resolve` and `zipped.unpacked`.
+    It unpacks a zipped model, and removes the unpacked file afterwards. Raises InputError like `resolve` and
+    `zipped.unpacked`.
     """
     file, row = path, format_of(path)
     with _ZIPPED_MODEL.model(path) if row is _row("zipped model") else nullcontext((file, row)) as found:
@@ -189,19 +190,19 @@ def unpacked(path: Path) -> Iterator[tuple[Path, Format]]:
 
 
 def resolve(path: Path) -> tuple[Path, Format]:
-    """Model file and format of a path, which may be the folder of a model.
+    """Model file and format at a path, which may be the folder of a model.
 
-    Raises InputError like `format_of`. Warns if the name suggests another format.
+    Raises InputError like `format_of`. Warns if the file's name has the suffix of another format.
     """
     path = model_path(path)
     row = format_of(path)
     if path.suffix.lower() not in {Path(f"x{suffix}").suffix for suffix in row.suffixes}:
-        warn(f"{path}: is {row.name} by its content, whatever its name says")
+        warn(f"{path}: is {row.name} by its content, in spite of its name")
     return path, row
 
 
 def is_model_name(path: Path) -> bool:
-    """True if the suffix is a model file's."""
+    """True if a path has the suffix of a model file."""
     return _named(path) is not None
 
 
@@ -212,12 +213,11 @@ def model_path(path: Path) -> Path:
 
 
 def load(path: str | os.PathLike[str], *, activated: Activated | None = None, doubts: bool = True) -> Gaussians:
-    """Read a model file of any format, repaired by `soundness.sound`.
+    """Read a model file of any format, and repair its values (`soundness.sound`).
 
-    activated: values that the file stores after activation; they become logits or logs. Without it, a warning says if
-      it seems to be needed.
-    doubts: False leaves out that warning.
-    Raises InputError that names the file and the problem.
+    activated: values to convert to logits or logs, because the file stores opacities or scales.
+    doubts: warn if the file seems to need `activated`.
+    Raises InputError.
     """
     path, row = resolve(Path(path))
     gaussians = soundness.sound(row.read(path), path, activated)
@@ -229,13 +229,13 @@ def load(path: str | os.PathLike[str], *, activated: Activated | None = None, do
 
 
 def colour_space(path: str | os.PathLike[str]) -> str:
-    """Colour space of a model file; sRGB if it records none. Raises InputError."""
+    """Colour space of a model file; sRGB if the file records none. Raises InputError."""
     path = model_path(Path(path))
     return format_of(path).space(path)
 
 
 def _near_of(gaussians: Gaussians) -> float:
-    """Near plane of a model without one: the default, unless the model is so small that it would be clipped."""
+    """Near plane for a model whose file has none: the default, or less if the model is very small."""
     some = gaussians.means[:: max(len(gaussians) // MODEL_SIZE_SAMPLES, 1)].astype(np.float64)
     size = float(np.median(np.linalg.norm(some - np.median(some, axis=0), axis=1)))
     return (
@@ -246,10 +246,10 @@ def _near_of(gaussians: Gaussians) -> float:
 
 
 def save(path: str | os.PathLike[str], gaussians: Gaussians, **options: Any) -> None:
-    """Write a model file atomically, in the format of its name.
+    """Write a model file atomically, in the format of its suffix.
 
-    options: keyword arguments of the format's `write`; unknown ones are ignored.
-    Raises InputError for a suffix that cannot be written.
+    options: keyword arguments for the format's `write`; arguments that it does not have are ignored.
+    Raises InputError for an unknown suffix or a read-only format.
     """
     write = format_of_name(path, writable=True).write
     assert write is not None

@@ -2,21 +2,22 @@
 """PlayCanvas' compressed PLY: 16 bytes a Gaussian in chunks of 256, and a byte for each higher SH coefficient.
 
 https://blog.playcanvas.com/compressing-gaussian-splats and https://github.com/playcanvas/splat-transform (read-ply,
-write-compressed-ply). Frame, quaternion order, log scales and signs are as in the 3DGS PLY.
+write-compressed-ply). Axes, quaternion order, log scales and signs are as in the 3DGS PLY.
 
 - element `chunk`: bounds of position, log scale and colour (0.5 + C0 f_dc) of 256 Gaussians. Older files have no colour
-  bounds, which are then 0 and 1. Log scales are clamped to -20 to 20 when written.
-- `vertex`, packed_position and packed_scale: 11, 10 and 11 bits from the top, between the chunk's bounds.
-- `vertex`, packed_rotation: the top 2 bits give the largest of w x y z, which is positive. The others follow in order,
-  10 bits each for -1/sqrt(2) to 1/sqrt(2).
+  bounds; colours are then between 0 and 1. Written log scales are clamped to -20 to 20.
+- `vertex`, packed_position and packed_scale: x, y and z in 11, 10 and 11 bits, from the highest bit down, between the
+  chunk's bounds.
+- `vertex`, packed_rotation: the top 2 bits are the index of the largest of w x y z, which is positive. The other
+  components follow in order, 10 bits each for -1/sqrt(2) to 1/sqrt(2).
 - `vertex`, packed_color: 8 bits each of red, green and blue, between the bounds, and of opacity, 0 to 1.
-- element `sh`, if there are higher coefficients: f_rest_*, channel-major, in bytes for -4 to 4. A byte is the middle of
-  one of 256 steps, but 0 and 255 are the ends.
+- element `sh`, if there are higher coefficients: f_rest_*, channel-major, in bytes for -4 to 4. A byte stands for the
+  middle of one of 256 steps, but 0 for -4 and 255 for 4.
 
-Some writers store infinite bounds, such as -inf, the log of a scale of 0. The Gaussians at that end of the steps get
-the infinite value, and so do all Gaussians between the ends, whose own values are lost.
+Some writers store infinite bounds, such as -inf, the log of a scale of 0. Gaussians at a finite bound keep their value;
+all others become infinite.
 
-The Gaussians of a chunk share its bounds, so they are sorted by position when written.
+The Gaussians of a chunk share its bounds, so a written file is sorted by position.
 """
 
 from __future__ import annotations
@@ -57,13 +58,13 @@ def recognises(head: bytes) -> bool:
 
 
 def read(path: Path) -> Gaussians:
-    """Read the file. Raises InputError if it is not a compressed PLY, lacks elements or properties, or is truncated."""
+    """Read a compressed PLY. Raises InputError for another format, missing elements or properties, or a short file."""
     with open_input(path, "a compressed PLY") as file:
         header = ply_file.read_header(file, path)
         chunks, vertex, sh = _elements(header)
         end, have = header.start(len(header.elements)), os.fstat(file.fileno()).st_size
         if have < end:
-            raise InputError(f"{path}: truncated: has {have} of the {end} bytes that its header promises")
+            raise InputError(f"{path}: truncated: has {have} bytes, but needs {end} by its header")
         bounds = _bounds(file, header, chunks)
         rest = [] if sh is None else [f"f_rest_{index}" for index in range(len(sh.properties))]
         result = packing.empty(vertex.count, {0: 0, 9: 1, 24: 2, 45: 3}[len(rest)])
@@ -88,7 +89,7 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def write(path: Path, gaussians: Gaussians, *, comments: Sequence[str] = ()) -> None:
-    """Write the file atomically, with the Gaussians in the order of `order`.
+    """Write a compressed PLY atomically, with the Gaussians in the order given by `order`.
 
     comments: lines for the header, in ASCII.
     """
@@ -120,12 +121,12 @@ def write(path: Path, gaussians: Gaussians, *, comments: Sequence[str] = ()) -> 
 
 
 def order(gaussians: Gaussians) -> NDArray[np.int64]:
-    """(n,) index of the Gaussian in each row of the file."""
+    """Index (n,) of the Gaussian in each row of the file."""
     return packing.morton_order(gaussians.means)
 
 
 def _elements(header: ply_file.PlyHeader) -> tuple[ply_file.Element, ply_file.Element, ply_file.Element | None]:
-    """Elements chunk, vertex and, if present, sh, with their properties checked."""
+    """The elements chunk, vertex and sh, with their properties checked; None for sh if the file has none."""
     path, names = header.path, [element.name for element in header.elements]
     if header.format == "ascii":
         raise InputError(f"{path}: is a compressed PLY in ascii, expected binary")
@@ -154,7 +155,7 @@ def _elements(header: ply_file.PlyHeader) -> tuple[ply_file.Element, ply_file.El
         properties = [(f"f_rest_{index}", "u1") for index in range(len(sh.properties))]
         if len(sh.properties) not in counts or set(properties) != set(sh.properties):
             raise InputError(
-                f"{path}: element sh has other properties than {' or '.join(map(str, counts))} uchars f_rest_*"
+                f"{path}: element sh has unknown properties, expected {' or '.join(map(str, counts))} uchars f_rest_*"
             )
         if sh.count != vertex.count:
             raise InputError(f"{path}: element sh has {sh.count} rows, expected {vertex.count} like element vertex")
@@ -172,7 +173,7 @@ def _rows(file: BinaryIO, header: ply_file.PlyHeader, element: ply_file.Element,
 
 
 def _bounds(file: BinaryIO, header: ply_file.PlyHeader, chunks: ply_file.Element) -> NDArray[np.float32]:
-    """Bounds (chunks, 3, 2, 3): least and largest position, log scale and colour."""
+    """Bounds of each chunk, (chunks, 3, 2, 3): of position, log scale and colour; minimum and maximum; components."""
     table = _rows(file, header, chunks, slice(0, chunks.count))
     bounds = np.zeros((chunks.count, 18), np.float32)
     bounds[:, 15:] = 1
@@ -183,13 +184,13 @@ def _bounds(file: BinaryIO, header: ply_file.PlyHeader, chunks: ply_file.Element
 
 
 def _fields(words: NDArray[Any], layout: tuple[tuple[int, int], ...]) -> NDArray[np.float32]:
-    """Bit fields (n, fields), scaled to 0 to 1. layout: shift and number of bits of each field."""
+    """Bit fields (n, fields) of words (n,), scaled to [0, 1]. layout: shift and number of bits of each field."""
     columns = [(words >> shift & (1 << bits) - 1) / np.float32((1 << bits) - 1) for shift, bits in layout]
     return np.stack(columns, axis=1).astype(np.float32)
 
 
 def _unpack(block: NDArray[Any], bounds: NDArray[np.float32], result: Gaussians, rows: slice) -> None:
-    """Unpack rows of `vertex` into the model; bounds (n, 3, 2, 3) of each row."""
+    """Unpack rows of `vertex` into the model. bounds (n, 3, 2, 3): bounds of each row's chunk, as in `_bounds`."""
 
     def between(words: NDArray[Any], layout: tuple[tuple[int, int], ...], what: int) -> NDArray[np.float32]:
         part = _fields(words, layout)
@@ -217,14 +218,14 @@ def _values(gaussians: Gaussians, rows: NDArray[np.int64]) -> tuple[NDArray[Any]
 
 
 def _ranges(*values: NDArray[Any]) -> NDArray[np.float32]:
-    """Bounds (chunks, 3, 2, 3) as in `_bounds`; only the last chunk may be partial."""
+    """Bounds (chunks, 3, 2, 3) of values, as in `_bounds`. The last chunk may be partial."""
     at = np.arange(0, len(values[0]), CHUNK_GAUSSIANS)
     ends = [[np.minimum.reduceat(column, at), np.maximum.reduceat(column, at)] for column in values]
     return np.asarray(ends, np.float32).transpose(2, 0, 1, 3)
 
 
 def _pack(gaussians: Gaussians, rows: NDArray[np.int64], ranges: NDArray[np.float32]) -> NDArray[Any]:
-    """Rows of `vertex`, (n, 4) uint32."""
+    """Pack Gaussians into rows of `vertex`, (n, 4) uint32."""
     bounds = ranges[np.arange(len(rows)) // CHUNK_GAUSSIANS].astype(np.float64)
 
     def fields(parts: NDArray[Any], layout: tuple[tuple[int, int], ...]) -> NDArray[np.uint32]:

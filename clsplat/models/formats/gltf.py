@@ -4,18 +4,18 @@
 Specifications: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, and for Gaussians
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting (ratified).
 
-- Frame: x left, y up, z forward, as the base specification says; half a turn about z from ours. The turn is applied
-  to the written values and not to a node, since not every viewer turns spherical harmonics with their node. An `origin`
-  becomes the node's translation. When reading, the nodes' transforms are applied.
+- Axes: x left, y up, z forward, as the base specification says; half a turn about z from clsplat's. The writer turns
+  the values and not a node, since not every viewer rotates spherical harmonics with their node. An `origin` becomes the
+  node's translation. The reader applies the nodes' transforms.
 - Values are float32: linear scales, opacities in [0, 1], unit quaternions x y z w. Each SH coefficient has an
-  attribute, with our order and signs. Normalised integers are read too. COLOR_0 is for viewers that draw points, in
-  linear light as glTF requires.
+  attribute, in clsplat's order and signs. The reader accepts normalised integers too. COLOR_0, linear as glTF requires,
+  is for viewers that draw points.
 - Colour space: srgb_rec709_display by default, or lin_rec709_display for a model trained in linear light.
-- Compression: the draft KHR_gaussian_splatting_compression_spz_2 stores an SPZ file in a buffer view. It demands
-  SPZ version 2, unpacked into glTF's frame. Such files are read, and written on request.
+- Compression: the draft KHR_gaussian_splatting_compression_spz_2 stores an SPZ file, version 2, in a buffer view. When
+  unpacked, its values are in glTF's axes. Such files are read, and written on request.
 
-The container, a JSON object and arrays at offsets, is parsed here, in place. Libraries for it load whole files and
-trust their contents.
+clsplat parses the container itself, a JSON object and arrays at offsets: glTF libraries load whole files and trust
+their contents.
 """
 
 from __future__ import annotations
@@ -60,18 +60,18 @@ GLB_MAGIC = 0x46546C67
 FLOAT32_COMPONENT, UINT16_COMPONENT = 5126, 5123
 MAX_GLB_BYTES = (1 << 32) - 1
 LOG_SCALE_WRITER, LOG_SCALE_WRITER_FIXED_VERSION = re.compile(r"splat-transform v?(\d+)\.(\d+)(?:\..*)?"), (2, 7)
-"""Pattern of a program's name and version, and the first version that writes scales. Earlier ones write their logs."""
+"""Pattern of splat-transform's name and version, and its first version that writes scales. Earlier ones write logs."""
 Rows = Callable[[slice], Array]
-"""An attribute: a function that returns some of its rows."""
+"""Function that returns rows of an attribute."""
 
 
 def recognises(head: bytes) -> bool:
-    """True if a file begins as a .glb, or as JSON, which is all that a .gltf begins with."""
+    """True if a file begins like a .glb, or like JSON, as a .gltf does."""
     return head[:4] == b"glTF" or head.lstrip()[:1] == b"{"
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Colour space and compression in the extension of the first primitive that has it."""
+    """The format's part of `clsplat info`: colour space and compression of the first primitive with Gaussians."""
     asset = Asset.open(path)
     for _, _, primitive in asset.primitives():
         said = as_object(primitive["extensions"][GAUSSIAN_EXTENSION])
@@ -86,36 +86,36 @@ def side_files(path: Path) -> list[Path]:
 
 
 def read(path: Path) -> Gaussians:
-    """Read every primitive of Gaussians in the scene, as one model. Raises InputError."""
+    """Read all primitives with Gaussians in the scene, merged into one model. Raises InputError."""
     asset = Asset.open(path)
-    primitives = list(asset.primitives())  # a list, so that they are counted before any is read
+    primitives = list(asset.primitives())  # a list, so that all are counted before any is read
     if not primitives:
         raise InputError(f"{path}: has no primitive with {GAUSSIAN_EXTENSION} in its scene, expected at least one")
     scaled: list[tuple[str, Gaussians]] = []
     parts = [_gaussians(asset, name, primitive, scaled) for name, _, primitive in primitives]
     if scaled:
         values.all_to_log_scales(scaled, _writer_of_logs(asset))
-    # the node's matrix is in glTF's frame, the Gaussians already in ours
+    # the nodes' matrices are in glTF's axes, the Gaussians already in clsplat's
     turn = np.diag([*LUF_SIGNS, 1.0])
     placed = zip(parts, primitives, strict=True)
     return merge([axes.place(part, turn @ matrix @ turn, f"{path}: {name}") for part, (name, matrix, _) in placed])
 
 
 def _writer_of_logs(asset: Asset) -> str:
-    """The program that wrote the file if it is known to write logs of scales; otherwise an empty text."""
+    """Name of the program that wrote the file, if it is known to write logs of scales; otherwise ""."""
     generator = str(as_object(asset.document.get("asset")).get("generator", ""))[:80]
     match = LOG_SCALE_WRITER.fullmatch(generator.strip())
     return generator if match and (int(match[1]), int(match[2])) < LOG_SCALE_WRITER_FIXED_VERSION else ""
 
 
 def _gaussians(asset: Asset, name: str, primitive: dict[str, Any], scaled: list[tuple[str, Gaussians]]) -> Gaussians:
-    """The primitive's Gaussians in our frame; if their scales are not logs yet, they are appended to `scaled`."""
+    """Read the Gaussians of a primitive, in clsplat's axes. If their scales are linear, append them to `scaled`."""
     said = as_object(primitive["extensions"][GAUSSIAN_EXTENSION])
     kernel, space = said.get("kernel", "ellipse"), said.get("colorSpace", GLTF_COLOR_SPACES[0])
     if kernel != "ellipse":
         warn(
-            f"{asset.path}: {name} has the kernel {str(kernel)[:40]!r}, expected ellipse; it is drawn as one, as the "
-            "extension prescribes for unknown kernels"
+            f"{asset.path}: {name} has the kernel {str(kernel)[:40]!r}, expected ellipse; it is drawn as an ellipse, "
+            "as the extension requires for unknown kernels"
         )
     if space != GLTF_COLOR_SPACES[0]:
         warn(f"{asset.path}: the colours are in {str(space)[:40]} and are not converted")
@@ -130,7 +130,7 @@ def _gaussians(asset: Asset, name: str, primitive: dict[str, Any], scaled: list[
 
 
 def _from_attributes(asset: Asset, name: str, indices: dict[str, Any]) -> Gaussians:
-    """The Gaussians of a primitive's attributes; their scales are not logs yet."""
+    """Read the Gaussians of a primitive from its attributes. `log_scales` has linear scales, as the file does."""
 
     def array(semantic: str, width: int) -> Array:
         if semantic not in indices:
@@ -165,7 +165,7 @@ def _from_attributes(asset: Asset, name: str, indices: dict[str, Any]) -> Gaussi
 def write(
     path: Path, gaussians: Gaussians, *, spz_compression: bool = False, color_space: str = GLTF_COLOR_SPACES[0]
 ) -> None:
-    """Write a .glb, or a .gltf and a .bin with its buffer. Each file is atomic; the .bin comes first.
+    """Write a .glb, or a .gltf with a .bin. Each file is written atomically, the .bin first.
 
     spz_compression: use the draft KHR_gaussian_splatting_compression_spz_2, which few viewers read.
     Raises InputError for non-finite values, and for a .glb of more than 4 GiB.
@@ -188,7 +188,7 @@ def write(
     padded = length + -length % 4
     total = 28 + len(text) + padded
     if total > MAX_GLB_BYTES:
-        raise InputError(f"{path}: a .glb holds 4 GiB at most, but {total} bytes are needed; write a .gltf")
+        raise InputError(f"{path}: a .glb can have 4 GiB at most, but {total} bytes are needed; write a .gltf")
     with atomic_writer(path, total) as file:
         file.write(struct.pack("<IIIII", GLB_MAGIC, 2, total, len(text), GLB_JSON_CHUNK) + text)
         file.write(struct.pack("<II", padded, GLB_BIN_CHUNK))
@@ -197,7 +197,7 @@ def write(
 
 
 def _attributes(gaussians: Gaussians, color_space: str) -> dict[str, Rows]:
-    """Attributes by name, in the order of the buffer and in glTF's frame."""
+    """Attributes by name, in the order of the buffer and in glTF's axes."""
 
     def rotation(rows: slice) -> Array:
         unit = values.unit_quaternions(gaussians.quaternions[rows]) * axes.quaternion_signs(LUF_SIGNS)
@@ -227,7 +227,7 @@ def _attributes(gaussians: Gaussians, color_space: str) -> dict[str, Rows]:
 
 
 def _blocks(attributes: Iterable[Rows], count: int) -> Iterator[memoryview]:
-    """Bytes of the attributes, one attribute after another."""
+    """Yield the bytes of all attributes, one attribute after another."""
     for rows_of in attributes:
         for rows in values.row_blocks(count):
             block = rows_of(rows)
@@ -235,7 +235,7 @@ def _blocks(attributes: Iterable[Rows], count: int) -> Iterator[memoryview]:
 
 
 class GaussianNode(TypedDict):
-    """The node of the written mesh. translation: the model's origin, if it has one."""
+    """The node of the written mesh. translation: the model's origin, if it is not 0."""
 
     mesh: int
     translation: NotRequired[list[float]]
@@ -244,7 +244,7 @@ class GaussianNode(TypedDict):
 def _document(
     path: Path, gaussians: Gaussians, spz_compression: bool, color_space: str
 ) -> tuple[dict[str, Any], Iterable[bytes | memoryview]]:
-    """The JSON without its buffers, and the contents of the single buffer."""
+    """The JSON object without its key `buffers`, and the contents of the only buffer."""
     count = len(gaussians)
     attributes = _attributes(gaussians, color_space)
     samples = {name: rows_of(slice(0, 1)) for name, rows_of in attributes.items()}
@@ -294,7 +294,7 @@ def _document(
 
 
 def _spz_blob(path: Path, gaussians: Gaussians) -> bytes:
-    """The model as an SPZ file, with means relative to the node."""
+    """The model as an SPZ file, with means relative to `origin`, which is the node's translation."""
     local = replace(gaussians, origin=np.zeros(3))
     blob = io.BytesIO()
     spz.write_to(blob, local, spz.header_for(path, local, 2))

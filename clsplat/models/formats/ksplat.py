@@ -7,7 +7,7 @@ buckets' centres and the Gaussians.
 
 - A Gaussian: position, scale, quaternion w x y z, bytes of red, green, blue and opacity, and higher SH.
 - Scales are standard deviations, not logs. SH above degree 0 are stored by degree, channel-major in each.
-- The frame and the signs of SH are as in the 3DGS PLY.
+- Axes and the signs of SH are as in the 3DGS PLY.
 - Level 0: float32.
 - Level 1: half floats, and positions in 16 bits around their bucket's centre.
 - Level 2: as level 1, but SH in bytes between the header's two bounds.
@@ -48,7 +48,7 @@ KSPLAT_SECTION_HEADER = np.dtype(
 BUCKET_CENTRE_BYTES = 12
 DEFAULT_POSITION_RANGE = 32767
 DEFAULT_SH_BOUND = 1.5
-"""Bound of SH if the header stores 0."""
+"""Magnitude of both SH bounds if the header stores 0."""
 SH_VALUES_BY_DEGREE = (0, 9, 24, 45)
 _POSITION_DTYPES, _FLOAT_DTYPES, _SH_DTYPES = ("<f4", "<u2", "<u2"), ("<f4", "<f2", "<f2"), ("<f4", "<f2", "u1")
 
@@ -60,9 +60,9 @@ class Section:
     count: number of Gaussians.
     start: byte offset of the first Gaussian.
     kind: dtype of a record.
-    step: world units per unit of a stored position. `middle` is the stored position at the centre of a bucket.
-    centres: (buckets, 3); None at level 0.
-    ends: index of the first Gaussian after each bucket; None at level 0.
+    step, middle: world units per unit of a stored position, and the stored position at the centre of a bucket.
+    centres: (buckets, 3), the buckets' centres in world units; None at level 0.
+    ends: (buckets,), index of the first Gaussian after each bucket; None at level 0.
     """
 
     count: int
@@ -76,9 +76,9 @@ class Section:
 
 
 def read(path: Path) -> Gaussians:
-    """Read the file.
+    """Read a .ksplat file.
 
-    Raises InputError for another version or level, a truncated file, inconsistent counts, and some negative scales.
+    Raises InputError for another version or level, a truncated file, inconsistent counts, or a few negative scales.
     """
     with open_input(path, "a .ksplat file") as file:
         size = os.fstat(file.fileno()).st_size
@@ -122,7 +122,7 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) -> list[Section]:
-    """All sections, checked against the file's size."""
+    """Read the headers of all sections, and check them against the file's size."""
     at = KSPLAT_HEADER.itemsize + sections * KSPLAT_SECTION_HEADER.itemsize
     if size < at:
         raise InputError(f"{path}: truncated: has {size} bytes, but its {sections} sections need {at}")
@@ -166,8 +166,10 @@ def _record(level: int, degree: int) -> np.dtype[Any]:
 
 
 def _ends(head: dict[str, Any], partial: NDArray[np.int64], name: str) -> NDArray[np.int64]:
-    """Index of the first Gaussian after each bucket, full buckets first. Raises InputError if the buckets hold too
-    few."""
+    """Index of the first Gaussian after each bucket, full buckets first.
+
+    Raises InputError if the buckets hold fewer Gaussians than the section has.
+    """
     full = head["full"]
     if full + len(partial) > head["buckets"]:
         raise InputError(

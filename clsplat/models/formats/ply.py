@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The 3DGS model file: a PLY with one vertex per Gaussian, as the paper's authors write it and every tool reads it.
+"""The 3DGS PLY: a PLY with a vertex for each Gaussian, as the paper's authors write it and every tool reads it.
 
 https://github.com/graphdeco-inria/gaussian-splatting (scene/gaussian_model.py, save_ply).
 Properties: x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3. f_rest is channel-major: all higher
 coefficients of red, then of green, then of blue. Files are streamed in blocks of rows, so reading or writing takes
 little more than the model's own memory.
 
-Every tool expects means in world coordinates, so means relative to another origin are converted, which rounds them. The
-exact means follow in a second element, with their origin in a comment. Other tools ignore both.
+Every tool expects means in world coordinates. A model with an `origin` has means relative to it, and their conversion
+rounds. So a second element stores the exact means, and a comment their origin. Other tools ignore both.
 """
 
 from __future__ import annotations
@@ -56,10 +56,9 @@ ROTATION_PROPERTIES = ("rot_0", "rot_1", "rot_2", "rot_3")
 MIP_FILTER_PROPERTY = "filter_3D"
 """Property in Mip-Splatting's files: the filter size that Mip-Splatting's renderer adds to the scales."""
 LOCAL_MEANS_ELEMENT = "clsplat_local"
-"""Element with the means relative to the origin."""
+"""Element with the exact means, relative to the origin."""
 RGB_PROPERTY_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-"""Names, in upper or lower case, of colour properties that nerfstudio's exports and point files have instead of f_dc.
-"""
+"""Names, in upper or lower case, of the colour properties in nerfstudio's exports and point files, in place of f_dc."""
 REQUIRED_PLY_PROPERTIES = (*POSITION_PROPERTIES, *DC_PROPERTIES, "opacity", *SCALE_PROPERTIES, *ROTATION_PROPERTIES)
 
 
@@ -71,11 +70,10 @@ def recognises(head: bytes) -> bool:
 def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read a 3DGS PLY: ascii or binary of either byte order, properties in any order, of any numeric type.
 
-    - SH degree 0 to 3 by the number of f_rest properties (0, 9, 24, 45). Degree 4 (72) is cut to 3, with a
-      warning.
-    - Gaussians without scale_2, as 2DGS writes them, are flat.
-    - Colours named as in RGB_PROPERTY_NAMES may replace f_dc; their values show their range (`values.full_scale`).
-    - Other properties are ignored. MIP_FILTER_PROPERTY, and bytes after the data, give a warning.
+    - The number of f_rest properties (0, 9, 24, 45) gives the SH degree, 0 to 3. Degree 4 (72) is cut, with a warning.
+    - Gaussians without scale_2, as in 2DGS, are flat.
+    - Colours named as in RGB_PROPERTY_NAMES may replace f_dc. Their range is guessed (`values.full_scale`).
+    - Other properties are ignored, MIP_FILTER_PROPERTY with a warning. Bytes after the data cause a warning too.
 
     Raises InputError, one line with the path, if the file is missing, truncated, not a PLY, lacks a property or has no
     Gaussians.
@@ -86,21 +84,21 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         vertex = header.vertex
         rest = _check_properties(header)
         if MIP_FILTER_PROPERTY in dict(vertex.properties):
-            warn(f"{path}: {MIP_FILTER_PROPERTY}, mip-splatting's filter, is ignored; fuse it first")
+            warn(f"{path}: {MIP_FILTER_PROPERTY}, Mip-Splatting's filter, is ignored; fuse it into the scales first")
         if vertex.count == 0:
             raise InputError(f"{path}: has 0 Gaussians (element vertex 0), expected at least one")
         gaussians = _assemble(read_vertices(file, header, "Gaussian"), vertex.count, rest)
-        _take_colours(gaussians, vertex)
+        _convert_colours(gaussians, vertex)
         if header.origin is not None:
-            _count_from(header.origin, gaussians, _local_means(file, header), path)
+            _subtract_origin(header.origin, gaussians, _local_means(file, header), path)
         gaussians.near, gaussians.antialiased, gaussians.by_rays = header.near, header.is_antialiased(), header.by_rays
         return gaussians
 
 
 def read_whole_numbers(path: Path, name: str) -> NDArray[np.int64]:
-    """An integer property of each Gaussian, (n,), without the Gaussians that `soundness.sound` leaves out.
+    """Values (n,) of an integer property, without the Gaussians that `soundness.sound` leaves out.
 
-    Raises InputError like `read`, and for a property that is missing or has other values.
+    Raises InputError like `read`, and if the property is missing or has values that are not 32-bit integers.
     """
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
@@ -115,14 +113,15 @@ def read_whole_numbers(path: Path, name: str) -> NDArray[np.int64]:
             columns.append(np.asarray(block[name], np.float64)[finite_rows(gaussians)])
     column = np.concatenate(columns)
     if not (np.abs(column) < 2**31).all() or (column != np.round(column)).any():
-        raise InputError(f"{path}: the property {name} holds other values than whole numbers of 32 bits")
+        raise InputError(f"{path}: the property {name} has values that are not whole numbers of 32 bits")
     return column.astype(np.int64)
 
 
 def blocks(path: Path) -> Iterator[Gaussians]:
-    """Gaussians in the file's order and in world coordinates, some rows at a time, each block with the file's origin.
+    """Yield the Gaussians in blocks of rows, in the file's order, with means in world coordinates.
 
-    Non-finite values, and colours named as in RGB_PROPERTY_NAMES, are passed through. Raises InputError like `read`.
+    `origin` of each block is the file's, for information. Non-finite values, and colours named as in
+    RGB_PROPERTY_NAMES, are not converted. Raises InputError like `read`.
     """
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
@@ -156,10 +155,10 @@ def write(
 ) -> None:
     """Write a binary little-endian 3DGS PLY of float32, atomically; equal Gaussians give equal bytes.
 
-    sh_degree: pad with zero coefficients up to this degree; the model's own by default.
+    sh_degree: degree up to which zero coefficients are added; by default the model's.
     comments: lines for the header, such as `colour.comment`.
-    Raises ValueError if the degree is lower than the model's, a comment is not a line of ASCII, or an array is not as
-    `Gaussians` requires. Raises InputError for non-finite values.
+    Raises ValueError for a degree lower than the model's, a comment that is not a line of ASCII, and invalid arrays
+    (`Gaussians.check`). Raises InputError for non-finite values.
     """
     check_comments(comments)
     values.check_writable(Path(path), gaussians)
@@ -199,7 +198,7 @@ def write(
 
 
 def _header(gaussians: Gaussians, names: Sequence[str], comments: Sequence[str]) -> bytes:
-    """Header of a written file, including its last line. names: properties of a Gaussian."""
+    """Header of a 3DGS PLY, up to and including `end_header`. names: properties of a Gaussian."""
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     far, count = bool(gaussians.origin.any()), len(gaussians)
     if far:
@@ -225,8 +224,7 @@ def check_comments(comments: Sequence[str]) -> None:
 
 
 def _local_means(file: BinaryIO, header: PlyHeader) -> Float32 | None:
-    """Means of the element LOCAL_MEANS_ELEMENT, if it follows the vertices directly. Raises InputError if it is
-    truncated."""
+    """Means (n, 3) of LOCAL_MEANS_ELEMENT; None if it does not follow the vertices. Raises InputError if too short."""
     wanted = Element(LOCAL_MEANS_ELEMENT, header.vertex.count, [(name, "f4") for name in POSITION_PROPERTIES])
     behind = len(header.before) + 1
     if header.format == "ascii" or header.elements[behind : behind + 1] != [wanted]:
@@ -243,8 +241,8 @@ def _local_means(file: BinaryIO, header: PlyHeader) -> Float32 | None:
     return np.stack([rows[name] for name in POSITION_PROPERTIES], axis=1).astype(np.float32)
 
 
-def _count_from(origin: Float64, gaussians: Gaussians, local: Float32 | None, path: Path) -> None:
-    """Make the means relative to the origin. Uses the exact means `local` where no tool has moved the vertex."""
+def _subtract_origin(origin: Float64, gaussians: Gaussians, local: Float32 | None, path: Path) -> None:
+    """Make the means relative to the origin. Uses the exact means `local` unless another tool has moved the vertex."""
     world = gaussians.means.astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
         means = (world - origin).astype(np.float32)
@@ -256,7 +254,10 @@ def _count_from(origin: Float64, gaussians: Gaussians, local: Float32 | None, pa
 
 
 def _check_properties(header: PlyHeader) -> int:
-    """Number of f_rest properties. Raises InputError if the layout is not a 3DGS model's."""
+    """Check the properties of the vertices. Returns the number of f_rest properties.
+
+    Raises InputError if the properties are not those of a 3DGS model.
+    """
     path, names = header.path, [name for name, _ in header.vertex.properties]
     missing = [name for name in REQUIRED_PLY_PROPERTIES if name not in names and name != SCALE_PROPERTIES[2]]
     if _colour_names(header.vertex) != DC_PROPERTIES:
@@ -283,29 +284,29 @@ def _check_properties(header: PlyHeader) -> int:
 
 
 def _degree(rest: int) -> int:
-    """SH degree that is read from a file with this number of f_rest properties."""
+    """SH degree to read from a file with `rest` f_rest properties."""
     return min(isqrt(1 + rest // 3) - 1, MAX_SH_DEGREE)
 
 
 def _colour_names(vertex: Element) -> tuple[str, ...]:
-    """Properties to read colours from: f_dc, unless the file lacks these and has colours by another name."""
+    """Names of the colour properties: f_dc, or those of RGB_PROPERTY_NAMES if the file has them and no f_dc."""
     names = [name for name, _ in vertex.properties]
     return _rgb_names(names) or DC_PROPERTIES if set(DC_PROPERTIES).isdisjoint(names) else DC_PROPERTIES
 
 
 def _rgb_names(names: Iterable[str]) -> tuple[str, ...]:
-    """Properties among `names` that match an entry of RGB_PROPERTY_NAMES, as spelt in the file; empty if none does."""
-    spelt = {name.lower(): name for name in names}
-    return next((tuple(spelt[name] for name in rgb) for rgb in RGB_PROPERTY_NAMES if spelt.keys() >= {*rgb}), ())
+    """The three of `names` that match an entry of RGB_PROPERTY_NAMES, in the file's spelling; empty if none match."""
+    own = {name.lower(): name for name in names}
+    return next((tuple(own[name] for name in rgb) for rgb in RGB_PROPERTY_NAMES if own.keys() >= {*rgb}), ())
 
 
-def _take_colours(gaussians: Gaussians, vertex: Element) -> None:
-    """Turn colours that were read in place of f_dc into SH coefficients."""
+def _convert_colours(gaussians: Gaussians, vertex: Element) -> None:
+    """Convert colours that were read in place of f_dc to SH coefficients, in place."""
     if (names := _colour_names(vertex)) != DC_PROPERTIES:
         kinds = {np.dtype(kind) for name, kind in vertex.properties if name in names}
         whole = all(kind.kind in "iu" for kind in kinds)
         levels = gaussians.sh[:, 0]
-        finite = levels[np.isfinite(levels)]  # ascii may have non-finite values for integers too
+        finite = levels[np.isfinite(levels)]  # an ascii file may have non-finite values in an integer property
         kind = np.dtype("u1") if kinds == {np.dtype("u1")} else np.dtype("i8")
         with np.errstate(invalid="ignore"):  # numbers that do not fit the type
             white = values.full_scale(finite.astype(kind) if whole else finite)
@@ -313,7 +314,7 @@ def _take_colours(gaussians: Gaussians, vertex: Element) -> None:
 
 
 def _columns(gaussians: Gaussians, rest: int) -> dict[str, NDArray[Any]]:
-    """The part of the model's arrays into which each property is read, by the property's name."""
+    """Views of the model's arrays, one for each property, by the property's name."""
     columns: dict[str, NDArray[Any]] = {"opacity": gaussians.opacity_logits}
     arrays = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.sh[:, 0])
     for names, array in zip(
@@ -327,20 +328,20 @@ def _columns(gaussians: Gaussians, rest: int) -> dict[str, NDArray[Any]]:
 
 
 def _fill(gaussians: Gaussians, block: Block, rest: int) -> None:
-    """Write a block into a model of as many Gaussians. A double beyond the range of float32 becomes infinite."""
+    """Copy a block into a model with the same number of Gaussians. Doubles beyond float32 become infinite."""
     with np.errstate(over="ignore", invalid="ignore"):
         for name, column in _columns(gaussians, rest).items():
             if name in block:
                 column[:] = block[name]
-    if SCALE_PROPERTIES[2] not in block:  # 2DGS: flat
+    if SCALE_PROPERTIES[2] not in block:  # 2DGS: flat Gaussians
         gaussians.log_scales[:, 2] = np.log(values.MIN_SCALE)
     if DC_PROPERTIES[0] not in block:
         gaussians.sh[:, 0] = np.stack([block[name] for name in _rgb_names(block)], axis=1)
 
 
 def _assemble(blocks: Iterator[Block], count: int, rest: int) -> Gaussians:
-    """Gather the blocks into one model."""
-    first = next(blocks)  # before anything is allocated: the count of an ascii file is unchecked
+    """Copy the blocks into one model of `count` Gaussians."""
+    first = next(blocks)  # checks the count, so comes before the allocation
     result = values.empty(count, _degree(rest))
     start = 0
     for block in chain([first], blocks):

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SOG, PlayCanvas's models as images: meta.json with lossless WebP files, or a .sog archive (zip) of these.
+"""SOG, PlayCanvas' models as images: meta.json with lossless WebP files, or a .sog archive (zip) of these.
 
 Specification: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/ (version 2). Version 1,
-without a number in meta.json, is read as in https://github.com/playcanvas/splat-transform.
+whose meta.json has no version, is read as in https://github.com/playcanvas/splat-transform.
 
-- Frame: as ours and the 3DGS PLY's. Each pixel is a Gaussian, row by row from the top.
-- means_l, means_u: low and high bytes of 16 bits between an axis's smallest and largest sign(x) ln(1 + |x|).
+- Axes are clsplat's. Each pixel is a Gaussian, row by row from the top.
+- means_l, means_u: low and high byte of sign(x) ln(1 + |x|) as 16 bits, between the smallest and largest value on the
+  axis.
 - quats: w x y z without the largest component, whose index plus 252 is in alpha; the others in steps of 1/180.
 - scales: indices into a codebook of 256 natural logs.
-- sh0: indices into a codebook of 256 values of SH coefficient 0. Alpha is the opacity in steps of 1/255; an
-  opacity of 0 loses the colours.
-- shN: a palette of up to 65,536 sets of coefficients, each an index into a third codebook; order and signs as ours.
-- Version 1 has ranges in 255 steps instead of codebooks, and opacity as a logit.
+- sh0: indices into a codebook of 256 values of SH coefficient 0. Alpha is the opacity in steps of 1/255. Gaussians of
+  opacity 0 lose their colours.
+- shN: a palette of up to 65,536 sets of coefficients, as indices into a third codebook; order and signs are clsplat's.
+- Version 1 has ranges in 255 steps instead of codebooks, and opacities as logits.
 """
 
 from __future__ import annotations
@@ -45,33 +46,32 @@ from clsplat.progress import Progress, no_progress
 
 Bytes = NDArray[np.uint8]
 PictureFile = Callable[[str, int], Path]
-"""Function that returns an image's file, given its name and the most bytes that it may have in an archive."""
+"""Function that returns the file of an image, given the image's name and its largest size in bytes in an archive."""
 
 SOG_META_FILE = "meta.json"
 SOG_IMAGE_PREFIXES = ("means", "quats", "scales", "sh0", "shN")
-"""Prefixes of the image names."""
+"""Prefixes of the images' names."""
 SH_IMAGE_FILES = ("shN_centroids.webp", "shN_labels.webp")
 MAX_PALETTE_ENTRIES = 1 << 16
 PALETTE_COLUMNS = 64
 QUATERNION_TAG_BASE = 252
 MAX_UNCHECKED_IMAGE_BYTES = 16 << 20
-"""Bytes that an image in an archive may have, in addition to 8 for each Gaussian, which are two raw pixels."""
+"""Number of bytes that an image in an archive may have, in addition to 8 bytes (two raw pixels) for each Gaussian."""
 
 
 def recognises(head: bytes) -> bool:
-    """True if a file begins as an archive or as JSON."""
+    """True if a file begins like a zip archive or like JSON."""
     return head.startswith(b"PK\x03\x04") or head.lstrip()[:1] == b"{"
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Version and antialiasing from meta.json."""
+    """The format's part of `clsplat info`: version and antialiasing."""
     with _opened(path) as (file, meta, _):
         return {"version": meta.get("version", 1), "antialiased": _is_antialiased(file, meta)}
 
 
 def _is_antialiased(path: Path, meta: dict[str, Any]) -> bool:
-    """True if meta.json says in `antialias` or `model` that the model is antialiased. Warns if they contradict each
-    other or are not understood."""
+    """True if meta.json says in `antialias` or `model` that the model is antialiased. Warns if this is unclear."""
     said = antialias.of_object(meta)
     if said.warning:
         warn(f"{path}: {SOG_META_FILE} {said.warning}")
@@ -79,13 +79,13 @@ def _is_antialiased(path: Path, meta: dict[str, Any]) -> bool:
 
 
 def side_files(path: Path) -> list[Path]:
-    """Images of a meta.json."""
+    """Paths of the images of a meta.json; empty for a .sog."""
     pictures = sorted(path.parent.glob("*.webp")) if path.name == SOG_META_FILE else []
     return [picture for picture in pictures if picture.stem.partition("_")[0] in SOG_IMAGE_PREFIXES]
 
 
 def read(path: Path) -> Gaussians:
-    """Read a .sog, a meta.json with its images, or the folder that holds them. Raises InputError."""
+    """Read a .sog, a meta.json with its images, or the folder that contains them. Raises InputError."""
     with _opened(path) as opened:
         meta = _Meta(*opened)
         model = meta.gaussians()
@@ -95,7 +95,7 @@ def read(path: Path) -> Gaussians:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Path, dict[str, Any], PictureFile]]:
-    """Context with the file to name in messages, the parsed meta.json, and the function that locates an image."""
+    """Context manager that yields the path for messages, the parsed meta.json, and a function that finds an image."""
     if path.is_dir() or path.name.lower().endswith(".json"):
         path = path / SOG_META_FILE if path.is_dir() else path
         yield path, _parsed(path, read_document(path, "SOG's meta.json")), partial(_beside, path)
@@ -112,7 +112,7 @@ def _opened(path: Path) -> Iterator[tuple[Path, dict[str, Any], PictureFile]]:
 
 
 def _members(archive: zipfile.ZipFile) -> dict[str, str]:
-    """Names of the archive's files relative to the folder of SOG_META_FILE, mapped to their names in the archive."""
+    """Names of an archive's files, keyed by their path relative to the folder of SOG_META_FILE."""
     whole = [name.replace("\\", "/") for name in archive.namelist()]
     metas = sorted(
         (name for name in whole if name.rpartition("/")[2] == SOG_META_FILE), key=lambda name: name.count("/")
@@ -126,8 +126,8 @@ def _names(folder: Path) -> list[str]:
     return [file.name for file in folder.iterdir()]
 
 
-def _spelt(name: str, names: Iterable[str]) -> str:
-    """The name itself, or the only one of `names` that differs just in case, as Windows and macOS find files."""
+def _match_case(name: str, names: Iterable[str]) -> str:
+    """`name` as spelt in `names`. Case may differ, as on Windows and macOS; without a single match, `name` itself."""
     names = list(names)
     alike = [other for other in names if other.lower() == name.lower()] if name not in names else []
     return alike[0] if len(alike) == 1 else name
@@ -139,20 +139,20 @@ def _parsed(path: Path, text: str | bytes) -> dict[str, Any]:
     except ValueError as error:
         raise InputError(f"{path}: {SOG_META_FILE} does not parse ({error})") from None
     if not isinstance(meta, dict) or "means" not in meta:
-        raise InputError(f"{path}: {SOG_META_FILE} has no means, expected that of a SOG model")
+        raise InputError(f"{path}: {SOG_META_FILE} has no key 'means', expected the {SOG_META_FILE} of a SOG model")
     return meta
 
 
 def _beside(path: Path, name: str, _limit: int) -> Path:
-    """An image in the folder of a meta.json."""
+    """The file of an image in the folder of a meta.json. Raises InputError."""
     folder = Path(os.path.realpath(path)).parent
     try:
         picture = Path(os.path.realpath(folder / name))
     except ValueError:  # a zero byte in the name
         picture = folder
     if picture.parent != folder:
-        raise InputError(f"{path}: has a picture {name[:80]!r}, expected one beside it")
-    if not is_file(picture) and is_file(other := folder / _spelt(picture.name, _names(folder))):
+        raise InputError(f"{path}: has a picture {name[:80]!r}, expected a name in the same folder")
+    if not is_file(picture) and is_file(other := folder / _match_case(picture.name, _names(folder))):
         return other
     if not is_file(picture):
         raise InputError(f"{path}: its picture {name} is missing")
@@ -162,10 +162,10 @@ def _beside(path: Path, name: str, _limit: int) -> Path:
 def _unpacked(
     path: Path, archive: zipfile.ZipFile, members: dict[str, str], target: Path, name: str, limit: int
 ) -> Path:
-    """A file of a .sog, at most `limit` bytes long, unpacked to `target`; members: as `_members` returns them."""
-    spelt = _spelt(name, members)
+    """Unpack a file of a .sog, of at most `limit` bytes, to `target`. Returns `target`. members: from `_members`."""
+    stored = _match_case(name, members)
     try:
-        with archive.open(members.get(spelt, spelt)) as source, target.open("wb") as file:
+        with archive.open(members.get(stored, stored)) as source, target.open("wb") as file:
             left = limit
             while block := source.read(min(1 << 20, left + 1)):
                 left -= len(block)
@@ -177,7 +177,7 @@ def _unpacked(
                 except OSError as error:
                     raise write_error(target, error) from None
     except KeyError:
-        raise InputError(f"{path}: has no {name[:80]} in it") from None
+        raise InputError(f"{path}: does not contain {name[:80]}") from None
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
         raise InputError(f"{path}: {name[:80]} does not unpack ({error}); is it damaged?") from None
     return target
@@ -210,9 +210,9 @@ class _Meta:
         return value
 
     def numbers(self, section: str, key: str, least: int, most: int) -> NDArray[np.float64]:
-        """A list of `least` to `most` numbers.
+        """The list `key` of a section, of `least` to `most` numbers.
 
-        JSON has no infinity, so null stands for -inf in scales, which are logs: the scale 0. Elsewhere it is NaN.
+        JSON has no infinity. So null stands for -inf in the logs of scales, and for NaN elsewhere.
         """
         where = f"{self.path}: {key} of {section} in {SOG_META_FILE}"
         if key not in self.section(section):
@@ -225,7 +225,7 @@ class _Meta:
         nulls = [number is None for number in value]
         if all(nulls) or (any(nulls) and section == "means"):
             found = "nothing but null" if all(nulls) else "null"
-            raise InputError(f"{where} has {found} in place of numbers; is the model it was made from damaged?")
+            raise InputError(f"{where} has {found} in place of numbers; was it made from a damaged model?")
         null = -np.inf if section == "scales" else np.nan
         array = numbers([null if empty else number for empty, number in zip(nulls, value, strict=True)])
         if array.shape != (len(value),) or not np.isfinite(array[~np.array(nulls)]).all():
@@ -234,7 +234,7 @@ class _Meta:
         return array
 
     def picture(self, section: str, index: int, channels: int, *, least: int | None = None) -> Bytes:
-        """Bytes (height, width, channels) of an image with a pixel for every Gaussian, or with `least` pixels."""
+        """Bytes (height, width, channels) of an image with at least `least` pixels; None for a pixel per Gaussian."""
         names = self.section(section).get("files")
         if not isinstance(names, list) or len(names) <= index or not isinstance(names[index], str):
             raise InputError(f"{self.path}: {section} in {SOG_META_FILE} has no file {index}")
@@ -292,7 +292,7 @@ class _Meta:
             if int(values.max()) >= len(entries):
                 raise InputError(f"{self.path}: {section} has an index {values.max()} into {len(entries)} entries")
             if section == "scales":
-                self.tell_of_nulls(entries, values)
+                self.warn_of_nulls(entries, values)
             return entries[values]
         width = {"scales": (3, 3), "sh0": (4, 4), "shN": (1, 1)}[section]
         low, high = (self.numbers(section, key, *width)[:3] for key in ("mins", "maxs"))
@@ -300,15 +300,15 @@ class _Meta:
         with np.errstate(invalid="ignore"):  # infinite bounds
             return packing.at_ends(low + (high - low) * part, low, high, part).astype(np.float32)
 
-    def tell_of_nulls(self, entries: Float32, indices: Bytes) -> None:
-        """Warn of null in the codebook of scales, unless it comes first, where -inf belongs as entries ascend."""
+    def warn_of_nulls(self, entries: Float32, indices: Bytes) -> None:
+        """Warn of null in the codebook of scales, except at the beginning: entries ascend, so -inf comes first."""
         null = np.isinf(entries)
         if (count := int(null.sum())) and null[int((~null).argmax()) :].any():
             users = int(null[indices].any(axis=1).sum())
             warn(
                 f"{self.path}: codebook of scales in {SOG_META_FILE} has null in place of {count} of {len(entries)} "
                 "numbers, "
-                f"which {users:,} of {self.count:,} Gaussians use as a scale of 0; was it made from a damaged model?"
+                f"which give {users:,} of {self.count:,} Gaussians a scale of 0; was it made from a damaged model?"
             )
 
     def rest(self) -> Float32:
@@ -332,24 +332,23 @@ def _unpacked_quaternions(pixels: Bytes) -> Float32:
     tag = pixels[:, 3].astype(np.int64) - QUATERNION_TAG_BASE
     three = (pixels[:, :3] * np.float32(2 / 255) - np.float32(1)) * np.float32(0.5**0.5)
     result = packing.restore_largest(np.maximum(tag, 0), three)
-    result[tag < 0] = (1, 0, 0, 0)  # no rotation, as in splat-transform
+    result[tag < 0] = (1, 0, 0, 0)  # the identity rotation, as in splat-transform
     return result
 
 
 def write(
     path: Path, gaussians: Gaussians, *, iterations: int = 10, sort: bool = False, progress: Progress = no_progress
 ) -> None:
-    """Write version 2: a .sog archive, or a meta.json with its images in the same folder, images first.
+    """Write version 2: a .sog archive, or a meta.json after its images in the same folder.
 
     iterations: number of k-means iterations for the palette.
-    sort: order the Gaussians by position (Morton order), so that the images compress better. They are read back in that
-      order.
+    sort: sort the Gaussians by position (Morton order), so that the images compress better.
     progress: function that is called with the current task and its finished fraction.
     Means are relative to the world's origin, and lose precision far from it. Equal Gaussians give equal values. Raises
     InputError for non-finite values.
     """
     packing.check_writable(path, gaussians, least=1)
-    # an upper bound: the WebP encoder crashes if the disk is full
+    # an upper bound of the images' bytes: the WebP encoder crashes if the disk is full
     room = 24 * len(gaussians) + 64 * min(len(gaussians), MAX_PALETTE_ENTRIES) + (1 << 16)
     with scratch_folder(room) as folder:
         order = packing.morton_order(gaussians.means) if sort else slice(None)
@@ -360,11 +359,11 @@ def write(
             for picture in files:
                 atomic_write(path.with_name(picture.name), picture.read_bytes())
             atomic_write(path, text)
-            for name in {*SH_IMAGE_FILES} - {picture.name for picture in files}:  # left over from a model with more SH
+            for name in {*SH_IMAGE_FILES} - {picture.name for picture in files}:  # of an earlier model with higher SH
                 path.with_name(name).unlink(missing_ok=True)
             return
         total = sum(picture.stat().st_size for picture in files)
-        with atomic_writer(path, total) as file, zipfile.ZipFile(file, "w") as archive:  # stored: WebP is compressed
+        with atomic_writer(path, total) as file, zipfile.ZipFile(file, "w") as archive:  # uncompressed, like WebP
             archive.writestr(zipfile.ZipInfo(SOG_META_FILE), text)
             for picture in files:
                 archive.writestr(zipfile.ZipInfo(picture.name), picture.read_bytes())
@@ -403,7 +402,7 @@ def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int, p
         "scales": {"codebook": scale_codes.tolist(), "files": [scales]},
         "quats": {"files": [picture("quats.webp", [quats])]},
         "sh0": {"codebook": colour_codes.tolist(), "files": [colours]},
-        # the specification's key, and the one that splat-transform reads
+        # the specification's key, and the key that splat-transform reads
         **({"antialias": True, "model": "antialiased"} if gaussians.antialiased else {}),
     }
     if gaussians.sh_degree:

@@ -3,13 +3,13 @@
 
 https://github.com/antimatter15/splat (convert.py and main.js). A record:
 
-- position: 3 float32, in the frame of the 3DGS PLY.
+- position: 3 float32, in the axes of the 3DGS PLY.
 - scale: 3 float32, standard deviations, not logs.
-- red, green, blue, opacity: 4 bytes. The colour is SH coefficient 0's, clamped to 0 to 1; there are no other
-  coefficients.
+- red, green, blue, opacity: 4 bytes. The colour is that of SH coefficient 0, clamped to [0, 1]. Higher coefficients are
+  not stored.
 - quaternion: w x y z in 4 bytes, 128 (q + 1) for each component q of the unit quaternion.
 
-The Gaussians keep our order; other writers sort them by size and opacity.
+A written file keeps the model's order; other writers sort by size and opacity.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from clsplat.models.codec import values
 from clsplat.models.codec.values import IO_BLOCK_ROWS
 
 UNIT_QUATERNION_TOLERANCE = 0.1
-"""Tolerance of a quaternion's length; rounding to bytes makes unit quaternions at most 0.02 longer."""
+"""Largest excess of a quaternion's length over 1. Rounding to bytes makes unit quaternions at most 0.02 longer."""
 
 SPLAT_RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quaternions", "u1", 4)])
 
 
 def read(path: Path) -> Gaussians:
-    """Read the file. Raises InputError for a partial record or no records, or if a few scales are negative."""
+    """Read a .splat file. Raises InputError for an empty file, a partial record, or a few negative scales."""
     with open_input(path, "a .splat file") as file:
         size = os.fstat(file.fileno()).st_size
         count, over = divmod(size, SPLAT_RECORD.itemsize)
@@ -55,20 +55,20 @@ def read(path: Path) -> Gaussians:
 
 
 def _check_first(block: Any, path: Path) -> None:
-    """Raise InputError if most of these records have no valid rotation; the format has no header to check."""
+    """Raise InputError if most of the records have an invalid rotation. The format has no header to check."""
     lengths = np.linalg.norm(block["quaternions"].astype(np.float32) / 128 - 1, axis=1)
     if np.median(lengths) > 1 + UNIT_QUATERNION_TOLERANCE:
         raise InputError(f"{path}: not a .splat file (rotations of length {np.median(lengths):.2f}, expected 1)")
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
-    """Write the file atomically."""
+    """Write a .splat file atomically."""
     values.check_writable(path, gaussians)
     with atomic_writer(path, SPLAT_RECORD.itemsize * len(gaussians)) as file:
         for rows in values.row_blocks(len(gaussians)):
             block: Any = np.empty(rows.stop - rows.start, SPLAT_RECORD)
             block["means"] = values.world_means(gaussians, rows)
-            with np.errstate(over="ignore"):  # a scale beyond float32 is clamped
+            with np.errstate(over="ignore"):  # scales too large for float32 are clamped
                 scales = np.exp(gaussians.log_scales[rows].astype(np.float64))
             block["scales"] = np.minimum(scales, np.finfo(np.float32).max)
             block["rgba"][:, :3] = values.to_bytes(values.colours(gaussians.sh[rows, 0]))

@@ -4,7 +4,7 @@
 Specification: https://github.com/nianticlabs/spz (README.md and src/cc/load-spz.cc). Attributes are stored one after
 another, each for all Gaussians: positions, alphas, colours, scales, rotations, spherical harmonics.
 
-- Frame: x right, y up, z backward (RUB), half a turn about x from ours. An extension of Adobe's may set another frame;
+- Axes: x right, y up, z backward (RUB), half a turn about x from clsplat's. An extension by Adobe may set other axes;
   other extensions are ignored.
 - Positions: 24-bit fixed point with `fractional_bits` after the point.
 - Alphas: opacity in steps of 1/255.
@@ -12,8 +12,8 @@ another, each for all Gaussians: positions, alphas, colours, scales, rotations, 
 - Scales: natural logs in steps of 1/16, -10 to 5.94.
 - Rotations: x y z w. Version 2 stores x y z in steps of 1/127.5, with w positive. Later versions leave out the largest
   component and store its index in 2 bits. The others take 10 bits each: a sign, and steps of 1/723.
-- SH: order and signs as ours, red green blue of each coefficient together, in steps of 1/128 within +-1. Writers keep
-  fewer bits for better compression.
+- SH: order and signs are clsplat's; red, green and blue of a coefficient are adjacent. Values are in steps of 1/128
+  within +-1. Writers round to fewer bits for better compression.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ Stream = Any
 """A file, or a gzip or Zstandard reader."""
 SPZ_VERSIONS = (2, 3, 4)
 DEFAULT_SPZ_VERSION = 3
-"""Version that most web readers accept (docs/formats.md); the format's library and splat-transform write 4."""
+"""Version that most web readers accept (docs/formats.md). Niantic's library and splat-transform write 4."""
 DEFAULT_SH_BITS = (6, 6)
-"""Bits of band 1, and of the higher bands. Readers need not know them.
+"""Bits to which SH are rounded, in band 1 and in the higher bands. The file does not record them.
 
-The format's library keeps 5 and 4 bits. Its files are a fifth smaller, but a trained model with strong view dependence
-is 11 dB worse, at 36 dB (docs/formats.md).
+Niantic's library keeps 5 and 4 bits. Its files are a fifth smaller, but renders of a trained model with strong view
+dependence are 11 dB worse, at 36 dB (docs/formats.md).
 """
 ANTIALIASED_FLAG, EXTENSIONS_FLAG = 1, 2
 COORDINATE_SYSTEM_EXTENSION = 0xADBE0003
@@ -58,10 +58,10 @@ COORDINATE_SYSTEM_SIGNS: tuple[Signs, ...] = (
     *(RUB_SIGNS, (-1, 1, -1), (1, 1, -1), (-1, -1, -1), RUB_SIGNS),  # unspecified, LDB, RDB, LUB, RUB
     *((-1, 1, 1), (1, 1, 1), (-1, -1, 1), (1, -1, 1)),  # LDF, RDF, LUF, RUF
 )
-"""Signs between our axes and those of each value of the coordinate system extension; larger values have z up."""
+"""Signs between clsplat's axes and those of each value of the coordinate system extension. Larger values have z up."""
 MAX_EXTENSION_BYTES = 1 << 20
 MAX_ZSTD_WINDOW_BYTES = 1 << 27
-"""Largest window in bytes that a Zstandard frame may demand of the decoder; the library's own limit."""
+"""Largest window in bytes that a Zstandard frame may require: the default limit of the Zstandard library."""
 COLOUR_STEPS_PER_UNIT = 0.15 * 255
 SQRT_HALF = 0.5**0.5
 
@@ -86,7 +86,7 @@ class SpzHeader:
 
 
 def recognises(head: bytes) -> bool:
-    """True if a file begins as an SPZ file."""
+    """True if a file begins like an SPZ file."""
     if head[:2] != GZIP_MAGIC:
         return head.startswith(SPZ_MAGIC)
     try:
@@ -96,7 +96,7 @@ def recognises(head: bytes) -> bool:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Version, fractional bits and antialiasing from the header."""
+    """The format's part of `clsplat info`: version, fractional bits and antialiasing."""
     with open_input(path, "an SPZ file") as file:
         header, _ = _open(file, os.fstat(file.fileno()).st_size, path)
     antialiased = bool(header.flags & ANTIALIASED_FLAG)
@@ -110,7 +110,7 @@ def read(path: Path) -> Gaussians:
 
 
 def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
-    """Read the contents of an SPZ file of `size` bytes from the start of `file`; `path` is for messages."""
+    """Read an SPZ file of `size` bytes from the start of `file`. path: for messages."""
     header, stream = _open(file, size, path)
     values.require_count(path, header.count, size)
     if header.degree > MAX_SH_DEGREE:
@@ -118,7 +118,7 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
     result = values.empty(header.count, min(header.degree, MAX_SH_DEGREE))
     result.antialiased = bool(header.flags & ANTIALIASED_FLAG)
     if header.version == 4:
-        signs = _frame(file.read(header.table - 32), path) if header.flags & EXTENSIONS_FLAG else RUB_SIGNS
+        signs = _axis_signs(file.read(header.table - 32), path) if header.flags & EXTENSIONS_FLAG else RUB_SIGNS
         _unpack(_zstd_streams(file, header, size, path), header, signs, result, path)
         return result
     assert stream is not None
@@ -129,7 +129,7 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
             f"{path}: unpacks to more than {header.count} Gaussians: over {MAX_EXTENSION_BYTES} bytes follow, expected "
             "only extensions; is it damaged?"
         )
-    if header.flags & EXTENSIONS_FLAG and (signs := _frame(behind, path)) != RUB_SIGNS:
+    if header.flags & EXTENSIONS_FLAG and (signs := _axis_signs(behind, path)) != RUB_SIGNS:
         flip(result, (signs[0] * RUB_SIGNS[0], signs[1] * RUB_SIGNS[1], signs[2] * RUB_SIGNS[2]))
     elif behind and not header.flags & EXTENSIONS_FLAG:
         warn(f"{path}: bytes after the last Gaussian are ignored")
@@ -137,7 +137,7 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
 
 
 def _open(file: BinaryIO, size: int, path: Path) -> tuple[SpzHeader, Any]:
-    """Header, and for versions up to 3 the stream of the data after it."""
+    """The header, and for versions 2 and 3 the stream that continues after it; None for version 4."""
     head = file.read(32)
     if head[:4] == SPZ_MAGIC and head[4:8] == struct.pack("<I", 4):
         if len(head) < 32:
@@ -156,7 +156,7 @@ def _open(file: BinaryIO, size: int, path: Path) -> tuple[SpzHeader, Any]:
     stream = gzip.GzipFile(fileobj=file, mode="rb") if head[:2] == GZIP_MAGIC else file
     start = _next(stream, 16, path, "the header")
     if start[:4] != SPZ_MAGIC:
-        raise InputError(f"{path}: not an SPZ file (it is a gzip file of something else)")
+        raise InputError(f"{path}: not an SPZ file (its gzip stream does not begin with NGSP)")
     header = SpzHeader(*struct.unpack("<IIBBB", start[4:15]))
     _check(header, path)
     return header, stream
@@ -171,8 +171,8 @@ def _check(header: SpzHeader, path: Path) -> None:
         raise InputError(f"{path}: SPZ has {header.fractional_bits} fractional bits, expected at most 31")
 
 
-def _frame(extensions: bytes, path: Path) -> Signs:
-    """Signs of the axes from the extensions. Each consists of type and length, 32 bits each, and its bytes."""
+def _axis_signs(extensions: bytes, path: Path) -> Signs:
+    """Signs of the axes from the extensions. An extension is its type and length, 32 bits each, and its bytes."""
     at, system = 0, b""
     while len(extensions) - at >= 8:
         kind, length = struct.unpack_from("<II", extensions, at)
@@ -191,7 +191,7 @@ def _frame(extensions: bytes, path: Path) -> Signs:
 
 @dataclass
 class _Slice:
-    """Reader of the next `left` bytes of a file."""
+    """Reads at most the next `left` bytes of a file."""
 
     file: BinaryIO
     left: int
@@ -235,14 +235,14 @@ def _next(stream: Stream, count: int, path: Path, what: str) -> bytes:
 
 
 def _rest(stream: Any, path: Path) -> bytes:
-    """Bytes after the Gaussians, at most MAX_EXTENSION_BYTES + 1; gzip verifies its checksum at the end."""
+    """Bytes after the Gaussians, at most MAX_EXTENSION_BYTES + 1. At its end gzip verifies its checksum."""
     with _decompressing(path, "at its end"):
         return bytes(stream.read(MAX_EXTENSION_BYTES + 1))
 
 
 @contextmanager
 def _decompressing(path: Path, place: str) -> Iterator[None]:
-    """Raise InputError for a stream that ends or is damaged. place: where in the file, for the message."""
+    """Context manager: turn errors of a truncated or damaged stream into InputError. place: for the message."""
     import zstandard
 
     try:
@@ -258,7 +258,7 @@ def _unpack(
 ) -> None:
     alpha_logits = values.byte_logits()
     means_factor = np.array(signs, np.float32) * np.float32(0.5**header.fractional_bits)
-    # full width: NumPy is several times slower if the last axis is short
+    # repeated for the three channels: NumPy is several times slower if it broadcasts a short last axis
     sh_factor = np.repeat(sh_signs(signs)[1 : result.sh.shape[1], None] / np.float32(128), 3, axis=1)
     for name, stream in streams:
         width = header.widths[name]
@@ -285,14 +285,14 @@ def _unpack(
 
 
 def _fixed(block: Bytes) -> Float32:
-    """Signed 24-bit integers, (n, 9) bytes -> (n, 3)."""
+    """Bytes (n, 9) -> signed 24-bit integers (n, 3)."""
     wide = np.zeros((len(block), 3, 4), np.uint8)
     wide[:, :, 1:] = block.reshape(-1, 3, 3)
     return (wide.view("<i4")[:, :, 0] >> 8).astype(np.float32)
 
 
 def _first_three(block: Bytes) -> Float32:
-    """Version 2: x y z (n, 3) -> quaternions w x y z (n, 4)."""
+    """Version 2: bytes (n, 3) of x y z -> quaternions w x y z (n, 4)."""
     result = np.empty((len(block), 4), np.float32)
     result[:, 1:] = block * np.float32(1 / 127.5) - np.float32(1)
     result[:, 0] = np.sqrt(np.maximum(0, 1 - np.square(result[:, 1:]).sum(axis=1)))
@@ -318,11 +318,10 @@ def write(
 ) -> None:
     """Write an SPZ file, atomically; equal Gaussians give equal bytes.
 
-    fractional_bits: number of fractional bits of positions. The default is 12, as in the format's library; more for a
-    model so small that 12 would be coarse, fewer for a model so large that it does not fit.
+    fractional_bits: number of fractional bits of positions; None as in `header_for`.
     sh_bits: bits of band 1 and of the higher bands, 1 to 8.
-    Means are relative to the world's origin, and lose precision far from it. Raises InputError for non-finite values
-    and for positions that fit no number of bits. Raises ValueError for settings out of range.
+    Means are relative to the world's origin, and lose precision far from it. Raises InputError for non-finite values,
+    and for positions that are too large. Raises ValueError for settings out of range.
     """
     if version not in SPZ_VERSIONS or not all(1 <= bits <= 8 for bits in sh_bits):
         raise ValueError(f"version is {version}, sh_bits {sh_bits}, expected version 2, 3 or 4, bits from 1 to 8")
@@ -333,10 +332,10 @@ def write(
 
 
 def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: int | None = None) -> SpzHeader:
-    """Header for `write_to`, for at least one Gaussian.
+    """Header for `write_to`. The model must have at least one Gaussian.
 
-    fractional_bits: the default is 12, more for a small model (measured without its farthest 1 % of Gaussians), and
-      fewer if the positions would not fit.
+    fractional_bits: None for 12, as in Niantic's library, or more for a small model (measured without its farthest 1 %
+      of Gaussians), or fewer if the positions would not fit.
     Raises InputError if the positions do not fit.
     """
     low, high = (
@@ -354,7 +353,7 @@ def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: 
         )
     if bits is None:
         spread = np.quantile(np.abs(gaussians.means - np.median(gaussians.means, axis=0)).max(axis=1), 0.99)
-        # steps of 2^-12 for a model of 16 units, finer in proportion for a smaller one
+        # steps of 2^-12 for a model of 16 units, proportionally finer steps for a smaller model
         bits = min(fits, max(12, 16 - int(np.ceil(np.log2(max(float(spread), 1e-6))))))
     elif bits < 0:
         raise ValueError(f"fractional_bits is {bits}, expected 0 to 23")
@@ -365,7 +364,7 @@ def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: 
 def write_to(
     file: BinaryIO, gaussians: Gaussians, header: SpzHeader, sh_bits: tuple[int, int] = DEFAULT_SH_BITS
 ) -> None:
-    """Write the contents of an SPZ file at the current position of a seekable file."""
+    """Write an SPZ file at the current position of a seekable file."""
     if header.version < 4:
         fields = (header.version, header.count, header.degree, header.fractional_bits, header.flags, 0)
         with gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=6, mtime=0) as stream:
@@ -416,7 +415,7 @@ def _pack(
 
 
 def _to_byte(steps: Float32) -> Bytes:
-    """Round to the nearest whole number from 0 to 255."""
+    """Round to the nearest integer from 0 to 255."""
     return np.asarray(np.clip(np.floor(steps + np.float32(0.5)), 0, 255).astype(np.uint8))
 
 
@@ -444,7 +443,7 @@ def _to_smallest_three(unit: Float32) -> Bytes:
 
 
 def _to_sh(rest: Float32, sh_bits: tuple[int, int]) -> Bytes:
-    """Bytes of coefficients (n, K - 1, 3) in our frame.
+    """Bytes of SH coefficients (n, K - 1, 3) in clsplat's axes.
 
     sh_bits: number of bits of band 1 and of the higher bands.
     """

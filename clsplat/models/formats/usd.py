@@ -4,14 +4,13 @@
 Specification: https://openusd.org/release/api/class_usd_vol_particle_field3_d_gaussian_splat.html, in OpenUSD since
 26.03. A release without the schema writes the same prim with the same attributes.
 
-- Frame: the stage's numbers are the model's world, as for cameras (clsplat/shots/readers/usd.py). The world is neither
-  turned to the stage's upAxis nor scaled to its metersPerUnit. When reading, the prims' transforms are applied. An
-  `origin` becomes the translation of the parent prim.
-- Values are float32 (half is read too): linear scales, opacities in [0, 1], unit quaternions. SH coefficients are
-  stored by Gaussian; order and signs as ours.
-- Hints: perspective projection, sorted by depth along the camera's axis, as in this renderer.
-- Colours: in the colour space that the SH coefficients, their prim or a prim above names. The default is sRGB, in which
-  3DGS trains.
+- Coordinates: the stage's world is the model's, as for cameras (clsplat/shots/readers/usd.py); upAxis and metersPerUnit
+  do not change it. The reader applies the prims' transforms. An `origin` becomes the translation of the parent prim.
+- Values are float32 (the reader accepts half): linear scales, opacities in [0, 1], unit quaternions. SH coefficients
+  are stored by Gaussian, in clsplat's order and signs.
+- Hints: perspective projection, sorted by depth along the camera's axis, as clsplat renders.
+- Colour space: as named by the attribute of the SH coefficients, their prim, or its nearest ancestor. The default is
+  sRGB, as in 3DGS.
 - A prim without SH has primvars:displayColor, linear by default, and displayOpacity if it lacks opacities.
 """
 
@@ -46,14 +45,14 @@ USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 """File name extensions of USD stages."""
 GAUSSIAN_PRIM_TYPE = "ParticleField3DGaussianSplat"
 GAUSSIAN_PRIM_TYPES = (GAUSSIAN_PRIM_TYPE, "ParticleField_3DGaussianSplat")
-"""The second is the name in a draft and in Nuke 17.0."""
+"""Type names of prims with Gaussians. The second is from a draft of the schema and in Nuke 17.0."""
 SH_COEFFICIENTS_ATTRIBUTE, SH_DEGREE_ATTRIBUTE = (
     "radiance:sphericalHarmonicsCoefficients",
     "radiance:sphericalHarmonicsDegree",
 )
 MAX_TEXT_BRACES = 5000
-"""Largest number of opening braces in a text file that is read without a trial process. USD's stack of 8 MiB
-suffices for under 20,000 levels of prims."""
+"""Largest number of opening braces in a text file that is read without a trial in another process. USD's stack of 8 MiB
+overflows below 20,000 levels of prims."""
 WORLD_PRIM_PATH, GAUSSIANS_PRIM_PATH = "/World", "/World/Gaussians"
 
 
@@ -65,27 +64,27 @@ def _require_pxr(path: Path) -> None:
 
 
 def recognises(head: bytes) -> bool:
-    """True if a file begins as USD text, USD binary, or an archive, such as .usdz."""
+    """True if a file begins like USD text, USD binary, or a zip archive, as .usdz."""
     return head.startswith((b"#usda", b"PXR-USDC", b"PK\x03\x04"))
 
 
 def survive(path: Path, call: str = "clsplat.models.formats.usd:read_here", **arguments: Any) -> None:
-    """Raise InputError if usd-core or the file is missing, or if reading the file crashes a separate process.
+    """Read a USD file in another process. Raises InputError if that crashes, or if usd-core or the file is missing.
 
-    USD's library may follow invalid offsets of a damaged binary file anywhere, or recurse until its stack overflows.
+    A damaged file can crash USD's library, by invalid offsets or a stack overflow. Safe text files are not tried.
 
     call: MODULE:FUNCTION to run in that process, with the path and `arguments`.
     """
     _require_pxr(path)
     with open_input(path, "a USD stage") as file:
-        alone, status = _stands_alone(file), os.fstat(file.fileno())
+        safe, status = _is_safe_text(file), os.fstat(file.fileno())
     words = json.dumps(arguments)
-    if not (alone or _lives(call, words, os.path.realpath(path), status.st_mtime_ns, status.st_size)):
-        raise InputError(f"{path}: USD's library crashes when it reads it; is it damaged, or a file that it refers to?")
+    if not (safe or _lives(call, words, os.path.realpath(path), status.st_mtime_ns, status.st_size)):
+        raise InputError(f"{path}: crashes USD's library; is it damaged, or a file that it refers to?")
 
 
-def _stands_alone(file: BinaryIO) -> bool:
-    """True if the file is text, refers to no other file and has few levels, so that USD reads it safely."""
+def _is_safe_text(file: BinaryIO) -> bool:
+    """True if a file is USD text that refers to no other file and has few levels, so that it cannot crash USD."""
     if file.read(5) != b"#usda":
         return False
     levels = 0
@@ -105,11 +104,11 @@ def _lives(call: str, arguments: str, path: str, *_: int) -> bool:
     )
     words = [sys.executable, "-c", code, path, arguments]
     done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, check=False)
-    return done.returncode in (0, 1)  # 1: an exception, which this process will meet itself
+    return done.returncode in (0, 1)  # 1: an exception, which the caller will get too
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The stage's up axis and units; neither changes the model here."""
+    """The format's part of `clsplat info`: the stage's up axis and unit, which do not change the model."""
     survive(path)
     stage = _open(path)
     from pxr import UsdGeom
@@ -120,7 +119,7 @@ def describe(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Turn errors that USD's bindings raise for damaged names and values into InputError."""
+    """Context manager: turn errors that USD's bindings raise for damaged names and values into InputError."""
     from pxr import Tf
 
     try:
@@ -130,7 +129,7 @@ def readable(path: Path) -> Iterator[None]:
 
 
 def open_stage(path: Path, name: str | Path, *load: Any) -> Any:
-    """Open the stage `name`. Raises InputError, prefixed with `path`."""
+    """Open the USD stage `name`, with `load` for `Usd.Stage.Open`. Raises InputError, prefixed with `path`."""
     from pxr import Tf, Usd
 
     with suppress(Tf.ErrorException):
@@ -140,10 +139,10 @@ def open_stage(path: Path, name: str | Path, *load: Any) -> Any:
 
 
 def _open(path: Path) -> Any:
-    """The stage, without payloads. Raises InputError unless all its layers are in the file's folder or below it."""
+    """Open a stage without payloads. Raises InputError unless all its layers are in the file's folder or below it."""
     from pxr import Ar, Usd, UsdUtils
 
-    diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # swallows the diagnostics that USD would print
+    diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # suppresses the messages that USD would print
     stage = open_stage(path, os.path.realpath(path), Usd.Stage.LoadNone)
     folder = Path(os.path.realpath(path)).parent
     for layer in stage.GetUsedLayers():
@@ -155,13 +154,13 @@ def _open(path: Path) -> Any:
 
 
 def read(path: Path) -> Gaussians:
-    """Read all prims of Gaussians of a stage, at its first time, as one model. Raises InputError."""
+    """Read all prims with Gaussians of a stage at its first time, merged into one model. Raises InputError."""
     survive(path)
     return read_here(path)
 
 
 def read_here(path: Path) -> Gaussians:
-    """`read` in this process, for a file that does not crash USD."""
+    """Read a stage like `read`, in this process. A damaged file may crash it (`survive`)."""
     stage = _open(path)
     from pxr import Usd
 
@@ -173,7 +172,7 @@ def read_here(path: Path) -> Gaussians:
         for place in places:
             where, own = f"{path}: {place.name}", place.prim.GetPath()
             matrix, shown = place.at(time)
-            if place.seat is not None and not shown:
+            if place.instance is not None and not shown:
                 continue
             if own not in read:
                 read[own] = gaussians_of(where, place.prim, time, space)
@@ -184,15 +183,14 @@ def read_here(path: Path) -> Gaussians:
 
 
 def splats_of(path: Path, stage: Any) -> tuple[list[UsdPlacement], list[str]]:
-    """Prims of Gaussians as drawn, including instances, and descriptions of prims that are not drawn here
-    (`find_places`).
+    """Placements of all prims with Gaussians in a stage, and descriptions of the prims that clsplat does not draw.
 
-    Raises InputError for a stage without any Gaussians.
+    Raises InputError for a stage without Gaussians.
     """
     places, left = find_places(stage, path, GAUSSIAN_PRIM_TYPES)
     if not places:
         nothing = f"; not drawn: {examples(left)}" if left else ""
-        raise InputError(f"{path}: has no {GAUSSIAN_PRIM_TYPE} in it that is drawn, expected at least one{nothing}")
+        raise InputError(f"{path}: has no {GAUSSIAN_PRIM_TYPE} that is drawn, expected at least one{nothing}")
     return places, left
 
 
@@ -205,8 +203,7 @@ def recorded_space(path: Path) -> str:
 
 
 def space_of(path: Path, prims: Sequence[Any]) -> str:
-    """Our name for the colour space of the prims with SH; sRGB if no prim has SH. Raises InputError if they differ
-    in it."""
+    """clsplat's name for the colour space of the prims with SH; sRGB without SH. Raises InputError if they differ."""
     spaces: dict[str, object] = {}
     for prim in prims:
         if attribute := _coefficients(prim):
@@ -218,13 +215,13 @@ def space_of(path: Path, prims: Sequence[Any]) -> str:
 
 
 def _coefficients(prim: Any) -> Any:
-    """Attribute of the SH coefficients; None if it has no value."""
+    """Attribute of a prim's SH coefficients; None if it has no value."""
     attributes = (prim.GetAttribute(name) for name in (SH_COEFFICIENTS_ATTRIBUTE, f"{SH_COEFFICIENTS_ATTRIBUTE}h"))
     return next((attribute for attribute in attributes if attribute and attribute.HasValue()), None)
 
 
 def _space(attribute: Any, usual: str) -> str:
-    """Our name for an attribute's colour space, which the attribute or the nearest prim above it names."""
+    """clsplat's name for an attribute's colour space; `usual` if neither the attribute nor a prim above names one."""
     name, prim = str(attribute.GetColorSpace() if attribute.HasColorSpace() else ""), attribute.GetPrim()
     while not name and prim and not prim.IsPseudoRoot():
         given = prim.GetAttribute("colorSpace:name")
@@ -234,7 +231,7 @@ def _space(attribute: Any, usual: str) -> str:
 
 
 def _array(where: str, prim: Any, name: str, time: Any, width: int, count: int | None) -> Float32 | None:
-    """Values (count, width) of the float or half attribute; None if neither has a value."""
+    """Values (count, width) of a prim's attribute `name` or its half variant `name`h; None if neither has a value."""
     for key in (name, f"{name}h"):
         attribute = prim.GetAttribute(key)
         value = attribute.Get(time) if attribute else None
@@ -251,7 +248,7 @@ def _array(where: str, prim: Any, name: str, time: Any, width: int, count: int |
 
 
 def gaussians_of(where: str, prim: Any, time: Any, space: str = SRGB) -> Gaussians:
-    """Gaussians of a prim in its own coordinates.
+    """Gaussians of a prim, in the prim's own coordinates.
 
     space: colour space to which displayColor is converted if the prim has no SH.
     Raises InputError, prefixed with `where`.
@@ -266,7 +263,7 @@ def gaussians_of(where: str, prim: Any, time: Any, space: str = SRGB) -> Gaussia
         array = _array(where, prim, name, time, len(default), count)
         return np.tile(np.array(default, np.float32), (count, 1)) if array is None else array
 
-    # the schema's defaults: no rotation, unit scale, opaque
+    # the schema's defaults: identity rotation, unit scale, opaque
     quaternions = np.ascontiguousarray(optional("orientations", 0, 0, 0, 1)[:, [3, 0, 1, 2]])
     scales = optional("scales", 1, 1, 1)
     shown = _array(where, prim, "opacities", time, 1, count)
@@ -279,7 +276,7 @@ def gaussians_of(where: str, prim: Any, time: Any, space: str = SRGB) -> Gaussia
 
 
 def _sh(where: str, prim: Any, time: Any, count: int) -> Float32:
-    """SH coefficients (count, K, 3)."""
+    """SH coefficients (count, K, 3) of a prim."""
     degree = prim.GetAttribute(SH_DEGREE_ATTRIBUTE).Get() if prim.GetAttribute(SH_DEGREE_ATTRIBUTE) else 3
     if not isinstance(degree, int) or not 0 <= degree <= 16:
         raise InputError(f"{where}: {SH_DEGREE_ATTRIBUTE} is {degree!r}, expected 0 to {MAX_SH_DEGREE}")
@@ -295,7 +292,7 @@ def _sh(where: str, prim: Any, time: Any, count: int) -> Float32:
 
 
 def _plain(where: str, prim: Any, time: Any, count: int, space: str) -> Float32:
-    """SH coefficients (count, 1, 3) of a prim without SH: its displayColor in the given space, or grey.
+    """SH coefficients (count, 1, 3) of a prim without SH, from its displayColor in `space`; grey without displayColor.
 
     Raises InputError if the colours cannot be converted to that space.
     """
@@ -312,7 +309,7 @@ def _plain(where: str, prim: Any, time: Any, count: int, space: str) -> Float32:
 
 
 def _primvar(where: str, prim: Any, name: str, time: Any, width: int, count: int) -> Float32 | None:
-    """Values (count, width), one for each Gaussian or one for all; None if there are none."""
+    """Values (count, width) of a primvar, which has a value for each Gaussian or one for all; None without a value."""
     attribute = prim.GetAttribute(name)
     value = attribute.Get(time) if attribute else None
     if value is None or not len(value):
@@ -324,9 +321,9 @@ def _primvar(where: str, prim: Any, name: str, time: Any, width: int, count: int
 
 
 def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_unit: float = 1.0) -> None:
-    """Write a stage with one prim, atomically; .usd is written as binary.
+    """Write a stage with one prim of Gaussians, atomically; .usd is written as binary.
 
-    up_axis, meters_per_unit: recorded in the stage; the model's coordinates do not change. The up axis is Y or Z.
+    up_axis, meters_per_unit: metadata of the stage, which do not change the coordinates. The up axis is Y or Z.
     Raises InputError for non-finite values, and if usd-core is not installed.
     """
     if up_axis not in ("Y", "Z") or not meters_per_unit > 0:

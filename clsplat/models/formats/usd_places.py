@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Placements of the Gaussians in a USD stage: each prim once, and once for each instance of a PointInstancer.
+"""Placements of the prims with Gaussians in a USD stage, including instances of PointInstancers.
 
-USD's own renderers follow the same rules:
+The rules are those of USD's own renderers:
 
-- Prims below an instancer are drawn only as its instances. A prototype outside the instancer is also drawn in its own
-  place.
-- An instance has the local transform of its prototype's prim. It is visible if the instancer and all prims from the
-  prototype down to the Gaussians are visible.
-- An instance is identified by its number, or by its id if the instancer has ids.
-- Between time samples USD interpolates, or follows the velocities.
+- Prims below an instancer are drawn only as its instances. A prototype elsewhere in the stage is also drawn where it
+  is.
+- An instance includes the local transform of its prototype's prim. It is visible if the instancer and all prims from
+  the prototype down to the Gaussians are visible.
+- An instance is identified by its id, or by its number if the instancer has no ids.
+- Between time samples USD interpolates, or extrapolates by the velocities.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from clsplat.arrays import Float64
 from clsplat.errors import InputError
 
 MAX_PLACED_PRIMS = 1_000_000
-"""Most prims of Gaussians that a stage may place; more are a mistake or an attempt to exhaust memory."""
+"""Largest number of placements in a stage. More are a mistake or an attempt to exhaust memory."""
 _MAX_CACHED_TIMES = 16
 """Number of times for which an instancer's transforms are cached."""
 _TRANSFORM_ATTRIBUTES = ("positions", "orientations", "orientationsf", "scales")
@@ -39,77 +39,77 @@ Key = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class UsdPlacement:
-    """One occurrence of a prim of Gaussians in a stage.
+    """One placement of a prim with Gaussians in a stage.
 
-    name: the prim's path; for an instance, INSTANCER[ID] followed by the path below the prototype.
-    seat: the instance that contains the prim; None outside of instancers.
+    name: the prim's path; in an instance, INSTANCER[ID] and the path below the prototype.
+    instance: the instance that contains the prim; None outside of instancers.
     """
 
     prim: Any
     name: str
-    seat: Seat | None = None
+    instance: PointInstance | None = None
 
     def at(self, code: Any) -> tuple[Float64, bool]:
-        """Matrix (4, 4) from the prim to the world, and visibility, at a time code. Raises InputError."""
-        matrix, shown = _seated(self.prim, self.seat, code)
-        # USD multiplies row vectors: its matrices are transposes of ours
+        """World-from-prim matrix (4, 4) and visibility at a time code. Raises InputError."""
+        matrix, shown = _world_from_prim(self.prim, self.instance, code)
+        # USD multiplies row vectors: its matrices are transposes of clsplat's
         return np.array(matrix, np.float64).T, shown
 
     @property
     def is_drawn(self) -> bool:
         """True unless the purpose of the prim, or of an instancer that contains it, is proxy or guide."""
-        seat, drawn = self.seat, _for_render(self.prim)
-        while seat is not None and drawn:
-            instances = seat.instances
-            seat, drawn = instances.seat, _for_render(instances.prim)
+        instance, drawn = self.instance, _for_render(self.prim)
+        while instance is not None and drawn:
+            instancer = instance.instancer
+            instance, drawn = instancer.outer, _for_render(instancer.prim)
         return drawn
 
     @property
     def moves(self) -> bool:
         """True if the prim's transform or visibility may change over time."""
-        if self.seat is None:
+        if self.instance is None:
             return any(map(_varies, _above(self.prim, None)))
-        return self.seat.instances.moves or any(map(_varies, _above(self.prim, self.seat.root)))
+        return self.instance.instancer.moves or any(map(_varies, _above(self.prim, self.instance.root)))
 
     @property
     def reach(self) -> tuple[float, float] | None:
-        """First and last time of the transforms of the prim and its parents; all times if an instancer has velocities.
+        """First and last time sample of the transforms of the prim and its ancestors; None if there are none.
 
-        None if no transform has a value over time.
+        -inf and inf if an instancer has velocities.
         """
-        times = [time for prim in _above(self.prim, self.seat and self.seat.root) for time in _samples_of(prim)]
-        seat = self.seat
-        while seat is not None:
-            times += seat.instances.reach
-            seat = seat.instances.seat
+        times = [time for prim in _above(self.prim, self.instance and self.instance.root) for time in _samples_of(prim)]
+        instance = self.instance
+        while instance is not None:
+            times += instance.instancer.reach
+            instance = instance.instancer.outer
         return (min(times), max(times)) if times else None
 
 
 @dataclass(frozen=True, eq=False)
-class Seat:
+class PointInstance:
     """An instance of a prototype.
 
     root: the prim of the prototype.
     """
 
-    instances: Instances
+    instancer: Instancer
     key: Key
     root: Any
 
 
-class Instances:
-    """The instances of a PointInstancer, which may itself be in an instance."""
+class Instancer:
+    """A PointInstancer with its instances. It may itself be in an instance, `outer`."""
 
-    def __init__(self, prim: Any, name: str, where: str, seat: Seat | None) -> None:
+    def __init__(self, prim: Any, name: str, where: str, outer: PointInstance | None) -> None:
         """Read the prototypes of an instancer.
 
-        name: the instancer's path, or its name as in `UsdPlacement`.
+        name: the instancer's path; if it is in an instance, its name as in `UsdPlacement`.
         where: prefix of errors.
         Raises InputError for missing prototypes.
         """
         from pxr import UsdGeom
 
-        self.prim, self.name, self.where, self.seat = prim, name, f"{where}: {name}", seat
+        self.prim, self.name, self.where, self.outer = prim, name, f"{where}: {name}", outer
         self._instancer = UsdGeom.PointInstancer(prim)
         stage = prim.GetStage()
         targets = self._instancer.GetPrototypesRel().GetForwardedTargets()
@@ -123,14 +123,14 @@ class Instances:
 
     @property
     def keys(self) -> list[Key]:
-        """All instances that exist at any time, in order of first appearance."""
+        """Keys of all instances that exist at any time, in order of first appearance."""
         return list(dict.fromkeys(key for keys in self._there for key in keys))
 
     @property
     def reach(self) -> list[float]:
-        """Times at which the instances have transforms."""
+        """Time samples of the transforms of the instances and the instancer; with velocities also -inf and inf."""
         moved = [time for name in _TRANSFORM_ATTRIBUTES for time in self._samples(name)]
-        own = moved + [time for prim in _above(self.prim, self.seat and self.seat.root) for time in _samples_of(prim)]
+        own = moved + [time for prim in _above(self.prim, self.outer and self.outer.root) for time in _samples_of(prim)]
         return [-math.inf, math.inf, *own] if moved and any(map(self._has, _VELOCITY_ATTRIBUTES)) else own
 
     @property
@@ -140,14 +140,14 @@ class Instances:
             self._samples(name) for name in (*_TRANSFORM_ATTRIBUTES, *_VELOCITY_ATTRIBUTES, *_MEMBERSHIP_ATTRIBUTES)
         ):
             return True
-        above = _above(self.prim, self.seat and self.seat.root)
-        return any(map(_varies, above)) or (self.seat is not None and self.seat.instances.moves)
+        above = _above(self.prim, self.outer and self.outer.root)
+        return any(map(_varies, above)) or (self.outer is not None and self.outer.instancer.moves)
 
     def of(self, key: Key, code: Any) -> tuple[Any, bool]:
-        """USD's matrix from the prototype's parent to the world, and visibility of the instance.
+        """USD's matrix from the prototype's parent to the world, and visibility, of the instance `key`.
 
-        An instance that does not exist at that time is invisible. Its matrix is the latest before that time, or else
-        the next one. Raises InputError.
+        An instance that does not exist at that time is invisible. Its matrix is then that of the last time at which it
+        existed, or else of the next. Raises InputError.
         """
         places, hidden = self._at(code)
         if key in places:
@@ -158,7 +158,7 @@ class Instances:
         return self._at(_code(self._times[there]))[0][key], False
 
     def _at(self, code: Any) -> tuple[dict[Key, Any], frozenset[Key]]:
-        """Matrices of the instances, and the set of hidden instances."""
+        """Matrices of the instances by key, and the keys of hidden instances, at a time code. Cached."""
         time = code.GetValue()
         if time not in self._known:
             if len(self._known) >= _MAX_CACHED_TIMES:
@@ -174,7 +174,7 @@ class Instances:
                 f"{self.where} at {here.GetValue():g}: has {len(keys)} protoIndices, expected as many positions, and "
                 "as many orientations and scales or none"
             )
-        outer, shown = _seated(self.prim, self.seat, code)
+        outer, shown = _world_from_prim(self.prim, self.outer, code)
         roots = [_local(root, code) for root in self.roots]
         mask = list(self._instancer.ComputeMaskAtTime(here)) or [True] * len(keys)
         hidden = (key for key, seen in zip(keys, mask, strict=True) if not (seen and shown))
@@ -182,10 +182,10 @@ class Instances:
         return places, frozenset(hidden)
 
     def _own(self, code: Any) -> list[Any]:
-        """USD's matrices of the instances, relative to the instancer, from its positions, orientations and scales.
+        """USD's matrices of the instances relative to the instancer. Empty if its arrays have different lengths.
 
-        Empty if USD finds arrays of different lengths. Rotations are computed from the quaternions as xformOp:orient
-        does. ComputeInstanceTransformsAtTime shears if a quaternion's length is not exactly 1, as with half floats.
+        Rotations come from the quaternions, as for xformOp:orient. USD's ComputeInstanceTransformsAtTime shears if a
+        quaternion's length is not exactly 1, as with half floats.
         """
         from pxr import Gf, UsdGeom
 
@@ -220,7 +220,7 @@ class Instances:
                 f"{len(self.roots)} prototypes"
             )
         ids = [int(number) for number in self._instancer.GetIdsAttr().Get(code) or ()]
-        if len(ids) != len(indices) or len(set(ids)) != len(ids):  # USD ignores ids then too
+        if len(ids) != len(indices) or len(set(ids)) != len(ids):  # USD ignores such ids too
             ids = list(range(len(indices)))
         return dict.fromkeys(zip(ids, indices, strict=True))
 
@@ -233,7 +233,7 @@ class Instances:
         return bool(attribute and attribute.HasAuthoredValue())
 
     def _first(self) -> float:
-        """First time at which the instances have a value; 0 if their values do not depend on time."""
+        """First time sample of the instances; 0 if they do not depend on time."""
         return min(
             (time for name in (*_TRANSFORM_ATTRIBUTES, *_MEMBERSHIP_ATTRIBUTES) for time in self._samples(name)),
             default=0.0,
@@ -245,7 +245,9 @@ class _StageFindings:
     """Results of a walk through a stage.
 
     where: prefix of errors.
-    unused, shapes: descriptions of prims that are not drawn, by path.
+    kinds: type names of prims with Gaussians.
+    unused: descriptions, by path, of prims with Gaussians that no instance draws.
+    shapes: descriptions, by path, of prims without Gaussians, which clsplat does not draw.
     """
 
     where: str
@@ -254,24 +256,23 @@ class _StageFindings:
     unused: dict[str, str] = field(default_factory=dict)
     shapes: dict[str, str] = field(default_factory=dict)
 
-    def walk(self, prims: Any, root: Any, seat: Seat | None, name: str, chain: tuple[Any, ...]) -> None:
-        """Collect the Gaussians among the prims.
+    def walk(self, prims: Any, root: Any, instance: PointInstance | None, name: str, chain: tuple[Any, ...]) -> None:
+        """Collect the prims with Gaussians among `prims`. Raises InputError.
 
         root: prim of the prototype that contains the prims; None outside of instancers.
         name: name of the instance.
         chain: paths of the instancers that contain the prims.
-        Raises InputError.
         """
         from pxr import UsdGeom
 
         for prim in prims:
             path = prim.GetPath()
-            own = str(path) if seat is None else name + str(path)[len(str(root.GetPath())) :]
+            own = str(path) if instance is None else name + str(path)[len(str(root.GetPath())) :]
             if prim.IsA(UsdGeom.PointInstancer):
                 prims.PruneChildren()
-                self._take_instances(Instances(prim, own, self.where, seat), chain)
+                self._walk_instances(Instancer(prim, own, self.where, instance), chain)
             elif prim.GetTypeName() in self.kinds:
-                self.places.append(UsdPlacement(prim, own, seat))
+                self.places.append(UsdPlacement(prim, own, instance))
                 if len(self.places) > MAX_PLACED_PRIMS:
                     raise InputError(
                         f"{self.where}: places over {MAX_PLACED_PRIMS:,} prims of Gaussians, expected fewer"
@@ -279,33 +280,34 @@ class _StageFindings:
             elif _is_visible_shape(prim):
                 self.shapes[str(path)] = f"{path} ({prim.GetTypeName()})"
 
-    def _take_instances(self, instances: Instances, chain: tuple[Any, ...]) -> None:
+    def _walk_instances(self, instancer: Instancer, chain: tuple[Any, ...]) -> None:
         from pxr import Usd
 
-        path = instances.prim.GetPath()
+        path = instancer.prim.GetPath()
         if path in chain:
-            raise InputError(f"{instances.where}: is inside its own prototype, expected an instancer outside it")
+            raise InputError(f"{instancer.where}: is inside its own prototype, expected an instancer outside it")
         used, empty = set(), set()
-        for number, index in instances.keys:
-            root, count = instances.roots[index], len(self.places)
+        for number, index in instancer.keys:
+            root, count = instancer.roots[index], len(self.places)
             used.add(root.GetPath())
             if index in empty:
                 continue
-            prims, seat = iter(Usd.PrimRange(root, _of_prototypes())), Seat(instances, (number, index), root)
-            self.walk(prims, root, seat, f"{instances.name}[{number}]", (*chain, path))
+            prims = iter(Usd.PrimRange(root, _of_prototypes()))
+            instance = PointInstance(instancer, (number, index), root)
+            self.walk(prims, root, instance, f"{instancer.name}[{number}]", (*chain, path))
             if len(self.places) == count:
-                empty.add(index)  # no Gaussians here, nor in other instances of the prototype
-        for prim in (prim for top in (instances.prim, *instances.roots) for prim in Usd.PrimRange(top, _of_classes())):
+                empty.add(index)  # this prototype has no Gaussians
+        for prim in (prim for top in (instancer.prim, *instancer.roots) for prim in Usd.PrimRange(top, _of_classes())):
             own = prim.GetPath()
             if prim.GetTypeName() in self.kinds and (prim.IsAbstract() or not any(map(own.HasPrefix, used))):
                 self.unused[str(own)] = f"{own} (which no instance of {path} draws)"
 
 
 def find_places(stage: Any, where: object, kinds: Collection[str]) -> tuple[list[UsdPlacement], list[str]]:
-    """All prims of these types as drawn, in the stage's order, and descriptions of the prims that are not drawn here.
+    """Placements of all prims of the types `kinds`, in the stage's order, and descriptions of prims that are not drawn.
 
-    The descriptions cover prims that a full USD renderer would draw or could not open. Raises InputError, prefixed with
-    `where`.
+    The latter are prims that another USD renderer would draw, or that refer to a file that cannot be opened. Raises
+    InputError, prefixed with `where`.
     """
     from pxr import Usd
 
@@ -317,7 +319,7 @@ def find_places(stage: Any, where: object, kinds: Collection[str]) -> tuple[list
 
 
 def _lost(stage: Any) -> list[str]:
-    """Prims that refer to files which cannot be opened, each with the file."""
+    """Descriptions of prims that refer to a file that cannot be opened."""
     lines = []
     for error in stage.GetCompositionErrors():
         if type(error).__name__ in ("ErrorInvalidAssetPath", "ErrorInvalidSublayerPath"):
@@ -327,14 +329,14 @@ def _lost(stage: Any) -> list[str]:
 
 
 def _of_prototypes() -> Any:
-    """USD predicate for the drawn prims of a prototype. It also accepts prims that are not defined."""
+    """USD predicate for the prims of a prototype that are drawn, including undefined prims."""
     from pxr import Usd
 
     return Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded & ~Usd.PrimIsAbstract)
 
 
 def _of_classes() -> Any:
-    """USD predicate that also accepts classes, which are never drawn."""
+    """USD predicate for the same prims and for classes, which are never drawn."""
     from pxr import Usd
 
     return Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
@@ -347,7 +349,7 @@ def _code(time: float) -> Any:
 
 
 def _above(prim: Any, root: Any) -> Iterator[Any]:
-    """The prim and its ancestors, up to `root` or to the top."""
+    """The prim and its ancestors, up to and including `root`, if it is given."""
     while prim and not prim.IsPseudoRoot():
         yield prim
         if root and prim == root:
@@ -355,21 +357,21 @@ def _above(prim: Any, root: Any) -> Iterator[Any]:
         prim = prim.GetParent()
 
 
-def _seated(prim: Any, seat: Seat | None, code: Any) -> tuple[Any, bool]:
-    """USD's matrix from the prim to the world, and visibility."""
+def _world_from_prim(prim: Any, instance: PointInstance | None, code: Any) -> tuple[Any, bool]:
+    """USD's matrix from a prim, in an instance or outside, to the world, and the prim's visibility."""
     from pxr import UsdGeom
 
     cache = UsdGeom.XformCache(code)
-    if seat is None:
+    if instance is None:
         shown = not prim.IsA(UsdGeom.Imageable) or (
             UsdGeom.Imageable(prim).ComputeVisibility(code) != UsdGeom.Tokens.invisible
         )
         return cache.GetLocalToWorldTransform(prim), shown
-    outer, shown = seat.instances.of(seat.key, code)
-    if prim == seat.root:
+    outer, shown = instance.instancer.of(instance.key, code)
+    if prim == instance.root:
         return outer, shown and not _hides(prim, code)
-    inner = cache.ComputeRelativeTransform(prim, seat.root)[0]
-    return inner * outer, shown and not any(_hides(own, code) for own in _above(prim, seat.root))
+    inner = cache.ComputeRelativeTransform(prim, instance.root)[0]
+    return inner * outer, shown and not any(_hides(own, code) for own in _above(prim, instance.root))
 
 
 def _local(prim: Any, code: Any) -> Any:
@@ -379,7 +381,7 @@ def _local(prim: Any, code: Any) -> Any:
 
 
 def _turn_of(matrix: Any, scales: Any) -> Any:
-    """The true rotation nearest to the one in USD's matrix, which is slightly sheared and multiplied by the scales."""
+    """The rotation nearest to USD's matrix divided by the scales, which may have a slight shear."""
     from pxr import Gf
 
     rows = np.array(matrix)[:3, :3] / np.array(scales, np.float64)[:, None]
@@ -402,7 +404,7 @@ def _for_render(prim: Any) -> bool:
 
 
 def _is_visible_shape(prim: Any) -> bool:
-    """True for visible meshes, curves, points, volumes and other particles with a render purpose."""
+    """True for a visible mesh, curve, point set, volume or particle field with the purpose default or render."""
     from pxr import Usd, UsdGeom
 
     if not (prim.IsA(UsdGeom.Gprim) or str(prim.GetTypeName()).startswith("ParticleField")):
@@ -412,7 +414,7 @@ def _is_visible_shape(prim: Any) -> bool:
 
 
 def _varies(prim: Any) -> bool:
-    """True if the prim's own transform or visibility may change over time."""
+    """True if a prim's own transform or visibility may change over time."""
     from pxr import UsdGeom
 
     if prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying():

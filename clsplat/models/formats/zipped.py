@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A .zip download that holds one model: finding the model among its files, and unpacking it.
+"""A .zip archive that contains one model: search for the model among the files, and unpacking.
 
 Format: https://pkware.cachefly.net/webdocs/casestudies/APPNOTE.TXT. Files added by Finder and Explorer (__MACOSX,
-hidden files) are ignored. If several files have a model's name, those whose beginning shows no Gaussians are ignored
-too. A model of several files has them in one folder of the archive, which is unpacked as a whole.
+hidden files) are ignored. If several files have a model's name, those whose first bytes show no Gaussians are ignored
+too. All files in the model's folder of the archive are unpacked, since a model may have several.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ from clsplat.gaussians import Gaussians
 MAX_ARCHIVE_FILES = 100_000
 MAX_UNCHECKED_UNPACKED_BYTES = 64 << 20
 MAX_UNPACK_RATIO = 100
-"""Limit of the unpacked bytes: the larger of MAX_UNCHECKED_UNPACKED_BYTES and this many for each byte of the archive.
+"""An archive may unpack to MAX_UNCHECKED_UNPACKED_BYTES, or to this many bytes for each of its bytes if that is more.
 
-A PLY whose spherical harmonics are all 0 has a ratio of about 5. The limit of deflate, which a bomb reaches, is 1032.
+The ratio of a PLY whose spherical harmonics are all 0 is about 5. A decompression bomb reaches deflate's limit, 1032.
 """
 ZIP_FILE_MAGIC = b"PK\x03\x04"
-"""First bytes of an archive that contains a file."""
+"""First bytes of an archive that is not empty."""
 MACOS_METADATA_FOLDER = "__MACOSX"
 ZIP_MEMBER_HEAD_BYTES = 16 << 20
-"""Number of bytes of a file that are searched for signs of Gaussians: a whole JSON, and the header of any PLY."""
+"""Number of bytes at the beginning of a file that are searched for signs of Gaussians: all of a JSON or PLY header."""
 ENCRYPTED_FLAG = 1
-"""Bit in the flags of an encrypted file."""
+"""Bit that is set in the flags of an encrypted file."""
 
 
 def recognises(head: bytes) -> bool:
-    """True if a file begins as an archive."""
-    return head.startswith((ZIP_FILE_MAGIC, b"PK\x05\x06"))  # the second: an archive without files
+    """True if a file begins like a zip archive."""
+    return head.startswith((ZIP_FILE_MAGIC, b"PK\x05\x06"))  # the second is of an archive without files
 
 
 @dataclass(frozen=True)
-class Inside:
-    """Access to the model in an archive, for its row in the table of formats.
+class ZipReader:
+    """Reads the model in a zip archive. Its functions come from the table of formats, which has a row for archives.
 
-    is_model_name: True for a model's file name.
-    has_gaussians: False for such a file if its first bytes show no Gaussians.
-    resolve: the model's file and its row, a `Format`.
+    is_model_name(path): True if a file has the name of a model.
+    has_gaussians(path, head): True if the first bytes of such a file show Gaussians.
+    resolve(path): the model's file and its `Format`.
     """
 
     is_model_name: Callable[[Path], bool]
@@ -59,19 +59,18 @@ class Inside:
 
     @contextmanager
     def model(self, path: Path) -> Iterator[tuple[Path, Any]]:
-        """Context with the unpacked model's file, which is removed afterwards, and its `Format`. Raises InputError like
-        `unpacked`."""
+        """Context manager that yields the unpacked model's file and its `Format`. Raises InputError like `unpacked`."""
         with unpacked(path, self) as model:
             yield self.resolve(model)
 
     def read(self, path: Path) -> Gaussians:
-        """Read the model. Raises InputError like `unpacked` and the model's own format."""
+        """Read the model. Raises InputError like `unpacked` and the format's `read`."""
         with self.model(path) as (file, row):
             gaussians: Gaussians = row.read(file)
         return gaussians
 
     def describe(self, path: Path) -> dict[str, Any]:
-        """The model's part of `clsplat info`, with its format and the format's losses."""
+        """The model's part of `clsplat info`, including its format and what the format loses."""
         with self.model(path) as (file, row):
             return {"format": f"{row.name} in a .zip", "loses": row.loses, **row.describe(file)}
 
@@ -82,24 +81,24 @@ class Inside:
         return space
 
     def names(self, path: Path) -> list[str]:
-        """Names of the files that may be the model; empty if there are none or the archive is damaged."""
+        """Names of the files that may be the model; empty for a damaged archive."""
         try:
             with _opened(path) as archive:
-                return [_parts(member)[-1] for member in _models_in(archive, self)]
+                return [_parts(member)[-1] for member in _possible_models(archive, self)]
         except InputError:
             return []
 
 
 @contextmanager
-def unpacked(path: Path, inside: Inside) -> Iterator[Path]:
-    """Context with the model unpacked to a file, which is removed afterwards.
+def unpacked(path: Path, reader: ZipReader) -> Iterator[Path]:
+    """Context manager that unpacks the model to a temporary file and yields the file's path.
 
-    Warnings and errors about that file name the archive and the member. Raises InputError if the archive is damaged,
-    encrypted, too large unpacked, or does not hold exactly one model.
+    Warnings and errors about that file show the archive's name instead. Raises InputError if the archive is damaged,
+    encrypted, too large unpacked, or does not contain exactly one model.
     """
     with ExitStack() as stack:
         with _opened(path) as archive:
-            model = _model_in(path, archive, inside)
+            model = _only_model(path, archive, reader)
             folder = _parts(model)[:-1]
             beside = [member for member in archive.infolist() if _parts(member)[:-1] == folder]
             total, limit = (
@@ -116,7 +115,7 @@ def unpacked(path: Path, inside: Inside) -> Iterator[Path]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
-    """The archive. Raises InputError if it is damaged or encrypted, also while it is read."""
+    """Context manager that opens an archive. Raises InputError if it is damaged or encrypted, also while it is read."""
     with open_input(path, "a .zip archive") as file:
         try:
             with zipfile.ZipFile(file) as archive:
@@ -132,33 +131,32 @@ def _parts(member: zipfile.ZipInfo) -> tuple[str, ...]:
     return PurePosixPath(member.filename.replace("\\", "/")).parts
 
 
-def _models_in(archive: zipfile.ZipFile, inside: Inside) -> list[zipfile.ZipInfo]:
-    """Files with a model's name; if there are several, those whose beginning shows Gaussians, if any."""
+def _possible_models(archive: zipfile.ZipFile, reader: ZipReader) -> list[zipfile.ZipInfo]:
+    """Files with a model's name. If there are several, only those whose first bytes show Gaussians, if any do."""
     models = []
     for member in archive.infolist():
         parts = _parts(member)
         added = any(part.startswith(".") or part == MACOS_METADATA_FOLDER for part in parts)
-        if parts and not (added or member.is_dir()) and inside.is_model_name(Path(parts[-1])):
+        if parts and not (added or member.is_dir()) and reader.is_model_name(Path(parts[-1])):
             models.append(member)
     if len(models) < 2:
         return models
-    return [member for member in models if _has_gaussians(archive, member, inside)] or models
+    return [member for member in models if _has_gaussians(archive, member, reader)] or models
 
 
-def _has_gaussians(archive: zipfile.ZipFile, member: zipfile.ZipInfo, inside: Inside) -> bool:
+def _has_gaussians(archive: zipfile.ZipFile, member: zipfile.ZipInfo, reader: ZipReader) -> bool:
     if member.flag_bits & ENCRYPTED_FLAG:
         return True
     with archive.open(member) as file:
-        return inside.has_gaussians(Path(_parts(member)[-1]), file.read(ZIP_MEMBER_HEAD_BYTES))
+        return reader.has_gaussians(Path(_parts(member)[-1]), file.read(ZIP_MEMBER_HEAD_BYTES))
 
 
-def _model_in(path: Path, archive: zipfile.ZipFile, inside: Inside) -> zipfile.ZipInfo:
-    """The only model. Raises InputError if there is none, if there are several, which it names, or if it is
-    encrypted."""
-    models = _models_in(archive, inside)
+def _only_model(path: Path, archive: zipfile.ZipFile, reader: ZipReader) -> zipfile.ZipInfo:
+    """The only model in an archive. Raises InputError for no model, several models, or an encrypted model."""
+    models = _possible_models(archive, reader)
     if len(models) != 1:
         names = f" ({examples(member.filename[:80] for member in models)})" if models else ""
-        raise InputError(f"{path}: holds {len(models)} model files{names}, expected one; unpack it first")
+        raise InputError(f"{path}: contains {len(models)} model files{names}, expected one; unpack it first")
     if models[0].flag_bits & ENCRYPTED_FLAG:
         raise InputError(f"{path}: is encrypted, expected a .zip without a password; unpack it first")
     return models[0]
@@ -178,7 +176,7 @@ def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo, folder: Path) -> 
 
 
 def _renamed(model: Path, name: str) -> Iterator[Path]:
-    """Yield the model's path; warnings and InputErrors raised meanwhile show `name` instead of it."""
+    """Yield the model's path. Warnings and InputErrors raised meanwhile show `name` instead of that path."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The length in which training counts learning rates and sizes, from what the photographs look at."""
+"""The scene's length unit, from the depths of the points that the photographs show."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ MAX_UNIT_PER_EXTENT = 0.25
 For a scene that cameras surround, depths are about as large as the extent. Such a scene keeps the authors' unit.
 """
 NEAR_PER_EXTENT = 1e-6
-"""Depth of the nearest points that count, as a fraction of the extent."""
+"""Least depth of a point that counts, as a fraction of the extent."""
 MAX_SAMPLED_VIEWS = 200
-"""Maximum number of photographs whose points are looked at, spread evenly over the training photographs."""
+"""Maximum number of sampled photographs, spread evenly over the training photographs."""
 MAX_SAMPLED_POINTS = 100_000
 """Maximum number of a scene's points that are projected, if it is not known which photographs show them."""
 
 
 def length_unit_of(scene: Scene) -> float:
-    """Length in world units: the extent, or 1.1 times the median depth where that is under a quarter of it.
+    """Length unit in world units: 1.1 times the median depth if that is under a quarter of the extent, else the extent.
 
     The depth is the median over the training photographs of the median depth of the points that they show. These are
     the points of a COLMAP model's tracks. Without tracks, each cell of a picture shows its nearest point.

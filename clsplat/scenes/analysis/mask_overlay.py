@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures that show the parts of a photograph that its masks leave out."""
+"""Pictures of a photograph in which the masked parts are tinted."""
 
 from __future__ import annotations
 

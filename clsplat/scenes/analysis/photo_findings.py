@@ -71,16 +71,16 @@ are best with 64 to 85 pixels per Gaussian for 25 photographs of bonsai, and wit
 photographs of fox (docs/quality.md, Few photographs and Growth).
 """
 SUPPORTED_GAUSSIANS_PER_POINT = 1.5
-"""Number of Gaussians per point that few photographs support even if they have few pixels: in small photographs,
-neighbouring pixels differ more."""
+"""Number of Gaussians per point that few photographs support even if they are small. Neighbouring pixels of a small
+photograph differ more."""
 FEW_STEPS_PER_VIEW = 60
 """Steps per training photograph below which high learning rates give better models
 (docs/decisions/0031-high-rates.md)."""
 SHORT_TRAINING_STEPS = range(1000, 10_001)
 """Numbers of training steps for which high learning rates are recommended. Trainings of 2000 to 7000 were measured."""
 RECOMMENDED_PASSES = 30
-"""Passes through the training photographs that a training needs to learn what each of them shows. With fewer, the
-schedule is stretched; the paper's 30,000 steps are 30 passes through 1000 photographs."""
+"""Number of passes through the training photographs below which a longer schedule is recommended. The paper's 30,000
+steps are 30 passes through 1000 photographs."""
 BLUR_SHARPNESS_RATIO = 0.72
 """Sharpness, relative to the scene's median, below which a photograph counts as blurred.
 
@@ -125,36 +125,36 @@ def findings(scene: Scene, use: MaskUse = NO_MASKS, iterations: int = 0) -> list
     iterations: planned number of training steps, 0 if unknown.
     Raises InputError like `Scene.check_pictures`.
     """
-    looked = VisiblePoints(scene)
+    visible = VisiblePoints(scene)
     found = (
         _few(scene),
         _some(scene, iterations),
         _few_steps(scene, iterations),
         _few_passes(scene, iterations),
-        _exposure(looked),
-        _scales(looked),
+        _exposure(visible),
+        _scales(visible),
         _masks(scene, use),
         _alpha(scene, use),
         _undistorted(scene),
-        _sky(looked),
+        _sky(visible),
         _blur(scene),
         _duplicates(scene),
     )
     return [each for each in found if each is not None]
 
 
-def _looked_at(scene: Scene) -> list[View]:
+def _sampled_training_views(scene: Scene) -> list[View]:
     """Training views that have thumbnails."""
     return [view for view in scene.sampled_views if view.split == "train"]
 
 
 def _counted(scene: Scene, count: int) -> str:
-    """A number of photographs as text, with the size of the sample if not all were inspected."""
+    """A number of photographs as text; if only a sample was inspected, with the sample's size."""
     return f"{count:,}" if scene.decoded_first else f"{count:,} of {len(scene.sampled_views):,} sampled"
 
 
-def _exposure(looked: VisiblePoints) -> Finding | None:
-    gains = looked.gains
+def _exposure(visible: VisiblePoints) -> Finding | None:
+    gains = visible.gains
     if len(gains) < 3:
         return None
     values = np.array(list(gains.values()))
@@ -170,10 +170,10 @@ def _exposure(looked: VisiblePoints) -> Finding | None:
     )
 
 
-def _scales(looked: VisiblePoints) -> Finding | None:
+def _scales(visible: VisiblePoints) -> Finding | None:
     distances = []
-    for view in looked.scene.train_views:
-        _, _, _, depths = looked.places.get(view.name, (0, 0, 0, np.empty(0)))
+    for view in visible.scene.train_views:
+        _, _, _, depths = visible.places.get(view.name, (0, 0, 0, np.empty(0)))
         if len(depths) >= MIN_POINTS_PER_VIEW:
             distances.append(float(np.median(depths)) / view.camera.fx * view.camera.width)
     if len(distances) < 3:
@@ -218,7 +218,7 @@ def _strange_masks(scene: Scene, reason: str) -> Finding | None:
 def _alpha(scene: Scene, use: MaskUse) -> Finding | None:
     if use.alpha != "blend":
         return None
-    shares = np.array([scene.glances[view.name].transparent for view in _looked_at(scene)])
+    shares = np.array([scene.glances[view.name].transparent for view in _sampled_training_views(scene)])
     if (shares >= TRANSPARENT_PIXEL_FRACTION).mean() < 0.5:
         return None
     part = f"{100 * shares.mean():.0f} %"
@@ -278,9 +278,9 @@ def _few_passes(scene: Scene, iterations: int) -> Finding | None:
     return Finding("few passes", text, ({"passes": RECOMMENDED_PASSES},))
 
 
-def _sky(looked: VisiblePoints) -> Finding | None:
-    scene = looked.scene
-    parts = [_sky_part(looked, view) for view in _looked_at(scene) if view.name in looked.places]
+def _sky(visible: VisiblePoints) -> Finding | None:
+    scene = visible.scene
+    parts = [_sky_part(visible, view) for view in _sampled_training_views(scene) if view.name in visible.places]
     with_sky = [part for part in parts if part >= MIN_SKY_PIXEL_FRACTION]
     if len(with_sky) < max(3, MIN_SKY_VIEW_FRACTION * len(parts)) or not len(scene.points):
         return None
@@ -288,13 +288,13 @@ def _sky(looked: VisiblePoints) -> Finding | None:
     return Finding("sky", f"{many} photographs have a sky without points, {area:.0f} % of their area")
 
 
-def _sky_part(looked: VisiblePoints, view: View) -> float:
+def _sky_part(visible: VisiblePoints, view: View) -> float:
     """Fraction of a view that is sky.
 
     Sky is a bright, smooth, blue or white region at the upper border, above the horizon, with hardly any points.
     """
-    pixels = looked.scene.glances[view.name].pixels
-    up = looked.up @ view.camera.rotation.T
+    pixels = visible.scene.glances[view.name].pixels
+    up = visible.up @ view.camera.rotation.T
     turns = int(np.round(np.arctan2(up[0], -up[1]) / (np.pi / 2))) % 4  # quarter turns that make the picture upright
     upright = np.rot90(pixels, turns)
     light = upright @ REC601_LUMA
@@ -311,9 +311,9 @@ def _sky_part(looked: VisiblePoints, view: View) -> float:
     part = float(reached.mean())
     if part < MIN_SKY_PIXEL_FRACTION or not likely[0].mean() > 0.5:
         return 0.0
-    _, rows, columns, _ = looked.places[view.name]
+    _, rows, columns, _ = visible.places[view.name]
     held = np.rot90(reached, -turns)[rows, columns].mean() if len(rows) else 1.0
-    if held > MAX_SKY_POINT_DENSITY_RATIO * part or _elevation(view, np.rot90(reached, -turns), looked.up) < 0:
+    if held > MAX_SKY_POINT_DENSITY_RATIO * part or _elevation(view, np.rot90(reached, -turns), visible.up) < 0:
         return 0.0
     return part
 
@@ -328,7 +328,7 @@ def _elevation(view: View, part: NDArray[np.bool_], up: Float64) -> float:
 
 
 def _blur(scene: Scene) -> Finding | None:
-    names = [view.name for view in _looked_at(scene)]
+    names = [view.name for view in _sampled_training_views(scene)]
     logs = np.log([max(scene.glances[name].sharpness, 1e-6) for name in names])
     if len(names) < 5:
         return None

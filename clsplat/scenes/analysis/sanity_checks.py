@@ -49,8 +49,8 @@ colour."""
 def of_scene(scene: Scene, background: Background) -> list[str]:
     """Warnings about the scene's points, cameras and photographs, and about the background colour."""
     lenses = absurd([(view.name, view.lens) for view in scene.views])
-    looked = spread(scene.train_views, MAX_CHECKED_VIEWS)
-    pictures = [_pixels(view) for view in looked]
+    checked = spread(scene.train_views, MAX_CHECKED_VIEWS)
+    pictures = [_pixels(view) for view in checked]
     doubts = (
         _many_points(scene),
         _other_clouds(scene),
@@ -58,7 +58,7 @@ def of_scene(scene: Scene, background: Background) -> list[str]:
         _principal_points(scene),
         lenses,
         _one_place(scene),
-        _empty(looked, pictures, background),
+        _empty(checked, pictures, background),
         _background(pictures, background),
     )
     return [text for text in doubts if text]
@@ -72,16 +72,16 @@ def of_pictures(
     draw: function that renders the image (H, W, 3) and alpha (H, W) of a camera.
     kind: name of the kind of views, for the message.
     """
-    looked = spread(views, MAX_CHECKED_VIEWS)
-    drawn = [draw(_small(view.camera)) for view in looked]
+    checked = spread(views, MAX_CHECKED_VIEWS)
+    drawn = [draw(_small(view.camera)) for view in checked]
     if not any(alpha.any() for _, alpha in drawn):
         return (
-            f"no Gaussian is visible in any of the {len(looked)} {kind} views that were checked: the points do not "
+            f"no Gaussian is visible in any of the {len(checked)} {kind} views that were checked: the points do not "
             "lie in front of the cameras; check that both have the same axes, scale and origin"
         )
-    if all(_is_flat(image) for image, _ in drawn) and not all(_is_flat(_pixels(view)) for view in looked):
+    if all(_is_flat(image) for image, _ in drawn) and not all(_is_flat(_pixels(view)) for view in checked):
         return (
-            f"each picture of the {len(looked)} {kind} views that were checked has a single colour, but the "
+            f"each picture of the {len(checked)} {kind} views that were checked has a single colour, but the "
             "photographs do not: check that cameras and points belong together, and settings other than the defaults"
         )
     return ""

@@ -20,7 +20,7 @@ THUMBNAIL_OCCLUSION_DEPTH_RATIO = 1.15
 THUMBNAIL_OCCLUSION_CELL_PX = 8
 """Side of an occlusion cell in thumbnail pixels."""
 MIN_POINTS_PER_VIEW = 40
-"""Minimum number of points in a photograph for measuring its brightness or scale."""
+"""Minimum number of visible points in a photograph whose brightness or scale is measured."""
 MIN_EXPOSURE_COLOUR, MAX_EXPOSURE_COLOUR = 0.06, 0.94
 """Range of colour values that are used to measure exposure. Smaller ones are noisy, and larger ones may be clipped."""
 COLOUR_NOISE_FLOOR = 1 / 255
@@ -47,10 +47,9 @@ class VisiblePoints:
 
     @cached_property
     def places(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Float64]]:
-        """For each sampled view's name: indices of the visible points, their rows and columns in the thumbnail, and
-        depths.
+        """Indices, rows, columns and depths of the points that each thumbnail shows, keyed by the view's name.
 
-        Panoramas and fisheyes are left out.
+        Rows and columns are in pixels of the thumbnail. Panoramas and fisheyes are left out.
         """
         flat = [view for view in self.scene.sampled_views if view.split == "train" and view.lens.native is None]
         return {view.name: self._place(view) for view in flat}

@@ -170,7 +170,7 @@ def safe_name(name: str) -> bool:
 
 
 def _named(path: Path, name: str) -> str:
-    """Name of a picture, without a drive, root or "..". Pictures with these are found by the end of their path.
+    """Name of a picture, without a drive, root or "..". Such a picture is later found by the end of its path.
 
     Raises InputError if the remaining name is not a path inside the images' folder.
     """

@@ -122,7 +122,7 @@ def _pictures(path: Path, readers: list[Keys], images: Path | None, missing: Mis
 
 
 def _smaller_folders(lost: list[Path], folder: Path) -> dict[Path, Path]:
-    """Downscaled copy for each folder of missing pictures that has no pictures at all but has such a copy."""
+    """Folders of missing pictures that have no pictures but a downscaled copy, each with that copy."""
     names = {parent for file in lost for parent in file.parents if folder in parent.parents}
     found = {name: or_smaller(name) for name in sorted(names)}
     return {name: copy for name, copy in found.items() if copy != name}
@@ -174,7 +174,7 @@ def _images(
 ) -> list[PosedImage]:
     """Images of frames, with their files.
 
-    missing: names of other frames' pictures.
+    missing: names of missing pictures, which the file's split may list.
     size: as for `read_poses`.
     Warns of contradictions.
     """

@@ -44,10 +44,11 @@ MAX_COMPARED_PIXELS_PER_PIXEL, MIN_COMPARED_WIDTH_PX = 0.5, 24
 In small pictures, resizing changes the pixels visibly.
 """
 MAX_COPY_RMS_LEVELS, MAX_COPY_RMS_PER_GRADIENT = 1.0, 0.2
-"""Maximum RMS difference of two thumbnails of one photograph: in 255ths, or relative to that of neighbouring pixels.
+"""Largest RMS difference of two thumbnails of one photograph: in 255ths, or as a multiple of the RMS difference of
+neighbouring pixels.
 
-The second is reached by a shift of 0.2 thumbnail pixels, 1/480 of the picture's width. JPEG and resizing filters cause
-less in pictures of at least 240 pixels.
+A shift of 0.2 thumbnail pixels, 1/480 of the picture's width, reaches the second. JPEG and resizing filters cause less
+in pictures of at least 240 pixels.
 """
 MIN_FOLDER_CORRELATION, CORRELATION_SIDE_PX = 0.9, 24
 """Minimum correlation of the pictures in two related folders, and longer side to which the pictures are reduced for it.
@@ -61,7 +62,7 @@ the distortion is strong. Folders of such frames are mistaken for copies.
 FOLDER_PAIR_SAMPLES = 5
 """Number of pairs of pictures that are decoded to compare two folders."""
 MAX_COPY_ASPECT_RATIO_CHANGE = 1.3
-"""Ratio of two pictures' aspect ratios from which they are different. Cropping by undistortion changes it by less."""
+"""Ratio of two aspect ratios from which the pictures are different. Cropping by undistortion changes it by less."""
 FEATURELESS_STD_LEVELS = 8.0
 """Standard deviation in 255ths below which a picture is featureless and resembles no other."""
 ASPECT_RATIO_TOLERANCE = 0.02
@@ -114,7 +115,7 @@ class Copy:
     why: str
 
 
-def told_by_names(folder: Path, names: Sequence[str]) -> dict[str, Copy]:
+def found_by_name(folder: Path, names: Sequence[str]) -> dict[str, Copy]:
     """Find copies before all photographs are decoded.
 
     Copies are files with the same bytes, and pictures with the same names in related folders. A sample of these
@@ -144,7 +145,7 @@ def told_by_names(folder: Path, names: Sequence[str]) -> dict[str, Copy]:
     return resolved({**copies, **_found(groups, rank, why)})
 
 
-def told_by_pictures(photos: Sequence[Decoded]) -> dict[str, Copy]:
+def found_by_picture(photos: Sequence[Decoded]) -> dict[str, Copy]:
     """Find copies among decoded photographs: the same picture with the same name in a sibling folder, or with another
     file type.
 
@@ -168,7 +169,7 @@ def told_by_pictures(photos: Sequence[Decoded]) -> dict[str, Copy]:
 
 
 def to_compare(names: Sequence[str]) -> set[str]:
-    """Photographs whose thumbnails `told_by_pictures` compares."""
+    """Photographs whose thumbnails `found_by_picture` compares."""
     return {place.name for group in _alike(names) for place in group}
 
 
@@ -187,7 +188,7 @@ def thumb_of(pixels: NDArray[Any], alpha: int) -> Thumb:
 
 
 def resolved(copies: dict[str, Copy]) -> dict[str, Copy]:
-    """Copies with the photograph that is used in the end: the photograph kept for a copy may itself be a copy."""
+    """Copies, each with the photograph that is used in the end. `Copy.kept` in the input may itself be a copy."""
 
     def last(name: str) -> str:
         while name in copies:
@@ -400,7 +401,7 @@ def _middle(path: Path) -> bytes:
 
 
 def _stage(folder: str) -> int:
-    """Index of a folder's name in UNDISTORTION_FOLDERS; their number for any other name."""
+    """Index in UNDISTORTION_FOLDERS of a folder's name; len(UNDISTORTION_FOLDERS) for any other name."""
     return next(
         (stage for stage, known in enumerate(UNDISTORTION_FOLDERS) if folder.casefold() in known),
         len(UNDISTORTION_FOLDERS),

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Structure from motion with pycolmap on the CPU: from a folder of photographs to a COLMAP scene with pinhole
-cameras."""
+"""Structure from motion with pycolmap on the CPU: makes a COLMAP scene with pinhole cameras from photographs."""
 
 from __future__ import annotations
 
@@ -122,7 +121,7 @@ def reconstruct(
     report = progress or no_progress
     settings.check()
     paths, left_out = sfm_photos.find_photos(images, excluded=output)
-    copies = sfm_copies.told_by_names(images, [sfm_photos.photo_name(images, path) for path in paths])
+    copies = sfm_copies.found_by_name(images, [sfm_photos.photo_name(images, path) for path in paths])
     paths = [path for path in paths if sfm_photos.photo_name(images, path) not in copies]
     shapes = _masks(images, paths, masks)
     fingerprint = sfm_photos.fingerprint(images, paths, f"{settings}{_described(masks, shapes)}")
@@ -171,7 +170,7 @@ def _staged_photos(
     photos = sfm_photos.stage_photos(
         images, paths, target, lambda fraction: report("reading photos", fraction), threads
     )
-    copies = sfm_copies.resolved({**copies, **sfm_copies.told_by_pictures(photos)})
+    copies = sfm_copies.resolved({**copies, **sfm_copies.found_by_picture(photos)})
     photos = [photo for photo in photos if photo.name not in copies]
     if copies:
         count = "1 photograph is a copy of another" if len(copies) == 1 else f"{len(copies):,} photographs are copies"

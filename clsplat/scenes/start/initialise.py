@@ -140,8 +140,8 @@ def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Ge
 
 
 def is_colourless(scene: Scene) -> bool:
-    """True if points have no colours: some are marked as colourless, as for --points, or all have the same colour, as
-    after reading other clouds without colours."""
+    """True if points lack colours: some are marked as colourless (from --points), or all have the same colour, as from
+    another cloud without colours."""
     return scene.colourless is not None or of_one_colour(scene.point_colors)
 
 

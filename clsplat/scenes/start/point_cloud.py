@@ -107,14 +107,14 @@ def without_stray_points(points: Float64, scene: Scene, where: object) -> NDArra
 
 
 def check_place(points: Float64, scene: Scene, path: Path) -> None:
-    """Raise InputError for a cloud (N, 3) that the training photographs do not show or that lies much nearer or farther
-    than the scene's points."""
-    looked = _spread(points)
-    seen, depths = _seen(looked, scene)
+    """Raise InputError for a cloud (N, 3) that the training photographs do not show, or that is much nearer to the
+    cameras or farther away than the scene's points."""
+    sample = _spread(points)
+    seen, depths = _seen(sample, scene)
     advice = "expected points with the axes, scale and origin of the scene's cameras"
-    if seen < max(MIN_CLOUD_POINTS_IN_VIEW * len(looked), 1):
+    if seen < max(MIN_CLOUD_POINTS_IN_VIEW * len(sample), 1):
         raise InputError(
-            f"{path}: only {100 * seen / len(looked):.1f} % of its points lie in a training photograph; the points lie "
+            f"{path}: only {100 * seen / len(sample):.1f} % of its points lie in a training photograph; the points lie "
             f"{_where(points)}, and the cameras {_where(_centres(scene))}; {advice}"
         )
     if len(scene.points):

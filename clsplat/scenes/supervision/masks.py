@@ -35,10 +35,9 @@ twice as many are read."""
 VOID_LABEL = 255
 """Label of undefined pixels, as at the object borders in VOC and Cityscapes."""
 MAX_LABEL = 40
-"""Maximum of the other labels. Soft masks have larger values."""
+"""Largest label except VOID_LABEL. Soft masks have larger values."""
 MAX_LABEL_NOISE_RATIO = 0.01
-"""A mask whose area labelled 1 is smaller than this times its area labelled 255 is taken for black and white with
-noise."""
+"""A mask is black and white with noise if its area labelled 1 is under this fraction of its area labelled 255."""
 
 
 @dataclass(frozen=True)
@@ -365,8 +364,7 @@ def for_sfm(use: MaskUse) -> MaskUse | None:
 
 
 def after_sfm(use: MaskUse, folder: Path) -> MaskUse:
-    """Use of the masks in a folder that `clsplat.scenes.sfm.reconstruct` made: white pixels count, and alpha is
-    included."""
+    """Use of the masks that `clsplat.scenes.sfm.reconstruct` wrote: white pixels count, and alpha is included."""
     if not (folder / MASK_FOLDERS[0]).is_dir():
         return replace(use, masks="none", invert=False)
     meaning: MaskMeaning = "none" if use.alpha == "blend" else use.alpha
