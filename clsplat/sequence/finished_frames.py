@@ -111,9 +111,9 @@ def frames_there(tasks: Sequence[Task], options: RenderOptions, video: VideoConf
     return {task.key for task, state in states.items() if state in ("recorded", "unrecorded")}
 
 
-def _state(task: Task, options: RenderOptions) -> Literal["told", "untold", "changed", "missing"]:
-    """State of a frame's file. told, untold: complete, and its settings are recorded or not. changed: of another model
-    or settings. missing: not there, damaged, or of another kind."""
+def _state(task: Task, options: RenderOptions) -> Literal["recorded", "unrecorded", "changed", "missing"]:
+    """State of a frame's file. recorded, unrecorded: complete, with or without a record of its settings. changed: of
+    another model or settings. missing: not there, damaged, or of another kind."""
     wanted = _identity(task, options)
     if _is_whole(task, options, wanted):
         return "unrecorded" if attribute(task.path, SETTINGS_DIGEST_ATTRIBUTE) is None else "recorded"
