@@ -97,7 +97,7 @@ static inline int add_gaussian(Pixels *p, floatL power, int i, int zero, float c
   return !ANYL(p->t > 0.0f);
 #else
   p->t = goes_on ? after : -fabs(before);
-  p->stop = goes_on ? p->stop : min(p->stop, i); // the first such pair: pairs are in order
+  p->stop = goes_on ? p->stop : min(p->stop, i); // pairs are in order: keeps the first
   return 0;
 #endif
 }

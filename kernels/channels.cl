@@ -1,5 +1,5 @@
-// Auxiliary channels: features blended with the image's weights, and channels by the order of the Gaussians. The latter
-// are the depths of the first Gaussian and of half opacity, the number of Gaussians, and the one of largest weight.
+// Auxiliary channels: features blended with the image's weights; the depth of the first Gaussian, the depth of half
+// opacity, the number of Gaussians, and the index of the Gaussian with the largest weight.
 //
 // Owner: A group owns a tile, as in blend.cl; transmittance has the same bits as there.
 // Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.

@@ -174,7 +174,8 @@ __kernel void ewa_grad(const uint n, const uint padded, __constant float *camera
   d_size = fmaL((floatL)(2.0f), thinner, d_size);
 #endif
 
-  // (165), (166): the mean in the camera's frame, through its position on the image, the Jacobian and its depth.
+  // (165), (166): the gradient with respect to the mean in the camera's axes, through its image position, the Jacobian
+  // and its depth.
   const floatL d_u = GATHER(d_means2d, 2, 0), d_v2 = GATHER(d_means2d, 2, 1);
   floatL d_x, d_y, d_z;
 #ifdef FISHEYE

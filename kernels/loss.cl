@@ -428,8 +428,9 @@ static INLINE void derivatives(const Block block, __local const float *near, __l
   }
 }
 
-// near = sums over vertical windows of the partials, then middle pixels of image and target. The first sum includes the
-// other two partials in the cells above and below, times the differences between their middle pixels and the block's.
+// near = sums over vertical windows of the three partials; after them, middle pixels of image and target. Partials in
+// the cells above and below are relative to the middle pixels there. So to the first sum are added the other two
+// partials times the differences of the middle pixels.
 static INLINE void adjoint_moments(const Block block, __local float *near) {
   FOR_PARTS(part, PARTS) {
     COLUMN_OF_PART(block, part)

@@ -1,6 +1,6 @@
 // The device's peak rates for the operations of the pipeline. `clsplat bench` compares each stage with them.
 //
-// Owner: A work-item owns OWNED cells of pixels of no image; in limit_copy, COPIED elements.
+// Owner: A work-item owns OWNED cells of pixels, which are not stored; in limit_copy, COPIED elements.
 // Launch: As many groups of ITEMS work-items as keep the device busy; limit_copy: one work-item for each COPIED
 //   elements.
 // Buffers: splats (LIMIT_SPLATS, SPLAT_SIZE) in pixels -> sums (items), so that compilers do not remove the arithmetic.

@@ -203,8 +203,8 @@ def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity:
         buffer = _Buffer(device.context, cl.mem_flags.READ_WRITE, nbytes)
     except cl.MemoryError:
         raise CapacityError(
-            f"{device.name} has no memory left for a buffer of {amount(nbytes)}, beside the "
-            f"{amount(device.memory.used)} in use: give --max-device-mem less than that"
+            f"{device.name} has no memory left for a buffer of {amount(nbytes)}, with "
+            f"{amount(device.memory.used)} in use: set --max-device-mem below {amount(device.memory.used)}"
         ) from None
     device.memory.add(buffer, nbytes)
     if (word := _poison()) is not None:

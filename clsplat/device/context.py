@@ -244,7 +244,7 @@ class Device:
 
     @property
     def row_alignment(self) -> int:
-        """Rows, of at least four bytes each, in the unit of alignment: a view of rows must begin at a multiple of it.
+        """Alignment of views: the first row of a view must be a multiple of this. Rows must have four bytes or more.
 
         OpenCL requires sub-buffers to be aligned, and kernels read whole vectors.
         """

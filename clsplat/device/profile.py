@@ -25,7 +25,7 @@ class StageRecord:
 
     kernels: milliseconds on the device, for each kernel, copy and fill by name.
     ms: sum of `kernels`.
-    wall_ms: elapsed milliseconds from idle device to idle device, including launches and work on the host.
+    wall_ms: elapsed milliseconds, including launches and work on the host. The device is idle before and after.
     bytes: bytes of the arrays that were passed to kernels.
     """
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Averages of a frame over samples: over the area of a pixel (supersampling), the time of the shutter, and the lens.
 
-The positions of samples are fixed, and samples of shutter and lens have equal weights. So a frame that is rendered
-again has the same bits, if it has them without samples. Only linear light is averaged. Channels that cannot be averaged
-come from a single sample.
+The positions of samples are fixed, and samples of shutter and lens have equal weights. So frames are as repeatable, to
+the last bit, as without samples. Only linear light is averaged. Channels that cannot be averaged come from a single
+sample.
 """
 
 from __future__ import annotations

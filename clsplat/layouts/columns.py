@@ -21,8 +21,8 @@ LOSS_ROWS: rows that a work-group of one item processes together, as their windo
 LOSS_COLUMNS: maximum columns in a block of such a work-group.
 LOSS_GROUP_ROWS, LOSS_GROUP_COLUMNS: rows and columns of a block for a work-group of several items.
 
-Five fields of a block must fit in 32 KiB of local memory. In a group of several items, a block is divided into
-LOSS_PARTS parts: along columns one for each column, margins included, and along rows 63 runs of six pixels. So nearly
+Five fields of a block must fit in 32 KiB of local memory. In a group of several items, a block has LOSS_PARTS parts.
+For vertical windows these are its columns, margins included; for horizontal windows, 63 runs of six pixels. So nearly
 every part has work in both directions.
 """
 

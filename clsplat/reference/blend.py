@@ -17,7 +17,7 @@ from clsplat.reference.project import ALPHA_MIN, BOX_SLACK, Footprint, Seen
 
 BLEND_ALPHA_MAX = float(np.float32(0.99))
 TRANSMITTANCE_MIN = float(np.float32(1e-4))
-"""The kernels' constants in float32. In decimal, two layers at the cap would leave (1 - 0.99)^2, the limit."""
+"""The kernels' constants, in float32. In float64, two layers at the cap would leave (1 - 0.99)^2, exactly the limit."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ def cam_from_pixel(camera: Camera, pixels: Float64) -> tuple[Float64, Float64]:
 
     pixels: (0.5, 0.5) is the centre of the first pixel.
 
-    Without a ray: NaN. That is beyond 180 degrees from a fisheye's axis, or a pole of an equirectangular image.
+    Pixels beyond 180 degrees from a fisheye's axis, or beyond a pole of an equirectangular image, get NaN.
     """
     pixels = np.asarray(pixels, np.float64)
     a = (pixels[:, 0] - camera.cx) / camera.fx

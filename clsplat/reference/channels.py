@@ -43,7 +43,7 @@ class ChannelsTwin:
 
 
 def normals(means: Float64, quaternions: Float64, log_scales: Float64, camera: Camera) -> Float64:
-    """Eq. (62): normals (N, 3), the axis of each Gaussian's smallest scale (of equal ones the first), to the camera."""
+    """Eq. (62): normals (N, 3), each along the axis of the smallest scale (the first of equals), towards the camera."""
     axes = rotation_matrices(quaternions)[np.arange(len(means)), :, np.argmin(log_scales, axis=1)]
     away = (view_directions(means, camera)[0] * axes).sum(axis=1)
     return np.where(away[:, None] > 0, -axes, axes)
@@ -57,7 +57,7 @@ def motions(means: Float64, camera: Camera, after: Camera, moved: Float64 | None
     to = means if moved is None else moved
     (here, _), (there, depths) = pixel_from_world(camera, means), pixel_from_world(after, to)
     if camera.model.wraps:
-        # the position of a mean may depend on the image's middle, for a window on the middle of its frame
+        # a panorama's pixels depend on the middle of the image; a window has the middle of its frame
         frame = camera.window or camera
         here[:, 0] = camera.model.wrapped(replace(camera, width=frame.width), here[:, 0])
         turned = (there[:, 0] - after.cx) / after.fx - (here[:, 0] - camera.cx) / camera.fx

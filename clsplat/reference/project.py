@@ -153,7 +153,7 @@ def rotation_matrices(quaternions: Float64) -> Float64:
 
 
 def _geometry(means: Float64, quaternions: Float64, log_scales: Float64, camera: Camera) -> _Geometry:
-    """Eqs. (1), (3), (4), (5); orthographic: (16) of docs/cameras.md."""
+    """Compute the `_Geometry`: eqs. (1), (3), (4), (5); orthographic: (16) of docs/cameras.md."""
     p = means @ camera.rotation.T + camera.translation
     plane = camera.model.projected(camera, p)
     rotations = rotation_matrices(quaternions)
@@ -196,7 +196,7 @@ class _Ellipses:
 
 
 def _ellipses(half: Float64, low_pass: float) -> _Ellipses:
-    """Eqs. (6) to (8), from M (N, 2, 3) of eq. (5)."""
+    """Compute the ellipses from M (N, 2, 3) of eq. (5): eqs. (6) to (8)."""
     m1, m2 = half[:, 0], half[:, 1]
     length1, length2 = (m1 * m1).sum(axis=1), (m2 * m2).sum(axis=1)
     sxx, sxy, syy = length1 + low_pass, (m1 * m2).sum(axis=1), length2 + low_pass
@@ -300,7 +300,7 @@ def covariance_grad(conics: Float64, d_conics: Float64) -> Float64:
 
 
 def quaternion_grad(quaternions: Float64, d_rotations: Float64) -> Float64:
-    """Eqs. (34), (35): raw quaternions (N, 4), dL/dR (N, 3, 3) -> dL/dq (N, 4), orthogonal to q."""
+    """Eqs. (34), (35): dL/dq (N, 4), orthogonal to q, from raw quaternions q (N, 4) and dL/dR (N, 3, 3)."""
     norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
     unit = quaternions / norms
     w, x, y, z = unit.T

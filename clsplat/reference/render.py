@@ -116,7 +116,7 @@ def render_grad(
 
 
 def projected_gradients(projected: ProjectedTwin, screen: BlendGradients) -> ProjectedGradients:
-    """Gradients with respect to the results of projection, from those of blending: of covariances instead of conics."""
+    """The gradients of blending, as the input of projection's gradient: covariances replace conics."""
     by_covariance = covariance_grad(projected.conics, screen.conics)
     return ProjectedGradients(screen.means2d, by_covariance, screen.opacities, screen.colors)
 

@@ -30,7 +30,7 @@ class Splats:
 
 
 def splats(conics: Float64, opacities: Float64, radii: NDArray[np.int32]) -> Splats:
-    """Eqs. (170) to (172), for positive definite conics (n, 3)."""
+    """Compute the splats, for positive definite conics (n, 3): eqs. (170) to (172)."""
     a, b, c = conics.T
     det = a * c - b * b
     drawn = (radii > 0).all(axis=1) & (opacities > ALPHA_MIN)
@@ -50,7 +50,7 @@ class SplatGradients:
 
 
 def splats_grad(conics: Float64, opacities: Float64, moments: Float64) -> SplatGradients:
-    """Eqs. (173) to (175).
+    """Compute the gradients: eqs. (173) to (175).
 
     moments: (n, 6), sums of g, g u, g v, g u^2, g u v, g v^2 over a Gaussian's pixels, where (u, v) = W d and d points
     from the pixel to the mean.

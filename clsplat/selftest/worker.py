@@ -43,7 +43,7 @@ DEFAULT_DEFINES: dict[str, dict[str, object]] = {
     "values": {"VALUES": 3},
     "values_grad": {"VALUES": 3, "GEOMETRY": True},
 }
-"""Defines for kernels that need some to be built at all."""
+"""Defines without which these kernel files cannot be built."""
 
 
 @cache

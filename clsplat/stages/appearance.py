@@ -25,7 +25,7 @@ APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON = 0.9, 0.999, 1e-15
 
 @dataclass(frozen=True)
 class GainEntries:
-    """Which column sums belong to the gains, and how Adam updates the gains.
+    """The column sums from which gains are updated, and settings of the update by Adam.
 
     first_row: row of the first entry in the column sums.
     mix_rate: learning rate of mixes, as a fraction of the rate of gains.

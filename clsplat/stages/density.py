@@ -110,7 +110,7 @@ def add_statistics(
     projected: Projected,
     screen: Screen,
 ) -> None:
-    """Add one view: its gradient norms are with respect to the visible means in NDC, like the paper's threshold."""
+    """Add a view to the statistics. Gradient norms are with respect to means in NDC, as is the paper's threshold."""
     n = projected.tile_counts.shape[0]
     rays = camera.model.along_rays
     kernels = device.kernels("density", {"RAYS": True} if rays else {})
@@ -124,7 +124,7 @@ def add_statistics(
 def add_contributions(
     device: Device, statistics: DensityStatistics, projected: Projected, contributions: DeviceArray, area: float
 ) -> None:
-    """Add the Gaussians' contributions (n,) to one view to the current epoch.
+    """Add the contributions (n,) that the Gaussians make to a view to the statistics of the current epoch.
 
     area: number of full-resolution pixels per pixel of a reduced image; contributions are multiplied by it.
     """

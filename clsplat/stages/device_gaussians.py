@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters, gradients and moments on the device, or on the host, from where parts are streamed to the device."""
+"""Parameters, gradients and moments: on the device, or on the host and streamed to the device in parts."""
 
 from __future__ import annotations
 

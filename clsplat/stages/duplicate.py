@@ -55,11 +55,11 @@ class Band:
 class Counted:
     """The visible Gaussians and the number of their pairs.
 
-    tile_counts, first_slots: (n), a Gaussian's number of tiles, and the prefix sums.
-    gaussian_from_visible, depth_keys: (visible), in order of the Gaussians.
+    tile_counts, first_slots: (n), the number of tiles of each Gaussian, and its first slot, a prefix sum of these.
+    gaussian_from_visible, depth_keys: (visible), in the order of the Gaussians' rows.
     visible, pairs: the numbers of visible Gaussians and of pairs; pairs are capped at 2^32 - 1.
     least_key: a lower bound of the depth keys.
-    key_bits: number of bits of the largest key minus least_key, or more.
+    key_bits: sufficient number of bits for all keys minus least_key.
     refused: the counts of `adam`.
 
     In a pass launched by capacity (`PairCapacity`), `visible` and `pairs` are upper bounds, and these fields are set:

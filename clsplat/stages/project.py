@@ -23,8 +23,8 @@ from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
 
 CPU_STEP_ROWS = 128
-"""Number of Gaussians per group of `project_step` on a CPU. Their gradients, 30 KiB, stay in the cache, and their rows
-of each array are enough for prefetching to pay. With groups of a single vector a step takes 1.5 times as long."""
+"""Number of Gaussians per group of `project_step` on a CPU. Their gradients, 30 KiB, stay in the cache, and each array
+is read in runs long enough for prefetching. With groups of a single vector a step takes 1.5 times as long."""
 
 STEP_REGISTERS = 96
 """Maximum registers per item of `project_step`, where the driver accepts a limit. Adam is bound by memory latency, so
@@ -45,7 +45,7 @@ class Projected:
 
     splats: (n, SPLAT).
     tile_counts: (n), 0 where culled.
-    shown: (n), 0 where a Gaussian has no splat, if culling is switched off; otherwise None, as tile_counts tells it.
+    shown: (n), 0 where a Gaussian has no splat, if culling is switched off. Otherwise None: tile_counts is 0 there.
     """
 
     splats: DeviceArray

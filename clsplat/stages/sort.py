@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches sort_radix.cl and sort_bitonic.cl: stable sorts of uint32 keys that also return each key's origin."""
+"""Launches sort_radix.cl and sort_bitonic.cl: stable sorts of uint32 keys, with the keys' positions in the input."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clsplat.device.launch import launch_groups
 from clsplat.stages.scan import Elements, chunking
 
 MAX_BITONIC_KEYS = 2048
-"""Maximum number of keys for bitonic sort. With positions they take 16 KiB of local memory; every device has 32."""
+"""Maximum number of keys for bitonic sort. With positions they take 16 KiB of local memory. Every device has 32 KiB."""
 
 BITONIC_KEYS_BY_KIND = {"cpu": 512, "gpu": 1024, "other": 1024}
 """Number of keys up to which bitonic sort is faster than the launches of radix sort."""

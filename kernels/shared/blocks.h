@@ -48,7 +48,7 @@ typedef int Open; // number of the item's cells with an open pixel
 typedef uint Reach;
 #define BLOCKS (BLOCK_COLUMNS * BLOCK_ROWS)
 #define ALL_BLOCKS (0xffffffffu >> (32 - BLOCKS))
-#define OF_FIRST_WARP (ALL_BLOCKS / ((1u << WARPS) - 1)) // every WARPS-th bit
+#define OF_FIRST_WARP (ALL_BLOCKS / ((1u << WARPS) - 1)) // the first warp's blocks: every WARPS-th bit
 #define FROM_OWN(blocks) ((blocks) >> WARP)
 #define FOR_CELLS(cell, reach) ALL_CELLS(cell) if ((reach) >> (cell * WARPS) & 1)
 

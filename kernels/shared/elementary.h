@@ -39,7 +39,7 @@ static inline floatL floorL(floatL x) {
   return x > -8388608.0f ? below : x;
 }
 
-// A number in two floats, whose sum it is (Dekker 1971).
+// A number as the sum of two floats, with twice the precision of one (Dekker 1971).
 typedef struct {
   floatL high, low;
 } Double;

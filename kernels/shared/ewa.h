@@ -169,7 +169,7 @@ static inline void covariance2(float eps, Ellipse2 *p) {
 #define EWA_NUMBER2(name, index)                                                                                       \
   {(floatL)(camera[EWA_##name##0 + (index)]), (floatL)(camera[EWA_##name##0_LOW + (index)])}
 
-// (57): recomputes b1, b2 and c in the lanes of `which`, in two floats until no more terms cancel.
+// (57): recomputes b1, b2 and c in the lanes of `which`, in two floats up to the last step where terms cancel.
 static inline void refine2(const uint *row, __global const float *quaternions, __constant float *camera, intL which,
                            Ellipse2 *p) {
   Double r[9];

@@ -73,7 +73,7 @@ static inline floatL compensation(floatL det0, floatL det) {
 #endif
 
 #ifndef RAYS
-// (57): recomputes J A and its minors in the lanes of `which`, in two floats until no more terms cancel.
+// (57): recomputes J A and its minors in the lanes of `which`, in two floats up to the last step where terms cancel.
 static inline void refine(const uint *row, __global const float *quaternions, __constant float *camera, intL which,
                           Projection *p) {
   Double r[9];
@@ -145,9 +145,9 @@ static inline int project_gaussians(const uint *row, __global const float *means
   }
   covariance(p);
 
-  // Rounding of the rotation moves the end of a long axis by 1e-7 of its length. That must be small compared to the
-  // short axis of the ellipse, which is between 1 and 1.42 times sqrt(det / (sxx + syy)). The gradient also needs an
-  // accurate axis if it points to the camera.
+  // Rounding of the rotation moves the end of a long axis by 1e-7 of its length. This error must be small compared to
+  // the short axis of the ellipse, which is between 1 and 1.42 times sqrt(det / (sxx + syy)). For the gradient, an axis
+  // that points to the camera must also be accurate.
   floatL longest = p->s[0] > p->s[1] ? p->s[0] : p->s[1];
   longest = longest > p->s[2] ? longest : p->s[2];
   const floatL across2 = fmaL(p->jx, p->jx, p->jy * p->jy);

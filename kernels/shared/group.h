@@ -1,4 +1,4 @@
-// Operations of a whole work-group. With ITEMS == 1 a group is a single work-item, and they compile to nothing.
+// Operations of a whole work-group. With ITEMS == 1 a group is one work-item, and the operations compile to nothing.
 #ifndef ITEMS
 #error "ITEMS must be defined: work-items per group, 1 on CPUs"
 #endif

@@ -29,7 +29,7 @@ class Capabilities:
     local_memory: maximum bytes of a group's local memory.
     allocation: maximum bytes of a buffer.
     exact_division: True if the device supports correctly rounded division and square roots.
-    contraction: True if the device may be probed for compilers that fuse a*b + c.
+    contraction: True if the compiler may be tested for fusing a*b + c (`Device._probe_fma`).
     """
 
     kind: str
@@ -47,7 +47,7 @@ _CAPABILITIES_BY_WORD: dict[str, dict[str, Any]] = {
 }
 """Changes of the capabilities by the word in CLSPLAT_PRETEND."""
 _LIMIT_FIELDS = {"group": "group", "local-memory": "local_memory", "allocation": "allocation"}
-"""Limits that CLSPLAT_PRETEND can lower, by their name in it."""
+"""Limits that CLSPLAT_PRETEND can lower: the fields of `Capabilities`, by their names in the variable."""
 
 
 def pretended() -> str:

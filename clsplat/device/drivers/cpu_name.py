@@ -30,7 +30,7 @@ CPU_NAMES_BY_FEATURES = (
 DEVICE_RECORD_BYTES = 2048
 """Number of bytes of PoCL's device record to search for the name; in PoCL 3.0 it is at byte 640."""
 _kept: dict[int, ctypes.Array[ctypes.c_char]] = {}
-"""Strings to which pointers in device records were set, by the address of the pointer."""
+"""Processor names that device records now point to, by the address of the pointer. They must stay in memory."""
 
 
 @cache

@@ -31,7 +31,7 @@ BREAK_KERNEL_VARIABLE = "CLSPLAT_BREAK_KERNEL"
 """Environment variable only for tests of `clsplat selftest`. STEM: OLD => NEW replaces words in a kernel's text, to
 simulate a driver that miscompiles an operation."""
 MAX_DRIVER_RECORDS = 16
-"""Maximum number of drivers and versions in the file, the latest; each takes a few KiB."""
+"""Maximum number of drivers and versions in the file. The latest are kept; each takes a few KiB."""
 
 
 @dataclass(frozen=True)

@@ -135,10 +135,10 @@ def asked_shape() -> str:
     text = os.environ.get("CLSPLAT_SHAPE", "")
     if text and _parsed(text, Shape(1, 1, 1)) is None:
         raise DeviceError(
-            f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; lanes are 1, 4, 8 or 16; a g behind "
-            f"{' and '.join(f'{lanes}x{items}' for lanes, items in BY_GAUSSIAN_SHAPES)} is for a gradient by "
-            "Gaussian, an s behind "
-            f"{', '.join(f'{lanes}x{items}' for lanes, items in SUBGROUP_SHAPES)} for sub-groups"
+            f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; lanes are 1, 4, 8 or 16; with "
+            f"{' or '.join(f'{lanes}x{items}' for lanes, items in BY_GAUSSIAN_SHAPES)}, suffix g selects a gradient by "
+            "Gaussian; with "
+            f"{', '.join(f'{lanes}x{items}' for lanes, items in SUBGROUP_SHAPES)}, suffix s selects sub-groups"
         )
     return text
 
@@ -179,8 +179,8 @@ def failures(device: cl.Device) -> dict[str, str]:
 def shape_of(device: cl.Device) -> tuple[Shape, str]:
     """The shape for a device that is opened without an explicit shape, and a warning or an empty string.
 
-    It is `wanted_shape`. If the driver has a recorded failure in that, it is the first shape without one, and there is
-    a warning. Raises DeviceError like `wanted_shape`.
+    It is `wanted_shape`. If the driver has a recorded failure in that shape, it is the first shape without a failure,
+    and there is a warning. Raises DeviceError like `wanted_shape`.
     """
     wanted, failed = wanted_shape(device), failures(device)
     shape = shapes_to_try(device, wanted, failed)[0]

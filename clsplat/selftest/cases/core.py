@@ -242,8 +242,7 @@ def _adam(bench: CaseBench) -> StageOutcome:
 
 
 def _steps_off(bench: CaseBench, given: Inputs) -> int:
-    """Count the elements of which `project_step` makes other values than float64 Adam with the gradients of
-    `project_grad`."""
+    """Count the elements in which `project_step` differs from float64 Adam with the gradients of `project_grad`."""
     device, (n, coefficients) = bench.device, (bench.model.count, bench.model.coefficients)
     view = (bench.camera_array, bench.projected, MadeUpSlots.of(bench).slots)
     gradients, screen = (

@@ -137,7 +137,7 @@ MARKS_CASE = Case(
 
 
 def of_statistics(bench: CaseBench) -> StageOutcome:
-    """Test the statistics, and the list of rows with thresholds inside the range of every statistic."""
+    """Test the statistics, and the list of rows. Its thresholds are inside the range of every statistic."""
     outcome, gaussians = STATISTICS_CASE.outcome(bench), bench.frozen.gaussians
     known = dict(zip(STATISTICS_CASE.digested, outcome.arrays, strict=True))
     middle, limit = 0.500001 * np.median(known["gradient_sums"]), float(np.median(gaussians.log_scales.max(axis=1)))

@@ -91,7 +91,7 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
 
 
 LOSS_CASE = Case(
-    # below and above the window's 11, vectors of 16 columns, blocks of 32 rows, and blocks of 7 x 54 with a border of 5
+    # below and above: windows of 11, vectors of 16 columns, blocks of 32 rows, blocks of 7 x 54 with a border of 5
     sizes=(
         *((1, 1), (1, 40), (40, 1), (11, 11), (15, 17), (16, 5), (17, 33), (5, 16), (63, 40), (33, 65)),
         *((54, 7), (55, 8), (53, 6), (59, 12), (60, 13), (64, 2), (65, 14), (109, 9)),
@@ -202,7 +202,7 @@ def _twin_of_depth_loss(given: Inputs, _: Arrays) -> dict[str, Wanted]:
     value, gradient = depth_loss(nearness, aims, weights, given.factor)
     return {
         "gradient": Wanted(gradient, 3e-7, np.abs(gradient)),  # rounding of a product
-        "loss": Wanted(np.array([value]), 1e-6, max(1.0, value)),  # of the depth term only: the pictures are equal
+        "loss": Wanted(np.array([value]), 1e-6, max(1.0, value)),  # only the depth term: the pictures are equal
     }
 
 

@@ -48,8 +48,8 @@ TESTED_FEATURES = Features.of(name for name in FEATURE_WIDTHS if name != "backwa
 MIN_NORMAL_COSINE = 1e-4
 """Cosine of a normal and the direction to the camera, below which the visible side depends on rounding."""
 MIN_TRANSMITTANCE_MARGIN = 1e-5
-"""Margin like `harness.MIN_DECISION_MARGIN`, but absolute: of the transmittance to one half and to the cuts of slices,
-and between the two largest weights."""
+"""Margin like `harness.MIN_DECISION_MARGIN`, but absolute: distance of the transmittance to one half and to the cuts of
+slices, and difference between the two largest weights."""
 MIN_MERGED_MARGIN = 1e-6
 """Margin of merged slices, where transmittance is a sum of up to 16 products."""
 DEEP_CASE_SLICES = 4

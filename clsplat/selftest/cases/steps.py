@@ -33,7 +33,7 @@ ADAM_RATES = {name: 2.0**-power for power, name in enumerate(PARAMETER_GROUPS, 3
 
 
 def _random_step(rng: Generator, count: int) -> Inputs:
-    """Gradients of 1e-15 to 1e6, with moments of any magnitude or zero. All Gaussians are updated, or the visible."""
+    """Gradients of 1e-15 to 1e6, with moments of any magnitude or zero. Adam updates all Gaussians or the visible."""
     step = int(rng.choice([1, 2, 10, 1000, 30_000, 10_000_000]))
     later, sparse = step > 1, bool(rng.random() < 0.5)
     visible = (rng.random(count) < 0.5) | (np.arange(count) >= 2 * count // 3)  # some vectors are visible as a whole
@@ -174,7 +174,7 @@ def _twin_of_noise(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     got |= {"moves": got["means"][~stays], "means of the opaque": got["means"][stays]}
     size = np.abs(wanted) + 0.1 * np.abs(wanted).max(initial=0)
     return {
-        "means": Wanted(wanted, 5e-6),  # the weight has an exponent 100 (o - dead), up to 16: an ulp of o is 1e-6 of it
+        "means": Wanted(wanted, 5e-6),  # an ulp of o changes 100 (o - dead), up to 16, by 1e-6
         "moves": Wanted(wanted[~stays], 1e-4, size[~stays]),
         "means of the opaque": exactly(np.zeros_like(got["means of the opaque"])),
         **{name: exactly(getattr(given, name)) for name in GEOMETRY_ARRAYS},

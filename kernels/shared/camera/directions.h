@@ -14,8 +14,8 @@ static inline floatL absL(floatL x) { return x < 0.0f ? -x : x; }
 
 #ifdef NEEDS_TANGENTS
 // (9), (10), (19), (30) for images whose radius depends only on the angle from the axis. f: the direction; across: its
-// distance from the axis; along / slope: radians of fx pixels away from the axis; around: radians of fx pixels around
-// it.
+// distance from the axis; along / slope: radians that fx pixels cover away from the axis; around: radians that they
+// cover around it.
 static inline void tangent_around_axis(const float *f, float across, float along, float slope, float around,
                                        __constant float *camera, Tangent *t) {
   const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];

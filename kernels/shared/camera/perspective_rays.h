@@ -2,7 +2,7 @@
 // Equation numbers refer to docs/cameras.md.
 #define ON_PLANE
 
-// The image position is a linear function of this; and its low part.
+// RATIO: the image position is a linear function of this. ratio_rest: its low part.
 #define RATIO(x, z) ((x) / (z))
 #define ratio_rest slope_rest
 
