@@ -1,19 +1,19 @@
-// Adam on one parameter group, from gradients in memory. The usual training step is fused into project_grad.cl. These
-// kernels serve steps that use the gradients in between, and they add up the gradients of a batch, one view at a time.
+// Adam on one parameter group, from gradients in memory. Usually Adam is fused into project_grad.cl. These kernels are
+// for steps that need the gradients in memory, such as batches, whose views they add up.
 //
-// The step zeroes the gradients it has used, because project_grad writes only the rows of visible Gaussians.
+// Adam sets the gradients to zero, because project_grad writes only the rows of visible Gaussians.
 //
 // Owner: A work-item owns ABREAST consecutive elements (adam), ABREAST rows (adam_visible), an element (add_view) or a
 //   row (join_view).
 // Launch: One work-item for each of these, in groups of 64; work-items past the end do nothing.
 // Buffers: The group's parameters in its own units, their gradients, the moments `first` and `second`; `readback`
-//   (READBACK_SIZE) counts refused elements. The scalars are those of Step. Shapes are above each kernel.
+//   (READBACK_SIZE) counts elements that are not updated. The scalars are those of Step. Shapes are above each kernel.
 // Equations: docs/gradients.md, (42).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/adam.h"
 
-// Steps the group as a flat array, ABREAST elements per work-item. parameters, gradients, first, second (n).
+// Updates the group as a flat array, ABREAST elements per work-item. parameters, gradients, first, second (n).
 __kernel void adam(const ulong n, const float rate, const float root, const float beta1, const float beta2,
                    const float epsilon, const float limit2, __global uint *readback, __global float *parameters,
                    __global float *gradients, __global float *first, __global float *second) {
@@ -31,8 +31,8 @@ __kernel void adam(const ulong n, const float rate, const float root, const floa
 }
 
 #ifdef WIDTH
-// Steps only the rows of visible Gaussians (OptimiserConfig.sparse), ABREAST rows per work-item. All other gradients
-// are zero already. tile_counts (n): 0 where hidden; parameters, gradients, first, second (n, WIDTH).
+// Updates only the rows of visible Gaussians (OptimiserConfig.sparse), ABREAST rows per work-item. The gradients of the
+// others are zero. tile_counts (n): 0 if not visible; parameters, gradients, first, second (n, WIDTH).
 __kernel void adam_visible(const uint n, const float rate, const float root, const float beta1, const float beta2,
                            const float epsilon, const float limit2, __global uint *readback,
                            __global const uint *tile_counts, __global float *parameters, __global float *gradients,
@@ -67,8 +67,8 @@ __kernel void adam_visible(const uint n, const float rate, const float root, con
   }
 }
 
-// Adds one view's gradients to the sums of the earlier views, one element per work-item. Rows of Gaussians that the
-// view does not show are not read. tile_counts (n / WIDTH): 0 where hidden; gradients, sums (n).
+// Adds a view's gradients to the sums over earlier views, one element per work-item. Gradients of Gaussians that are
+// not visible in the view are not read. tile_counts (n / WIDTH): 0 if not visible; gradients, sums (n).
 __kernel void add_view(const ulong n, __global const uint *tile_counts, __global const float *gradients,
                        __global float *sums) {
   const size_t i = get_global_id(0);
@@ -76,7 +76,7 @@ __kernel void add_view(const ulong n, __global const uint *tile_counts, __global
 }
 #endif
 
-// tile_counts (n) of one view -> shown (n): nonzero where this view or an earlier one shows the Gaussian.
+// tile_counts (n) of a view -> shown (n): nonzero if the Gaussian is visible in this view or an earlier one.
 __kernel void join_view(const uint n, __global const uint *tile_counts, __global uint *shown) {
   const size_t i = get_global_id(0);
   if (i < n) shown[i] |= tile_counts[i];

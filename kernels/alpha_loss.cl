@@ -6,7 +6,7 @@
 // Buffers: stops (rows, stride), negative where a pixel does not count; transmittance, alpha (rows, stride); scale: the
 //   weight divided by the number of pixels that count -> gradient (rows, stride) with respect to the transmittance, 0
 //   in pixels that do not count; sums (rows / TILE, stride) of |A - alpha|. alpha and gradient are the fourth planes of
-//   their buffers, after the three colour planes.
+//   their buffers, after the colours.
 // Equations: docs/gradients.md, (81).
 #include "shared/math.h"
 

@@ -1,4 +1,4 @@
-// Exposure and white balance of photographs: a gain for each channel, its gradient, and Adam's step.
+// Exposure and white balance of photographs: a gain for each channel, its gradient, and its update by Adam.
 //
 // Owner: A work-item owns a pixel (remove_gains), sixteen pixels of a column (gain_sums), a column of these sums
 //   (column_sums), or one entry of one photograph (move_gains, centre_gains). Sums are added in the same order on every
@@ -13,16 +13,16 @@
 #include "shared/lanes.h"
 
 #define MOST_LOG 16.0f
-#define MOST_MIX 0.2f // largest mix: the map of six mixes up to this size can be inverted
+#define MOST_MIX 0.2f // limit of a mix: the matrix of six mixes is invertible up to it
 
-// gains, target -> target: the photograph divided by its gains, so that it has the model's exposure.
+// gains, target -> target: the photograph divided by its gains, as if it had the model's exposure.
 __kernel void remove_gains(const int photograph, const int stride, const int plane, __global const float *gains,
                            __global float *target) {
   const size_t at = (size_t)stride * get_global_id(1) + get_global_id(0);
   for (int c = 0; c < 3; ++c) target[(size_t)plane * c + at] /= gains[3 * photograph + c];
 }
 
-// image, gradient with respect to image -> partials: sums for the gradient with respect to the logs, divided by ln 2.
+// image, gradient with respect to image -> partials: sums of the gradient with respect to the logs, divided by ln 2.
 __kernel void gain_sums(const int height, const int stride, const int plane, const int tiles_y,
                         __global const float *image, __global const float *gradient, __global float *partials) {
   const int x = get_global_id(0), y0 = get_global_id(1) * TILE, y1 = min(y0 + TILE, height);
@@ -46,7 +46,8 @@ __kernel void column_sums(const int stride, const int tiles_y, __global const fl
 }
 
 // columns of one photograph, logs, start, begins, others, weights -> moved; first and second in place. The entries of
-// all photographs are stepped; other photographs' gradients are 0. The learning rate of mixes is `slow` times `rate`.
+// all photographs are updated; the other photographs' gradients are 0. The learning rate of mixes is `slow` times
+// `rate`.
 __kernel void move_gains(const int count, const int entries, const int photograph, const int stride, const int at,
                          const float rate, const float slow, const float root, const float beta1, const float beta2,
                          const float epsilon, __global const uint *readback, __global const float *columns,
@@ -61,7 +62,7 @@ __kernel void move_gains(const int count, const int entries, const int photograp
   if (c < 3) g *= LN2;
   const int begin = begins[photograph], end = begins[photograph + 1];
   if (i / entries == photograph && end > begin) {
-    float told = 0.0f, apart = 0.0f, pull = 0.0f; // the mean offset of all pulled photographs is not pulled
+    float told = 0.0f, apart = 0.0f, pull = 0.0f; // the mean offset of the pulled photographs is subtracted
     for (int k = 0; entries * k < count; ++k)
       if (begins[k + 1] > begins[k]) told += 1.0f, apart = added(apart, logs[entries * k + c] - start[entries * k + c]);
     for (int k = begin; k < end; ++k) {

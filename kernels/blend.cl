@@ -1,16 +1,16 @@
 // Front-to-back blending until a pixel's alpha saturates: the image from each tile's list of Gaussians.
 //
-// Owner: A group owns a tile. On a CPU (ITEMS == 1) one work-item walks the tile's Gaussians, and for each Gaussian
-//   only the open cells that its ellipse reaches. On a GPU (LANES == 1) each work-item has its own pixels. The group
-//   fetches Gaussians in batches, as in Kerbl et al., and each warp walks those that reach its blocks. Both give the
-//   same bits.
+// Owner: A group owns a tile. On a CPU (ITEMS == 1) a work-item loops over the tile's Gaussians, and over the cells of
+//   open pixels that each ellipse reaches. On a GPU (LANES == 1) each work-item has its own pixels. The group fetches
+//   Gaussians in batches, as in Kerbl et al., and each warp loops over those that reach its blocks. Both give the same
+//   bits.
 // Launch: One group of ITEMS work-items for each tile of a band or of the whole image, in row-major order from
 //   first_tile on.
 // Buffers: ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE) in pixels, background (3), with RAYS
 //   camera -> image (3, height, width): colour; transmittance (height, width): final value, 0 to 1; stops (height,
-//   width): the first sorted index that the pixel does not take, -1 in padding; with NEARNESS nearness (height, width):
-//   the sum of weight / depth, 0 in padding; with RECORD_CELLS cells_from_sorted (pairs): bits of the tile's cells that
-//   the Gaussian contributes to, for the backward pass. Planes are padded with black to whole tiles.
+//   width): the sorted index of the first pair that is not added to the pixel, -1 in padding; with NEARNESS nearness
+//   (height, width): the sum of weight / depth, 0 in padding; with RECORD_CELLS cells_from_sorted (pairs): bits of the
+//   cells to which the Gaussian contributes, for the backward pass. Planes are padded with black to whole tiles.
 // Equations: docs/gradients.md, (14) to (16), (45) and (120); with RAYS docs/cameras.md, (14); Kerbl et al. 2023,
 //   section 6 and algorithm 2.
 #include "shared/widened.h"
@@ -32,8 +32,8 @@
 #else
 #define RECORD(statements)
 #endif
-// Whether a vector of pixels is worth blending. CELLS_BY_ELLIPSE leaves out most vectors that are not, so that testing
-// the mask too would cost more than it saves.
+// Nonzero if a vector of pixels should be blended. With CELLS_BY_ELLIPSE most vectors without an effect are skipped
+// before, and a test of the mask would cost more than it saves.
 #if defined(RECORD_CELLS) && VECTORS > 1 // a cell of two vectors stays open while one of them is open
 #define CONTRIBUTES(mask) RECORDED((mask) & MASKL(pixels[cell].t > 0.0f))
 #elif defined(RECORD_CELLS)
@@ -49,9 +49,9 @@
 #define COUNT(statements)
 #endif
 
-// `t` is the transmittance of open pixels. Finished pixels get no weight without a test of their own. On a CPU t is 0
-// there, and their final transmittance is in `kept`, which is rarely written. On a GPU, for fewer instructions, t is
-// minus the final transmittance, which is always under TRANSMITTANCE_MIN.
+// `t` is the transmittance of open pixels. In a finished pixel, t is such that weights are 0 without a further test: on
+// a CPU t is 0, and `kept`, rarely written, has the final transmittance; on a GPU, to save instructions, t is minus the
+// final transmittance, and so below TRANSMITTANCE_MIN.
 typedef struct {
   floatL t;
 #if ITEMS == 1
@@ -71,8 +71,8 @@ typedef struct {
 #define T_AT_END(p) fabs((p).t)
 #endif
 
-// Adds the tile's i-th pair to a cell. On a CPU it returns true if this finishes the cell's last open pixel. `zero` is
-// that of exp2_by; TRANSMITTANCE_MIN is from math.h.
+// Adds the tile's i-th pair to a cell. On a CPU, returns true if that finishes the cell's last open pixel. zero: see
+// exp2_by.
 static inline int add_gaussian(Pixels *p, floatL power, int i, int zero, float c_red, float c_green,
                                float c_blue NEAR_PARAMETER) {
   const floatL before = p->t;
@@ -90,14 +90,14 @@ static inline int add_gaussian(Pixels *p, floatL power, int i, int zero, float c
 #endif
 #if ITEMS == 1
   p->t = AS_FLOATL(AS_INTL(after) & goes_on);
-  const intL ended = AS_INTL(before) & ~goes_on; // the bits of `before` where the pixel is finished now, else 0
+  const intL ended = AS_INTL(before) & ~goes_on; // nonzero where the pixel is finished by this pair
   if (!ANYL(ended)) return 0;
   p->kept = ended != 0 ? before : p->kept;
   p->stop = ended != 0 ? (intL)(i) : p->stop;
   return !ANYL(p->t > 0.0f);
 #else
   p->t = goes_on ? after : -fabs(before);
-  p->stop = goes_on ? p->stop : min(p->stop, i); // pairs come in order
+  p->stop = goes_on ? p->stop : min(p->stop, i); // pairs are in order: keeps the first
   return 0;
 #endif
 }
@@ -144,7 +144,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
 
 #if ITEMS == 1
   int i = begin;
-  Reach reach, second; // loaded two at a time, ahead of their use, so that neither load waits for the previous cells
+  Reach reach, second; // loaded in twos before their use, so that no load waits for the previous cells
   for (; i < end && GOES_ON(open); ++i) {
     const int turn = (i - begin) & 1;
     if (!turn) {
@@ -182,7 +182,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   const int zero = min(pixels[0].stop + 1, 0); // see exp2_by
   for (int block = ITEM; block < BLOCKS; block += ITEMS) open_in[block] = 0;
   BARRIER_LOCAL();
-  for (int batch = begin; batch < end; batch += BATCH) { // count open pixels, fetch, list; then walk without barriers
+  for (int batch = begin; batch < end; batch += BATCH) { // count open pixels, fetch, list; then loop without barriers
     ALL_CELLS(cell) if (GOES_ON(pixels[cell].t > 0.0f)) atomic_inc(open_in + cell * WARPS + WARP);
     BARRIER_LOCAL();
 
@@ -201,7 +201,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     uint next = list[0];
     for (int k = 1; k <= count; ++k) {
       const uint entry = next;
-      next = list[k]; // read ahead, so that nothing waits for it
+      next = list[k]; // loaded before its use
       const int i = batch + PAIR_OF(entry);
       SPLAT_STAGED(staged[PAIR_OF(entry)])
       NEAR_HERE(s.near)

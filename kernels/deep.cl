@@ -1,5 +1,5 @@
-// A deep image: each pixel's light, cut into at most `bins` slices along depth. The cuts make the largest error of the
-// light in front of any depth as small as possible.
+// A deep picture: each pixel in at most `bins` slices by depth. The slices are chosen such that the error of the
+// transmittance, at the depth where it is largest, is as small as possible.
 //
 // Owner: A group owns a tile, as in blend.cl; transmittance has the same bits as there.
 // Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
@@ -16,7 +16,7 @@
 #include "shared/prefetch.h"
 #include "shared/slices.h"
 
-// Appends the current slice in the lanes of `which`, and begins an empty slice there.
+// In the lanes of `which`, writes the current slice and begins an empty one.
 static inline void write_slices(Lanes *values, IntLanes *slices, intL which, __global float *planes, size_t plane,
                                 size_t stride) {
   IntLanes written;

@@ -1,12 +1,11 @@
-// Merges several deep images of one size with weights: the samples of a shutter and a lens, or the source pixels of a
-// warped one. At any depth the transmittance is the weighted mean of the pictures' transmittances.
+// Merges several deep pictures of the same size with weights: the samples of a shutter or lens, or the source pixels of
+// a warp. At every depth the transmittance is the weighted mean of the pictures' transmittances.
 //
 // Owner: A work-item owns a pixel.
 // Launch: One work-item for each pixel.
 // Buffers: share: 1 / (DEEP_LEVELS bins); lists (pictures, bins, DEEP_SIZE, pixels): as deep.cl's planes; weights
-//   (pictures, pixels), which add up to 1 -> sources (pictures * bins, pixels): the picture that each slice is from,
-//   front to back; left (pictures * bins, pixels): the light left behind the slice; planes (bins, DEEP_SIZE, pixels):
-//   as deep.cl's.
+//   (pictures, pixels), whose sum is 1 -> sources (pictures * bins, pixels): the picture of each slice, front to back;
+//   left (pictures * bins, pixels): the transmittance behind the slice; planes (bins, DEEP_SIZE, pixels): as deep.cl's.
 // Equations: docs/pictures.md, (73), (74) and (187).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -47,12 +46,12 @@ __kernel void deep_merge(const int pixels, const int pictures, const int bins, c
     int p = 0;
     for (int other = 1; other < pictures; ++other) p = depth[other] < depth[p] ? other : p;
     if (depth[p] == INFINITY) break;
-    if (depth[p] > last) // slices of equal depth count as one: each gets the light behind all of them
+    if (depth[p] > last) // slices of equal depth count as one: they get the same transmittance
       for (; told < events; ++told) left[plane * told + pixel] = after;
     last = depth[p];
     __global const float *at = lists + picture * p + slice * next[p];
     t[p] = fma1(-t[p], at[plane * DEEP_ALPHA], t[p]);
-    after = 0.0f; // summed anew each time: a running sum would lose small remainders
+    after = 0.0f; // summed again each time: a running sum would lose small remainders
     for (int each = 0; each < pictures; ++each) after += t[each];
     sources[plane * events + pixel] = (uchar)p;
     const bool more = ++next[p] < bins && at[slice + plane * DEEP_ALPHA] > 0.0f;

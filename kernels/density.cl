@@ -1,10 +1,9 @@
-// Adaptive density control: the statistics that it reads, the marking of rows, and the copying of rows.
+// Adaptive density control: its statistics, the marks of Gaussians, and the copies of rows.
 //
 // Owner: A work-item owns a Gaussian; in gather_rows, an output row.
 // Launch: One work-item for each Gaussian or row, in groups of 64; work-items past the end do nothing.
-// Buffers: tile_counts (n): 0 where not seen; screen (n, 2): gradient with respect to the mean's image position, per
-//   pixel; splats (n, SPLAT_SIZE) in pixels. Statistics (n) are accumulated in place. The other shapes are above each
-//   kernel.
+// Buffers: tile_counts (n): 0 if not visible; screen (n, 2): gradient with respect to the mean's image position, per
+//   pixel; splats (n, SPLAT_SIZE) in pixels. Statistics (n) are updated in place. Other shapes are above each kernel.
 // Equations: docs/gradients.md, (43) and (55); Kerbl et al. 2023, section 5.
 #include "shared/math.h"
 #include "shared/splat.h"
@@ -19,9 +18,9 @@ static inline float ndc_norm(__global const float *screen, const size_t i, const
   return sqrt(fma1(gx, gx, gy * gy));
 }
 
-// Gaussians with tiles count as seen. x_scale, y_scale: convert `screen` to NDC -> gradient_sums (n): sums of norms;
-// seen (n): numbers of views; radii (n): largest radius at 3 sigma, in pixels. Here and below, a view does not count
-// for a Gaussian whose value there is not finite.
+// Gaussians with tiles are visible. x_scale, y_scale: convert `screen` to NDC -> gradient_sums (n): sums of norms; seen
+// (n): numbers of views; radii (n): largest radius at 3 sigma, in pixels. Here and below, a value of a view that is not
+// finite is ignored, as if the Gaussian were not visible in it.
 __kernel void density_statistics(const uint n, const float x_scale, const float y_scale,
 #ifdef RAYS
                                  const float pixels, // pixels per radian
@@ -60,9 +59,9 @@ __kernel void contribution_statistics(const uint n, const float area, __global c
   largest[i] = largest[i] > contribution ? largest[i] : contribution;
 }
 
-// Scores of the Gaussians for densification. seen (n): numbers of views -> scores (n): the mean gradient if it is over
-// gradient_edge, else UNWANTED; USELESS if no view has a contribution over contribution_edge. A mean that is not finite
-// counts as 0.
+// Scores of the Gaussians for densification. seen (n): numbers of views -> scores (n): the mean gradient norm if it is
+// over gradient_edge, else UNWANTED; USELESS if no contribution to a view is over contribution_edge. A mean that is not
+// finite counts as 0.
 __kernel void density_scores(const uint n, const float gradient_edge, const float contribution_edge,
                              __global const float *gradient_sums, __global const float *seen,
                              __global const float *whole_largest, __global const float *current_largest,
@@ -76,9 +75,9 @@ __kernel void density_scores(const uint n, const float gradient_edge, const floa
   scores[i] = useless ? USELESS : wanted ? gradient : UNWANTED;
 }
 
-// Marks `count` of the n rows, beginning at row `first`. scores, radii (n); log_scales (count, 3), logits (count): of
+// Marks `count` of the n Gaussians, from row `first` on. scores, radii (n); log_scales (count, 3), logits (count): of
 // these rows; cut_off, cut_off_row: scores above `cut_off` qualify, and scores equal to it up to row cut_off_row ->
-// marks (3, n), 0 or 1: the row stays, is cloned, is split.
+// marks (3, n), 0 or 1: the Gaussian remains, is cloned, is split.
 __kernel void density_marks(const uint n, const uint first, const uint count, const float cut_off,
                             const uint cut_off_row, const float large_edge, const float transparent_edge,
                             const float oversized_edge, const float oversized_half_edge, const float radius_edge,
@@ -98,8 +97,8 @@ __kernel void density_marks(const uint n, const uint first, const uint count, co
 }
 
 // marks (3, n); places (3, n): their prefix sums; counts[0]: the sum of marks -> rows (2 n): the source row of each new
-// row; counts[1]: the number of splits. Order: rows that stay, clones, all first halves, all second halves; all but the
-// rows that stay carry the flag FRESH.
+// row; counts[1]: the number of splits. Order: remaining Gaussians, clones, first halves, second halves. All but the
+// remaining ones have the flag FRESH.
 __kernel void density_rows(const uint n, __global const uint *marks, __global const uint *places, __global uint *rows,
                            __global uint *counts) {
   const size_t i = get_global_id(0);
@@ -114,8 +113,7 @@ __kernel void density_rows(const uint n, __global const uint *marks, __global co
   if (i == 0) counts[1] = splits;
 }
 
-// rows (count): the source row in `from` of each row of `to`. With `renews`, rows flagged FRESH are filled with
-// `fresh`.
+// rows (count): the source row in `from` of each row of `to`. If `renews`, FRESH rows are filled with `fresh` instead.
 __kernel void gather_rows(const uint count, const uint width, const uint renews, const float fresh,
                           __global const uint *rows, __global const float *from, __global float *to) {
   const uint j = get_global_id(0);

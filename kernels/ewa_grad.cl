@@ -4,11 +4,11 @@
 // Owner: A work-item owns LANES Gaussians.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
 // Buffers: ewa.cl's inputs except opacities; radii (n, 2); d_means2d (n, 2), d_depths (n), d_conics (n, 3), where b
-//   counts as one number; with COMPENSATED d_compensations (n) -> d_means (n, 3); d_quaternions (n, 4) and d_scales (n,
-//   3), or d_covariances (n, 6), where an off-diagonal entry holds the sum for its two places in the matrix. With ADDED
-//   they are added to the arrays. Culled rows are zero, or unchanged with ADDED. With BY_CAMERA by_camera
-//   (BY_CAMERA_SIZE, padded): each Gaussian's gradient with respect to the camera's numbers, zero from n on. The
-//   numbers are the view matrix row by row, its translation, fx, fy, cx and cy.
+//   counts as one variable; with COMPENSATED d_compensations (n) -> d_means (n, 3); d_quaternions (n, 4) and d_scales
+//   (n, 3), or d_covariances (n, 6), where an off-diagonal entry holds the sum for its two places in the matrix. With
+//   ADDED they are added to the arrays. Culled rows are zero, or unchanged with ADDED. With BY_CAMERA by_camera
+//   (BY_CAMERA_SIZE, padded): each Gaussian's gradient with respect to the camera, zero from n on: to the view matrix
+//   row by row, its translation, fx, fy, cx and cy.
 // Equations: docs/gradients.md, (159) to (166), with (58) to (60).
 #include "shared/math.h"
 #define NEEDS_GRADIENT
@@ -174,7 +174,8 @@ __kernel void ewa_grad(const uint n, const uint padded, __constant float *camera
   d_size = fmaL((floatL)(2.0f), thinner, d_size);
 #endif
 
-  // (165), (166): the mean in the camera's frame, through its position on the image, the Jacobian and its depth.
+  // (165), (166): the gradient with respect to the mean in the camera's axes, through its image position, the Jacobian
+  // and its depth.
   const floatL d_u = GATHER(d_means2d, 2, 0), d_v2 = GATHER(d_means2d, 2, 1);
   floatL d_x, d_y, d_z;
 #ifdef FISHEYE
@@ -247,7 +248,7 @@ __kernel void ewa_grad(const uint n, const uint padded, __constant float *camera
 #elif defined(PARALLEL_RAYS)
   d_fx = fmaL(p.x, d_u, d_fx);
   d_fy = fmaL(p.y, d_v2, d_fy);
-#else // the clamp's limit is a position on the image, which moves with the principal point
+#else // the limit of the clamp is a position on the image, and moves with the principal point
   d_fx = fmaL(p.x / p.z, d_u, fmaL(p.rx, beyond[0], d_fx));
   d_fy = fmaL(p.y / p.z, d_v2, fmaL(p.ry, beyond[1], d_fy));
   d_cx += beyond[0];

@@ -1,5 +1,5 @@
-// Each visible Gaussian's features for the auxiliary channels: a row of FEATURES floats. FEATURE_X is the place of
-// feature X in the row, defined if X is requested.
+// Features of each visible Gaussian for the auxiliary channels, a row of FEATURES floats. FEATURE_X is the offset of
+// feature X in the row; it is defined if X is requested.
 //
 // Owner: A work-item owns a Gaussian. Built with one lane; LANES and ITEMS do not change its bits.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.

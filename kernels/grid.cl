@@ -1,5 +1,5 @@
-// Bilateral grids: applies a photograph's grid of colour maps to the render, computes the gradient of this, and takes
-// Adam's step for the grid.
+// Bilateral grids: applies a photograph's grid of colour transforms to the render, computes the gradients, and updates
+// the grid by Adam.
 //
 // Owner: A work-item owns a pixel (slice, slice_gradient); a channel, a grid column and an image line (line_sums); one
 //   coefficient of one photograph's grid (grid_sums, move_grid) or of all grids (centre_grids). Sums are added in the
@@ -15,7 +15,7 @@
 #define GRID_COLUMNS 16
 #define GRID_ROWS 16
 #define GRID_LEVELS 8
-#define MAP 12 // coefficients of a colour map: three rows of four
+#define MAP 12 // coefficients of a colour transform: three rows of four
 #define GRID_FLOATS (GRID_LEVELS * GRID_ROWS * GRID_COLUMNS * MAP)
 #define LEVEL_FLOATS (GRID_ROWS * GRID_COLUMNS * MAP)
 
@@ -23,13 +23,13 @@ static inline float luminance_of(const float r, const float g, const float b) {
   return fma1(0.299f, r, fma1(0.587f, g, 0.114f * b));
 }
 
-// The coordinate of a luminance among the levels; NaN maps to the first level.
+// The coordinate of a luminance along the levels; NaN gives the first level.
 static inline float level_of(const float luminance) {
   return luminance > 0.0f ? min(luminance, 1.0f) * (GRID_LEVELS - 1) : 0.0f;
 }
 
-// A pixel's colour map and the map's derivative with respect to the level. It interpolates bilinearly within two
-// levels, then linearly between them.
+// A pixel's colour transform, and its derivative with respect to the level: interpolated bilinearly in two levels, then
+// linearly between them.
 static inline void pixel_map(const float u, const float v, const float level, __global const float *grid, float *map,
                              float *risen) {
   const int i = min((int)u, GRID_COLUMNS - 2), j = min((int)v, GRID_ROWS - 2), l = min((int)level, GRID_LEVELS - 2);
@@ -47,7 +47,7 @@ static inline void pixel_map(const float u, const float v, const float level, __
   }
 }
 
-// grids, image -> seen: the image with each pixel's colour map applied.
+// grids, image -> seen: the image after the colour transform of each pixel.
 __kernel void slice(const int photograph, const int stride, const int plane, const float across, const float down,
                     __global const float *grids, __global const float *image, __global float *seen) {
   const int x = get_global_id(0), y = get_global_id(1);
@@ -87,7 +87,7 @@ __kernel void slice_gradient(const int photograph, const int stride, const int p
   gradient[2 * (size_t)plane + at] = fma1(0.114f, by_luminance, by_blue);
 }
 
-// image, gradient with respect to seen -> lines: sums over the pixels of a line, weighted by column and level.
+// image, gradient with respect to seen -> lines: sums over the pixels of a line, with the weights of column and level.
 __kernel void line_sums(const int width, const int stride, const int plane, const float across,
                         __global const float *image, __global const float *gradient, __global float *lines) {
   const int i = get_global_id(0), y = get_global_id(1), c = get_global_id(2);
@@ -111,8 +111,8 @@ __kernel void line_sums(const int width, const int stride, const int plane, cons
   for (int k = 0; k < 4 * GRID_LEVELS; ++k) line[k] = sums[k];
 }
 
-// The sum of a coefficient's differences from its neighbours on one axis, `step` floats away: half the gradient of
-// their squares.
+// The sum of a coefficient's differences from its two neighbours along an axis, `step` floats away. It is half the
+// gradient of their squares.
 static inline float pull(__global const float *value, const int place, const int count, const int step) {
   float sum = 0.0f;
   if (place > 0) sum += value[0] - value[-step];
@@ -120,7 +120,7 @@ static inline float pull(__global const float *value, const int place, const int
   return sum;
 }
 
-// lines, the photograph's grid -> by_grid: the lines weighted by grid row and summed, plus the gradient of the
+// lines, the photograph's grid -> by_grid: sums of the lines with the weights of grid rows, plus the gradient of the
 // smoothness penalty.
 __kernel void grid_sums(const int photograph, const int height, const float down, const float weight,
                         __global const float *grids, __global const float *lines, __global float *by_grid) {
@@ -145,7 +145,7 @@ __kernel void grid_sums(const int photograph, const int height, const float down
   by_grid[at] = fma1(above, pull(value, l, GRID_LEVELS, LEVEL_FLOATS), sum);
 }
 
-// Adam's step: by_grid -> the photograph's grid and its moments `first` and `second`, in place.
+// Adam: by_grid -> the photograph's grid and its moments `first` and `second`, in place.
 __kernel void move_grid(const int photograph, const float rate, const float root, const float beta1, const float beta2,
                         const float epsilon, __global const uint *readback, __global const float *by_grid,
                         __global float *grids, __global float *first, __global float *second) {
@@ -159,7 +159,7 @@ __kernel void move_grid(const int photograph, const float rate, const float root
   grids[at] -= rate * m / fma1(sqrt(v), root, epsilon);
 }
 
-// Centres all photographs' grids in place: their mean becomes the identity.
+// Shifts the grids of all photographs in place, so that their mean is the identity.
 __kernel void centre_grids(const int photographs, __global const uint *readback, __global float *grids) {
   const int item = get_global_id(0);
   if (item >= GRID_FLOATS || readback[READBACK_STOPPED]) return;

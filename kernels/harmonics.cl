@@ -5,8 +5,7 @@
 // Buffers: directions (n, 3) of any length, or with CAMERA means (n, 3) in world units and centre (6), high parts
 //   before low parts; sh (n, coefficients, 3): the first `used` coefficients are read, with DEGREE_4 up to 25; with
 //   MASKED mask (n, mask_width): rows whose first entry is not positive are skipped -> colours (n, 3), zero in skipped
-//   rows; with CAMERA, 0.5 is added and the sum is at least 0. A direction of length 0 uses the first coefficient
-//   alone.
+//   rows; with CAMERA, 0.5 is added and the sum is at least 0. A direction of length 0 uses only the first coefficient.
 // Equations: docs/gradients.md, (12) and (167); the basis is in docs/conventions.md.
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -1,10 +1,10 @@
-// Holdout: renders the light of blend.cl that the surfaces of other elements let through.
+// Holdout: the image of blend.cl, without the light that surfaces of other elements absorb.
 //
 // Owner: A group owns a tile, as in blend.cl; transmittance has the same bits as there.
 // Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
 // Buffers: blend's ranges, gaussian_from_sorted, splats, background and stops; the surfaces of held.h; with RAYS camera
 //   -> blend's image (3, height, width) and transmittance (height, width), overwritten: colour, and 1 minus the visible
-//   alpha. Pixels without a surface in front of a Gaussian keep their bits.
+//   alpha. The bits of pixels without a surface in front of a Gaussian do not change.
 // Equations: docs/pictures.md, (75) to (77).
 #define HOLDOUT
 #include "shared/math.h"

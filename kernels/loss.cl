@@ -2,23 +2,23 @@
 // with zeros outside the image. The window is separable: vertical first, into local memory, then horizontal. A second
 // pair of passes, the adjoint of the first, convolves the three partial derivatives.
 //
-// Owner: A group owns blocks of one channel. With ITEMS == 1 it goes down a block ROWS rows at a time and keeps the
-//   derivatives of LOSS_RING rows; rows shared with other blocks are recomputed. Otherwise a block is ROWS x COLUMNS
-//   pixels in PARTS parts, of which an item takes one or several, and the image's derivatives are written between two
-//   launches.
+// Owner: A group owns blocks of one channel. With ITEMS == 1 it processes a block from the top, ROWS rows at a time,
+//   and keeps the derivatives of LOSS_RING rows; rows shared with other blocks are recomputed. Otherwise a block is
+//   ROWS x COLUMNS pixels in PARTS parts, of which an item has one or several. A first launch writes the derivatives of
+//   the whole image, and a second reads them.
 // Launch: With ITEMS == 1 any number of groups, which share the blocks; otherwise a grid of groups of at most PARTS
 //   items, for the blocks across and down and the channels. Blocks are numbered in this order.
 // Buffers: image, target (3, rows, stride): colour, padded to whole tiles with zeros; with PHOTOGRAPH the target is
 //   (height, width, 3), bytes or floats; partials: with ITEMS == 1 (groups, LOSS_RING, 3, field), otherwise (3
-//   channels, strips of COLUMNS columns, height, 3 derivatives, COLUMNS), so that a column's addresses are constants
-//   apart; gradient (3, rows, stride), 0 right of the image; sums (3, ...) of SSIM, of |image - target| and of its
+//   channels, strips of COLUMNS columns, height, 3 derivatives, COLUMNS), so that address differences in a column are
+//   constants; gradient (3, rows, stride), 0 right of the image; sums (3, ...) of SSIM, of |image - target| and of its
 //   square: one per block, or per row of a block with ITEMS == 1.
 // Equations: docs/gradients.md, (17) to (21) in the forms (78) and (79); with several items (188) and (189).
 //
-// In bright, flat pictures E[x^2] - E[x]^2 cancels to nothing. So a window sums differences from one of its own pixels
-// (docs/gradients.md, section 12): variances are sums of small squares, and the gradient is a sum of differences too.
+// In bright, flat pictures E[x^2] - E[x]^2 cancels. So a window sums differences from one of its own pixels
+// (docs/gradients.md, section 12). Variances are then sums of small squares, and the gradient is a sum of differences.
 #if ITEMS == 1 && LANES == 8 && defined(FMA_BY_CONTRACTION)
-#undef LANES // Two vectors at once: a window's sum is a chain of dependent additions.
+#undef LANES // Two vectors at a time, because a window's sum is a chain of dependent additions.
 #define LANES 16
 #endif
 #include "shared/math.h"
@@ -37,12 +37,12 @@ __constant float window[TAPS] = {1.02838008e-3f, 7.59875814e-3f, 3.60007721e-2f,
 #define PIXEL_AT(block, x, y) ((uint)(block).stride * (uint)(y) + (uint)(x))
 
 #if ITEMS == 1
-// Number of columns beyond either side of a block that a window reaches, rounded up to whole vectors.
+// Number of columns that a window reaches beyond each side of a block, rounded up to whole vectors.
 #define MARGIN ((REACH + LANES - 1) / LANES * LANES)
 #define ROWS LOSS_ROWS
 #define RING_ROW(y) ((y) & (LOSS_RING - 1))
 
-// Local memory `near`: five fields of ROWS rows of a block, with margins. A block has LOSS_COLUMNS columns at most.
+// Local memory `near`: five fields of ROWS rows of a block with margins. A block has at most LOSS_COLUMNS columns.
 #define NEAR_MARGIN (2 * MARGIN)
 #define NEAR_WIDTH (LOSS_COLUMNS + 2 * NEAR_MARGIN)
 #define NEAR_FIELD (ROWS * NEAR_WIDTH)
@@ -54,8 +54,8 @@ __constant float window[TAPS] = {1.02838008e-3f, 7.59875814e-3f, 3.60007721e-2f,
 #define STORE_NEAR(x, p) (*(__local floatU *)(p) = (x))
 #endif
 
-// Columns x0 to x1 of one channel. partials: its derivatives, `pitch` floats between rows and `field` floats between
-// fields, starting at column x_partials.
+// Columns x0 to x1 of a channel. partials: its derivatives from column x_partials on, with `pitch` floats between rows
+// and `field` floats between fields.
 typedef struct {
   __global const float *image, *target;
   __global float *partials;
@@ -65,21 +65,21 @@ typedef struct {
 } Block;
 #define PARTIALS_AT(block, x, y) ((block).pitch * (uint)RING_ROW(y) + (uint)((x) - (block).x_partials))
 
-// FOR_VECTORS and VECTOR loop over the vectors in `rows` rows, with `margin` columns on either side; they define x, row
-// and `near_at`. Vertical windows are taken column by column, because neighbouring rows share pixels.
+// FOR_VECTORS and VECTOR loop over the vectors in `rows` rows, with `margin` columns on each side; they define x, row
+// and `near_at`. The inner loop is over rows, because vertical windows of neighbouring rows share pixels.
 #define FOR_VECTORS(block, margin, rows)                                                                               \
   for (int x = (block).x0 - (margin); x < (block).x1 + (margin); x += LANES)                                           \
     for (int row = 0; row < (rows); ++row)
 #define VECTOR(block) __local float *near_at = near + (row * NEAR_WIDTH + x - (block).x0 + NEAR_MARGIN);
 #define OUTSIDE(block, x, y) ((x) < 0 || (x) >= (block).stride || (y) < 0 || (y) >= (block).height)
 
-// The taps [result.x, result.y) of a window around row y that are inside the image.
+// The range [result.x, result.y) of a window's taps that are inside the image, for a window around row y.
 static inline int2 taps_inside(const Block block, const int y) {
   return (int2)(max(0, REACH - y), min(TAPS, block.height + REACH - y));
 }
 
-// near = vertical windows around row y and the rows below: means of image and target, their variances, and the
-// covariance; 0 outside the image.
+// near = sums over vertical windows around row y and the rows below: means of image and target, their variances, and
+// the covariance; 0 outside the image.
 static inline void moments(const Block block, const int margin, const int y, __local float *near) {
   FOR_VECTORS(block, margin, ROWS) {
     VECTOR(block)
@@ -88,7 +88,7 @@ static inline void moments(const Block block, const int margin, const int y, __l
       continue;
     }
     const int2 taps = taps_inside(block, y + row);
-    float beyond = 0.0f; // weight of the taps outside the image, where all is 0
+    float beyond = 0.0f; // weight of the taps outside the image, where pixels are 0
     for (int tap = 0; tap < taps.x; ++tap) beyond += window[tap];
     for (int tap = taps.y; tap < TAPS; ++tap) beyond += window[tap];
     const uint here = PIXEL_AT(block, x, y + row);
@@ -158,8 +158,8 @@ static inline float derivatives(const Block block, const int margin, const int y
   return sumL(total);
 }
 
-// near = vertical windows of the partials, then image and target; 0 outside the image. The first window also takes in
-// the other two, times the pixels' differences from the centre pixel.
+// near = sums over vertical windows of the partials, then image and target; 0 outside the image. The first sum includes
+// the other two partials, times differences of pixels from the centre pixel.
 static inline void adjoint_moments(const Block block, const int margin, const int y, __local float *near) {
   FOR_VECTORS(block, margin, ROWS) {
     VECTOR(block)
@@ -191,7 +191,7 @@ static inline void adjoint_moments(const Block block, const int margin, const in
   }
 }
 
-// near -> gradient, one plane. Returns the item's sums of |image - target| and of its square. l1_scale and ssim_scale
+// near -> gradient, a plane. Returns the item's sums of |image - target| and of its square. l1_scale and ssim_scale
 // are the loss weights divided by the number of pixels and channels.
 static inline float2 differences(const Block block, const int y, const float l1_scale, const float ssim_scale,
                                  __local float *near, __global float *gradient) {
@@ -261,9 +261,9 @@ GROUP __kernel void loss(const int width, const int height, const int stride, co
   }
 }
 #else
-// A part is a column of the block, or of the margins on either side, in vertical windows, and a run of RUN pixels in
-// horizontal ones. Windows slide over values in registers, and sum differences from one pixel that all windows of the
-// part contain: the middle one of a column or, across, of a cell of ROWS x RUN pixels. The bits do not depend on ITEMS.
+// For vertical windows, a part is a column of the block or of its margins; for horizontal windows, a run of RUN pixels.
+// Windows slide over values in registers. They sum differences from a pixel that all windows of the part contain: the
+// middle of the column, or of a cell of ROWS x RUN pixels. The bits do not depend on ITEMS.
 #if ITEMS > LOSS_PARTS
 #undef ITEMS
 #define ITEMS LOSS_PARTS
@@ -272,22 +272,22 @@ GROUP __kernel void loss(const int width, const int height, const int stride, co
 #define COLUMNS LOSS_GROUP_COLUMNS
 #define PARTS LOSS_PARTS // COLUMNS + 2 * REACH, a power of four
 #define RUN 6
-#define RUNS (COLUMNS / RUN) // of a row; ROWS * RUNS <= PARTS
+#define RUNS (COLUMNS / RUN) // runs in a row; ROWS * RUNS <= PARTS
 #define TALL (ROWS + 2 * REACH)
 #define WIDE (RUN + 2 * REACH)
-#define INLINE inline __attribute__((always_inline)) // PoCL does not inline long functions, and garbles their results
+#define INLINE inline __attribute__((always_inline)) // PoCL computes wrong results if it does not inline
 #define FOR_PARTS(part, count) for (int part = get_local_id(0) % ITEMS; part < (count); part += ITEMS)
 
-// The middle pixel of the cell of pixel (x, y), which is inside the image.
+// The middle pixel of the cell that contains pixel (x, y). It is inside the image.
 #define MIDDLE_X(block, x) min((x) / RUN * RUN + RUN / 2, (block).width - 1)
 #define MIDDLE_Y(block, y) min((y) / ROWS * ROWS + ROWS / 2, (block).height - 1)
 
 // Local memory `near`: fields of ROWS x PARTS values.
 #define FIELD (ROWS * PARTS)
-#define SUMS (PARTS + PARTS / 2) // of a block's parts, and room to add them up
+#define SUMS (PARTS + PARTS / 2) // sums of the parts, and space to add them up
 
-// Pixel (x0, y0) is the first of the block. partials: the channel's, a strip of COLUMNS columns for each block across:
-// (strips, height, 3, COLUMNS).
+// A block, whose first pixel is (x0, y0). partials: those of the channel, (strips, height, 3, COLUMNS), with a strip of
+// COLUMNS columns for each block across.
 typedef struct {
   __global const float *image;
   __global const source_t *target;
@@ -324,26 +324,26 @@ static inline Block block_of_group(const int width, const int height, const int 
 #define BLOCKS (get_num_groups(0) * get_num_groups(1) * get_num_groups(2))
 #define BLOCK_NUMBER ((get_group_id(2) * get_num_groups(1) + get_group_id(1)) * get_num_groups(0) + get_group_id(0))
 
-// Defines x and y of the first of the TALL pixels of a part's column, and which of them are inside the image. The block
-// has a row inside, so that of rows before it only those above the image are outside, and of the others those below.
+// Defines x and y of the first of the TALL pixels in a part's column, and which of them are inside the image. As the
+// block's first row is inside, rows before it can only be above the image, and rows after it only below.
 #define COLUMN_OF_PART(block, part)                                                                                    \
   const int x = (block).x0 - REACH + (part), y = (block).y0 - REACH, column_inside = x >= 0 && x < (block).width;      \
   const int above = column_inside ? -y : TALL, below = column_inside ? (block).height - y : 0;
 #define ROW_INSIDE(i) ((i) < REACH ? (i) >= above : (i) < below)
 
-// Defines row, x and y of a part's run; skips it if it is outside the block, or outside the image of this `width`.
+// Defines row, x and y of a part's run. Skips a run outside the block, or outside an image of this `width`.
 #define RUN_OF_PART(block, part, width)                                                                                \
   const int run = (part) % RUNS * RUN, row = (part) / RUNS, x = (block).x0 + run, y = (block).y0 + row;                \
   if (row >= ROWS || x >= (width) || y >= (block).height) continue;
 
-// Adds weight * value to sums[k] for each window k of `count`: `place` is the value's place in the first window.
+// Adds weight * value to sums[k] for each of `count` windows. place: position of the value in window 0.
 #define ADD_TO_WINDOWS(sums, count, place, value)                                                                      \
   UNROLL for (int k = 0; k < (count); ++k) {                                                                           \
     if ((place) - k >= 0 && (place) - k < TAPS) sums[k] = fma1(window[(place) - k], value, sums[k]);                   \
   }
 #define ZEROS(sums, count) UNROLL for (int k = 0; k < (count); ++k) sums[k] = 0.0f;
 
-// near = vertical windows: means of image and target, the sum of their variances, and the covariance.
+// near = sums over vertical windows: means of image and target, the sum of their variances, and the covariance.
 static INLINE void moments(const Block block, __local float *near) {
   FOR_PARTS(part, PARTS) {
     COLUMN_OF_PART(block, part)
@@ -377,8 +377,8 @@ static INLINE void moments(const Block block, __local float *near) {
   }
 }
 
-// 1 / x for positive x whose reciprocal is in float's range: three steps of Newton's method from a start that is up to
-// 12 % off. Its error is under 2 ulp, and its bits are the same on every device.
+// 1 / x for positive x, if it is a normal float: three steps of Newton's method from a start that is off by up to 12 %.
+// The error is under 2 ulp, and the bits are the same on every device.
 static inline float reciprocal(const float x) {
   const float a = as_float(0x7ef311c7u - as_uint(x)), b = fma1(a, fma1(-x, a, 1.0f), a),
               c = fma1(b, fma1(-x, b, 1.0f), b);
@@ -428,8 +428,9 @@ static INLINE void derivatives(const Block block, __local const float *near, __l
   }
 }
 
-// near = vertical windows of the partials. The first also takes in the other two of the cells above and below, times
-// the differences of their middle pixels from that of the block's cell. These follow, of image and target.
+// near = sums over vertical windows of the three partials; after them, middle pixels of image and target. Partials in
+// the cells above and below are relative to the middle pixels there. So to the first sum are added the other two
+// partials times the differences of the middle pixels.
 static INLINE void adjoint_moments(const Block block, __local float *near) {
   FOR_PARTS(part, PARTS) {
     COLUMN_OF_PART(block, part)
@@ -472,7 +473,7 @@ static INLINE void adjoint_moments(const Block block, __local float *near) {
   }
 }
 
-// near -> gradient, one plane. parts = the parts' sums of |image - target|, then of its square. l1_scale and ssim_scale
+// near -> gradient, a plane. parts = the parts' sums of |image - target|, then of its square. l1_scale and ssim_scale
 // are the loss weights divided by the number of pixels and channels.
 static INLINE void differences(const Block block, const float l1_scale, const float ssim_scale,
                                __local const float *near, __global float *gradient, __local float *parts) {
@@ -480,7 +481,7 @@ static INLINE void differences(const Block block, const float l1_scale, const fl
     parts[part] = parts[SUMS + part] = 0.0f;
     RUN_OF_PART(block, part, block.stride)
     __local const float *in = near + (row * PARTS + run), *middle = near + (3 * FIELD + run);
-    const float p0 = middle[REACH], q0 = middle[REACH + PARTS]; // of this cell; then less those of the cells beside it
+    const float p0 = middle[REACH], q0 = middle[REACH + PARTS]; // of this cell; next, minus the cells beside it
     const float p_left = p0 - middle[REACH - 1], q_left = q0 - middle[REACH - 1 + PARTS];
     const float p_right = p0 - middle[REACH + RUN], q_right = q0 - middle[REACH + RUN + PARTS];
     float by_mean[RUN], by_variance[RUN], by_covariance[RUN], absolute = 0.0f, squares = 0.0f;
@@ -515,8 +516,8 @@ static INLINE void differences(const Block block, const float l1_scale, const fl
   }
 }
 
-// Adds up the parts' sums of `fields` fields, SUMS apart, each in a fixed tree of which TOP is the place of the whole.
-// Only the group's first item may read that before the next barrier.
+// Adds up the parts' sums of `fields` fields, which are SUMS floats apart, in a fixed order. The total of a field is at
+// TOP. Before the next barrier, only the group's first item may read it.
 #define TOP (PARTS + PARTS / 4 + PARTS / 16)
 static INLINE void add_parts(__local float *parts, const int fields) {
   UNROLL for (int count = PARTS / 4; count > 0; count /= 4) {

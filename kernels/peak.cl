@@ -1,9 +1,9 @@
-// The device's peak rates for the pipeline's own operations. `clsplat bench` states each stage's fraction of them.
+// The device's peak rates for the operations of the pipeline. `clsplat bench` compares each stage with them.
 //
-// Owner: A work-item owns OWNED cells of imaginary pixels; in limit_copy, COPIED elements.
+// Owner: A work-item owns OWNED cells of pixels, which are not stored; in limit_copy, COPIED elements.
 // Launch: As many groups of ITEMS work-items as keep the device busy; limit_copy: one work-item for each COPIED
 //   elements.
-// Buffers: splats (LIMIT_SPLATS, SPLAT_SIZE) in pixels -> sums (items), which keep compilers from removing the work.
+// Buffers: splats (LIMIT_SPLATS, SPLAT_SIZE) in pixels -> sums (items), so that compilers do not remove the arithmetic.
 //   limit_copy: from (n) -> to (n).
 // Equations: those of blend.cl and blend_grad.cl, without branches.
 #define SUMS_OF_LANES // the bits of the sums do not matter
@@ -17,8 +17,8 @@
 
 #define LIMIT_SPLATS 64
 
-// The arithmetic of blending, pair after pair without branches. Every Gaussian reaches every pixel, sums stay in
-// registers, and splats stay in the nearest cache. Each item does rounds * OWNED * LANES pairs.
+// The arithmetic of blending without branches. Every Gaussian reaches every pixel, sums stay in registers, and splats
+// in the nearest cache. Each item processes rounds * OWNED * LANES pairs.
 GROUP __kernel void limit_blend(const int rounds, __global const float *splats, __global float *sums) {
   float sum = 0.0f;
   for (int k = 0; k < OWNED; ++k) {
@@ -44,7 +44,7 @@ GROUP __kernel void limit_blend(const int rounds, __global const float *splats, 
   sums[get_global_id(0)] = sum;
 }
 
-// Like limit_blend, the arithmetic of blending's gradient: alpha again, transmittance by division, nine sums.
+// Like limit_blend, for the gradient of blending: alpha, transmittance by division, nine sums.
 GROUP __kernel void limit_blend_grad(const int rounds, __global const float *splats, __global float *sums) {
   float sum = 0.0f;
   for (int k = 0; k < OWNED; ++k) {

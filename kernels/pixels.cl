@@ -1,4 +1,4 @@
-// Conversion between blending's planes, padded to whole tiles, and arrays with a pixel's values side by side.
+// Conversion between the planes of blending, padded to whole tiles, and arrays of pixels with interleaved values.
 //
 // Owner: A work-item owns a pixel.
 // Launch: One work-item for each pixel of the image, row by row, in groups of 64; work-items past the end do nothing.

@@ -1,13 +1,13 @@
-// The gradient with respect to a camera's pose, from the gradients with respect to the model; also sums of the gradient
-// with respect to the camera's lens.
+// The gradient with respect to a camera's pose, from the gradients with respect to the model; and the sum over
+// Gaussians of the gradient with respect to the camera's lens.
 //
 // Owner: A work-item owns POSE_ROWS consecutive Gaussians (pose_rows, lens_rows), then POSE_ROWS consecutive sums
 //   (pose_sums). Built with one lane; LANES and ITEMS do not change its bits.
-// Launch: One work-item for each POSE_ROWS Gaussians; then one for each of `width` columns of POSE_ROWS sums, until one
-//   row is left.
+// Launch: One work-item for each POSE_ROWS Gaussians; then one for each POSE_ROWS sums of each of `width` columns,
+//   until one row is left.
 // Buffers: tile_counts (n), means (n, 3), quaternions (n, 4), sh_rest (n, coefficients - 1, 3). The gradients with
 //   respect to means, quaternions and sh_dc (n, 3), not read in rows without tiles -> sums (ceil(n / POSE_ROWS), 6),
-//   from row first_block on: with respect to the rotation about the world's axes, then the translation along them.
+//   from row first_block on: with respect to rotation about the world's axes, then translation along them.
 //   by_lens (n, 4) of project_grad.cl -> sums (ceil(n / POSE_ROWS), 4).
 // Equations: docs/gradients.md, (140) to (142), (144).
 #include "shared/math.h"
@@ -32,8 +32,7 @@ __kernel void pose_rows(const uint n, const uint first_block, const int coeffici
     shift[1] += gy;
     shift[2] += gz;
 
-    // (142): the gradient with respect to the view direction, which depends on the mean or is the same for all
-    // Gaussians.
+    // (142): the gradient with respect to the view direction, which for parallel rays does not depend on the mean.
     const float distance = sqrt(fma1(x, x, fma1(y, y, z * z)));
     const float ux = SEEN_ALONG(x, distance, camera[CAMERA_R20]), uy = SEEN_ALONG(y, distance, camera[CAMERA_R21]),
                 uz = SEEN_ALONG(z, distance, camera[CAMERA_R22]);
@@ -43,7 +42,7 @@ __kernel void pose_rows(const uint n, const uint first_block, const int coeffici
     float weight[16], by[3];
     for (int k = 1; k < coefficients; ++k, f += 3) weight[k] = fma1(red, f[0], fma1(green, f[1], blue * f[2]));
     sh_direction_gradient(coefficients, ux, uy, uz, weight, by);
-    // (141): the SH do not turn with the camera, so the torque of the gradient through the direction is subtracted.
+    // (141): SH do not rotate with the camera, so the torque of the gradient through the direction is subtracted.
     const float across_x = uy * by[2] - uz * by[1], across_y = uz * by[0] - ux * by[2],
                 across_z = ux * by[1] - uy * by[0];
 

@@ -1,12 +1,12 @@
-// Photographs by several cameras: removes from a photograph its own colour gains and mixes and its lens's vignette, and
-// computes the gradient with respect to them. Adam's step is in appearance.cl.
+// Photographs by several cameras: removes the gains and colour mixes of a photograph and the vignette of its lens, and
+// computes the gradient with respect to these. appearance.cl updates them by Adam.
 //
 // Owner: A work-item owns LANES neighbouring pixels (develop), or LANES columns of a tile row (camera_sums). Sums are
 //   added in the same order on every device, with any LANES and ITEMS.
 // Launch: Grids of stride / LANES x rows and stride / LANES x tiles_y.
 // Buffers: Planes (3, rows, stride) of colour, or the loss's gradient with respect to it; gains, logs (photographs,
-//   COLOURS): three gains; in logs, six mixes follow: into channel c from channels c + 1 and c + 2, modulo 3; vignettes
-//   (lenses, VIGNETTE); partials (COLOURS + VIGNETTE, tiles_y, stride). Shapes are above each kernel.
+//   COLOURS): three gains; in logs, six mixes follow, for each channel c from channels c + 1 and c + 2, modulo 3;
+//   vignettes (lenses, VIGNETTE); partials (COLOURS + VIGNETTE, tiles_y, stride). Shapes are above each kernel.
 // Equations: docs/gradients.md, "Colours and vignettes".
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -15,14 +15,14 @@
 #define VIGNETTE 3
 #define MOST_FALLOFF 16.0f
 
-// The pixels' squared distances from (across, down), times scale.
+// Squared distances of pixels from (across, down), times scale.
 static inline floatL spread(const int x, const int y, const float across, const float down, const float scale) {
   const floatL from_x = (floatL)((float)x + 0.5f) + LANE_INDEX - across;
   const float from_y = (float)y + 0.5f - down;
   return fmaL(from_x, from_x, (floatL)(from_y * from_y)) * scale;
 }
 
-// gains, logs, vignettes, target -> target: the photograph that the render should match.
+// gains, logs, vignettes, target -> target: the photograph without them, to which the render is compared.
 __kernel void develop(const int photograph, const int lens, const int stride, const int plane, const float across,
                       const float down, const float scale, __global const float *gains, __global const float *logs,
                       __global const float *vignettes, __global float *target) {
@@ -40,8 +40,8 @@ __kernel void develop(const int photograph, const int lens, const int stride, co
   STOREL(fmaL((floatL)(mix[5]), b - g, fmaL((floatL)(mix[4]), b - r, b)), target + last);
 }
 
-// image, gradient with respect to image -> partials of the gradients with respect to gains and vignette (divided by ln
-// 2) and to mixes.
+// image, gradient with respect to image -> partials: sums of the gradients with respect to gains and vignette, divided
+// by ln 2, and with respect to mixes.
 __kernel void camera_sums(const int height, const int stride, const int plane, const int tiles_y, const float across,
                           const float down, const float scale, __global const float *image,
                           __global const float *gradient, __global float *partials) {

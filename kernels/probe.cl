@@ -1,4 +1,4 @@
-// Wrappers that let tests call the shared functions one by one; probe_fma also runs when a device is opened.
+// Kernels by which tests call single shared functions. probe_fma also runs when a device is opened.
 //
 // Owner: A work-item owns an element; in probe_fma one work-item owns all.
 // Launch: One work-item for each element; for probe_fma, a single work-item.

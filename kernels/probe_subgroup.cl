@@ -1,6 +1,6 @@
-// The exchange within sub-groups: shows whether a driver's shuffles work as subgroup.h expects.
+// Test of the exchange within sub-groups: a driver's shuffles must work as subgroup.h expects.
 //
-// Owner: A group of ITEMS work-items; each item has a place in every row.
+// Owner: A group of ITEMS work-items; each item has an element of every row.
 // Launch: One group.
 // Buffers: out (log2 SUBGROUP, ITEMS): row k: the number of the item from which item i received, across bit k.
 // Equations: none.

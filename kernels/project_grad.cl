@@ -1,21 +1,19 @@
-// The gradient of projection: sums a Gaussian's slots in the order of its tiles, then applies the chain rule back to
-// its parameters. project_step fuses Adam's step into it, so that no gradient goes to memory.
+// The gradient of projection: sums a Gaussian's slots in the order of its tiles, then applies the chain rule down to
+// its parameters. project_step also updates the parameters by Adam, so that no gradient is written to memory.
 //
 // Owner: A work-item owns LANES Gaussians, or one in add_slots; project_grad skips those that are not visible. A group
-//   of project_step owns ROWS Gaussians and walks each of the model's arrays in order.
-// Launch: One work-item for each LANES Gaussians, or for each in add_slots, in groups of 64; work-items past the end do
-//   nothing.
-//   project_step: groups of one item, or with one lane of ROWS items.
+//   of project_step owns ROWS Gaussians, and processes one array of the model after another.
+// Launch: One work-item for each LANES Gaussians, in add_slots for each Gaussian, in groups of 64; work-items past the
+//   end do nothing. project_step: groups of one item; if LANES is 1, of ROWS items.
 // Buffers: slots (pairs, SLOT_STRIDE) of blend_grad.cl, or with ADDED_UP their sums (n, SLOT_STRIDE); tile_counts,
-//   first_slots (n): its scan; parameters, splats and camera as in project.cl -> screen (n, 2): gradient with respect
-//   to the mean's image position, per pixel, plain or absolute. With CONTRIBUTIONS contributions (n): each Gaussian's
-//   blending weights, summed over all pixels. With LENS by_lens (n, 4): each Gaussian's gradient with respect to the
-//   logs of the focal lengths and, per pixel, to the principal point. project_grad: gradients in the parameters'
-//   shapes, in loss per unit; rows that are not visible stay unchanged. project_step, built with ADAM: parameters,
+//   first_slots (n): its prefix sums; parameters, splats and camera as in project.cl -> screen (n, 2): gradient with
+//   respect to the mean's image position, per pixel, plain or absolute. With CONTRIBUTIONS contributions (n): each
+//   Gaussian's blending weights, summed over all pixels. With LENS by_lens (n, 4): each Gaussian's gradient with
+//   respect to the logs of the focal lengths and, per pixel, to the principal point. project_grad: gradients in the
+//   parameters' shapes, in loss per unit; rows that are not visible do not change. project_step, with ADAM: parameters,
 //   moments `first` and `second`; `readback` (READBACK_SIZE); the scalars of Step, one per group where they differ.
-//   Rows that are not visible have a zero gradient; with SPARSE they stay unchanged. After a stopped pass
-//   (duplicate.cl) nothing changes. With PENALTIES the gradient includes that of opacity_weight o + scale_weight (s_0 +
-//   s_1 + s_2).
+//   Rows that are not visible have a zero gradient; with SPARSE they do not change. After a stopped pass (duplicate.cl)
+//   nothing changes. PENALTIES adds the gradient of opacity_weight o + scale_weight (s_0 + s_1 + s_2).
 // Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91); (144) and
 //   (145). With RAYS docs/cameras.md, (22) to (29).
 #include "shared/math.h"
@@ -39,8 +37,8 @@
 #endif
 
 #ifndef ADAM
-// Adds one band's slots to running sums. tile_counts, first_slots (n), slots (pairs) of the band -> sums (n,
-// SLOT_STRIDE). Over all bands in order these are the same additions that project_grad makes.
+// Adds the slots of a band to the sums. tile_counts, first_slots (n), slots (pairs) of the band -> sums (n,
+// SLOT_STRIDE). With all bands in order, the additions are the same as in project_grad.
 __kernel void add_slots(const uint n, __global const uint *tile_counts, __global const uint *first_slots,
                         __global const float *slots, __global float *sums) {
   const uint i = get_global_id(0);
@@ -108,7 +106,7 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
 #define BLOCKS (ROWS / LANES)
 #define ROW_ALIGNED __attribute__((aligned(4 * ABREAST)))
 #define SH_FLOATS (3 * SH_HIGHER) // floats in a Gaussian's higher SH bands
-// The model's arrays: number, name, floats in a row, gradients, and constants of the step.
+// The model's arrays: number, name, floats per row, gradients, and constants of the step.
 #ifdef NO_SH_REST
 #define ARRAYS 5
 #define SH_REST(EACH)
@@ -125,7 +123,7 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   SH_REST(EACH)
 
 #if LANES > 1
-// Adam's step of LANES rows, or fewer at the end of n. gradients (LANES, width): zero in rows that are not `shown`.
+// Updates LANES rows by Adam, or fewer at the end of n. gradients (LANES, width): zero in rows that are not `shown`.
 static inline void step_rows(const uint n, const uint first_row, const uint width, const int *shown,
                              const float *gradients, Step s, Stepped model) {
   const size_t begin = (size_t)first_row * width;
@@ -141,7 +139,7 @@ static inline void step_rows(const uint n, const uint first_row, const uint widt
 #else
 #define TAKEN(k) (intL)(-1)
 #endif
-  ulong left = 0; // bits of the vectors with a refused element or an element past the last row
+  ulong left = 0; // bits of vectors that have a refused element or go past the last row
   for (uint k = 0; k < width; ++k) {
     const floatL g = *(const floatL *)(gradients + k * LANES);
     if ((k + 1) * LANES > count || !step_vector(begin + k * LANES, g, TAKEN(k), s, model)) left |= (ulong)1 << k;
@@ -157,8 +155,8 @@ static inline void step_rows(const uint n, const uint first_row, const uint widt
 }
 #else
 #define ROLLED _Pragma("unroll 1")
-// A group's step of an array of the model. gradients (rows, width); the numbers as in Step. A group keeps these in
-// local memory: so many pointers do not fit into the scalar registers of AMD's GPUs.
+// Arguments for a group's update of an array of the model. gradients (rows, width); scalars as in Step. They are in
+// local memory, because so many pointers do not fit into the scalar registers of AMD's GPUs.
 typedef struct {
   Stepped model;
   __local const float *gradients;
@@ -191,7 +189,7 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
   Gradients d;
   const uint sh_width = 3 * (coefficients - 1);
 #if LANES > 1
-  // Steps one array of the model after another, in runs that are long enough for the processor's prefetcher.
+  // Updates one array of the model after another, so that runs are long enough for the processor's prefetcher.
   const uint begin = get_global_id(0) * BLOCKS * LANES;
   if (begin >= n || readback[READBACK_STOPPED]) return;
   int shown[ROWS];
@@ -226,7 +224,8 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
   MODEL(STEP_ARRAY)
 
 #else // LANES == 1
-  // The gradients of a group's Gaussians, row by row; then its items walk the model's arrays side by side.
+  // Each item computes the gradients of a Gaussian. Then the items together update one array of the model after
+  // another.
   __local float by_mean[3 * ROWS] ROW_ALIGNED, by_quaternion[4 * ROWS] ROW_ALIGNED, by_log_scale[3 * ROWS] ROW_ALIGNED;
   __local float by_opacity[ROWS] ROW_ALIGNED, by_sh_dc[3 * ROWS] ROW_ALIGNED, by_sh_rest[SH_FLOATS * ROWS] ROW_ALIGNED;
   __local int in_view[ROWS];
@@ -239,7 +238,7 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
   const uint me = get_local_id(0), first_row = get_global_id(0) - me;
   const uint rows = first_row < n && !readback[READBACK_STOPPED] ? min((uint)get_local_size(0), n - first_row) : 0;
   const uint own = ABREAST * me, stride = ABREAST * get_local_size(0);
-  const int aligned = first_row % ABREAST == 0; // but where a driver allows less than ABREAST items in a group
+  const int aligned = first_row % ABREAST == 0; // false only if a driver allows less than ABREAST items in a group
 #define GROUP_STEP(number, group, columns, by, root, limit2)                                                           \
   steps[number] = (GroupStep){{group, first_##group, second_##group}, by, columns, rate_##group, root, limit2};
   if (me == 0) {
@@ -249,7 +248,8 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
 #ifdef SPARSE
   barrier(CLK_LOCAL_MEM_FENCE);
 #endif
-  // Items read the SH coefficients side by side: a row an item, each access would touch a line of memory for each.
+  // Adjacent items read adjacent SH coefficients. If each read its own row, every access would touch a cache line per
+  // item.
   __global const float *from = sh_rest + (size_t)sh_width * first_row;
   const uint floats = sh_width * rows, whole_floats = aligned ? floats / ABREAST * ABREAST : 0;
 #define WANTED(k) ((k) < whole_floats && (TAKEN(k, sh_width) | TAKEN((k) + ABREAST - 1, sh_width)))
@@ -278,14 +278,14 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
 #ifndef NO_SH_REST
   for (uint k = any ? 3 * (SH_USED(coefficients) - 1) : 0; k < sh_width; ++k) own_sh_rest[k] = 0.0f;
 #endif
-  barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);     // a row is read by one item and written by several
-  ROLLED for (int number = 0; number < ARRAYS; ++number) { // a loop for each array would be six times the code
+  barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);     // a row is read by an item and written by others
+  ROLLED for (int number = 0; number < ARRAYS; ++number) { // unrolled, the code would be six times as long
     const GroupStep step = steps[number];
     const Step s = {step.rate, step.root, beta1, beta2, epsilon, step.limit2, readback};
     const uint width = step.width, count = rows * width, whole = aligned ? count : 0;
     const size_t begin = (size_t)width * first_row, at = begin + own;
     Stepped model = {step.model.parameters + at, step.model.first + at, step.model.second + at};
-    uint left = 0; // bits of the vectors with a refused element or an element past the last row
+    uint left = 0; // bits of vectors that have a refused element or go past the last row
     ROLLED for (uint k = own, bit = 1; k < count; k += stride, bit += bit) {
       const floatA g = *(__local const floatA *)(step.gradients + k);
       const intA taken = (intA)(TAKEN(k, width), TAKEN(k + 1, width), TAKEN(k + 2, width), TAKEN(k + 3, width));

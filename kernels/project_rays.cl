@@ -1,5 +1,5 @@
-// Projection along rays, for the camera models with RAYS. Each Gaussian becomes an ellipse on the tangent plane of the
-// direction sphere at its mean, where perspective distorts it least. There is no pole and no seam.
+// Projection for the camera models along rays (RAYS). Each Gaussian becomes an ellipse on the plane that touches the
+// sphere of directions at its mean, where the distortion is smallest. So poles and seams need no special case.
 //
 // Owner: A work-item owns a Gaussian. Built with one lane; LANES and ITEMS do not change its bits.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
@@ -20,16 +20,16 @@
 #include "shared/random.h"
 #endif
 
-// Slack of a box in pixels, on top of TILE_SLACK: the rounding of float32 angles in a picture 32768 pixels wide.
+// Slack of a box in pixels, in addition to TILE_SLACK, for rounding of float32 angles in a picture 32768 pixels wide.
 #define BOX_SLACK 0.1f
-// Stores the box's tiles as `ellipse_of` reads them.
+// Stores the tiles of a box in the form that `ellipse_of` reads.
 static inline void store_box(const Box *t, int width, int height, int tiles_x, int tiles_y, __constant float *camera,
                              __global float *splat) {
   int x0 = 0, x1 = tiles_x;
   if (!t->whole_rows) {
     float low = t->low_x - BOX_SLACK, high = t->high_x + BOX_SLACK;
 #ifdef WRAPS
-    // Visible columns are those of one full turn from `begin` on; the picture may be narrower.
+    // Columns of a full turn begin at `begin`; the picture may be narrower.
     const float turn = 2.0f * HALF_TURN * camera[CAMERA_FX], begin = 0.5f * ((float)width - turn);
     const float shift = turn * floor((low - begin) / turn);
     low -= shift;

@@ -1,4 +1,4 @@
-// The smallest scale at which the training pictures resolve each Gaussian, as a lower limit of its scales.
+// Lower limit of each Gaussian's scales: the smallest size that the training pictures resolve at its mean.
 //
 // Owner: A work-item owns a Gaussian.
 // Launch: One work-item for each, in groups of 64; work-items past the end do nothing.
@@ -20,8 +20,8 @@
   fma1(camera[CAMERA_R##row##0], x,                                                                                    \
        fma1(camera[CAMERA_R##row##1], y, fma1(camera[CAMERA_R##row##2], z, camera[CAMERA_T##row])))
 
-// A pixel's width at the mean (x, y, z), in world units, if the camera sees it; 1e30 if not. It sees points up to 0.15
-// of the picture's size beyond the edges, which is also where the Jacobian is clamped.
+// The width of a pixel at the mean (x, y, z), in world units; 1e30 if the camera does not see the mean. Points up to
+// 0.15 of the picture's size beyond its edges, where the Jacobian is clamped, count as seen.
 static inline float width_at(float x, float y, float z, __global const float *camera) {
   return pixel_width(ALONG(0), ALONG(1), ALONG(2), camera);
 }

@@ -1,7 +1,7 @@
-// Bitonic sort of a short array in a single launch, by one group in local memory. For short arrays, a radix sort's
-// dozen launches cost more. Equal keys are ordered by value; values are positions, so the sort is stable.
+// Bitonic sort of a short array in a single launch, by one group in local memory. For short arrays, the dozen launches
+// of a radix sort take longer. Equal keys are ordered by value; values are positions, so the sort is stable.
 //
-// Owner: The group owns the array; a work-item owns every ITEMS-th of the pairs to compare.
+// Owner: The group owns the array; a work-item compares every ITEMS-th pair.
 // Launch: One group of ITEMS work-items.
 // Buffers: keys (n) -> keys_out, values_out (n): sorted; a value is the position in keys. k, v (padded) in local
 //   memory; padded: a power of two, at least n.

@@ -1,11 +1,11 @@
-// Splats from projected Gaussians in arrays: the whitening of a conic, and its ellipse's extent and tiles.
+// Splats from arrays of projected Gaussians: the whitening of a conic, and the extent and tiles of its ellipse.
 //
 // Owner: A work-item owns LANES Gaussians. The common part runs in vectors, the rest one visible Gaussian at a time.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
-// Buffers: radii (n, 2) in whole pixels, a Gaussian with a 0 is culled; means2d (n, 2) in pixels; conics (n, 3): a, b,
-//   c of the inverse covariance; opacities (n) in [0, 1]; depths (n); values (n, width): the first three are the
-//   colour, where missing ones count as 0 -> splats (n, SPLAT_SIZE), written where visible; tile_counts (n): 0 where
-//   culled. With LISTED the caller has made the tile lists, so every splat is written; culled ones have an alpha of 0.
+// Buffers: radii (n, 2) in whole pixels, a radius of 0 culls; means2d (n, 2) in pixels; conics (n, 3): a, b, c of the
+//   inverse covariance; opacities (n) in [0, 1]; depths (n); values (n, width): the first three, or zeros if there are
+//   fewer, are the colour -> splats (n, SPLAT_SIZE), written where visible; tile_counts (n): 0 where culled. With
+//   LISTED the tile lists are the caller's, so every splat is written; that of a culled Gaussian has an alpha of 0.
 // Equations: docs/gradients.md, (170) to (172), with (44) to (47).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -13,15 +13,16 @@
 #include "shared/splat.h"
 #include "shared/tile.h"
 
-// Limits within which float32 represents a conic's determinant; then the limit of a mean's position, in pixels.
+// Limits of a and c of a conic, between which float32 can represent the determinant; and of a mean's position in
+// pixels.
 #define LEAST_CONIC 1e-15f
 #define LARGEST_CONIC 1e15f
 #define FARTHEST_PIXEL 1e9f
 
-// Fraction of a c by which rounding of a, b and c may change the determinant.
+// Rounding of a, b and c may change the determinant by this fraction of a c.
 #define ROUNDING 5.9604645e-8f
 
-// log2 of an alpha that no pixel takes.
+// log2 of an alpha that is too small for every pixel.
 #define NO_ALPHA -1e3f
 
 __kernel void splats(const uint n, const int tiles_x, const int tiles_y, const int width, __global const int *radii,
@@ -33,8 +34,8 @@ __kernel void splats(const uint n, const int tiles_x, const int tiles_y, const i
   const floatL a = GATHER(conics, 3, 0), b = GATHER(conics, 3, 1), c = GATHER(conics, 3, 2);
   const floatL opacity = GATHER(opacities, 1, 0);
 
-  // (170): a c - b^2 to the last bit. A conic that rounding made singular gets the smallest determinant that float32
-  // resolves.
+  // (170): a c - b^2 to the last bit. If rounding has made a conic singular, it gets the smallest determinant that
+  // float32 resolves.
   const floatL bb = b * b, ac = a * c;
   const floatL exact = fmaL(a, c, -bb) + fmaL(-b, b, bb), least = ROUNDING * ac;
   const floatL det = exact > least ? exact : least;

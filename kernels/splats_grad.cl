@@ -1,13 +1,13 @@
-// The gradient of splats: sums a Gaussian's slots in the order of its tiles, then applies the chain rule back to the
+// The gradient of splats: sums a Gaussian's slots in the order of its tiles, then applies the chain rule down to the
 // arrays.
 //
 // Owner: A work-item owns one Gaussian.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
 // Buffers: slots (pairs, FIELDS) of blend_grad.cl or values_grad.cl: sums of g and its moments, gradients with respect
 //   to VALUES values, with ABSOLUTE_GRADIENTS absolute gradients with respect to the mean; tile_counts, first_slots
-//   (n): its scan; splats of splats.cl -> d_means2d (n, 2), d_conics (n, 3), d_opacities (n), in loss per unit;
+//   (n): its prefix sums; splats of splats.cl -> d_means2d (n, 2), d_conics (n, 3), d_opacities (n), in loss per unit;
 //   d_values (n, width): up to VALUES columns, from `first` on; absolute (n, 2): with respect to means2d. Rows of
-//   Gaussians without tiles are zero. add_values: slots (pairs, VALUES) -> d_values alone.
+//   Gaussians without tiles are zero. add_values: slots (pairs, VALUES) -> d_values only.
 // Equations: docs/gradients.md, (173) to (176).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -50,12 +50,12 @@ __kernel void splats_grad(const uint n, const int width, const int first, __glob
   const uint count = tile_counts[i];
   float sums[FIELDS], by_mean[2] = {0.0f, 0.0f}, by_conic[3] = {0.0f, 0.0f, 0.0f}, by_opacity = 0.0f;
   add_up(count, slots + (size_t)FIELDS * (count > 0 ? first_slots[i] : 0), FIELDS, sums);
-  if (count > 0) { // the splats of other Gaussians are not written
+  if (count > 0) { // the splats of other Gaussians are uninitialised
     __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
     const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
     by_mean[0] = -INVERSE_WHITEN2 * (l11 * sums[SLOT_GU]); // (173)
     by_mean[1] = -INVERSE_WHITEN2 * fma1(l12, sums[SLOT_GU], l22 * sums[SLOT_GV]);
-    // (174): moments of the offsets in pixels. In a needle the moment along its axis is by far the largest, and is
+    // (174): moments of the offsets in pixels. In a needle, the moment along its axis is by far the largest; it is
     // added last.
     const float in_x = splat[SPLAT_INVERSE_L11], in_y = 1.0f / l22, lean = l12 * in_y;
     const float uv = fma1(-lean, sums[SLOT_GVV], sums[SLOT_GUV]);

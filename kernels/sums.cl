@@ -1,7 +1,7 @@
-// Sums along an array's rows, in one order on every device: the Gaussians' gradients with respect to a camera's
-// numbers.
+// Sums along the rows of an array, in the same order on every device. They are used for gradients with respect to a
+// camera, summed over Gaussians.
 //
-// Owner: A work-item owns SUM_ROWS neighbouring numbers of a row.
+// Owner: A work-item owns SUM_ROWS adjacent numbers of a row.
 // Launch: One work-item for each SUM_ROWS numbers of each row, in groups of 64; work-items past the end do nothing.
 // Buffers: parts (rows, padded), padded a multiple of SUM_ROWS -> sums (rows, stride), stride at least padded /
 //   SUM_ROWS; the rest of a row of sums is zero.

@@ -1,12 +1,12 @@
-// Copies a photograph into blend's layout, with its alpha composited over the render's background.
+// Copies a photograph to planes in the layout of blend.cl. A photograph with alpha is composited over the render's
+// background.
 //
-// Owner: A work-item owns OWNED pixels of a row of the padded planes: a tile's row if there are vectors, otherwise one
-//   pixel.
+// Owner: A work-item owns OWNED pixels of a row of the padded planes: a row of a tile with vectors, otherwise a pixel.
 // Launch: A grid of stride / OWNED x rows, whole tiles.
 // Buffers: source (height, width, channels), bytes or floats, interleaved; background (3) -> planes (3, rows, stride):
-//   colour, in [0, 1] for bytes, 0 in padding; with ALPHA a fourth plane, of alpha. With MASKED the source's fifth
-//   channel is 0 in pixels that do not count. There the planes and the render's image (3, rows, stride) become 0, and
-//   its stop (rows, stride) becomes -1, as in padding, so that blend_grad skips the pixel.
+//   colour, in [0, 1] for bytes, 0 in padding; with ALPHA a fourth plane, alpha. With MASKED the source's fifth channel
+//   is 0 in pixels that do not count. There the planes and the render's image (3, rows, stride) become 0, and its stops
+//   (rows, stride) -1, as in padding, so that blend_grad skips these pixels.
 // Equations: alpha c + (1 - alpha) background.
 #include "shared/math.h"
 #include "shared/photograph.h"

@@ -1,4 +1,4 @@
-// Blends any number of values per Gaussian with the image's weights, VALUES of them in a pass.
+// Blends values of Gaussians with the image's weights, VALUES per pass. Their number per Gaussian is not limited.
 //
 // Owner: A group owns a tile, as in blend.cl; transmittance has the same bits as there.
 // Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.

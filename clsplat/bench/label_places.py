@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Label placement for plots: no label covers another label, a point or a leader line.
 
-Boxes are (..., 4) pixels: left, bottom, right, top.
-Segments are (..., 2, 2): the x and y of both ends.
+Boxes are (..., 4): left, bottom, right, top, in pixels.
+Segments are (..., 2, 2): x and y of each end.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ MARKER_RADIUS_PX = 6.0
 LEADER_LINE_DISTANCE_PX = 12.0
 """Distance in pixels beyond which a label has a leader line."""
 CROSSING_COST_PX = 60.0
-"""Cost of crossing a line, in pixels: equal to the cost of this distance between point and label."""
+"""Cost of a crossing with a line, as an additional distance in pixels between point and label."""
 AMBIGUOUS_POINT_COST_PX = 40.0
-"""Cost in pixels of each other point that is about as near to the label as the labelled point."""
+"""Cost in pixels for each other point that is about as near to the label as its own point."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelBox:
-    """Box (4,) of a label, and the leader line (2, 2) to its point; None if the label is near the point."""
+    """Box (4,) of a label, and the leader line (2, 2) to its point; the line is None if the label is near the point."""
 
     box: Float64
     leader: Float64 | None
@@ -45,8 +45,8 @@ def place_labels(points: Float64, sizes: Float64, frame: Float64, lines: Float64
     lines: segments that labels and leader lines should not cross.
     A point's marker covers a square around it.
     The search is greedy and starts with the points that have the most neighbours.
-    Each label gets the candidate box that covers least, and among equals the one with the lowest cost.
-    Costs are the distance, crossings, and other points as near to the label as the labelled one.
+    Each label gets the candidate box with the smallest covered area; among equal areas, the lowest cost decides.
+    Costs are for the distance, for crossings, and for other points near the label.
     """
     markers = np.hstack([points - MARKER_RADIUS_PX, points + MARKER_RADIUS_PX])
     crowded = (1 / (1 + np.linalg.norm(points[:, None] - points, axis=2))).sum(axis=1)
@@ -74,9 +74,9 @@ def place_labels(points: Float64, sizes: Float64, frame: Float64, lines: Float64
 
 
 def _candidates(point: Float64, size: Float64) -> Float64:
-    """Candidate boxes around a point, (candidates, 4), ring by ring. Each ring begins on the right.
+    """Candidate boxes (candidates, 4) around a point, ring by ring. Each ring begins on the right.
 
-    Each box touches its ring from outside in one of the directions.
+    Each box lies outside its ring and touches it, in one of DIRECTIONS_PER_RING directions.
     """
     angles = 2 * pi * np.arange(DIRECTIONS_PER_RING) / DIRECTIONS_PER_RING
     directions = np.round(np.stack([np.cos(angles), np.sin(angles)], axis=1), 9)

@@ -2,8 +2,8 @@
 """The two plots of `clsplat bench --plot`. They need matplotlib, the optional extra `plot`.
 
 The file name's ending selects SVG or PNG.
-Plots are legible at a width of 800 pixels, as fonts have at least 10 points on a width of 8 inches.
-The colours are the palette of Okabe and Ito, which colour-blind readers can distinguish.
+Plots are legible at a width of 800 pixels: fonts have at least 10 points, at a width of 8 inches.
+The colours are the palette of Okabe and Ito, which colour-blind readers can tell apart.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from clsplat.files.atomic import atomic_writer
 
 PLOT_EXTENSIONS = (".svg", ".png")
 FIGURE_WIDTH_INCHES, LAYOUT_DPI = 8.0, 100
-"""Width of a figure in inches, and pixels per inch for its layout."""
+"""Width of a figure in inches, and pixels per inch in its layout."""
 FONT_SIZE_POINTS = 10
 """Font size in points."""
 OKABE_ITO_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000", "#666666")
 PLOT_BLUE, PLOT_ORANGE, _, PLOT_VERMILION, _, _, PLOT_BLACK, PLOT_GREY = OKABE_ITO_COLOURS
 CHARACTERS_PER_LINE = 92
-"""Number of characters in a line of a figure's full width."""
+"""Number of characters in a line of text across a figure."""
 LEGEND_ABOVE_AXES = {
     "loc": "lower right",
     "bbox_to_anchor": (1, 1),
@@ -73,7 +73,7 @@ def plot_settings(path: Path, result: Mapping[str, Any], title: str) -> tuple[Pa
 
 
 def _draw_switches(result: Mapping[str, Any], title: str) -> Any:
-    """Bar chart of the times of a frame and a step without each exact switch, relative to those with all switches."""
+    """Bar chart of the times of a frame and of a step without each exact switch, divided by the times with all."""
     exact = _exact_point(result)
     rows = []
     if exact is not None:
@@ -168,7 +168,7 @@ def _draw_error(result: Mapping[str, Any], title: str) -> Any:
         lines.append(((ms, axes.get_ylim()[0]), (ms, top)))
     texts = [f"{point['name']} ({point['max_abs']:.2g})" for point in drawn]
     axes.legend(**LEGEND_ABOVE_AXES)
-    figure.draw_without_rendering()  # fixes the position of the axes
+    figure.draw_without_rendering()  # computes the final position of the axes
     _label_points(figure, axes, [(point["frame_ms"], point["psnr"]) for point in drawn], texts, lines)
     return figure
 
@@ -178,13 +178,13 @@ def _exact_point(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 
 def _around(values: Sequence[float], below: float) -> tuple[float, float]:
-    """Axis limits: the values' range, extended by a tenth of its length above and by `below` times its length below."""
+    """Axis limits: the range of the values, extended above by a tenth of its length and below by `below` lengths."""
     span = max(values) - min(values) or 1.0
     return min(values) - below * span, max(values) + 0.1 * span
 
 
 def _steps(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Staircase of the best quality for each cost: horizontal up to the next cost, then vertical."""
+    """Corners of the Pareto front as a staircase: horizontal to the next cost, then vertical."""
     path = list(corners[:1])
     for (_, quality), (cost, better) in pairwise(corners):
         path += [(cost, quality), (cost, better)]
@@ -194,7 +194,7 @@ def _steps(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 def _label_points(
     figure: Any, axes: Any, points: Sequence[Point], texts: Sequence[str], lines: Sequence[tuple[Point, Point]]
 ) -> None:
-    """Write a text near each point. It has a leader line if it is away from the point, and avoids crossing `lines`.
+    """Write a text near each point, with a leader line if it is not next to the point. Texts avoid `lines`.
 
     The axes must already have their final position and limits.
     """
@@ -219,7 +219,7 @@ def _label_points(
 
 
 def _sheet(titles: Sequence[str], notes: Sequence[str], inches: float) -> tuple[Any, Any]:
-    """Figure with one pair of axes, `inches` high, titles above it (the first in bold) and notes below."""
+    """Figure with one pair of axes, `inches` high. Titles are above, the first in bold, and notes below."""
     head, below = (
         [line for text in texts for line in wrap(text, CHARACTERS_PER_LINE)] for texts in (titles[1:], notes)
     )
@@ -235,7 +235,7 @@ def _sheet(titles: Sequence[str], notes: Sequence[str], inches: float) -> tuple[
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Write the figure without matplotlib's date and random ids in SVG, so that equal plots give equal files."""
+    """Write the figure. SVG files have no date and no random ids, so that equal plots give equal files."""
     with import_module("matplotlib").rc_context({"svg.hashsalt": "clsplat"}):
         kind = path.suffix.lower()[1:]
         with atomic_writer(path) as file:

@@ -35,11 +35,11 @@ from clsplat.stages.device_gaussians import AnyGaussians, upload_gaussians
 REFERENCE_CROP_SIDE_PX = 192
 """Side in pixels of the central crop that is compared with the float64 reference. Smaller images are compared whole."""
 ALL_EXACT_SWITCHES_OFF = "all exact switches off"
-"""Setting in which all exact switches are off. A switch with several values has the one with the largest effect."""
+"""Setting in which all exact switches are off. A switch of several values has the value with the largest effect."""
 MAX_PSNR_DB = 160.0
 """PSNR in dB that is reported for equal images, whose PSNR is infinite."""
 APPROXIMATING_SETTINGS = ("sh_degree_limit", "sh_tolerance", "sh_storage", "alpha_min", "transmittance_min")
-"""Settings that approximate unless they have the `exact` preset's value. `extent` approximates only with 3sigma."""
+"""Settings that are approximations unless they have the value of the `exact` preset; `extent` only if it is 3sigma."""
 
 
 def error_of(picture: NDArray[Any], wanted: NDArray[Any]) -> dict[str, float]:
@@ -80,7 +80,7 @@ def settings() -> dict[str, BenchSwitches]:
 
 
 def approximate(config: RasterizerConfig) -> bool:
-    """True if a setting that may change bits differs from the `exact` preset's value."""
+    """True if a setting that may change bits differs from the `exact` preset."""
     exact = RASTERIZER_PRESETS["exact"]
     return config.extent == "3sigma" or any(
         getattr(config, key) != getattr(exact, key) for key in APPROXIMATING_SETTINGS
@@ -97,8 +97,8 @@ def compare(
 ) -> dict[str, Any]:
     """Measure run time and error of each setting.
 
-    Times are medians for a frame and for a training step. The settings are measured in turn in each round.
-    Errors are differences from the float64 reference in a crop, and from the exact preset's frame in the full image.
+    Times are medians for a frame and for a training step. Each round measures all settings in turn.
+    Errors are relative to the float64 reference in a crop, and to the frame of the exact preset in the full image.
     If the settings include exact and ALL_EXACT_SWITCHES_OFF, the result also has the ratio of their times.
     """
     say = progress or no_progress
@@ -143,9 +143,9 @@ def compare(
 
 
 class _Comparison:
-    """Rasterizers of several settings that draw the same frame and do the same training step.
+    """Rasterizers with different settings, which draw the same frame and do the same training step.
 
-    exact: the exact preset's frame.
+    exact: the frame of the exact preset.
     """
 
     def __init__(self, subject: Subject, device: Device, tried: Mapping[str, BenchSwitches]) -> None:
@@ -174,7 +174,7 @@ class _Comparison:
         self._trainer.train_step()
 
     def times(self, repeat: int, say: Progress) -> dict[str, list[tuple[float, float]]]:
-        """Times in ms of a frame and a step, for each setting: `repeat` rounds in which the settings take turns."""
+        """Milliseconds of a frame and a step for each setting, in `repeat` rounds that measure all settings in turn."""
         times: dict[str, list[tuple[float, float]]] = {name: [] for name in self.rasterizers}
         for done in range(repeat):
             say("times", done / repeat)
@@ -191,9 +191,9 @@ def _points(
     differences: Mapping[str, Mapping[str, Mapping[str, float]]],
     against: str,
 ) -> dict[str, dict[str, Any]]:
-    """Record of each setting: median times, errors, and whether the setting is on the Pareto front.
+    """Record of each setting: median times, errors, and True or False for the Pareto front.
 
-    against: name of the difference that is used as the setting's error.
+    against: name of the reference whose difference is used as the setting's error.
     """
     points: dict[str, dict[str, Any]] = {}
     for name, config in tried.items():
@@ -213,7 +213,7 @@ def _points(
 
 
 def _exact_switches_faster(points: Mapping[str, Mapping[str, Any]], exact: str | None) -> dict[str, float] | None:
-    """Ratios of the times with all exact switches off to the times with all of them on; None unless both were measured.
+    """Times with all exact switches off, divided by the times with all on; None unless both were measured.
 
     exact: name of the exact preset among the points.
     """
@@ -224,7 +224,7 @@ def _exact_switches_faster(points: Mapping[str, Mapping[str, Any]], exact: str |
 
 
 def front(points: list[tuple[float, float]]) -> list[bool]:
-    """True for each (cost, quality) pair that no other pair dominates: the Pareto front."""
+    """The Pareto front: True for each pair (cost, quality) that no other pair dominates."""
     return [
         not any(c <= cost and q >= quality and (c < cost or q > quality) for c, q in points) for cost, quality in points
     ]

@@ -3,8 +3,8 @@
 
 Each candidate runs in a separate process, because a driver may abort.
 `clsplat tune` saves the result (device/drivers/shapes.py).
-The search never starts automatically: other load may disturb a trial and thus change which shape is chosen.
-Gradients have the same bits only within a shape, so the same seed would then give other results.
+The search never starts automatically: other load may disturb a trial, so that another shape is chosen.
+Gradients have other bits in another shape, so the same seed would then give other results.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 
 TRIAL_WORKLOAD = (50_000, 640, 480)
-"""Number of Gaussians, width and height of the trial's frame."""
+"""Number of Gaussians, and width and height of the frame, in a trial."""
 REPLACEMENT_TIME_RATIO = 0.97
-"""Largest ratio of a shape's time to the default's at which the shape is preferred. Smaller gains may be noise."""
+"""A shape is preferred if its time divided by the default's is at most this. Smaller gains may be noise."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Result of one candidate.
+    """Result of a candidate shape.
 
-    ms: time in milliseconds of a frame and its gradient; None if the driver failed or took too long.
+    ms: milliseconds of a frame and its gradient; None if the driver failed or took too long.
     """
 
     shape: Shape
@@ -73,7 +73,7 @@ def tune(device: cl.Device, index: int, progress: Callable[[Shape], None]) -> tu
 
 
 def choose(trials: list[Trial]) -> Shape:
-    """The fastest shape if it is clearly faster than the default, which is the first trial; else the default."""
+    """The fastest shape if it is clearly faster than the default shape, which is the first trial; else the default."""
     default = trials[0]
     timed = [(trial.ms, trial.shape) for trial in trials if trial.ms is not None]
     if not timed:
@@ -91,7 +91,7 @@ def _in_a_process(index: int, shape: Shape) -> float | None:
 
 
 def measure(device: Device, workload: tuple[int, int, int] = TRIAL_WORKLOAD, repeat: int = 7) -> float:
-    """Median milliseconds of a frame and its gradient on a synthetic scene."""
+    """Median milliseconds of a frame and its gradient, for a synthetic scene."""
     subject = synthetic(*workload)
     rasterizer = Rasterizer(device)
     gaussians = upload_gaussians(device, subject.gaussians)

@@ -34,9 +34,9 @@ from clsplat.stages.peak import Limits, measure_limits
 from clsplat.training.trainer import Trainer
 
 FRAME_STAGES = ("transfers", "project", "duplicate", "ranges", "blend")
-"""Stages measured in a frame. All others are measured in a training step."""
+"""Stages that are measured in a frame. The others are measured in a training step."""
 TRAINING_BYTES_PER_GAUSSIAN = 4 * floats_of(16) * 4
-"""Bytes per Gaussian of SH degree 3 in a training step, for parameters, gradients and two moments."""
+"""Bytes per Gaussian in a training step, with SH degree 3: parameters, gradients and two moments."""
 
 
 def bench(
@@ -59,7 +59,7 @@ def bench(
     say("frame", None)
     trainer = trainer_of(subject, device, config)
     rasterizer, gaussians = trainer.rasterizer, trainer.parameters
-    if held_kind(config) != held_kind(RasterizerConfig()):  # only for the frame: the step uses the trainer's copy
+    if held_kind(config) != held_kind(RasterizerConfig()):  # for the frame; the step uses the trainer's model
         gaussians = upload_gaussians(device, subject.gaussians, held_sh(subject.gaussians, config))
 
     def draw() -> ForwardPass:
@@ -101,7 +101,7 @@ def bench(
 
 
 def _pairs_of(rasterizer: Rasterizer, frame: ForwardPass) -> dict[str, int]:
-    """Number of a frame's (tile, Gaussian) pairs, and of its contributing and evaluated (pixel, Gaussian) pairs."""
+    """Numbers of (tile, Gaussian) pairs of a frame, and of contributing and evaluated (pixel, Gaussian) pairs."""
     pairs = contributing = evaluated = 0
     for band in frame.bands:
         listed = rasterizer.listed(frame, band)
@@ -113,9 +113,9 @@ def _pairs_of(rasterizer: Rasterizer, frame: ForwardPass) -> dict[str, int]:
 
 
 def _table(stages: Mapping[str, StageRecord], limits: Limits, contributing: int) -> dict[str, dict[str, Any]]:
-    """Record of each stage with its rates, and with the rates' fractions of the device's limits.
+    """Record of each stage: its rates, also as fractions of the device's limits.
 
-    contributing: number of pairs that change a pixel.
+    contributing: number of (pixel, Gaussian) pairs that change a pixel.
     """
     table: dict[str, dict[str, Any]] = {}
     for name, record in stages.items():
@@ -130,7 +130,7 @@ def _table(stages: Mapping[str, StageRecord], limits: Limits, contributing: int)
 
 
 def calls_of(device: Device, work: Callable[[], object]) -> Calls:
-    """Count the queue calls of `work`, which must have run before so that kernels are built and memory is allocated."""
+    """Numbers of queue calls of `work`, which must have run before: kernels are then built, and memory allocated."""
     before = replace(device.calls)
     work()
     return device.calls.since(before)
@@ -140,9 +140,9 @@ def calls_of(device: Device, work: Callable[[], object]) -> Calls:
 class _Cost:
     """Cost of a frame or a training step. Times are medians.
 
-    wall_ms, host_ms: wall time, and processor time of this thread.
+    wall_ms, host_ms: elapsed time, and processor time of this thread.
     calls: numbers of queue calls.
-    by_wall: True if the stages' times are wall times, because the driver's events have no times.
+    by_wall: True if times of stages are elapsed times, because the driver's events have no times.
     """
 
     wall_ms: float
@@ -155,8 +155,8 @@ class _Cost:
 def _measure(device: Device, work: Callable[[], object], repeat: int) -> _Cost:
     """Measure the cost of `work`, in `repeat` rounds.
 
-    In each round, `work` runs three times: without recording, with events, and with waits between stages. Wall time and
-    processor time are measured in the run without recording.
+    In each round, `work` runs three times: without recording, with events, and with waits between stages. Elapsed time
+    and processor time are measured without recording.
     """
     for _ in range(2):
         work()
@@ -193,16 +193,16 @@ class _Picture(View):
 
     pixels: Float32 = field(kw_only=True)
 
-    # the picture exists in one size only
+    # the picture has a single size
     def load_sizes(self, sizes: Sequence[tuple[int, int]], *, reduce: bool = False) -> list[Float32]:  # noqa: ARG002
         return [self.pixels for _ in sizes]
 
 
 def trainer_of(subject: Subject, device: Device, config: RasterizerConfig) -> Trainer:
-    """Trainer whose steps do all the work of training but keep the model unchanged, as all learning rates are zero."""
+    """Trainer whose steps do all the work of training. The model does not change, as all learning rates are zero."""
     camera = subject.camera
     photograph = subject.photograph
-    if photograph is None:  # the mirrored frame: similar content, with a gradient everywhere
+    if photograph is None:  # the mirrored frame, which is similar and gives a gradient everywhere
         mirrored = Renderer(device, config=config).render(subject.gaussians, camera).image[:, ::-1]
         photograph = np.rint(255 * np.clip(mirrored, 0, 1)).astype(np.uint8)
     lens = Lens("PINHOLE", camera.width, camera.height, (camera.fx, camera.fy, camera.cx, camera.cy))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Subjects of a measurement: a synthetic scene, a model or a run."""
+"""Subjects of a measurement: a synthetic scene, a model, a run or a scene."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Subject:
     """Subject of a measurement.
 
     camera: camera for which frames are rendered.
-    photograph: (H, W, 3) uint8, the target of a training step; None to derive a target from the frame.
-    masks: use of masks. With masks, the photograph is (H, W, 5), as from `View.load_masked`.
+    photograph: (H, W, 3) uint8, the target of a training step; None makes a target from the frame.
+    masks: use of masks. With masks, the photograph is (H, W, 5) as from `View.load_masked`.
     """
 
     name: str
@@ -62,9 +62,9 @@ def synthetic(count: int = 200_000, width: int = 1024, height: int = 768) -> Sub
 def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Progress | None = None) -> Subject:
     """Load the subject at a path.
 
-    For a run, it is the run's model, seen from the first view of its scene.
-    For a model file, it is the same if this is a run's model, else the model seen from a camera in front of it.
-    For a scene, it is the Gaussians with which training starts, seen from its first view.
+    A run: its model and the camera of the first view of its scene.
+    A model file: the same if it is a run's model, otherwise the model and a camera in front of it.
+    A scene: the initial Gaussians of a training and the camera of the first view.
     Raises InputError.
     """
     run = run_of(path)
@@ -99,7 +99,7 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
 
 
 def facing(gaussians: Gaussians, width: int, height: int) -> tuple[Gaussians, Camera]:
-    """Copy of the Gaussians with origin zero, and a camera with the world's axes that sees nine tenths of them."""
+    """Copy of the Gaussians with origin zero, and a camera, not rotated, in whose view are nine tenths of them."""
     low, middle, high = np.quantile(gaussians.means.astype(np.float64), (0.05, 0.5, 0.95), axis=0)
     focal = 0.9 * width
     half = np.maximum(high - middle, middle - low)

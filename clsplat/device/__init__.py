@@ -3,14 +3,14 @@
 
 import os
 
-# Set before pyopencl is imported: it switches pyopencl's own cache off. Drivers cache their builds by the whole source
-# text. A second cache only adds binaries that some drivers fail to load again, and needs a writable home.
+# Switches pyopencl's own cache off, so it is set before the import. Drivers already cache their builds by the whole
+# source text. A second cache needs a writable home, and some drivers fail to load its binaries.
 os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
 
 from clsplat.device.drivers import quirks
 from clsplat.process import undisturbed
 
-# before a driver is loaded
+# must come before a driver is loaded
 quirks.make_cache_folder()
 quirks.pin_threads()
 quirks.offer_packaged()

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays in device memory (a shape and a dtype over a buffer), and a workspace of named scratch arrays that grow.
+"""Arrays in device memory, each a buffer with a shape and a dtype; and a workspace of scratch arrays by name.
 
-Debug mode: with CLSPLAT_POISON=1 every array is filled with NaN (2143289344 as an integer) when it is allocated or
-taken from a workspace. CLSPLAT_POISON=0xff800000, or another 32-bit number, fills it with that number. A kernel that
-reads memory that was never written then shows it in its results.
+To debug reads of uninitialised memory, CLSPLAT_POISON=1 fills every array with NaN (2143289344 as an integer) when it
+is allocated or taken from a workspace. CLSPLAT_POISON=0xff800000, or another 32-bit number, fills it with that number.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ class DeviceArray:
         self._write(values, 0)
 
     def send(self, values: NDArray[Any]) -> None:
-        """Copy from the host without waiting: `values` must not change until the host has waited for the device.
+        """Copy from the host without waiting. `values` must not change until the host has waited for the device.
 
         Raises ValueError if the shape or dtype differs, or the array is not C-contiguous.
         """
@@ -68,7 +67,7 @@ class DeviceArray:
             self.device.calls.writes += 1
             event = cl.enqueue_copy(self.device.queue, self.buffer, values, is_blocking=False)
             self._note("write", event)
-            self.device.under_way.append(event)  # without a reference, pyopencl's event waits when it is deleted
+            self.device.under_way.append(event)  # keeps the event alive: its deletion would wait
 
     def _check(self, values: NDArray[Any]) -> None:
         if values.shape != self.shape or values.dtype != self.dtype:
@@ -93,10 +92,10 @@ class DeviceArray:
         self._read(host, 0)
 
     def begin_get(self, into: NDArray[Any] | None = None) -> Callable[[], NDArray[Any]]:
-        """Start a copy to the host, queued behind all work that is on the queue now.
+        """Start a copy to the host, which runs after all work that is on the queue now.
 
-        into: host memory of that shape for the copy, for example from `pinned`.
-        Returns a function that waits for this copy only, and then returns the host array.
+        into: host memory for the copy, of the same shape, for example from `pinned`.
+        Returns a function that waits for this copy only and returns the host array.
         """
         host = np.empty(self.shape, self.dtype) if into is None else into
         copying = partial(cl.enqueue_copy, self.device.queue, host, self.buffer, is_blocking=False)
@@ -144,11 +143,11 @@ class DeviceArray:
             self.device.under_way.clear()
 
     def _at(self, row: int) -> int:
-        """The byte at which a row begins. An array of no dimensions has only row 0."""
+        """The byte offset of a row. An array without dimensions has only row 0."""
         return row * (self.nbytes // self.shape[0]) if row else 0
 
     def rows(self, start: int, stop: int) -> DeviceArray:
-        """The rows [start, stop) in place. `start` must be a multiple of `Device.row_alignment`."""
+        """A view of the rows [start, stop). `start` must be a multiple of `Device.row_alignment`."""
         if (start, stop) == (0, self.shape[0]):
             return self
         width = self.nbytes // max(self.shape[0], 1)
@@ -161,7 +160,7 @@ class DeviceArray:
 
 
 def _poison() -> NDArray[np.uint32] | None:
-    """The word that new memory is filled with, or None to leave memory as it is. Raises InputError."""
+    """The word to fill new memory with, or None to leave memory uninitialised. Raises InputError."""
     value = os.environ.get("CLSPLAT_POISON", "")
     if value in ("", "0"):
         return None
@@ -172,7 +171,7 @@ def _poison() -> NDArray[np.uint32] | None:
 
 
 def _fill_bytes(device: Device, buffer: cl.Buffer, word: NDArray[np.uint32], nbytes: int) -> None:
-    """Fill the buffer's first `nbytes`: whole words, and the remaining bytes with the word's last byte."""
+    """Fill the buffer's first `nbytes` with the word; bytes after the last whole word get the word's last byte."""
     whole = nbytes // 4 * 4
     if whole:
         cl.enqueue_fill_buffer(device.queue, buffer, word, 0, whole)
@@ -204,8 +203,8 @@ def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity:
         buffer = _Buffer(device.context, cl.mem_flags.READ_WRITE, nbytes)
     except cl.MemoryError:
         raise CapacityError(
-            f"{device.name} has no memory left for a buffer of {amount(nbytes)}, beside the "
-            f"{amount(device.memory.used)} in use: give --max-device-mem less than that"
+            f"{device.name} has no memory left for a buffer of {amount(nbytes)}, with "
+            f"{amount(device.memory.used)} in use: set --max-device-mem below {amount(device.memory.used)}"
         ) from None
     device.memory.add(buffer, nbytes)
     if (word := _poison()) is not None:
@@ -221,19 +220,19 @@ def upload(device: Device, values: NDArray[Any]) -> DeviceArray:
 
 
 def shared(device: Device, values: NDArray[Any]) -> DeviceArray:
-    """Let a device that shares the host's memory read a C-contiguous host array in place; it takes no device memory.
+    """A device array over a C-contiguous host array, without a copy, for a device that shares the host's memory.
 
-    The array must not change while the result lives.
+    The host array must not change as long as the result exists.
     """
     buffer = cl.Buffer(device.context, cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR, hostbuf=values)
     return DeviceArray(device, buffer, values.shape, values.dtype)
 
 
 def from_host(device: Device, values: NDArray[Any]) -> DeviceArray:
-    """Make a host array available to kernels that read it.
+    """A device array that holds the host array's values, for kernels that only read it.
 
-    It is used in place if it is C-contiguous and the device shares the host's memory, otherwise copied without waiting.
-    The array must not change while the result lives.
+    A C-contiguous array is not copied if the device shares the host's memory. Otherwise it is copied without waiting.
+    The host array must not change as long as the result exists.
     """
     host = np.ascontiguousarray(values).reshape(values.shape)
     if device.shares_memory and host.size:
@@ -245,14 +244,14 @@ def from_host(device: Device, values: NDArray[Any]) -> DeviceArray:
 
 @dataclass(frozen=True, eq=False)
 class Hosted:
-    """An array that kernels write, and the host memory that receives it: the same memory if the device uses host
-    memory."""
+    """An array that kernels write, and host memory for its values. If the device shares the host's memory, both are the
+    same memory."""
 
     array: DeviceArray
     _host: NDArray[Any]
 
     def get(self) -> NDArray[Any]:
-        """The array on the host, not a copy; waits for the device. Read it before a kernel writes there again."""
+        """The host memory, not a copy; waits for the device. Valid until a kernel writes to the array again."""
         if not self._host.size:
             return self._host
         if not self.array.device.shares_memory:
@@ -284,9 +283,9 @@ def hosted(device: Device, shape: tuple[int, ...], dtype: DTypeLike = np.float32
 
 
 def pinned(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Allocate pinned host memory, to which a device copies by itself.
+    """Allocate pinned host memory, to which a device can copy asynchronously.
 
-    A copy to other memory may make the host wait, even if the call asks not to wait.
+    A copy to other memory may make the host wait, even if the call is non-blocking.
     """
     nbytes = prod(shape) * np.dtype(dtype).itemsize
     buffer = cl.Buffer(device.context, cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR, nbytes)
@@ -296,16 +295,16 @@ def pinned(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[
 
 
 MAX_COMMAND_BUFFERS_PER_OBJECT = 256
-"""Largest number of command buffers of one object: enough for photographs of a few sizes. At this number all of them
-are dropped."""
+"""Maximum number of command buffers of an object, enough for photographs of a few sizes. At this number, all command
+buffers are dropped."""
 
 
 class Workspace:
     """Scratch arrays by name.
 
-    The buffer of a name is reused from call to call. A buffer that is too small is replaced by a buffer of 1.5 times
-    the required size, or of just that size if memory is `tight`. The workspace also keeps command buffers of work on
-    its arrays; they are valid until one of these arrays gets another buffer.
+    An array by the same name reuses the buffer of the last call. If that is too small, it is replaced by a buffer of
+    1.5 times the required size, or of exactly that size if memory is `tight`. The workspace also keeps command buffers
+    that use its arrays. They are dropped when one of these arrays gets another buffer.
     """
 
     def __init__(self, device: Device) -> None:
@@ -323,14 +322,15 @@ class Workspace:
     def replayed(
         self, of: object, key: tuple[object, ...], make: Callable[[], R], numbers: tuple[float, ...] = ()
     ) -> R:
-        """Return the result of `make`. From the second call with this key on, a command buffer replays its queue
-        commands.
+        """Return the result of `make`. From the second call with the same key on, a command buffer replays the commands
+        that `make` put on the queue.
 
-        For one key, `make` must always return the same result and put the same commands on the queue.
+        For the same key, `make` must always return the same result and put the same commands on the queue.
 
-        of: the object whose arrays `make` uses in addition to the workspace's. Its command buffers are dropped with it.
-        key: everything else that `make` depends on, except `numbers`.
-        numbers: the numbers that `make` launches as `LaunchParameter`, in order.
+        of: an object whose arrays `make` uses, in addition to the workspace's. When it is deleted, its command buffers
+        are dropped.
+        key: all other inputs of `make`, except `numbers`.
+        numbers: the values that `make` passes to kernels as `LaunchParameter`, in order.
         """
         if self._poison is not None or self._use == "0" or not self._device.replays:
             return make()
@@ -358,13 +358,13 @@ class Workspace:
     def array(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
     ) -> DeviceArray:
-        """An array whose contents are undefined until they are written.
+        """The array of this name, whose contents are undefined until they are written.
 
-        kept: True to keep the contents. The array must have been returned before in this shape.
+        kept: True keeps the contents of the last call. The last call for this name must have had the same shape.
         """
         latest = self._latest.get(name)
         if latest is not None and latest[0].shape == shape and latest[1] is dtype and self._poison is None:
-            return latest[0]  # as in nearly every step
+            return latest[0]  # the usual case
         kind = np.dtype(dtype)
         elements = prod(shape)
         held = self._arrays.get(name)
@@ -375,7 +375,7 @@ class Workspace:
                 self._forget_command_buffers()
             held = self._arrays.pop(name, None)
             latest = self._latest.pop(name, None)
-            del held, latest  # freed before the new buffer is allocated: there may not be room for both
+            del held, latest  # frees the old buffer first: there may not be room for both
             held = self._arrays[name] = allocate(self._device, (elements,), kind, max(elements, spare))
         if self._poison is not None and not kept:
             _fill_bytes(self._device, held.buffer, self._poison, elements * kind.itemsize)

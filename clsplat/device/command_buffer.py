@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded command buffers: they put work on a device's queue again, without running the Python code that made it.
+"""Command buffers: recorded launches, fills and copies. A replay puts them on a device's queue without the Python code
+that made them.
 
-CLSPLAT_TAPES=0 disables replay. CLSPLAT_TAPES=check launches everything as usual, and compares each launch with the
-recorded one: an argument that differs is an error unless it was declared as `LaunchParameter`.
+CLSPLAT_TAPES=0 disables replays. CLSPLAT_TAPES=check launches everything as usual and compares each launch with the
+recorded launch. An argument that differs is an error, unless it was passed as `LaunchParameter`.
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ CHECK_TAPES = "check"
 
 
 class LaunchParameter(float):
-    """A float argument of a launch that each replay sets again."""
+    """A float argument of a launch, which may be different in each replay."""
 
 
 class LaunchParameterWord(int):
-    """An unsigned 32-bit argument of a launch that each replay sets again."""
+    """An unsigned 32-bit argument of a launch, which may be different in each replay."""
 
 
 def asked() -> str:
-    """The use of command buffers that TAPES_VARIABLE asks for: 1, 0 or CHECK_TAPES. Raises InputError."""
+    """The value of TAPES_VARIABLE: 1 (the default), 0 or CHECK_TAPES. Raises InputError for other values."""
     value = os.environ.get(TAPES_VARIABLE) or "1"
     if value not in ("0", "1", CHECK_TAPES):
         raise InputError(f"{TAPES_VARIABLE}={value}: expected 1, 0 or {CHECK_TAPES}")
@@ -49,7 +50,7 @@ def typed(value: Any) -> Any:
 
 
 def described(value: Any) -> object:
-    """A comparable form of an argument: equal for two arguments that give the kernel the same value."""
+    """A form of an argument for comparison: two arguments have equal forms if the kernel gets the same value."""
     value = typed(value)
     if isinstance(value, cl.MemoryObjectHolder):
         return value.int_ptr
@@ -59,14 +60,14 @@ def described(value: Any) -> object:
 class CommandBuffer:
     """Launches, fills and copies to the host, in order.
 
-    entries: functions that put these on the queue, each with its kernel if it is a launch.
+    entries: functions that put one command each on the queue; with its kernel if the command is a launch.
     calls: the number of calls of each kind.
-    anew: setter and argument index of each argument that a replay sets again.
+    anew: setter and argument index of each `LaunchParameter`.
     reads: the entries that copy to the host.
 
-    Each launch has its own kernel object, whose other arguments stay set. Other command buffers use the object later,
-    because pyopencl takes at least 0.2 ms to make one. A command buffer keeps no array alive: its owner must drop it
-    before one of its arrays is freed.
+    Each launch has its own kernel object, whose other arguments stay set. When a command buffer is dropped, its kernel
+    objects are kept for later command buffers, because pyopencl takes at least 0.2 ms to make a kernel object. A
+    command buffer keeps no array alive: its owner must drop it before one of its arrays is freed.
     """
 
     def __init__(self) -> None:
@@ -108,7 +109,7 @@ class CommandBuffer:
         for index, value in enumerate(values):
             own.set_arg(index, typed(value))
             if given := isinstance(value, (LaunchParameter, LaunchParameterWord)):
-                set_bytes = getattr(own, "_set_arg_buf", own.set_arg)  # takes a tenth of the time: no type check
+                set_bytes = getattr(own, "_set_arg_buf", own.set_arg)  # faster than set_arg: no type checks
                 self.anew.append((set_bytes, index))
                 self._numbers.append(value)
             description.append(None if given else described(value))
@@ -116,13 +117,12 @@ class CommandBuffer:
         self._described.append((kernel.name, kernel.variant, size, local, *description))
 
     def set(self, numbers: Iterable[float]) -> None:
-        """Set the arguments that each replay sets again."""
+        """Set the values of the launch parameters, in order."""
         for (set_bytes, index), number in zip(self.anew, numbers, strict=True):
             set_bytes(index, typed(number))
 
     def check(self, fresh: CommandBuffer, numbers: Sequence[float]) -> None:
-        """Raise AssertionError if a replay with these numbers would put anything different from `fresh` on the
-        queue."""
+        """Raise AssertionError if a replay with these numbers would differ from `fresh`, which was just recorded."""
         assert len(self._described) == len(fresh._described), "a command buffer has another number of commands than now"
         for one, other in zip(self._described, fresh._described, strict=True):
             assert len(one) == len(other), f"{one[0]} in a command buffer has another number of arguments than now"
@@ -134,9 +134,9 @@ class CommandBuffer:
         assert given == made, f"numbers given to a command buffer are {list(numbers)}, launched {fresh._numbers}"
 
     def is_all_of(self, calls: Calls) -> bool:
-        """Store the counts of calls since the recording began.
+        """Store the numbers of calls since the recording began.
 
-        Returns False if the command buffer lacks some of them: a write, or a call for which the host waited.
+        Returns False if some of these calls were not recorded: a write, or a call for which the host waited.
         """
         self.calls = calls
         return len(self.entries) == calls.launches + calls.fills + calls.reads == calls.total

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Device selection, and the open device: its queue, kernel shape and kernels."""
+"""Selection of devices, and the class of an open device, which has its queue, kernel shape and kernels."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from clsplat.process import undisturbed
 T = TypeVar("T")
 
 SYNC_VARIABLE = "CLSPLAT_SYNC"
-"""Environment variable that makes each launch wait for its kernel, so that an error names the kernel that hangs or
+"""Environment variable that makes each launch wait for its kernel. So an error message names the kernel that hangs or
 fails."""
 
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """Entry of a device in `clsplat devices`."""
+    """A device's entry in the list of `clsplat devices`."""
 
     index: int
     name: str
@@ -56,7 +56,7 @@ class DeviceInfo:
 def all_devices() -> list[cl.Device]:
     """All visible OpenCL devices, by index. Raises DeviceError in a forked process (`forks`)."""
     forks.claim()
-    with undisturbed():  # otherwise Ctrl-C would end compilers and linkers that a driver's threads start
+    with undisturbed():  # otherwise Ctrl-C would reach compilers and linkers that the driver starts
         devices = _visible()
     for device in devices:
         name_processor(device)
@@ -99,7 +99,7 @@ def list_devices() -> list[DeviceInfo]:
 
 
 def limits(device: cl.Device) -> dict[str, object]:
-    """The device's limits that affect kernel launches, for a bug report."""
+    """The device's limits on kernel launches, for a bug report."""
     names = (
         *("driver_version", "opencl_c_version", "extensions", "max_clock_frequency", "max_compute_units"),
         *("max_work_group_size", "local_mem_size", "max_constant_buffer_size", "max_mem_alloc_size", "global_mem_size"),
@@ -118,15 +118,15 @@ def limits(device: cl.Device) -> dict[str, object]:
 class Device:
     """A device with its context, in-order queue, kernel shape and built kernels.
 
-    why: warning that the kernel shape is not the preferred one, shown when the device is first used; empty otherwise.
-    only_tries: True if launches are only tried in the sandbox, and not made (`launch.only_tried`).
-    waits: True if each launch waits for its kernel, as SYNC_VARIABLE requests.
+    why: warning that another shape than the preferred one is used; shown at the first use of the device. Usually empty.
+    only_tries: True if launches are only tried in the sandbox (`launch.only_tried`).
+    waits: True if each launch waits for its kernel (SYNC_VARIABLE).
     shares_memory: True if the device uses the host's memory.
-    calls: the number of calls on its queue.
+    calls: the numbers of calls on its queue.
     command_buffers: the command buffers that are being recorded.
     under_way: events and buffers that keep host arrays alive while the device may still read them.
-    part: for a part of a listed device, that device and the part's number.
-    index: position in the list of devices; for a part, the position of the whole device.
+    part: for a part of a device: the whole device and the part's number.
+    index: position in the list of devices, for a part that of the whole device.
     """
 
     def __init__(
@@ -175,11 +175,11 @@ class Device:
         return self._queue
 
     def kernels(self, stem: str, defines: Mapping[str, object] = {}, registers: int = 0) -> Kernels:
-        """The kernels of `stem`.cl in this device's shape with these defines, built at the first call.
+        """The kernels of `stem`.cl for this device's shape and these defines, built at the first call.
 
-        registers: limit per work-item, where the driver has such an option; 0 for none.
+        registers: maximum registers per work-item, if the driver has an option for it; 0 for no limit.
         """
-        if self._why_another:  # only now: until its first use, the self-test may choose another shape
+        if self._why_another:  # not shown earlier: until this first use, the self-test may still choose another shape
             tell_once(self._why_another)
         if self._switches:
             text = kernel_source(stem)
@@ -196,8 +196,8 @@ class Device:
 
     def _built(self, stem: str, defines: Mapping[str, object], registers: int = 0) -> Kernels:
         given, text = {"LANES": self.shape.lanes, "ITEMS": self.shape.items, **defines}, text_of(stem)
-        # A driver's cache is keyed by the options. Only options that the text names are given, so that shapes share the
-        # build of a file that does not depend on the shape.
+        # Only defines that occur in the text are passed. A driver's cache is keyed by the options, so all shapes share
+        # the build of a file that does not depend on the shape.
         named = {name: value for name, value in given.items() if name.partition("(")[0] in text}
         limit = register_limit(self.cl_device, registers) if registers else ""
         variant = variant_of(stem, named, f"{self._options} {limit}")
@@ -208,7 +208,7 @@ class Device:
     def with_shape(
         self, label: str = "", *, lanes: int | None = None, items: int | None = None, chunks: int | None = None
     ) -> Device:
-        """A device like this with another shape, given by its label or by lanes, items and chunks."""
+        """A copy of this device with another kernel shape, given by its label or by lanes, items and chunks."""
         shape = self.shape.relabelled(label) if label else self.shape
         if lanes or items or chunks:
             shape = Shape(lanes or shape.lanes, items or shape.items, chunks or shape.chunks)
@@ -217,37 +217,36 @@ class Device:
         return device
 
     def with_switches(self, switches: Mapping[str, object]) -> Device:
-        """The same device, queue and kernel cache, with these defines added for kernels whose text names them."""
+        """A copy of this device, with the same queue, that adds these defines to kernels in whose text they occur."""
         device = copy(self)
         device._switches = {**self._switches, **switches}  # noqa: SLF001  # a copy of our own class
         return device
 
     @property
     def is_another(self) -> bool:
-        """True if this shape was chosen because the driver had failed in the preferred one."""
+        """True if this shape was chosen because the driver failed in the preferred shape."""
         return bool(self._why_another)
 
     def switched(self, *names: str) -> bool:
-        """True if kernels are built with any of these switches."""
+        """True if any of these defines was added by `with_switches`."""
         return any(name in self._switches for name in names)
 
     def with_memory_limit(self, limit: int | None) -> Device:
-        """The same device, queue and kernels, with its own memory account of at most `limit` bytes of buffers."""
+        """A copy of this device, with the same queue and kernels, whose buffers may take at most `limit` bytes."""
         device = copy(self)
         device.memory = Memory(limit)
         return device
 
     @property
     def budget(self) -> int:
-        """Bytes that may be in use: the limit if there is one, otherwise all of the device's memory."""
+        """Bytes that buffers may take: the limit if there is one, otherwise all of the device's memory."""
         return self.memory.limit or int(self.cl_device.global_mem_size)
 
     @property
     def row_alignment(self) -> int:
-        """A part of an array that is used in place must begin at a multiple of this many rows, of at least four bytes
-        each.
+        """Alignment of views: the first row of a view must be a multiple of this. Rows must have four bytes or more.
 
-        OpenCL requires an alignment of sub-buffers, and kernels read whole vectors of lanes.
+        OpenCL requires sub-buffers to be aligned, and kernels read whole vectors.
         """
         return max(int(self.cl_device.mem_base_addr_align) // 32, self.shape.lanes, 32)
 
@@ -260,13 +259,13 @@ class Device:
         *,
         wait: bool = False,
     ) -> cl.Event:
-        """Put a kernel on the queue; wait for it if asked to, or if CLSPLAT_SYNC=1. Raises DriverError."""
+        """Put a kernel on the queue. Wait for it if `wait`, or if CLSPLAT_SYNC=1. Raises DriverError."""
         try:
             event = kernel.cl_kernel(self.queue, size, local, *values)
             self.calls.launches += 1
             if self.waits:
                 self._wait_for(event, kernel)
-            elif wait:  # so that the last kernel in the log is the one that failed
+            elif wait:  # then the last kernel in the log is the kernel that failed
                 self.finish()
         except cl.Error as error:
             raise self._not_launched(kernel, error) from None
@@ -278,8 +277,8 @@ class Device:
         return self.trials.error(kernel.variant, kernel.name, f"cannot be launched: {' '.join(str(error).split())}")
 
     def record(self, work: Callable[[], T]) -> tuple[T, CommandBuffer | None]:
-        """The result of `work`, and a command buffer of its queue commands, or None if they cannot be replayed
-        unchanged."""
+        """The result of `work`, and a command buffer of the commands that it put on the queue; None if they cannot be
+        replayed."""
         commands, before = CommandBuffer(), copy(self.calls)
         self.command_buffers.append(commands)
         try:
@@ -302,11 +301,11 @@ class Device:
 
     @property
     def replays(self) -> bool:
-        """True if command buffers may be replayed: nothing needs to observe each launch."""
+        """True if command buffers may be replayed; False if each launch is waited for, recorded or only tried."""
         return not (self.waits or self.recorder.on or self.only_tries)
 
     def _wait_for(self, event: cl.Event, kernel: Kernel) -> None:
-        """Wait for a kernel that is on the queue. Raises DriverError if it does not finish in time, or fails."""
+        """Wait for a kernel that is on the queue. Raises DriverError if it fails or does not finish in time."""
         self.queue.flush()
         start, seconds, pause = time.monotonic(), driver_timeout(), 1e-5
         while (status := event.command_execution_status) > cl.command_execution_status.COMPLETE:
@@ -324,7 +323,7 @@ class Device:
         self.under_way.clear()
 
     def timed(self, work: Callable[[], T]) -> tuple[T, float]:
-        """The result of `work` and its milliseconds, from an idle device to an idle device."""
+        """The result of `work`, and the milliseconds that it took. The device is idle before and after."""
         self.finish()
         start = time.perf_counter()
         result = work()
@@ -332,11 +331,11 @@ class Device:
         return result, 1e3 * (time.perf_counter() - start)
 
     def _probe_fma(self) -> dict[str, object]:
-        """The define FMA_BY_CONTRACTION if the compiler fuses a lone a*b + c in vectors, which then is the fastest way
-        to the bits of fma.
+        """The define FMA_BY_CONTRACTION if the compiler fuses a*b + c in vectors. That is then the fastest way to get
+        the bits of fma.
 
-        Without vectors it is never set: Intel's runtime vectorises loops by itself, and then fuses only some of these
-        operations.
+        Without vectors it is never set: Intel's runtime vectorises loops by itself, and then fuses only some of the
+        multiply-adds.
         """
         if self.shape.lanes == 1:
             return {}
@@ -346,7 +345,7 @@ class Device:
         return fused if np.all(results == np.float32(2.0**-24)) else {}
 
     def _with_subgroups(self) -> dict[str, object]:
-        """The defines of the first of `subgroup_ways` in which items exchange values correctly. Raises DeviceError."""
+        """The first defines of `subgroup_ways` with which items exchange the right values. Raises DeviceError."""
         if self._subgroups:
             return self._subgroups[0]
         for defines in subgroup_ways(self.cl_device):
@@ -369,9 +368,9 @@ class Device:
     def _probed(
         self, kernel: Kernel, items: int, shape: int | tuple[int, ...], *numbers: object
     ) -> NDArray[np.float32]:
-        """An array of this shape, written by one group of `items` work-items.
+        """The array of this shape that the kernel writes, in a single group of `items` work-items.
 
-        numbers: the kernel's other arguments.
+        numbers: further arguments of the kernel.
         """
         results = np.empty(shape, np.float32)
         buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, results.nbytes)
@@ -386,11 +385,11 @@ class Device:
 
 
 def select(selector: str | None) -> cl.Device:
-    """The device that `selector` names: an index, `cpu`, `gpu`, or part of its name, platform or version.
+    """The device for a selector: an index, `cpu`, `gpu`, or part of a device's name, platform or version.
 
-    Without a selector: `CLSPLAT_DEVICE` if set, else the first GPU, else the first device. Raises DeviceError.
+    None selects by `CLSPLAT_DEVICE` if set, else the first GPU, else the first device. Raises DeviceError.
     """
-    driver_timeout()  # raises InputError for an invalid environment variable before a kernel needs it
+    driver_timeout()  # raises InputError for an invalid environment variable now, not at the first kernel
     devices = list(zip(all_devices(), list_devices(), strict=True))
     if not devices:
         raise no_device()
@@ -415,21 +414,21 @@ def find_device(selector: str | None) -> DeviceInfo:
 
 
 def _names(selector: str | None) -> list[str]:
-    """The names of devices in `selector`. Raises DeviceError if it is not text."""
+    """The selectors in `selector`, which are separated by commas. Raises DeviceError if it is not text."""
     if not isinstance(selector, str | None):
         raise DeviceError(f"device is {selector!r}, expected text, such as '0', 'gpu' or a part of a name")
     return device_names(selector)
 
 
 def _part_of(name: str) -> tuple[str, int | None]:
-    """The device name and part number in NAME/NUMBER; the number is None for a whole device."""
+    """NAME and NUMBER of a part, written NAME/NUMBER; the number is None for a whole device."""
     whole, slash, number = name.rpartition("/")
     return (whole, int(number)) if slash and whole and number.isdigit() else (name, None)
 
 
 @lru_cache(maxsize=8)
 def _divided(index: int, parts: int) -> list[cl.Device]:
-    """Equal parts of the `index`-th device, by OpenCL's device fission; empty if it cannot be divided so."""
+    """Equal parts of the `index`-th device, by OpenCL's device fission; empty if it cannot be divided equally."""
     device = all_devices()[index]
     try:
         units = device.max_compute_units // parts
@@ -460,12 +459,12 @@ def _open(
 def open_devices(
     selector: str | None = None, memory_limit: int | None = None, *, profile: bool = False
 ) -> list[Device]:
-    """Open each device that `selector` names, separated by commas (see `select`).
+    """Open the devices of a list of selectors (see `select`), separated by commas.
 
-    Without a limit, repeated calls return the same object for the same device. NAME/K is part K, counted from 0, of a
-    device that OpenCL divides equally. The device is divided into as few parts as the largest K needs, at least two.
+    NAME/K is part K, from 0, of a device that OpenCL divides into equal parts: the largest K plus one, at least two.
+    Without a limit, repeated calls return the same object for the same device.
 
-    memory_limit: largest number of bytes that all buffers of one returned object may take together.
+    memory_limit: maximum bytes of all buffers of each returned device.
     profile: make queues that record timings.
     Raises DeviceError if a device is named twice.
     """

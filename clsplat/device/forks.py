@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check for forks of a process that has used OpenCL: a fork lacks the driver's threads, so a call would wait
+"""Check for a fork of a process that has used OpenCL. A fork lacks the driver's threads, so a call would wait
 forever."""
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Host memory for arrays that devices write and callers keep. Freed memory is used again.
+"""Host memory for arrays that a device writes and callers keep. Freed memory is reused.
 
-New pages cost a page fault each: for 20 MB they take as long as projecting 100,000 Gaussians.
+Each new page costs a page fault: for 20 MB these take as long as the projection of 100,000 Gaussians.
 """
 
 from __future__ import annotations
@@ -13,18 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 HOST_ALIGNMENT_BYTES = 4096
-"""Alignment of the memory in bytes. With it drivers use the memory in place instead of copying it."""
+"""Alignment of the memory in bytes, with which drivers use the memory in place instead of copying it."""
 MIN_RECYCLED_BYTES = 1 << 18
-"""Smallest size, in bytes, of memory that is kept for reuse; below it, reuse saves no time."""
+"""Minimum bytes of memory that is kept for reuse. For less, reuse saves no time."""
 MAX_IDLE_BYTES = 1 << 28
-"""Largest number of bytes kept for reuse."""
+"""Maximum bytes kept for reuse."""
 
 _lock = threading.Lock()
 _idle: list[NDArray[np.uint8]] = []
 
 
 def host_bytes(count: int) -> NDArray[np.uint8]:
-    """(count,) uninitialised bytes, aligned to HOST_ALIGNMENT_BYTES. They are freed with the last array over them."""
+    """Uninitialised bytes (count,), aligned to HOST_ALIGNMENT_BYTES. They are freed with the last array that uses
+    them."""
     size = -(-count // HOST_ALIGNMENT_BYTES) * HOST_ALIGNMENT_BYTES
     if size < MIN_RECYCLED_BYTES:
         return _aligned(np.empty(size + HOST_ALIGNMENT_BYTES, np.uint8))[:count]
@@ -33,7 +34,7 @@ def host_bytes(count: int) -> NDArray[np.uint8]:
 
 
 def _found(size: int) -> NDArray[np.uint8] | None:
-    # A finalizer may run within these statements and call this function: it then gets new memory instead of waiting.
+    # A finalizer may call this function while this thread holds the lock. It then gets new memory instead of waiting.
     if not _lock.acquire(blocking=False):
         return None
     try:
@@ -46,14 +47,14 @@ def _found(size: int) -> NDArray[np.uint8] | None:
 
 
 class _Block:
-    """Memory that arrays use. NumPy keeps this object while such an array exists."""
+    """Memory of arrays. NumPy keeps this object alive as long as one of the arrays exists."""
 
     def __init__(self, raw: NDArray[np.uint8]) -> None:
         self._raw = raw
         self.__array_interface__: dict[str, Any] = raw.__array_interface__
 
     def __del__(self) -> None:
-        # An array may be deleted within any statement, even while the lock is held: then its memory is not reused.
+        # An array may be deleted while this thread holds the lock. Its memory is then not reused.
         if not _lock.acquire(blocking=False):
             return
         try:

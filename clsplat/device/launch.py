@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel launches: argument conversion, group sizes, and the sandbox trial before a kernel's first launch."""
+"""Kernel launches: conversion of arguments, group sizes, and the sandbox trial before the first launch of a kernel."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from clsplat.device.profile import UPDATED_ARRAYS_BY_KERNEL
 from clsplat.device.program import Kernel
 
 DEFAULT_GROUP_ITEMS = 64
-"""Work-items per group in kernels whose items do not co-operate: enough for a GPU's wave, few enough for a CPU's
-chunk."""
+"""Work-items per group in kernels whose items do not co-operate: enough to fill a GPU's wave, and few enough to divide
+the work over a CPU's processors."""
 _LOW_32_BITS = 0xFFFFFFFF
 _RECOMPILED_SIZE_ITEMS = 1 << 16
-"""Number of items along an axis from which PoCL compiles a kernel again."""
+"""Number of items along an axis from which on PoCL compiles a kernel again."""
 
 
 @contextmanager
 def only_tried(device: Device) -> Iterator[None]:
-    """Within the block, try kernels in the sandbox if necessary, but do not launch them on this device.
+    """Inside the block, launches only try the kernel in the sandbox, if that is necessary; nothing runs on the device.
 
-    If a driver fails in a trial, nothing has been changed yet.
+    So if a driver fails in a trial, no array has been changed yet.
     """
     device.only_tries = True
     try:
@@ -38,7 +38,7 @@ def only_tried(device: Device) -> Iterator[None]:
 
 
 def _values(arguments: tuple[Any, ...]) -> list[Any]:
-    """The arguments that the kernel gets: whole numbers as 32 bits, signed or unsigned."""
+    """The arguments converted for the kernel: whole numbers become 32 bits, signed or unsigned."""
     return [
         argument.buffer
         if (kind := type(argument)) is DeviceArray
@@ -57,9 +57,9 @@ def _type(value: Any) -> Any:
 
 
 def form_of(device: Device, size: tuple[int, ...], local: tuple[int, ...] | None) -> str:
-    """The form of a launch, for a driver that compiles a kernel again for each form; empty for the usual form.
+    """The kind of launch by size, for a driver that compiles a kernel anew for each kind; usually empty.
 
-    The group size is not part of the form: it may be an image's width, and each width would need a trial.
+    The group size is not part of it: a group size may be an image's width, and each width would then need a trial.
     """
     if not device.compiles_by_size:
         return ""
@@ -75,7 +75,7 @@ def _first(
     values: Sequence[Any],
     form: str,
 ) -> None:
-    """Set the types of the kernel's arguments, and check that the driver can launch it. Raises DriverError."""
+    """Prepare a kernel's first launch: set its argument types, and try it in the sandbox. Raises DriverError."""
     types = [_type(value) for value in values]
     most = device.max_group
     if tells_group_sizes(device.cl_device):
@@ -112,7 +112,7 @@ def _enqueue(
 
 
 def launch_items(device: Device, kernel: Kernel, items: int, *arguments: Any) -> None:
-    """Launch `items` work-items, rounded up to whole groups; the kernel ignores the surplus. 0 items launch nothing."""
+    """Launch `items` work-items, rounded up to whole groups. The kernel skips items in excess. 0 launches nothing."""
     if items > 0:
         size = -(-items // DEFAULT_GROUP_ITEMS) * DEFAULT_GROUP_ITEMS
         local = (DEFAULT_GROUP_ITEMS,) if device.max_group >= DEFAULT_GROUP_ITEMS else None
@@ -122,16 +122,16 @@ def launch_items(device: Device, kernel: Kernel, items: int, *arguments: Any) ->
 def launch_groups(
     device: Device, kernel: Kernel, groups: int | tuple[int, int, int], items: int, *arguments: Any
 ) -> None:
-    """Launch `groups` work-groups of `items` work-items, or a grid of such groups. 0 groups launch nothing."""
+    """Launch work-groups of `items` work-items. groups: their number, or the sizes of a grid. 0 launches nothing."""
     first, *further = groups if isinstance(groups, tuple) else (groups,)
     if all((first, *further)):
         _enqueue(device, kernel, (first * items, *further), (items, *(1 for _ in further)), arguments)
 
 
 def launch_grid(device: Device, kernel: Kernel, size: tuple[int, ...], *arguments: Any) -> None:
-    """Launch a grid of work-items. A side of 0 launches nothing.
+    """Launch a grid of work-items. If a side is 0, nothing is launched.
 
-    On a CPU each row is a group, as the driver might otherwise make one group of the whole grid.
+    On a CPU each row is a group; otherwise the driver might make the whole grid a single group.
     """
     if all(size):
         fits = size[0] <= min(device.max_group, 1024)

@@ -22,7 +22,7 @@ class Memory:
         """Raise CapacityError if `nbytes` more bytes would exceed the limit."""
         if self.limit is None or self.used + nbytes <= self.limit:
             return
-        gc.collect()  # frees buffers that only an exception's traceback or a reference cycle holds
+        gc.collect()  # frees buffers that only a reference cycle or a traceback refers to
         if self.used + nbytes > self.limit:
             raise CapacityError(
                 f"--max-device-mem {amount(self.limit)} is too little: {amount(self.used)} of the device's memory are "

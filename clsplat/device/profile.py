@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Costs of the stages: kernels, milliseconds, launches and bytes, recorded while `clsplat bench` requests them."""
+"""Costs of the stages: kernels, milliseconds, launches and bytes; recorded only on request, for `clsplat bench`."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 TRANSFERS_STAGE = "transfers"
-"""Name under which work outside all stages is recorded: copies of the camera and the background."""
+"""Name for work outside all stages: copies of the camera and the background."""
 
 
 @dataclass
 class StageRecord:
     """The costs of one stage.
 
-    kernels: milliseconds on the device by kernel, including copies and fills.
+    kernels: milliseconds on the device, for each kernel, copy and fill by name.
     ms: sum of `kernels`.
-    wall_ms: milliseconds from idle device to idle device, including launches and the host's work.
-    bytes: bytes of the arrays passed to the launches.
+    wall_ms: elapsed milliseconds, including launches and work on the host. The device is idle before and after.
+    bytes: bytes of the arrays that were passed to kernels.
     """
 
     kernels: dict[str, float] = field(default_factory=dict)
@@ -40,9 +40,9 @@ class StageRecord:
 class Calls:
     """Numbers of calls on a device's queue since the device was opened.
 
-    launches: kernels.
-    fills, writes, reads: buffer operations for which the host does not wait.
-    blocking_writes, blocking_reads: buffer operations for which it waits.
+    launches: kernel launches.
+    fills, writes, reads: buffer operations that do not block the host.
+    blocking_writes, blocking_reads: buffer operations that block the host.
     """
 
     launches: int = 0
@@ -62,15 +62,15 @@ class Calls:
         return sum(astuple(self))
 
     def add(self, more: Calls) -> None:
-        """Add the counts of a command buffer, which never waits."""
+        """Add the counts of a replayed command buffer, which contains no blocking calls."""
         self.launches += more.launches
         self.fills += more.fills
         self.reads += more.reads
 
 
 class Recorder:
-    """The recorder of a device. It is off except inside `recording`; there it notes every launch and transfer by
-    stage."""
+    """The recorder of a device. Inside `recording` it records every launch and transfer, by stage; otherwise it is
+    off."""
 
     def __init__(self, queue: cl.CommandQueue) -> None:
         self._queue = queue
@@ -82,10 +82,10 @@ class Recorder:
 
     @contextmanager
     def recording(self, *, wait: bool) -> Iterator[dict[str, StageRecord]]:
-        """Yield the stages of the work in the block, filled in at its end.
+        """Record the work in the block. Yields the records by stage, which are filled in at the end of the block.
 
-        wait: finish the queue around each stage for `wall_ms`. Otherwise the device runs ahead as usual, and the
-        kernels' times come from the events. They are 0 if the queue was made without profiling, or the driver reports
+        wait: True waits for the device before and after each stage, to measure `wall_ms`. False does not wait; kernel
+        times then come from OpenCL's events. They are 0 if the queue was made without profiling, or the driver reports
         wrong times.
         """
         stages: dict[str, StageRecord] = {}
@@ -101,7 +101,7 @@ class Recorder:
             self.on, self._stages, self._events = False, {}, []
 
     def add(self, name: str, event: Any, nbytes: int) -> None:
-        """Record a launch or transfer. Call it only while `on`."""
+        """Record a launch or transfer. Call this only while `on` is True."""
         stage = self._stack[0] if self._stack else TRANSFERS_STAGE
         record = self._stages.setdefault(stage, StageRecord())
         record.launches += 1
@@ -110,7 +110,7 @@ class Recorder:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Assign the work in the block to stage `name`, unless it is already inside a stage."""
+        """Assign the work in the block to stage `name`, unless the block is inside another stage."""
         outermost = not self._stack
         self._stack.append(name)
         timed = outermost and self._wait
@@ -137,7 +137,7 @@ D = TypeVar("D", bound=Recorded)
 
 
 UPDATED_ARRAYS_BY_KERNEL: dict[str, int] = {}
-"""For each kernel by name, the number of trailing array arguments that it both reads and writes."""
+"""Number of array arguments that a kernel reads and writes, by the kernel's name. They are its last arguments."""
 
 
 def stage(name: str, **updated: int) -> Callable[[Callable[Concatenate[D, P], R]], Callable[Concatenate[D, P], R]]:

@@ -36,15 +36,15 @@ class Variant:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def anew(self, salt: str) -> Variant:
-        """The same kernels in another text, which no driver has cached: a cached entry may come from an aborted build.
+        """The same kernels with a text that no driver has cached, because a cache entry may be of an aborted build.
 
-        The texts must differ in more than a comment, as PoCL's cache is keyed by the preprocessor's output.
+        The text differs in more than a comment, as PoCL's cache is keyed by the preprocessor's output.
         """
         return replace(self, source=f"{self.source}typedef int anew_{salt};\n") if salt else self
 
 
 def variant_of(stem: str, defines: Mapping[str, object], options: str) -> Variant:
-    """`stem`.cl with these defines. Raises InputError if CLSPLAT_BREAK_KERNEL is invalid."""
+    """The variant of `stem`.cl with these defines. Raises InputError if CLSPLAT_BREAK_KERNEL is invalid."""
     flags = [f"-D{name}" if value is True else f"-D{name}={value}" for name, value in sorted(defines.items())]
     return Variant(stem, text_of(stem), (*flags, *options.split()))
 
@@ -72,13 +72,12 @@ def text_of(stem: str) -> str:
 
 
 def build(context: cl.Context, device: cl.Device, variant: Variant) -> tuple[cl.Program, str]:
-    """Compile a kernel file. Returns the program, and the salt of `Variant.anew` that it needed, or an empty string.
+    """Compile a kernel file. Returns the program, and the salt (`Variant.anew`) that its build needed, usually empty.
 
-    A failed build is repeated once, with a source text that is unique to this process. An aborted build leaves a
-    program without kernels in PoCL's cache, and another process that builds the same text may remove its files.
+    A failed build is repeated once, with a text that is unique to this process. The reasons: an aborted build leaves a
+    program without kernels in PoCL's cache, and another process that builds the same text may remove its files there.
 
-    Raises KernelBuildError with the device, the options, the log and the source, and DriverError for a program without
-    kernels.
+    Raises KernelBuildError with the device, options, log and source; and DriverError for a program without kernels.
     """
     if (saved := binary_cache.load(context, device, variant.digest, variant.options)) is not None:
         return saved, ""
@@ -117,9 +116,9 @@ def _compiled(context: cl.Context, device: cl.Device, variant: Variant) -> cl.Pr
 class Kernel:
     """A built kernel.
 
-    tried: the forms of launch (`launch.form_of`) that the driver has passed. Before the first launch
-    pyopencl gets the types of the kernel's scalars. Without them each scalar costs 10 microseconds a launch.
-    spare: kernel objects of dropped command buffers, which new command buffers may use.
+    tried: the kinds of launch (`launch.form_of`) that have been tried. Before the first launch, pyopencl is given the
+    types of the scalar arguments. Without the types, each scalar costs 10 microseconds per launch.
+    spare: kernel objects of dropped command buffers, for new command buffers.
     """
 
     def __init__(self, variant: Variant, program: cl.Program, kernel: Any) -> None:
@@ -130,12 +129,12 @@ class Kernel:
         self.tried: set[str] = set()
 
     def most_items(self, device: cl.Device) -> int:
-        """Work-items that the driver allows in a group of this kernel."""
+        """Maximum work-items that the driver allows in a group of this kernel."""
         return int(self.cl_kernel.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, device))
 
 
 class Kernels:
-    """The kernels of one source file with one set of defines, by name; each kernel object is made once."""
+    """The kernels of a source file with certain defines, as attributes. Each kernel object is made once."""
 
     def __init__(self, variant: Variant, program: cl.Program) -> None:
         self._kernels = {kernel.function_name: Kernel(variant, program, kernel) for kernel in program.all_kernels()}
@@ -144,4 +143,4 @@ class Kernels:
         try:
             return self._kernels[name]
         except KeyError:
-            raise AttributeError(f"no kernel {name}; there are {', '.join(self._kernels)}") from None
+            raise AttributeError(f"no kernel {name}, expected one of {', '.join(self._kernels)}") from None

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trials: the first build and the first launch of every kernel run in a sandbox process that a driver may crash.
+"""Trials of kernels: the first build and the first launch of each kernel run in a sandbox process.
 
-A driver's compiler may abort or hang at the build, or, like PoCL's code generator, only at the launch. So before a
-driver first gets a kernel's text and options here, another process builds the kernel, and launches it on zero-filled
-arrays of the same sizes. The outcome is recorded (`driver_records`), and the trial is not repeated with that driver.
+A driver's compiler may abort or hang when it builds a kernel, or, like PoCL's code generator, at the launch. So a
+kernel is first built in another process, and launched there on zero-filled arrays of the same sizes. The outcome is
+recorded (`driver_records`), so that the trial is not repeated with the same driver.
 """
 
 from __future__ import annotations
@@ -32,16 +32,17 @@ from clsplat.device.program import Kernel, Variant, text_of
 from clsplat.errors import DriverError
 
 SANDBOX_IDLE_SECONDS = 20.0
-"""Seconds after which the idle process is ended, as it occupies device memory, and needs only 0.5 s to start again."""
+"""Seconds after which an idle sandbox process is ended: it occupies device memory, and starts again in 0.5 s."""
 MAX_TRIAL_BYTES = 2 << 30
-"""Bytes of a launch's arrays beyond which the kernel is only built: the memory may not hold them twice."""
+"""Maximum bytes of the arrays of a launch that is tried. With more the kernel is only built, as memory may not suffice
+for the arrays in both processes."""
 MAX_TRIAL_ITEMS = 1 << 17
-"""The most work-items of a trial's launch along each axis. PoCL compiles the same code for any larger number, and other
-code for less than 65,536. This many take almost no time."""
+"""Maximum work-items along each axis of a launch that is tried. They take almost no time. PoCL compiles the same code
+for more work-items, and other code for less than 65,536."""
 
 
 class _Process:
-    """The sandbox process of one device, started when needed and ended when idle."""
+    """The sandbox process of a device, which is started when needed and ended when idle."""
 
     def __init__(self, index: int) -> None:
         self._index = index
@@ -50,9 +51,9 @@ class _Process:
         self._timer: threading.Timer | None = None
 
     def ask(self, trial: Mapping[str, Any]) -> dict[str, Any]:
-        """The outcome of a trial, a message of `sandbox_worker`. `lasting` is False if it says nothing of the driver.
+        """The outcome of a trial, as `sandbox_worker` sends it. `lasting` is False if the failure is not the driver's.
 
-        A crash counts only if a second try crashes too, as the driver's linker may have been killed the first time.
+        A crash counts only if a second try crashes too, as another program may have killed the driver's linker.
         Raises TrialInterrupted, and DriverError if the process cannot be started.
         """
         try:
@@ -103,10 +104,10 @@ def _process(index: int) -> _Process:
 
 
 class KernelTrials:
-    """The kernels that a driver has been seen to build and launch, in one kernel shape, LANESxITEMS.
+    """The trials of a driver in one kernel shape, and the kernels that passed.
 
-    In a worker process that tests a driver, like `clsplat.selftest.worker`, no sandbox is used. `say`, if set, is
-    called there with the name of each kernel before its first use.
+    No sandbox is used in a worker process that tests a driver, such as `clsplat.selftest.worker`. There `say`, if set,
+    is called with the name of each kernel before its first use.
     """
 
     def __init__(self, device: cl.Device, index: int, shape: str) -> None:
@@ -116,14 +117,14 @@ class KernelTrials:
 
     @cached_property
     def known(self) -> dict[str, str]:
-        """Names of working builds and launches, with the salt of `Variant.anew` that each text needs.
+        """Names of the builds and launches that passed, with the salt (`Variant.anew`) that each text needs.
 
-        In a worker process: names of the builds and launches that it has begun.
+        In a worker process: names of the builds and launches that have begun.
         """
         return {} if regardless() else dict(driver_records.entry(self._device, self._shape).kernels)
 
     def build(self, variant: Variant) -> Variant:
-        """Check that the kernel file can be built, and return the text to build. Raises DriverError."""
+        """Try the build of a kernel file, and return the variant to build. Raises DriverError."""
         self._try(variant, "", variant.digest)
         return variant.anew(self.known[variant.digest])
 
@@ -135,18 +136,18 @@ class KernelTrials:
         arguments: Sequence[Any],
         form: str = "",
     ) -> None:
-        """Check that the kernel can be launched in this form (`launch.form_of`). Raises DriverError."""
+        """Try a launch of the kernel. form: the kind of launch (`launch.form_of`). Raises DriverError."""
         given = [_described(argument) for argument in arguments]
         if regardless() or sum(value for kind, value in given if kind == "buffer") <= MAX_TRIAL_BYTES:
             launch = {"kernel": kernel.name, "size": _few(size, local), "local": local, "arguments": given}
             self._try(kernel.variant, kernel.name, f"{kernel.variant.digest} {kernel.name}{form}", {"launch": launch})
 
     def built(self, variant: Variant, salt: str) -> None:
-        """Note the salt that this process's own build of the text needed."""
+        """Record the salt that the build in this process needed."""
         self.known[variant.digest] = salt or self.known[variant.digest]
 
     def _try(self, variant: Variant, kernel: str, name: str, asked: Mapping[str, Any] = {}) -> None:
-        """Try a build, or the launch in `asked`, in the sandbox, unless the driver's record has its name."""
+        """Try a build, or the launch in `asked`, in the sandbox. Nothing happens if the driver's record has `name`."""
         if regardless():
             self.known.setdefault(name, "")
             if self.say is not None:
@@ -158,7 +159,7 @@ class KernelTrials:
             raise DriverError(self._failed[name])
         text = variant.anew(self.known.get(variant.digest, ""))
         answer = _process(self._index).ask({"build": asdict(text), **asked})
-        if answer.get("memory"):  # no fault of the driver, and the trial need not be repeated at every launch
+        if answer.get("memory"):  # not the driver's fault; the trial is not repeated
             driver_records.tell_once(
                 f"{self._device.name.strip()}: not enough memory to try every kernel in a process of its own before it "
                 "is used here"
@@ -166,10 +167,10 @@ class KernelTrials:
         elif trouble := answer.get("trouble"):
             trial = {**asked, "name": name, "build": {"stem": variant.stem, "options": variant.options}}
             error = self.fail(variant, kernel, trouble, trial, lasting=answer.get("lasting", True))
-            self._failed[name] = str(error)  # so that this process does not try it again
+            self._failed[name] = str(error)  # this process will not try it again
             raise error
         self.known[name] = str(answer.get("salt", ""))
-        if "salt" in answer:  # a launch refused with a reason is refused here as well
+        if "salt" in answer:  # not set if the compiler reports an error: it will do so here too
             driver_records.remember(self._device, self._shape, kernels={name: self.known[name]})
 
     def fail(
@@ -181,10 +182,10 @@ class KernelTrials:
         *,
         lasting: bool = True,
     ) -> DriverError:
-        """The error to raise for a failure.
+        """The error to raise for a failure of the driver.
 
         trial: the failed trial (`driver_records.Entry`), if there was one.
-        lasting: also record that the driver cannot be used in this shape.
+        lasting: also record the failure, so that the driver is not used in this shape again.
         """
         advice = f"CLSPLAT_DEVICE takes another device, {TRUST_DRIVER_VARIABLE}=1 goes on regardless"
         if lasting and not regardless():
@@ -194,7 +195,7 @@ class KernelTrials:
         return self.error(variant, kernel, f"{trouble}; {advice}")
 
     def error(self, variant: Variant, kernel: str, trouble: str) -> DriverError:
-        """The error to raise for trouble with a kernel file, or with a kernel in it."""
+        """The error to raise for a problem with a kernel file, or with a kernel in it."""
         text = _text(variant, kernel, trouble)
         return DriverError(f"{title(self._device)}, kernels in the shape {self._shape}: {text}")
 
@@ -206,7 +207,7 @@ def _text(variant: Variant, kernel: str, trouble: str) -> str:
 def again(index: int, trial: Mapping[str, Any]) -> str:
     """Repeat a failed trial (`driver_records.Entry.trial`) on the `index`-th device.
 
-    Returns the failure in words, or an empty string. A record that clsplat did not write may raise any exception.
+    Returns the failure in words, or an empty string. A trial that clsplat did not record may raise any exception.
     """
     build = trial["build"]
     variant = Variant(build["stem"], text_of(build["stem"]), tuple(build["options"]))
@@ -215,7 +216,7 @@ def again(index: int, trial: Mapping[str, Any]) -> str:
 
 
 def _few(size: tuple[int, ...], local: tuple[int, ...] | None) -> list[int]:
-    """The size of the launch along each axis, at most MAX_TRIAL_ITEMS, in whole groups."""
+    """Work-items along each axis of the launch to try: at most MAX_TRIAL_ITEMS, in whole groups."""
     groups = local or tuple(1 for _ in size)
     return [min(n, max(MAX_TRIAL_ITEMS // group, 1) * group) for n, group in zip(size, groups, strict=True)]
 

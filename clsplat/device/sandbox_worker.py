@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sandbox process: it tries kernels, so that a driver that aborts ends this process and not the caller's."""
+"""The sandbox process, which tries kernels. If the driver crashes, it ends this process and not the caller's."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from clsplat.errors import DriverError, KernelBuildError
 
 
 def _given(context: cl.Context, queue: cl.CommandQueue, kind: str, value: Any) -> Any:
-    """The argument that `_described` encoded, with buffers filled with zeros."""
+    """The kernel argument that `_described` encoded; a buffer is filled with zeros."""
     if kind == "local":
         return cl.LocalMemory(value)
     if kind != "buffer":
@@ -30,7 +30,7 @@ def _given(context: cl.Context, queue: cl.CommandQueue, kind: str, value: Any) -
 
 
 class _Stage:
-    """A device with a queue on which the worker tries kernels, and the kernels built on it."""
+    """The device on which the worker tries kernels, with a queue and the kernels built so far."""
 
     def __init__(self, device: cl.Device) -> None:
         self._device, self._context = device, cl.Context([device])
@@ -38,7 +38,7 @@ class _Stage:
         self._kernels: dict[str, dict[str, Any]] = {}
 
     def answer(self, message: dict[str, Any]) -> dict[str, Any]:
-        """Build, and launch if requested."""
+        """Build a kernel file, and launch a kernel if requested."""
         text = message["build"]
         variant = Variant(text["stem"], text["source"], tuple(text["options"]))
         try:
@@ -68,7 +68,7 @@ class _Stage:
 
 
 def _serve(index: int) -> None:
-    """Answer messages until the parent ends. If a driver hangs by then, end this process all the same."""
+    """Answer messages until the parent ends. This process then ends even if a driver hangs."""
     stage = None
     for line in sys.stdin:
         message = json.loads(line)

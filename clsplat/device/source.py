@@ -24,7 +24,8 @@ def kernel_root() -> Path:
 def kernel_source(stem: str) -> str:
     """The text of `stem`.cl, with each `#include "..."` (relative to the kernel root) inserted once.
 
-    The headers are inserted here rather than found by the compiler with `-I`, so that drivers' caches notice a change.
+    Drivers cache builds by the source text. So headers are inserted here, instead of by the compiler's `-I`, and their
+    changes are noticed.
     """
     seen: set[str] = set()
     lines: list[str] = []

@@ -15,17 +15,16 @@ from clsplat.device.context import Device
 from clsplat.errors import CapacityError
 
 UPLOAD_RING_SLOTS = 3
-"""Number of slots: one for the current work, one for the work queued behind it, and one for the array being
-uploaded."""
+"""Number of slots: for the array in use, for the array of the work queued next, and for the array being uploaded."""
 
 
 @dataclass(eq=False)
 class _Slot:
-    """Memory for one array on the device, and as much pinned memory on the host.
+    """Memory for an array on the device, and pinned memory of the same size on the host.
 
-    key: key of the array that the slot holds.
+    key: key of the array in the slot.
     arrived: event of the copy to the device.
-    used: event of the last work that was launched with the array.
+    used: event of the last launch that uses the array.
     """
 
     array: DeviceArray
@@ -37,7 +36,7 @@ class _Slot:
 
 
 class UploadRing:
-    """Memory for UPLOAD_RING_SLOTS arrays of at most `nbytes` each. Raises CapacityError if the device lacks the
+    """Memory for UPLOAD_RING_SLOTS arrays of at most `nbytes` each. Raises CapacityError if there is not enough
     memory."""
 
     def __init__(self, device: Device, nbytes: int) -> None:
@@ -52,7 +51,7 @@ class UploadRing:
         """The slots, in order of their last use; the least recently used is first."""
 
     def begin(self, key: object, values: NDArray[Any]) -> None:
-        """Start to upload an array for `take`, unless it is too large or its upload has already begun."""
+        """Start to upload an array, for `take`. Nothing happens if it is too large or its upload has already begun."""
         if values.nbytes > self.nbytes or any(slot.key == key for slot in self._slots):
             return
         done = cl.enqueue_marker(self._device.queue)
@@ -63,7 +62,7 @@ class UploadRing:
         slot = self._slots[0]
         self._touch(slot)
         if slot.arrived is not None:
-            slot.arrived.wait()  # waits until the slot's last upload has left the pinned memory
+            slot.arrived.wait()  # until the slot's last upload no longer reads the pinned memory
         host = slot.host[: values.nbytes].view(values.dtype).reshape(values.shape)
         host[...] = values
         slot.held, slot.key = DeviceArray(self._device, slot.array.buffer, values.shape, values.dtype), key
@@ -74,9 +73,9 @@ class UploadRing:
         self._device.calls.writes += 1
 
     def take(self, key: object) -> DeviceArray | None:
-        """The uploaded array with this key, for work launched from now on; None if it was not sent.
+        """The uploaded array with this key, for later launches; None if it was not uploaded.
 
-        It is valid until UPLOAD_RING_SLOTS - 1 other arrays have been sent or taken.
+        It is valid until UPLOAD_RING_SLOTS - 1 other arrays have been uploaded or taken.
         """
         for slot in self._slots:
             if slot.key == key and slot.arrived is not None:

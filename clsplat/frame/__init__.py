@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps between a rendered frame and its file: windows, filters, samples, warps, strips, deep slices."""
+"""Steps between the kernels and a frame's file: windows, filters, samples, warps, strips and deep pictures."""

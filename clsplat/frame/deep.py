@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Deep pictures: rendered by the kernels, averaged over samples of shutter and lens, and warped (docs/pictures.md).
 
-A `DrawDeep` renders the slices of a camera's picture as planes (bins, DEEP_FLOATS, H, W): red, green and blue,
-premultiplied by alpha; alpha; depth. All are 0 behind a pixel's last slice.
+A `DrawDeep` returns the slices of a camera's picture as planes (bins, DEEP_FLOATS, H, W): premultiplied red, green and
+blue, alpha, and depth. Pixels with fewer slices have zeros after the last slice.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from clsplat.stages.deep import DEEP_FLOATS
 from clsplat.stages.deep_merge import deep_merge, merge_bytes
 
 DrawDeep = Callable[[Camera], Float32]
-"""Function from a camera to the planes of its picture, which may be a view of another array."""
+"""Function from a camera to the planes of its picture. The planes may be a view of another array."""
 Convert = Callable[[Float32, Float32], Float32]
-"""Function from rgb (h, w, 3), and the alpha (h, w) that it is premultiplied by, to rgb in another space."""
+"""Function from premultiplied rgb (h, w, 3) and its alpha (h, w) to rgb in another colour space."""
 Weighted = tuple[Float32, Float32]
-"""Planes of a picture, and the weight of each of its pixels (H, W)."""
+"""Planes of a picture, and weights (H, W) of its pixels."""
 _MERGE_MEMORY_DIVISOR = 16
-"""A merge may use the device's memory limit divided by this. Rendering uses the rest."""
+"""The device's memory limit divided by this is the limit of a merge. Rendering uses the rest."""
 _WARP_BATCH_PIXELS = 1 << 14
-"""Number of pixels that are warped at once, which bounds the host's memory."""
+"""Number of pixels that are warped at a time, which limits the memory on the host."""
 
 
 def render_deep(renderer: Renderer, gaussians: Gaussians, camera: Camera, bins: int) -> Float32:
-    """Slices (bins, H, W, 5) of a camera's picture, which may be a window of its frame."""
+    """Slices (bins, H, W, 5) of a camera's picture. The camera may have a window."""
     larger, rows, columns = on_tiles(camera)
     return renderer.render_deep(gaussians, larger, bins)[:, rows, columns]
 
@@ -56,18 +56,18 @@ def drawn_in_slices(renderer: Renderer, gaussians: Callable[[], Gaussians], bins
 
 
 def deep_rows(device: Device, camera: Camera, bins: int, pictures: int = 1) -> int:
-    """Rows of a deep picture's strips, in whole tiles, for `bins` slices.
+    """Number of rows in the strips of a deep picture of `bins` slices, a multiple of the tile size.
 
-    pictures: number of pictures that each pixel is the mean of.
+    pictures: number of pictures that are averaged.
     """
     floats = DEEP_FLOATS * bins
     most = DEEP_STRIP_FLOATS if pictures == 1 else DEEP_MERGE_FLOATS // min(pictures, DEEP_PICTURES)
     pixels = min(most // floats, frame_pixels(device, planes=4 * floats))
-    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # with the padding of the first and last tile
+    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # padding of the first and last tile included
 
 
 def deep_in_strips(draw: DrawDeep, rows: Callable[[Camera], int]) -> DrawDeep:
-    """A DrawDeep that renders the same planes in strips.
+    """A DrawDeep that renders the planes in strips.
 
     rows: function from a camera to the number of rows of a strip.
     """
@@ -75,13 +75,13 @@ def deep_in_strips(draw: DrawDeep, rows: Callable[[Camera], int]) -> DrawDeep:
 
 
 def deep_converted(draw: DrawDeep, convert: Convert) -> DrawDeep:
-    """A DrawDeep of the same planes, with colours in another space."""
+    """A DrawDeep of the planes with colours in another colour space."""
 
     def drawn(camera: Camera) -> Float32:
         planes = np.array(draw(camera))
         alpha = planes[:, 3]
         there = alpha > 0
-        # plane by plane: a quarter faster than masking three planes at once
+        # plane by plane: a quarter faster than a mask over three planes
         rgb = np.stack([planes[:, channel][there] for channel in range(3)], axis=1)
         converted = convert(rgb[None], alpha[there][None])[0]
         for channel in range(3):
@@ -92,7 +92,7 @@ def deep_converted(draw: DrawDeep, convert: Convert) -> DrawDeep:
 
 
 class Merge:
-    """Averages deep pictures with a weight for each pixel. Colours have to be linear."""
+    """Function that averages deep pictures, with weights for each pixel. Colours must be linear."""
 
     def __init__(self, device: Device, bins: int) -> None:
         self.bins, self._device, self._work = bins, device, Workspace(device)
@@ -100,9 +100,9 @@ class Merge:
         self._pixels = max(limit // merge_bytes(DEEP_PICTURES, bins), TILE)
 
     def __call__(self, pictures: Iterable[Weighted]) -> Float32:
-        """The weighted mean of one or more pictures. The weights of a pixel add up to 1.
+        """The weighted mean of one or more pictures. For each pixel the sum of weights must be 1.
 
-        Pictures are merged in groups, and the results merged again, to limit the number of pictures in memory.
+        To limit memory, groups of pictures are merged, and then the results of these merges.
         """
         groups = list(self._groups(pictures))
         return groups[0][0] if len(groups) == 1 else self(groups)
@@ -127,9 +127,9 @@ class Merge:
 
 
 def deep_sampled(draws: Sequence[DrawDeep], cameras: Sequence[Camera], merge: Merge) -> DrawDeep:
-    """A DrawDeep of the mean over samples. The camera that is passed to it gives only size and window.
+    """A DrawDeep of the mean over samples. Of the camera that is passed to it, only size and window are used.
 
-    draws, cameras: for each sample, its DrawDeep and its camera of the whole frame.
+    draws, cameras: for each sample, a DrawDeep and a camera of the whole frame.
     """
 
     def blurred(camera: Camera) -> Float32:
@@ -141,10 +141,10 @@ def deep_sampled(draws: Sequence[DrawDeep], cameras: Sequence[Camera], merge: Me
 
 
 def deep_warped(draw: DrawDeep, warp: Warp, merge: Merge) -> DrawDeep:
-    """A DrawDeep of warped pictures. The camera that is passed to it gives only size and window.
+    """A DrawDeep of warped pictures. Of the camera that is passed to it, only size and window are used.
 
-    A pixel is the mean over `Warp.samples` by `Warp.samples` places, each a bilinear mix of the four pixels around. A
-    filter with negative weights would not give valid slices. Where nothing is seen, there are no slices.
+    A pixel is the mean over `Warp.samples` by `Warp.samples` positions, each interpolated bilinearly: the negative
+    weights of a cubic filter would give invalid slices. Pixels in which nothing is visible have no slices.
     """
 
     def bent(camera: Camera) -> Float32:
@@ -161,9 +161,9 @@ def deep_warped(draw: DrawDeep, warp: Warp, merge: Merge) -> DrawDeep:
 
 
 def _around(straight: Float32, places: Float64) -> Iterator[Weighted]:
-    """The four pixels around each place, with their bilinear weights.
+    """Yield the four pixels around each position, with their bilinear weights.
 
-    places: (h, samples, w, samples, 2), NaN where nothing is seen.
+    places: positions (h, samples, w, samples, 2), NaN where nothing is visible.
     """
     height, width = straight.shape[2:]
     samples = places.shape[1]

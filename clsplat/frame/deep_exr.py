@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Deep EXR: a pixel's samples are slices of the scene by depth, each with its alpha and premultiplied colour.
+"""Deep EXR files. The samples of a pixel are slices of the scene by depth, with premultiplied colour and alpha.
 
-Composited front to back, the samples give the flat picture, since the slices contain the Gaussians that the pixel
-blends. Each pixel has its own slices, at the depths where its light is absorbed (docs/pictures.md).
+The samples, composited front to back, give the flat picture. The slices of a pixel are at the depths where its light is
+absorbed (docs/pictures.md).
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from clsplat.images.frame_files import MAX_HALF_FLOAT, FrameFileHeader, deep_spe
 from clsplat.images.writing import write_rows
 
 _ENCODE_BATCH_PIXELS = 1 << 16
-"""Number of pixels that are encoded at once: few enough for the host's memory, enough rows for the encoder's
-threads."""
+"""Number of pixels that are encoded at a time, which limits the memory on the host and gives every thread of the
+encoder some rows."""
 
 
 def write_deep(
@@ -41,12 +41,11 @@ def write_deep(
     header: FrameFileHeader | None = None,
     convert: Convert | None = None,
 ) -> bool:
-    """Draw and write a deep scanline EXR, atomically, in strips of `rows` that bound the memory. Returns True if the
-    picture is empty.
+    """Draw and write a deep scanline EXR, atomically. Returns True if the picture is empty.
 
-    Channels are R, G, B, A, Z and ZBack. A pixel has at most `bins` slices, each stored as one sample at a single
-    depth. Colours are half or float, as `encoding` says, in the space to which `convert` converts; depths are float.
-    Raises InputError and ClsplatError in the cases of `images.frame_files.write_channels`.
+    Channels are R, G, B, A, Z and ZBack. A pixel has at most `bins` slices; each is a sample at a single depth. Colours
+    are half or float according to `encoding`, in the colour space of `convert`; depths are float. Strips of `rows` rows
+    limit the memory. Raises InputError and ClsplatError like `images.frame_files.write_channels`.
     """
     encoding, header = encoding or Encoding(), header or FrameFileHeader()
     if path.suffix.lower() != ".exr":
@@ -64,7 +63,7 @@ def write_deep(
                     counts, columns = _samples(some, convert, half=encoding.depth == "half")
                     seen.append(bool(counts.any()))
                     yield deep_data(folder / "rows.exr", counts, columns), len(counts)
-                del planes, some  # frees their memory before the next strip allocates
+                del planes, some  # frees the memory before the next strip
 
         write_rows(path, spec, "exr", pieces())
     return not any(seen)
@@ -73,14 +72,14 @@ def write_deep(
 def _samples(
     slices: Float32, convert: Convert | None, *, half: bool
 ) -> tuple[NDArray[np.int32], dict[str, NDArray[Any]]]:
-    """The number of samples of each pixel, and their values in the form that `deep_data` takes.
+    """The number of samples in each pixel, and the samples' values by channel, pixel after pixel.
 
     slices: planes of a few rows.
     """
     _, floats, height, width = slices.shape
     planes = np.ascontiguousarray(slices.swapaxes(0, 1)).reshape(floats, -1)
     counts = (slices[:, 3] > 0).sum(axis=0, dtype=np.int32)
-    # a pixel fills its first slices: sample k of pixel p is at k H W + p
+    # a pixel's slices are its first ones: sample k of pixel p is at k H W + p
     first = np.cumsum(counts.ravel(), dtype=np.int64) - counts.ravel()
     pixels = np.repeat(np.arange(height * width), counts.ravel())
     at = (np.arange(len(pixels)) - first[pixels]) * (height * width) + pixels

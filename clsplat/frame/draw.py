@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The type `Draw`, a function that renders channels of a camera's picture, and the Draw that uses the kernels."""
+"""The type `Draw`, a function that renders channels of a camera's picture, and the Draw that calls the kernels."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from clsplat.rendering.renderer import OBJECTS_PER_COVERAGE_PASS, Renderer
 from clsplat.stages.channels import Features
 
 Planes = dict[str, NDArray[Any]]
-"""Channels by name, (height, width) or (height, width, floats). rgb is composited over the background; over black, this
+"""Channels by name, (height, width) or (height, width, floats). rgb is composited over the background; over black, that
 is rgb premultiplied by alpha."""
 Draw = Callable[[Camera, Collection[str]], Planes]
 """Function from a camera and the names of channels to their planes."""
@@ -39,11 +39,12 @@ def drawn_by(
 ) -> Draw:
     """A Draw that renders with the kernels.
 
-    after, before: cameras of whole frames to which motion and backward motion lead.
-    cut: function from a camera to its surfaces in the frame's holdout; None without a holdout.
-    moved, earlier: Gaussians to which motion and backward motion lead; None if they stand still.
-    mattes: mattes by the names of their channels.
-    Planes need not be contiguous: the encoder, which may run in another thread, makes them so.
+    after, before: cameras of whole frames at the end of motion and of backward motion.
+    cut: function from a camera to the holdout surfaces in its picture; None without a holdout.
+    moved, earlier: Gaussians at the end of motion and of backward motion; None if they do not move.
+    mattes: mattes by channel name.
+
+    Planes may be non-contiguous. The encoder, which may run in another thread, makes them contiguous.
     """
 
     def draw(camera: Camera, names: Collection[str]) -> Planes:
@@ -79,7 +80,7 @@ def drawn_by(
 
 
 def in_two(light: Draw, rest: Draw) -> Draw:
-    """A Draw that takes the channels of light from one Draw, and the other channels from another."""
+    """A Draw that takes rgb and alpha from `light`, and the other channels from `rest`."""
 
     def draw(camera: Camera, names: Collection[str]) -> Planes:
         of_light, others = light_and_rest(names)
@@ -90,15 +91,15 @@ def in_two(light: Draw, rest: Draw) -> Draw:
 
 
 def feature_floats(names: Collection[str]) -> int:
-    """Floats per Gaussian that these channels are blended from, 0 for colour alone."""
+    """Floats per Gaussian that are blended for these channels; 0 for colour alone."""
     _, rest = light_and_rest(names)
     floats = Features.of(feature_names(rest)).floats if rest else 0
     return max(floats, OBJECTS_PER_COVERAGE_PASS) if any(name in CRYPTOMATTE_CHANNELS for name in names) else floats
 
 
 def on_tiles(camera: Camera) -> tuple[Camera, slice, slice]:
-    """A camera whose picture begins at a tile border of its frame, and the rows and columns of the wanted picture in
-    it."""
+    """A camera whose picture is extended to begin at a tile border of its frame; and the rows and columns of the
+    original picture in it."""
     if camera.window is None:
         return camera, slice(None), slice(None)
     left, top = camera.window.x % TILE, camera.window.y % TILE

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame's holdout, resampled for the pictures that are rendered: windows, strips and supersampled pictures."""
+"""A frame's holdout, resampled for the rendered pictures: windows, strips and supersampled pictures."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from clsplat.images.holdouts import Holdout, Surfaces
 
 
 class Cut:
-    """Cuts the surfaces of a camera's picture out of its frame's holdout.
+    """Function that returns the surfaces of a frame's holdout in a camera's picture.
 
-    The last result is cached, because all samples of a shutter or a lens show the same picture.
+    The last result is cached, because all samples of a shutter or lens have the same picture.
     """
 
     def __init__(self, holdout: Holdout) -> None:
@@ -21,9 +21,9 @@ class Cut:
         self._last: Surfaces | None = None
 
     def __call__(self, camera: Camera) -> Surfaces | None:
-        """The surfaces in the picture's pixels, with depths as the kernels measure them; None if there are none.
+        """The surfaces of each pixel of the picture, with depths as in the kernels; None if there are none.
 
-        Each pixel takes the surfaces of the holdout's pixel that contains it.
+        A pixel has the surfaces of the holdout's pixel that contains it.
         """
         window, holdout = camera.window, self._holdout
         x, y, across, down = (
@@ -43,7 +43,7 @@ class Cut:
 
     @property
     def goes_on(self) -> bool:
-        """True if there are surfaces at an edge of the frame beyond which the file has no pixels."""
+        """True if surfaces touch an edge of the frame, and the file has no pixels beyond this edge."""
         counts, (width, height) = self._holdout.surfaces.counts, self._holdout.size
         left, top = -self._holdout.x, -self._holdout.y
         right, bottom = left + width - counts.shape[1], top + height - counts.shape[0]

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Warps of a picture: where each of its pixels lies in a straight picture, by an STMap or by a photograph's lens.
+"""Warps: the position of each pixel of a distorted picture in a straight picture, by an STMap or a photograph's lens.
 
-The straight picture is rendered as far as these places reach, also beyond the frame. `warp` samples the warped picture
-from it.
+The straight picture is rendered as far as these positions reach, also beyond the frame. `warp` samples it.
 """
 
 from __future__ import annotations
@@ -20,36 +19,35 @@ from clsplat.images.stmap import StMap
 from clsplat.scenes.dataset import Lens
 
 MAX_BEYOND_EDGE_FRAMES = 1.0
-"""Largest distance of places beyond an edge of the straight frame, in frame sizes. Places farther out count as seeing
-nothing, because a map may have any value there."""
+"""Maximum distance of a position beyond an edge of the straight frame, in frame sizes. Farther out nothing is visible,
+because the values of a map may be arbitrary there."""
 PLACE_STEP_PX = 2.0**-20
-"""Places are rounded to multiples of this, in pixels, so that subtracting a window's corner causes no rounding
-error."""
+"""Positions are rounded to multiples of this, in pixels, so that subtraction of a window's corner is exact."""
 INTERPOLATION_MARGIN_PX = 2
-"""Number of pixels on each side of a place that its interpolation reads."""
+"""Number of pixels on each side of a position that the interpolation reads."""
 PROBE_GRID_SIDE = 33
-"""Number of places across and down at which a lens is sampled to find properties of the whole frame."""
+"""Number of positions across and down by which properties of the whole warp are estimated."""
 MAX_SINGLE_SAMPLE_PX = 1.25
-"""Size of a warped pixel, in straight pixels, up to which a single sample is taken."""
+"""Maximum size of a warped pixel, in straight pixels, for a single sample."""
 MAX_WARP_SAMPLES = 16
-"""Largest number of samples across a pixel, and down."""
+"""Maximum number of samples across a pixel, and down."""
 _HALF_PIXEL_STEPS = ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
 
 
 class Places(Protocol):
-    """A source of places: positions of warped pixels in a straight picture."""
+    """A mapping from positions in a warped picture to positions in a straight picture."""
 
     def size(self, frame: Camera) -> tuple[int, int]:
-        """Width and height of the warped frame that belongs to a straight frame."""
+        """Width and height of the warped frame for a straight frame."""
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """Positions (h, w, 2) in the straight frame that are seen at x (w,), y (h,) of the warped frame; NaN where
-        nothing is seen. All are in pixels."""
+        """Positions (h, w, 2) in the straight frame of the positions x (w,), y (h,) of the warped frame, all in pixels.
+        NaN where nothing is visible."""
 
 
 @dataclass(frozen=True, eq=False)
 class ByMap:
-    """Places from an STMap."""
+    """The mapping of an STMap."""
 
     stmap: StMap
 
@@ -65,9 +63,9 @@ class ByMap:
 
 @dataclass(frozen=True, eq=False)
 class ByLens:
-    """Places from a photograph's lens. The warped picture has the photograph's pixels.
+    """The mapping of a photograph's lens. The pixels of the warped picture are those of the photograph.
 
-    The straight frame is that of `Lens.bare`'s camera, at any size.
+    The straight frame is that of the camera of `Lens.bare`, at any size.
     """
 
     lens: Lens
@@ -87,7 +85,7 @@ class ByLens:
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """A straight frame, and the places of a warped frame's pixels in it.
+    """A straight frame, and the mapping to it from a warped frame.
 
     frame: camera of the whole straight frame.
     """
@@ -96,7 +94,7 @@ class Warp:
     frame: Camera
 
     def at(self, x: Float64, y: Float64) -> Float64:
-        """Places (h, w, 2), NaN also where they are too far outside the frame."""
+        """Positions (h, w, 2) in the straight frame; NaN where they are too far outside."""
         places = np.round(self.source.places(self.frame, x, y) / PLACE_STEP_PX) * PLACE_STEP_PX
         size = np.array([self.frame.width, self.frame.height])
         with np.errstate(invalid="ignore"):
@@ -107,15 +105,15 @@ class Warp:
 
     @property
     def shown(self) -> Camera:
-        """A camera of the warped frame's size. Only its size and window are valid, not its rays."""
+        """A camera that has the size of the warped frame. Only its size and window are valid, not its rays."""
         width, height = self.source.size(self.frame)
         return replace(self.frame, width=width, height=height)
 
     @cached_property
     def _grid(self) -> tuple[Float64, Float64]:
-        """Places (33, 33, 2) spread over the frame, and the distance (33, 33) between adjacent pixels' places.
+        """Positions (33, 33, 2) of pixels that are spread over the frame, and sizes (33, 33) of these pixels.
 
-        The distance is the larger of the distances across and down.
+        The size is the distance to the position of the next pixel, across or down, whichever is larger.
         """
         width, height = self.source.size(self.frame)
         x, y = ((np.arange(PROBE_GRID_SIDE) / (PROBE_GRID_SIDE - 1)) * (side - 1) + 0.5 for side in (width, height))
@@ -127,7 +125,7 @@ class Warp:
 
     @property
     def empty(self) -> float:
-        """Fraction of the frame in which nothing is seen."""
+        """Fraction of the frame in which nothing is visible."""
         return float(np.isnan(self._grid[0][:, :, 0]).mean())
 
     @cached_property
@@ -138,7 +136,7 @@ class Warp:
 
     @cached_property
     def clamp(self) -> float:
-        """`Window.clamp` of the straight frame, the same for all of its windows."""
+        """`Window.clamp` for all windows of the straight frame."""
         places = self._grid[0].reshape(-1, 2)
         if np.isnan(places).all():
             return JACOBIAN_CLAMP_HALF_FRAMES
@@ -147,10 +145,10 @@ class Warp:
         return max(JACOBIAN_CLAMP_HALF_FRAMES, float((2 * beyond / size).max()))
 
     def of_window(self, camera: Camera) -> tuple[Float64, Camera | None]:
-        """Places (k height, k width, 2) of the samples of a picture or of its window, and the straight window that
-        holds them.
+        """Positions (k height, k width, 2) of the samples of a picture, and the window of the straight frame that
+        contains them.
 
-        The window is None if nothing is seen.
+        The window is None if nothing is visible.
         """
         x, y = (camera.window.x, camera.window.y) if camera.window else (0, 0)
         samples = self.samples
@@ -167,7 +165,7 @@ class Warp:
 
 
 def distorted_places(lens: Lens, straight: Camera) -> Float64:
-    """Positions (height, width, 2), in the straight picture, of the pixels of the lens's picture; NaN where none."""
+    """Positions (height, width, 2) in the straight picture of the pixels of the distorted picture; NaN for none."""
     grid = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     rays = lens.cam_from_img(np.stack([axis.ravel() for axis in grid], axis=1))
     places = rays * (straight.fx, straight.fy) + (straight.cx, straight.cy)
@@ -175,7 +173,7 @@ def distorted_places(lens: Lens, straight: Camera) -> Float64:
 
 
 def undistorted_places(lens: Lens, straight: Camera) -> Float64:
-    """Positions (height, width, 2), in the lens's picture, of the pixels of the straight picture; NaN where none."""
+    """Positions (height, width, 2) in the distorted picture of the pixels of the straight picture; NaN for none."""
     x = (np.arange(straight.width) + 0.5 - straight.cx) / straight.fx
     y = (np.arange(straight.height) + 0.5 - straight.cy) / straight.fy
     across, down = np.meshgrid(x, y)

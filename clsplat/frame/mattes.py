@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Objects of a frame's mattes."""
+"""Mattes of a frame: masks of named objects."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Matte:
-    """Objects of a matte.
+    """The objects of a matte.
 
-    names: the name of each object.
-    owners: (n,), for each Gaussian the index of its object.
+    names: names of the objects.
+    owners: (n,), the index of each Gaussian's object.
     """
 
     names: tuple[str, ...]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All passes that make a frame: kernels, linear light, filter, samples, strips and warp, and last the file's colours.
+"""All passes that make a frame, always in the same order.
 
-The order is always the same. The kernels render in the model's colour space. The result is converted to linear light,
-filtered and averaged, and then converted to the output's space. A strip is a window of the picture, and goes through
-all passes on its own.
+The kernels render in the model's colour space. The result is converted to linear light, filtered, averaged over
+samples, and warped; at the end it is converted to the colour space of the file. A strip is a window of the picture, and
+goes through all passes by itself.
 """
 
 from __future__ import annotations
@@ -42,27 +42,27 @@ from clsplat.shots.shutter_times import sample_moments
 from clsplat.stages.holdout import held_bytes
 
 BLANK_COLOUR_TOLERANCE = 1e-6
-"""Largest difference from the background's colour at which a pixel counts as empty, since averages of equal samples are
-rounded."""
+"""Maximum difference from the background's colour at which a pixel counts as empty. It is not 0, because averages of
+equal samples are rounded."""
 
 
 DrawAt = Callable[[float], Draw]
-"""Function from a time, in frames from the frame, to the Draw at that time. The time is 0 if nothing moves."""
+"""Function from a time to the Draw at that time. The time is relative to the frame, in frames; 0 if nothing moves."""
 Pass = Callable[[DrawAt], DrawAt]
-"""One step in making a frame. It takes the Draw of the step before and returns its own."""
+"""A step in making a frame: a function from the Draw of the previous step to its own Draw."""
 
 
 @dataclass(frozen=True)
 class FrameRequest:
-    """A frame that a job's pipeline draws.
+    """A frame that the pipeline of a job draws.
 
-    at: function from a time, in frames from this frame, to the camera of the whole frame in its final size.
+    at: function from a time, relative to this frame in frames, to the camera of the whole frame in its final size.
     after, before: cameras of the next and the previous frame, for motion.
-    lens: warps the picture.
-    sampling: the sampling of this frame; None takes the job's.
-    cut: function from a camera to its surfaces in the frame's holdout, for every sample of the frame.
-    models: function from a time to the Gaussians; None takes the pipeline's own.
-    moved: Gaussians to which motion and backward motion lead; None if they stand still.
+    lens: the warp of the picture.
+    sampling: the sampling of this frame; None uses the job's.
+    cut: function from a camera to the holdout surfaces in its picture, for all samples of the frame.
+    models: function from a time to the Gaussians; None uses the pipeline's model.
+    moved: Gaussians at the end of motion and of backward motion; None if they do not move.
     """
 
     at: Callable[[float], Camera]
@@ -76,7 +76,7 @@ class FrameRequest:
 
 
 def at_each_time(apply: Callable[[Draw], Draw]) -> Pass:
-    """A pass that applies a function to the Draw of each time."""
+    """A pass that applies a function to the Draw of every time."""
     return lambda draw: lambda time: apply(draw(time))
 
 
@@ -87,7 +87,7 @@ def _at_its_samples(at: Callable[[float], Camera], sampling: SamplingConfig, dra
 
 
 class FramePipeline:
-    """Renders the frames of one job."""
+    """Renders the frames of a job."""
 
     def __init__(
         self,
@@ -103,7 +103,7 @@ class FramePipeline:
 
         recorded: the model's colour space (`colour.recorded_space`).
         background: colour of the background in that space; black if alpha is written.
-        mattes: mattes by the names of their channels.
+        mattes: mattes by channel name.
         Raises InputError for settings and colour spaces that are not compatible.
         """
         self.config = config or PictureConfig()
@@ -113,9 +113,9 @@ class FramePipeline:
         self._mattes = mattes or {}
 
     def draw(self, frame: FrameRequest) -> tuple[Draw, Callable[[Planes], Planes]]:
-        """The Draw of a frame, and the conversion of its planes to the file's colours, which needs no device.
+        """The Draw of a frame, and a function that converts its planes to the file's colours without the device.
 
-        The camera that is passed to the Draw gives only size and window, of the picture or of a strip.
+        Of the camera that is passed to the Draw, only size and window are used: those of the picture or of a strip.
         """
         draw = self._by_kernels(frame)
         for apply in self._passes(frame):
@@ -129,7 +129,7 @@ class FramePipeline:
     def _by_kernels(self, frame: FrameRequest) -> DrawAt:
         def draw_at(time: float) -> Draw:
             def draw(camera: Camera, names: Collection[str]) -> Planes:
-                gaussians = self._gaussians if frame.models is None else frame.models(time)  # when drawn, not before
+                gaussians = self._gaussians if frame.models is None else frame.models(time)  # not before it is drawn
                 cameras, mattes = (self._background, frame.after, frame.before), self._mattes
                 return drawn_by(self._renderer, gaussians, *cameras, frame.cut, *frame.moved, mattes)(camera, names)
 
@@ -138,7 +138,7 @@ class FramePipeline:
         return draw_at
 
     def _passes(self, frame: FrameRequest) -> list[Pass]:
-        """The passes of a frame in order, starting right after the kernels."""
+        """The passes of a frame after the kernels, in order."""
         sampling, framing = self._sampling(frame), self.config.framing
         passes: list[Pass] = []
         if self._in_light(frame):
@@ -154,12 +154,12 @@ class FramePipeline:
         return passes
 
     def _to_light(self, draw: Draw) -> Draw:
-        """The same picture in linear light."""
+        """Convert the picture to linear light."""
         colours = self.colours
         return lambda camera, names: converted(draw(camera, names), colours, colours.model, colours.light)
 
     def _in_strips(self, frame: FrameRequest, draw: Draw) -> Draw:
-        """The same picture in strips that leave memory for the model and its pairs."""
+        """Render the picture in strips that leave memory for the model and its pairs."""
         device, framing = self._renderer.device, self.config.framing
 
         def drawn(camera: Camera, names: Collection[str]) -> Planes:
@@ -169,9 +169,9 @@ class FramePipeline:
         return drawn
 
     def draw_deep(self, bins: int, frame: FrameRequest) -> tuple[DrawDeep, Convert, Callable[[Camera], int]]:
-        """Deep counterpart of `draw`: the DrawDeep, and the conversion of its colours to the file's.
+        """Like `draw` for deep pictures: the DrawDeep, and the function that converts its colours to the file's.
 
-        Also returns a function from a camera to the rows of its strips.
+        The third result is a function from a camera to the number of rows in its strips.
         """
         sampling, colours, device = self._sampling(frame), self.colours, self._renderer.device
         space = colours.light if self._in_light(frame) else colours.model
@@ -196,22 +196,22 @@ class FramePipeline:
         return draw, between(space, colours.output), rows
 
     def _with_ranks(self, planes: Planes) -> Planes:
-        """The same planes, with mattes in the form in which they are written."""
+        """The planes, with mattes in the form that is written to files."""
         return {
             name: ranked(plane, self._mattes[name].names) if name in self._mattes else plane
             for name, plane in planes.items()
         }
 
     def _sampling(self, frame: FrameRequest) -> SamplingConfig:
-        """Sampling of the frame if it has its own, else of the job."""
+        """The sampling of the frame if it has one, otherwise of the job."""
         return frame.sampling or self.config.sampling
 
     def _in_light(self, frame: FrameRequest) -> bool:
-        """True if the frame's pixels are means of several values, which must be averaged in linear light."""
+        """True if pixels of the frame are averages, which must be computed in linear light."""
         return self._sampling(frame).on or self.config.framing.supersample > 1 or frame.lens is not None
 
     def is_blank(self, planes: Planes, frame: FrameRequest) -> bool | None:
-        """True if planes of `draw`, before conversion, show only the background; None if no channel can tell."""
+        """True if the planes of `draw`, before conversion, show only the background; None if no channel tells it."""
         for name in ("alpha", "count", "depth"):
             if name in planes:
                 return not planes[name].any()
@@ -224,9 +224,9 @@ class FramePipeline:
 
 
 def converted(planes: Planes, colours: Colours, source: str, target: str) -> Planes:
-    """The same planes with rgb in another colour space.
+    """The planes with rgb in another colour space.
 
-    If alpha is present, rgb is divided by it for the conversion and multiplied again; without alpha, pixels are opaque.
+    If there is alpha, rgb is divided by it before the conversion and multiplied after; otherwise pixels are opaque.
     """
     if source == target or "rgb" not in planes:
         return planes

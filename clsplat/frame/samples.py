@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples that a frame is the mean of: over a pixel (supersampling), the shutter's time and the lens's area.
+"""Averages of a frame over samples: over the area of a pixel (supersampling), the time of the shutter, and the lens.
 
-Samples have fixed places, and samples of shutter and lens have equal weights. So rendering a frame again gives the same
-bits wherever it does so without samples. Light is averaged in linear values only. Channels that have no mean come from
-one sample.
+The positions of samples are fixed, and samples of shutter and lens have equal weights. So frames are as repeatable, to
+the last bit, as without samples. Only linear light is averaged. Channels that cannot be averaged come from a single
+sample.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
 
 
 def filter_taps(config: FramingConfig) -> NDArray[np.float32]:
-    """Weights of the samples across a pixel and its margins; symmetric, with a sum of 1."""
+    """Weights of the samples along a line across a pixel and its margins; symmetric, with a sum of 1."""
     samples, radius = config.supersample, _FILTER_RADII_PX[config.filter]
     margin = samples * _margin(config)
     at = (np.arange(-margin, samples + margin) + 0.5) / samples - 0.5
@@ -43,14 +43,14 @@ def filter_taps(config: FramingConfig) -> NDArray[np.float32]:
 
 
 def _margin(config: FramingConfig) -> int:
-    """Pixels beyond the picture that its filter reads."""
+    """Number of pixels beyond the picture's edge that the filter reads."""
     return int(np.ceil(_FILTER_RADII_PX[config.filter] - 0.5))
 
 
 def finer(camera: Camera, config: FramingConfig) -> Camera:
-    """The camera for rendering a supersampled picture: larger, with the margin that its filter reads.
+    """The camera of the picture to filter: `supersample` times larger, with the margin that the filter reads.
 
-    Raises InputError for a panorama with a filter wider than a pixel, since nothing lies beyond its edges.
+    Raises InputError for a panorama with a filter wider than a pixel, since a panorama has no pixels beyond its edges.
     """
     margin, samples = _margin(config), config.supersample
     if margin == 0:
@@ -62,10 +62,10 @@ def finer(camera: Camera, config: FramingConfig) -> Camera:
 
 
 def supersampled(draw: Draw, config: FramingConfig) -> Draw:
-    """rgb and alpha filtered from a frame `supersample` times larger; other channels at the original size.
+    """A Draw that filters rgb and alpha of a picture `supersample` times larger. Other channels are not filtered.
 
-    `draw` must give rgb in linear light, the only space in which light adds up. The order of summation does not depend
-    on the picture's place in its frame.
+    `draw` must return rgb in linear light, because only that may be averaged. The order of summation does not depend on
+    the position of the picture in its frame.
     """
     samples = config.supersample
     if samples == 1:
@@ -85,17 +85,14 @@ def supersampled(draw: Draw, config: FramingConfig) -> Draw:
 
 
 def lens_points(count: int) -> Float64:
-    """Points (count, 2) on the unit disc, each for an equal share of its area (Vogel's spiral)."""
+    """Points (count, 2) on the unit disc, evenly distributed (Vogel's spiral)."""
     index = np.arange(count)
     radius, angle = np.sqrt((index + 0.5) / count), GOLDEN_ANGLE * index
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
 def lens_radius(camera: Camera, config: SamplingConfig) -> float:
-    """Radius of the lens in scene units.
-
-    camera: camera of a whole frame.
-    """
+    """Radius of the lens in scene units. camera: camera of a whole frame."""
     if config.f_stop is None:
         return config.aperture or 0.0
     focal_length = camera.fx * (config.sensor_width or SENSOR_WIDTH_MM) / camera.width / 1000 / (config.metres or 1.0)
@@ -103,10 +100,10 @@ def lens_radius(camera: Camera, config: SamplingConfig) -> float:
 
 
 def through_lens(camera: Camera, x: float, y: float, focus: float) -> Camera:
-    """The camera from the point (x, y) of its lens, in scene units.
+    """The camera moved to a point (x, y) of its lens, in scene units.
 
-    It is sheared so that points at the depth `focus` stay in place in the picture. Raises InputError for a camera
-    without an image plane.
+    It is sheared so that points at depth `focus` do not move in the picture. Raises InputError for a camera without an
+    image plane.
     """
     if not camera.is_pinhole:
         raise InputError(f"depth of field is not defined for {camera.projection} cameras; use a perspective camera")
@@ -119,9 +116,9 @@ def through_lens(camera: Camera, x: float, y: float, focus: float) -> Camera:
 
 
 def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tuple[Camera, list[Camera]]:
-    """The camera at the middle of the shutter's time and of the lens, and one camera per sample, all of whole frames.
+    """The camera at the middle of shutter time and lens, and the camera of each sample, all of whole frames.
 
-    at: function from a time, in frames from the frame, to the camera, such as `Shot.at`.
+    at: function from a time, relative to the frame in frames, to the camera, such as `Shot.at`.
     A single sample has the camera at the middle.
     """
     middle = at(config.middle)
@@ -138,12 +135,12 @@ def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tup
 
 
 def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera], light: Callable[[int], Draw] | None = None) -> Draw:
-    """A Draw of rgb and alpha as the mean over the cameras. Other channels have no mean and come from the middle
-    camera.
+    """A Draw whose rgb and alpha are the mean over the cameras. Other channels cannot be averaged and come from the
+    middle camera.
 
-    middle, cameras: cameras of whole frames. The camera that is passed to the Draw gives only size and window.
-    light: the Draw of each sample, if it differs from `draw`.
-    `draw` must give rgb in linear light. Sums are float64, in the cameras' order.
+    middle, cameras: cameras of whole frames. Of the camera that is passed to the Draw, only size and window are used.
+    light: function from a sample's number to its Draw; None uses `draw` for all samples.
+    `draw` must return rgb in linear light. Sums are float64, in the order of the cameras.
     """
 
     def blurred(camera: Camera, names: Collection[str]) -> Planes:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames too large for the memory of the device or the host: rendered in strips, and written strip by strip."""
+"""Rendering in strips, for frames that are too large for the device's memory, and writing by strips, for the host's."""
 
 from __future__ import annotations
 
@@ -28,23 +28,25 @@ def strip_rows(
     config: FramingConfig | None = None,
     planes: int = 0,
 ) -> int:
-    """Rows of a strip, in whole tiles, that leaves room for the model and pairs; the picture's height if one is enough.
+    """Rows of a strip, a multiple of the tile size, such that memory is left for the model and its pairs.
 
-    names: names of the wanted channels.
+    This is the picture's height if it fits in a single strip.
+
+    names: names of the channels to render.
     config: the framing; with supersampling, rendered strips are larger than written strips.
-    planes: bytes per pixel in further planes.
+    planes: bytes per pixel of further planes.
     """
     samples = config.supersample if config else 1
     most = min(frame_pixels(device, feature_floats(names), planes), STRIP_PIXELS)
     across = -(-camera.width * samples // TILE) * TILE * samples
-    rows = most // across - 2 * TILE  # room for a window that begins within a tile, and for a filter's margins
+    rows = most // across - 2 * TILE  # for windows that begin inside a tile, and margins of a filter
     if rows >= camera.height:
         return camera.height
     return max(rows // TILE, 1) * TILE
 
 
 def strips(camera: Camera, rows: int) -> Iterator[Camera]:
-    """The picture in strips of at most `rows`, from the top. All but the last end at the frame's tile borders."""
+    """Cameras of the picture's strips, of at most `rows` rows, from the top. All but the last end at tile borders."""
     if rows >= camera.height:
         yield camera
         return
@@ -57,7 +59,7 @@ def strips(camera: Camera, rows: int) -> Iterator[Camera]:
 
 
 def in_strips(draw: Draw, rows: int) -> Draw:
-    """A Draw of the same channels in strips. Bounds the device's memory, not the host's."""
+    """A Draw that renders in strips. This limits the memory on the device, not on the host."""
 
     def drawn(camera: Camera, names: Collection[str]) -> Planes:
         parts = [draw(strip, names) for strip in strips(camera, rows)]
@@ -67,9 +69,9 @@ def in_strips(draw: Draw, rows: int) -> Draw:
 
 
 def check_parts(camera: Camera, encoding: Encoding, views: int = 1) -> None:
-    """Raise InputError for several parts or views: a file stores them one after the other, which strips cannot fill.
+    """Raise InputError for several parts or views: a file stores one after the other, so strips cannot be written.
 
-    views: number of views of a stereo pair in the file.
+    views: number of views in the file, 2 for a stereo pair.
     """
     if views > 1:
         raise InputError(
@@ -93,9 +95,9 @@ def write_in_strips(
 ) -> None:
     """Draw and write a picture strip by strip, atomically.
 
-    The bytes are the same as `write_channels` writes for the whole picture, except in formats whose layout depends on
-    how rows arrive. Raises InputError for channels that the format cannot hold, and for several parts (see
-    `check_parts`). Raises ClsplatError if writing fails.
+    The file has the bytes that `write_channels` writes for the whole picture, except in formats whose layout depends on
+    the number of rows that are written at a time. Raises InputError for channels that the format cannot store and like
+    `check_parts`. Raises ClsplatError if writing fails.
     """
     encoding, header, extension = encoding or Encoding(), header or FrameFileHeader(), path.suffix.lower()
     check_target(path, names)
@@ -107,5 +109,5 @@ def write_in_strips(
     if header.window is None:
         spec.full_height = camera.height
     pieces = chain(iter([first]), (pixels for pixels, _ in parts))
-    del first  # frees its memory before the third strip is drawn
+    del first  # frees the memory before the third strip is drawn
     write_rows(path, spec, extension[1:], ((pixels, len(pixels)) for pixels in pieces))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Warped pictures, sampled from straight ones at the places of their pixels (docs/pictures.md).
+"""Warped pictures, sampled from straight pictures at the positions that a `Warp` gives (docs/pictures.md).
 
-A window of a warped picture has the same pixels as the whole picture has there.
+The pixels of a window are the same as in the whole warped picture.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from clsplat.frame.draw import Draw, Planes
 from clsplat.frame.lens import Warp
 
 _SAMPLE_ROWS_PER_BATCH = 128
-"""Number of rows of samples that are taken at once, which bounds the host's memory."""
+"""Number of rows that are sampled at a time, which limits the memory on the host."""
 
 
 def warped(draw: Draw, warp: Warp) -> Draw:
-    """A Draw of warped pictures. The camera that is passed to it gives only size and window.
+    """A Draw of warped pictures. Of the camera that is passed to it, only size and window are used.
 
-    `draw` renders straight windows, with rgb in linear light. rgb and alpha are means over `Warp.samples` by
-    `Warp.samples` samples of a pixel, interpolated by Catmull and Rom's cubic. Other channels come from the nearest
-    pixel. Where nothing is seen, all values are 0, and ids -1.
+    `draw` renders windows of the straight frame, with rgb in linear light. rgb and alpha are means over `Warp.samples`
+    by `Warp.samples` samples per pixel, interpolated by the Catmull-Rom cubic. Other channels come from the nearest
+    pixel. Where nothing is visible, ids are -1 and all other values 0.
     """
 
     def bent(camera: Camera, names: Collection[str]) -> Planes:
@@ -44,7 +44,7 @@ def warped(draw: Draw, warp: Warp) -> Draw:
 
 
 def _taken(plane: NDArray[Any], places: Float64, samples: int, name: str) -> NDArray[Any]:
-    """Sample a plane (h, w) or (h, w, floats) at places (k rows, k columns, 2)."""
+    """Sample a plane (h, w) or (h, w, floats) at positions (k rows, k columns, 2)."""
     height, width = places.shape[0] // samples, places.shape[1] // samples
     channel = FRAME_CHANNELS.get(name)
     result = np.empty((height, width, *plane.shape[2:]), plane.dtype)
@@ -63,7 +63,7 @@ def _taken(plane: NDArray[Any], places: Float64, samples: int, name: str) -> NDA
 
 
 def nearest(plane: NDArray[Any], places: Float64, nothing: float = 0) -> NDArray[Any]:
-    """Values of the pixels that contain places (h, w, 2); `nothing` where a place is NaN."""
+    """Values of the pixels at positions (h, w, 2); `nothing` where a position is NaN."""
     there = ~np.isnan(places[:, :, 0])
     at = np.where(there[:, :, None], np.floor(places), 0).astype(np.int64)
     x, y = (np.clip(at[:, :, axis], 0, plane.shape[1 - axis] - 1) for axis in (0, 1))
@@ -73,15 +73,15 @@ def nearest(plane: NDArray[Any], places: Float64, nothing: float = 0) -> NDArray
 
 
 def cubic(plane: NDArray[Any], places: Float64) -> NDArray[Any]:
-    """Interpolate a plane at places by Catmull and Rom's cubic; 0 where a place is NaN.
+    """Interpolate a plane at positions by the Catmull-Rom cubic; 0 where a position is NaN.
 
-    The result is clamped to the range of the sixteen pixels around, so that it is never darker or brighter than these.
+    The result is clamped to the range of the sixteen pixels that are read.
     """
     there = ~np.isnan(places[:, :, 0])
     at = np.where(there[:, :, None], places, 0.5) - 0.5
     first = np.floor(at).astype(np.int64)
     weights = [_catmull_rom((at - first)[:, :, axis].astype(np.float32)) for axis in (0, 1)]
-    # a repeated border keeps the offsets between the sixteen pixels the same everywhere
+    # with a repeated border, the offsets of the sixteen pixels are the same everywhere
     edges = [(2, 2), (2, 2)] + [(0, 0)] * (plane.ndim - 2)
     padded = np.pad(np.asarray(plane, np.float32), edges, mode="edge")
     height, width = padded.shape[:2]
@@ -103,7 +103,7 @@ def cubic(plane: NDArray[Any], places: Float64) -> NDArray[Any]:
 
 
 def _catmull_rom(t: Float32) -> tuple[Float32, Float32, Float32, Float32]:
-    """Weights of the four pixels around a place at the distance t after the second pixel."""
+    """Weights of the four pixels around a position, which is at the distance t after the second pixel."""
     return (
         0.5 * t * (t * (2 - t) - 1),
         0.5 * (t * t * (3 * t - 5) + 2),

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Windows of a frame, the pixels that are rendered: overscan and region of interest.
+"""The part of a frame that is rendered, with overscan and region of interest.
 
-A picture is a window of its frame (`Camera.window`). Its pixels are bit-identical to the frame's pixels there
+A picture is a window of its frame (`Camera.window`). Its pixels are bit-identical to those of the whole frame
 (docs/pictures.md).
 """
 
@@ -15,7 +15,7 @@ from clsplat.errors import InputError
 
 
 def framed(camera: Camera, config: FramingConfig) -> Camera:
-    """The camera of the written picture, from a camera of the frame's size.
+    """The camera of the picture to write, from the camera of the whole frame.
 
     Its window is None if the picture is the whole frame. Raises InputError for a region outside the frame.
     """
@@ -39,13 +39,13 @@ def framed(camera: Camera, config: FramingConfig) -> Camera:
 
 
 def crop(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
-    """The part of a picture that begins at its pixel (x, y). It may extend beyond the picture."""
+    """The camera of a part of a picture, which begins at its pixel (x, y). It may extend beyond the picture."""
     window = camera.window or Window(0, 0, camera.width, camera.height)
     return replace(camera, width=width, height=height, window=replace(window, x=window.x + x, y=window.y + y))
 
 
 def reframed(camera: Camera, like: Camera) -> Camera:
-    """A camera of a whole frame, with the size and window of another camera, whose frame may be larger or smaller."""
+    """The camera of a whole frame, with the size and window of `like`, whose frame may be larger or smaller."""
     frame = like.window or like
     sized = camera if (camera.width, camera.height) == (frame.width, frame.height) else None
     sized = sized or camera.resized(frame.width, frame.height)

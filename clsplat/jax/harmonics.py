@@ -17,7 +17,7 @@ from clsplat.library.checks import check_shape
 def spherical_harmonics(
     degree: int, directions: jax.Array, coefficients: jax.Array, masks: jax.Array | None = None
 ) -> jax.Array:
-    """Evaluate real spherical harmonics in given directions, with gradients of directions and coefficients.
+    """Evaluate real spherical harmonics in given directions, differentiable in directions and coefficients.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def spherical_harmonics(
     coefficients : (..., K, 3) jax.Array
         K is at least (degree + 1)^2.
     masks : (...) jax.Array of bool, optional
-        Where it is False the result is 0.
+        False makes a result 0.
 
     Returns
     -------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calls from JAX programs to NumPy functions."""
+"""Calls of NumPy functions from JAX programs."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ import numpy as np
 
 SCHEDULABLE_CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 if SCHEDULABLE_CORES == 1:
-    # On one core XLA has one thread. A callback would block it while waiting for that same thread to copy its
+    # On a single core XLA has a single thread. A callback would block this thread, and wait for it to copy its
     # arguments. XLA reads NPROC when JAX makes its first array.
     os.environ.setdefault("NPROC", "2")
 
 
 def shape_like(array: Any) -> jax.ShapeDtypeStruct:
-    """Shape and dtype of an array that may be traced."""
+    """Shape and dtype of an array, which may be a tracer."""
     return jax.ShapeDtypeStruct(array.shape, array.dtype)
 
 
 def on_host(function: Callable[..., Any], shapes: Any, *arguments: Any) -> Any:
-    """Call a function of NumPy arrays from a JAX program. `vmap` calls it once for each element.
+    """Call a function of NumPy arrays from a JAX program. Under `vmap` it is called for each element.
 
-    shapes: a tree of jax.ShapeDtypeStruct with the structure of the function's result.
+    shapes: shapes and dtypes of the result, a tree of jax.ShapeDtypeStruct.
     """
 
     def called(*given: Any) -> Any:

@@ -26,7 +26,7 @@ from clsplat.library.rasterize import rasterize as rasterize_numpy
 from clsplat.stages.harmonics import MAX_SH_BASIS_DEGREE
 
 MAX_CACHED_FORWARD_PASSES = 8
-"""Maximum number of forward passes cached for their gradients. The gradient of an older pass repeats the pass."""
+"""Maximum number of forward passes that are kept for their gradients. The gradient of an older pass repeats it."""
 
 
 class Rasterized(NamedTuple):
@@ -93,7 +93,7 @@ def rasterize(
     means2d_probe: jax.Array | None = None,
     device: Device | str | None = None,
 ) -> Rasterized:
-    """Render Gaussians in a JAX program, with gradients of all arrays.
+    """Render Gaussians in a JAX program, differentiable in all arrays.
 
     Parameters
     ----------
@@ -106,10 +106,10 @@ def rasterize(
     backgrounds, covars : jax.Array, optional
         The arrays of `clsplat.rasterize`.
     absolute_gradients : bool
-        Let the gradient of means2d_probe be the sum over pixels of the absolute gradients of means2d.
+        Make the gradient of means2d_probe the sum over pixels of the absolute gradients with respect to `means2d`.
     means2d_probe : (C, N, 2) jax.Array, optional
-        An array of zeros, whose gradient is the loss's gradient with respect to `means2d`, for density control. Its
-        values are not used.
+        An array of zeros whose values are not used. Its gradient is the gradient with respect to `means2d`, for density
+        control.
     device : Device or str, optional
         An open OpenCL device, or a name as `clsplat devices` lists them. JAX's own devices are not used.
 
@@ -147,7 +147,7 @@ def rasterize(
     check_given(covars, quaternions, scales)
     floats = {name: jnp.asarray(array, jnp.float32) for name, array in arrays.items() if array is not None}
     for name, side in (("viewmats", 4), ("intrinsics", 3)):
-        if floats[name].shape == (side, side):  # one camera's matrix
+        if floats[name].shape == (side, side):  # the matrix of a single camera
             floats[name] = floats[name][None]
     if backgrounds is not None and floats["backgrounds"].shape == floats["colors"].shape[-1:]:
         floats["backgrounds"] = jnp.tile(floats["backgrounds"], (len(floats["viewmats"]), 1))
@@ -195,7 +195,7 @@ class StaticArguments:
     device: Device | str | None
 
     def run(self, arrays: dict[str, Any]) -> Rasterization:
-        """Call the NumPy function with arrays keyed by argument name. Arrays that are None are absent from the dict."""
+        """Call the NumPy function. arrays: by argument name, without arguments that are None."""
         return rasterize_numpy(
             arrays["means"],
             arrays.get("quaternions"),
@@ -222,7 +222,7 @@ class StaticArguments:
         )
 
     def shapes(self, arrays: dict[str, Any]) -> dict[str, jax.ShapeDtypeStruct]:
-        """Shapes and dtypes of the results. Raises InputError, which names the argument, for shapes that do not fit."""
+        """Shapes and dtypes of the results. Raises InputError for a wrong shape; it names the argument."""
         sizes = {name: array.shape for name, array in arrays.items()}
         checked_modes(self.render_mode, self.rasterize_mode, self.alpha_max)
         checked_planes(self.near_plane, self.far_plane, self.eps2d, self.radius_clip, self.camera_model)
@@ -269,7 +269,7 @@ class StaticArguments:
 
 
 class PendingForwards:
-    """Forward passes that wait for their gradient, keyed by a serial number."""
+    """Forward passes that wait for their gradient, by number."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -278,7 +278,7 @@ class PendingForwards:
         self._lock = threading.Lock()
 
     def add(self, result: Rasterization) -> np.int32:
-        """Store a pass, and drop the oldest if there are too many. Returns its number."""
+        """Store a pass, and return its number. If there are too many passes, the oldest is deleted."""
         with self._lock:
             number = next(self._numbers) % 2**31
             self._results[number] = result
@@ -287,7 +287,7 @@ class PendingForwards:
         return np.int32(number)
 
     def pop(self, number: int) -> Rasterization | None:
-        """Remove a pass and return it, or None if it is no longer there."""
+        """Remove and return a pass; None if it has been deleted."""
         with self._lock:
             return self._results.pop(number, None)
 
@@ -309,7 +309,7 @@ def _forward(call: StaticArguments, arrays: dict[str, Any]) -> Any:
     shapes = call.shapes(arrays)
 
     def run(arrays: dict[str, Any]) -> Any:
-        # copies, since the library reads its arrays until the gradient, and XLA reuses their memory earlier
+        # copies, since the gradient reads the arrays, and XLA may reuse their memory before
         result = call.run({name: np.array(array) for name, array in arrays.items()})
         return _results(result, shapes), _kept.add(result)
 

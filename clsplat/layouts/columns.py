@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The layouts that host and kernels share, declared once; kernels include them as `kernels/shared/layouts.h`.
+"""Layouts and constants that host and kernels share. Kernels include them as `kernels/shared/layouts.h`.
 
 `python -m clsplat.layouts.columns > kernels/shared/layouts.h` generates that file.
 """
@@ -18,25 +18,26 @@ LOSS_ROWS, LOSS_COLUMNS, LOSS_GROUP_ROWS, LOSS_GROUP_COLUMNS = 2, 640, 7, 54
 """Block sizes of the loss kernel.
 
 LOSS_ROWS: rows that a work-group of one item processes together, as their windows share pixels.
-LOSS_COLUMNS: maximum number of columns of such a work-group's block.
+LOSS_COLUMNS: maximum columns in a block of such a work-group.
 LOSS_GROUP_ROWS, LOSS_GROUP_COLUMNS: rows and columns of a block for a work-group of several items.
 
-Five fields of a block must fit in 32 KiB of local memory. A group's block has as many columns with its margins as parts
-(LOSS_PARTS), and its rows hold 63 runs of six pixels: nearly every part has work in both directions.
+Five fields of a block must fit in 32 KiB of local memory. In a group of several items, a block has LOSS_PARTS parts.
+For vertical windows these are its columns, margins included; for horizontal windows, 63 runs of six pixels. So nearly
+every part has work in both directions.
 """
 
 LOSS_PARTS = 64
-"""Parts of a block for a work-group of several items, and the most items of such a group: LOSS_GROUP_COLUMNS and five
-columns on either side."""
+"""Number of parts of a block in a work-group of several items, and maximum items of such a group. It is
+LOSS_GROUP_COLUMNS plus five columns on each side."""
 
 LOSS_RING = 16
-"""Rows of derivatives that a work-group of one item stores.
+"""Number of rows of derivatives that a work-group of one item stores.
 
-It is a power of two, and at least the window's 11 plus LOSS_ROWS - 1, rounded up to a multiple of LOSS_ROWS.
+It is a power of two and a multiple of LOSS_ROWS, and at least the window's 11 plus LOSS_ROWS - 1.
 """
 
 POSE_ROWS = 64
-"""Number of Gaussians whose contributions to the gradient of a camera's pose are summed sequentially."""
+"""Number of Gaussians whose terms of a pose gradient are added in sequence, before the sums are added."""
 
 _TRANSFORM = (
     *(f"R{row}{column}" for row in range(3) for column in range(3)),
@@ -58,8 +59,8 @@ In order:
 - HAND: 1, or -1 if the rotation is a reflection.
 - The first pixel in its frame (`Camera.window`).
 - A fisheye's coefficients, and the largest angle and distance from the axis that it shows.
-- _LOW: the errors of rounding the values of the first item to float32. With them a mean's place on the image is
-  accurate to 1e-6 pixels, and a needle's ellipse to 1e-4.
+- _LOW: the rounding errors of the first item's values in float32. With them, a mean on the image is accurate to
+  1e-6 pixels, and the ellipse of a needle to 1e-4.
 """
 
 _EWA_ROUNDED = (
@@ -80,17 +81,17 @@ In order:
 - The view matrix, which need not be a rotation; intrinsics; the limits of x/z and y/z in the Jacobian; the cofactors
   of the matrix's 3 x 3 part.
 - Near and far plane, the image's size, the low-pass in px^2, and the radius up to which Gaussians are culled.
-- _LOW: the errors of rounding the values of the first item to float32.
+- _LOW: the rounding errors of the first item's values in float32.
 """
 
 EWA_GRADIENT = _TRANSFORM
 """The fields of a camera with respect to which `kernels/ewa_grad.cl` computes gradients."""
 
 SUM_ROWS = 64
-"""How many neighbouring numbers a work-item of `kernels/sums.cl` sums."""
+"""Number of adjacent numbers that a work-item of `kernels/sums.cl` adds."""
 
 _SEEN = ("LOG2O", "RED", "GREEN", "BLUE", "DEPTH")
-"""The fields with the same meaning and place in SPLAT and RAY: blending reads them from either."""
+"""Fields that have the same meaning and position in SPLAT and RAY, so that blending can read both."""
 
 SPLAT = (
     *("PIXEL_X", "PIXEL_Y", "SUB_X", "SUB_Y", "L11", "L12", "L22"),
@@ -101,7 +102,7 @@ SPLAT = (
 
 In order:
 
-- The mean in whole pixels, and the remainder.
+- The mean in whole pixels, and the fraction of a pixel.
 - L11 to L22: the whitening W of docs/gradients.md times sqrt(log2(e) / 2), so that log2(alpha) = LOG2O - u^2 - v^2.
 - Log of the opacity, colour, camera depth.
 - Half extents in pixels of the ellipse where alpha is 1/255.
@@ -112,45 +113,45 @@ RAY = (
     *_SEEN,
     *("VY", "VZ", "COLUMNS", "ROWS"),
 )
-assert len(RAY) == len(SPLAT), "they share the array"
-assert all(RAY.index(name) == SPLAT.index(name) for name in _SEEN), "blending reads either"
-"""A projected Gaussian of an equirectangular or fisheye camera.
+assert len(RAY) == len(SPLAT), "both are stored in the same array"
+assert all(RAY.index(name) == SPLAT.index(name) for name in _SEEN), "blending reads both"
+"""A projected Gaussian of a camera model along rays, such as equirectangular or fisheye.
 
-F: the mean's direction.
+F: direction of the mean.
 U, V: a ray r in the camera has u = U.r / F.r and v = V.r / F.r, so that log2(alpha) = LOG2O - u^2 - v^2.
 DEPTH: the distance.
-COLUMNS, ROWS: the box in tiles, 16 bits each for the first and one past the last (kernels/shared/tile.h).
+COLUMNS, ROWS: the bounding box in tiles: 16 bits for the first tile, 16 for the end (kernels/shared/tile.h).
 """
 
 SLOT = ("G", "GU", "GV", "GUU", "GUV", "GVV", "RED", "GREEN", "BLUE", "ABSX", "ABSY")
-"""Partial gradients of one (tile, Gaussian) pair; the last two only with absolute gradients.
+"""Partial gradients of a (tile, Gaussian) pair. The last two exist only with absolute gradients.
 
-The sum of the blending weights follows if contributions are computed. The gradient with respect to nearness, 1 / depth,
-follows last if depths are compared (`kernels/shared/splat.h`: SLOT_WEIGHT, SLOT_NEAR).
+If contributions are computed, the sum of blending weights follows. If depths are compared, the gradient with respect to
+nearness, 1 / depth, is last (`kernels/shared/splat.h`: SLOT_WEIGHT, SLOT_NEAR).
 """
 
 SLOT_PLAIN = SLOT.index("ABSX")
 
 REFUSED = ("parameters", "gradients", "moments", "steps")
-"""Reasons for which adam.cl refuses and counts an element's step."""
+"""Reasons for which adam.cl does not update an element, and counts it."""
 
 COUNTED = ("VISIBLE", "PAIRS", "KEY_COMPLEMENT", "LARGEST_KEY")
 
 READBACK = (*COUNTED, "STOPPED", *(f"REFUSED_{reason.upper()}" for reason in REFUSED))
-"""Numbers that the host reads back from a forward pass in one copy.
+"""Numbers that the host reads back from a forward pass, in a single copy.
 
-VISIBLE, PAIRS: totals of visible Gaussians and of pairs.
+VISIBLE, PAIRS: numbers of visible Gaussians and of pairs.
 KEY_COMPLEMENT, LARGEST_KEY: the complement of the smallest depth key, and the largest depth key.
-STOPPED: 1 after a pass with BY_CAPACITY has stopped (duplicate.cl).
-REFUSED_*: the refused steps that `adam` has counted.
+STOPPED: 1 if a pass with BY_CAPACITY has stopped (duplicate.cl).
+REFUSED_*: numbers of elements that `adam` did not update, by reason.
 """
 
 
 DEEP_SLICE = ("RED", "GREEN", "BLUE", "ALPHA", "DEPTH")
-"""A pixel's slice of a deep picture: colour, premultiplied with alpha; alpha; and its depth."""
+"""A slice of a deep picture at a pixel: premultiplied colour, alpha, and depth."""
 
 DEEP_LEVELS = 64
-"""Number of levels of the slack s, (74) of docs/pictures.md, with which a pixel's slices are cut."""
+"""Number of values of the slack s, (74) of docs/pictures.md, that are tried for a pixel's slices."""
 
 DEEP_PICTURES = 16
 """Maximum number of deep pictures that are merged at once."""
@@ -161,8 +162,8 @@ class SlotFields:
     """Fields of a slot in addition to the plain gradients.
 
     absolute: absolute gradients (AbsGS).
-    contributions: the contribution to the image.
-    nearness: the gradient with respect to nearness (one over the depth).
+    contributions: the sum of blending weights.
+    nearness: the gradient with respect to nearness, 1 / depth.
     """
 
     absolute: bool = False

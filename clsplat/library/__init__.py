@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Differentiable rasterization of arrays: each stage of a view has a vector-Jacobian product."""
+"""Differentiable rasterization of arrays: each step from Gaussians to pixels has a vector-Jacobian product."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One camera's view of arrays of Gaussians: projection, colours and pixels, and the gradient back through them."""
+"""The pass of a camera over arrays of Gaussians: projection, colours and pixels, and the gradients of these."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from clsplat.stages.harmonics import (
 )
 
 MIN_EXPECTED_DEPTH_ALPHA = np.float32(1e-10)
-"""Smallest alpha by which an expected depth is divided. It avoids a division by zero in empty pixels."""
+"""Lower limit of the alpha by which an expected depth is divided. It avoids a division by zero in empty pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +75,12 @@ class Given:
 
     @property
     def channels(self) -> int:
-        """D, the number of blended values of a Gaussian without its depth."""
+        """D, the number of values of a Gaussian that are blended, not counting its depth."""
         return int(self.colors.shape[-1])
 
     @property
     def by_camera(self) -> bool:
-        """True if each camera has colours of its own."""
+        """True if colors are given for each camera."""
         return self.colors.ndim == (3 if self.sh_degree is None else 4)
 
     def colors_of(self, camera: int) -> Float32:
@@ -95,7 +95,7 @@ def check_coefficients(sh_degree: int, found: int) -> None:
 
 
 class Gradients:
-    """Gradients of the arrays of a call, summed over the views."""
+    """Gradients with respect to the arguments of a call, summed over its cameras."""
 
     def __init__(self, given: Given, device: Device) -> None:
         self.given = given
@@ -108,7 +108,7 @@ class Gradients:
         self.intrinsics: list[Float64] = []
 
     def sh(self, device: Device) -> tuple[DeviceArray, bool]:
-        """The device array for a view's SH gradient, and True if it already holds the sum of earlier views."""
+        """The device array for the SH gradient of a camera, and True if it already holds the sum of earlier cameras."""
         given = self.given
         add = bool(self.coefficients) and not given.by_camera
         if not add:
@@ -116,7 +116,7 @@ class Gradients:
         return self.coefficients[-1].array, add
 
     def by_name(self, *, cameras: bool) -> dict[str, Any]:
-        """The gradients on the host, under the argument names of `rasterize`."""
+        """The gradients on the host, by the names of the arguments of `rasterize`."""
         found = {name: one.get() for name, one in self.room.hosted.items()}
         if self.given.shapes.covariance_layout == "full":
             found["covars"] = full_gradient(found["covars"])
@@ -138,8 +138,8 @@ class PassSettings:
     mode: one of RASTERIZE_RENDER_MODES.
     alpha_max: the cap of alpha.
     compensated: multiply opacities by the compensation for the low-pass filter.
-    absolute: also sum absolute gradients over pixels.
-    differentiable: prepare for a gradient.
+    absolute: also compute sums over pixels of absolute gradients.
+    differentiable: keep data by which the gradient is faster.
     """
 
     mode: str
@@ -151,9 +151,9 @@ class PassSettings:
 
 @dataclass(frozen=True, eq=False)
 class ViewGradients:
-    """Gradients with respect to one view's projected Gaussians, on the host. None counts as 0.
+    """Gradients with respect to a camera's projected Gaussians, on the host. None counts as 0.
 
-    on_image: with respect to the arrays of `Ewa` except the compensations, keyed by their names.
+    on_image: with respect to the arrays of `Ewa` except the compensations, by name.
     opacities: (N,), with respect to the compensated opacities.
     colors: (N, D), with respect to the blended colours.
     """
@@ -164,9 +164,9 @@ class ViewGradients:
 
 
 class CameraPass:
-    """One camera's view of the Gaussians. It keeps the device memory for its gradient until it is dropped.
+    """The pass of one camera over the Gaussians. It keeps the device memory for its gradient until it is deleted.
 
-    index: number of the camera.
+    index: index of the camera.
     background: (D,), or None.
     """
 
@@ -196,7 +196,7 @@ class CameraPass:
                 harmonics(device, self._harmonics, self._colours.array)
             factors = self.compensations
             self.opacities: Float32 = given.opacities.copy() if factors is None else given.opacities * factors
-            """(N,), after compensation. A copy, so that the caller may change the array."""
+            """(N,), after compensation. A copy, as the caller may change its array."""
             splats, blended = self.projected.arrays, self.opacities if settings.compensated else covers
             flat = (splats.means2d, splats.conics, blended, self._values(), splats.depths, splats.radii)
             view = (screen_gaussians(device, *flat), (camera.width, camera.height), self._behind(background))
@@ -204,20 +204,20 @@ class CameraPass:
         self._has_background = background is not None
 
     def _values(self) -> Float32 | DeviceArray:
-        """(N, X): the blended values, with the depth last."""
+        """(N, X): the values to blend, with the depth last."""
         if not self.with_depth:
             return self._colours.array if isinstance(self._colours, Hosted) else self._colours
         depths = self.depths[:, None]
         return np.concatenate([self.colors, depths], axis=1) if self.with_colours else depths
 
     def _behind(self, background: Float32 | None) -> Float32 | None:
-        """(X,): the background, 0 for the depth channel."""
+        """(X,): the background, whose depth is 0."""
         if background is None or not self.with_colours:
             return None
         return np.append(background, np.float32(0)) if self.with_depth else np.ascontiguousarray(background)
 
     def splats(self, name: str) -> NDArray[Any]:
-        """An array of the projection, by its name in `Ewa`."""
+        """A result of the projection, by its name in `Ewa`."""
         with self._session.lock:
             return self.projected.get(name)
 
@@ -233,7 +233,7 @@ class CameraPass:
 
     @property
     def colors(self) -> Float32:
-        """(N, D): the blended values without the depth."""
+        """(N, D): the values to blend, without the depth."""
         if not isinstance(self._colours, Hosted):
             return self._colours
         with self._session.lock:
@@ -255,7 +255,7 @@ class CameraPass:
         return image
 
     def pixel_gradients(self, d_image: ArrayLike, d_alpha: ArrayLike | None) -> dict[str, Float32]:
-        """Gradients of this view for `Rasterization.vjp_pixels`."""
+        """The gradients of this camera that `Rasterization.vjp_pixels` returns."""
         shape = (self._camera.height, self._camera.width)
         by_image = gradient("d_images", d_image, self.image.shape)
         assert by_image is not None, "`Rasterization.vjp_pixels` passes one for each camera"
@@ -285,7 +285,7 @@ class CameraPass:
         return found
 
     def add_gradients(self, gradients: Gradients, by: ViewGradients, *, cameras: bool) -> None:
-        """Add to `gradients` the gradients of the arguments, from the gradients `by` of the projected Gaussians."""
+        """Add this camera's gradients to `gradients`. by: the gradients with respect to the projected Gaussians."""
         session, given, device = self._session, self._given, self._session.device
         on_image, compensations = by.on_image, self.compensations
         if by.opacities is not None:
@@ -313,9 +313,9 @@ class CameraPass:
     def _colours_back(
         self, gradients: Gradients, d_means: DeviceArray, by_colour: Float32 | None, *, cameras: bool
     ) -> DeviceArray | None:
-        """Add the gradients of the SH coefficients, and of the means through the viewing directions.
+        """Add the gradients with respect to the SH coefficients, and to the means through the viewing directions.
 
-        Returns the gradient of the camera's centre if `cameras` is set.
+        Returns the gradient with respect to the camera's centre if `cameras` is True.
         """
         session, count = self._session, self._given.count
         if self._harmonics is None:

@@ -28,7 +28,7 @@ def floats(name: str, values: Any, *shapes: Shape) -> Float32:
         flat = result.reshape(-1)
         finite = np.isfinite(flat @ flat) or bool(
             np.isfinite(flat).all()
-        )  # the dot product is faster than isfinite, but may overflow
+        )  # a dot product is faster than isfinite, but may overflow
     if not finite:
         at = np.unravel_index(int(np.argmin(np.isfinite(result))), result.shape)
         place = ", ".join(str(int(index)) for index in at)
@@ -37,9 +37,9 @@ def floats(name: str, values: Any, *shapes: Shape) -> Float32:
 
 
 def gradient(name: str, values: Any, shape: tuple[int, ...]) -> Float32 | None:
-    """The gradient of an output as a C-contiguous float32 array of that output's shape, or None.
+    """The gradient with respect to an output, as a C-contiguous float32 array of the output's shape; None stays None.
 
-    Raises InputError like `floats`, but accepts NaN and infinite numbers.
+    Raises InputError like `floats`, except that NaN and infinite numbers are accepted.
     """
     if values is None:
         return None
@@ -52,18 +52,18 @@ def gradient(name: str, values: Any, shape: tuple[int, ...]) -> Float32 | None:
 def matrices(name: str, given: Any, side: int, count: int | str) -> Float64:
     """(count, side, side) float64, from one matrix or several. Raises InputError like `floats`."""
     floats(name, given, (count, side, side), (side, side))
-    array: Float64 = np.array(given, np.float64)  # a copy: the caller may change its array before the gradient
+    array: Float64 = np.array(given, np.float64)  # a copy: the caller may change the array later
     return array.reshape(-1, side, side)
 
 
 def plain(given: Any) -> Any:
-    """The Python number in an array or tensor with one element. Any other argument is returned unchanged."""
+    """The Python number in an array or tensor with a single element. Other arguments are returned unchanged."""
     one = hasattr(given, "item") and prod(getattr(given, "shape", (0,))) == 1
     return given.item() if one else given
 
 
 def whole(given: Any) -> int | None:
-    """An integer from an integer, a whole float (40.0), or an array or tensor with such an element; else None."""
+    """The integer value of an integer, a float such as 40.0, or an array or tensor with one such element; else None."""
     number = plain(given)
     if isinstance(number, bool) or not isinstance(number, (int, float)) or number != number // 1:
         return None
@@ -71,7 +71,7 @@ def whole(given: Any) -> int | None:
 
 
 def sizes(name: str, given: Any, count: int) -> list[int]:
-    """A length in pixels for each of `count` cameras, from one length or one per camera. Raises InputError."""
+    """Lengths in pixels for `count` cameras, from one length for all or one for each. Raises InputError."""
     each = [whole(size) for size in ([given] * count if np.ndim(given) == 0 else given)]
     lengths = [size for size in each if size is not None and 0 < size < 2**24]
     if not len(lengths) == len(each) == count:

@@ -43,8 +43,8 @@ class HarmonicColors:
         Returns
         -------
         dict
-            float32 arrays: "directions" (..., 3) and "coefficients" (..., K, 3). Both are zero where the mask is False;
-            coefficients above the degree have zero gradients too.
+            float32 gradients "directions" (..., 3) and "coefficients" (..., K, 3). They are zero where the mask is
+            False, and for coefficients above the degree.
 
         Raises
         ------
@@ -59,7 +59,7 @@ class HarmonicColors:
             device = session.device
             by_directions, by_sh = hosted(device, given.directions.shape), hosted(device, given.sh.shape)
             d_colours = from_host(device, values.reshape(-1, 3))
-            colours = given.directions  # a placeholder: the kernel reads colours only for a camera's directions
+            colours = given.directions  # not read: the kernel needs colours only if directions are from a camera
             gradients = HarmonicsGradients(by_sh.array, by_directions.array)
             harmonics_grad(device, session.scratch, given, colours, d_colours, gradients)
             batch = self.colors.shape[:-1]
@@ -77,7 +77,7 @@ def spherical_harmonics(
     *,
     device: Device | str | None = None,
 ) -> HarmonicColors:
-    """Evaluate real spherical harmonics in given directions, with the conventions of gsplat's function of this name.
+    """Evaluate real spherical harmonics in given directions, with the conventions of gsplat's `spherical_harmonics`.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def spherical_harmonics(
     sh = floats("coefficients", coefficients, (*batch, "K", 3))
     used = (degree + 1) ** 2
     if sh.shape[-2] < used:
-        raise InputError(f"coefficients: got {sh.shape[-2]} of them, expected {used} or more for degree {degree}")
+        raise InputError(f"coefficients: got {sh.shape[-2]}, expected {used} or more for degree {degree}")
     mask = None if masks is None else _mask(masks, batch)
     session = session_of(device)
     with session.lock:
@@ -131,7 +131,7 @@ def spherical_harmonics(
 
 
 def _mask(masks: ArrayLike, batch: tuple[int, ...]) -> NDArray[np.int32]:
-    """The masks as one axis of integers, 1 where a colour is evaluated. Raises InputError."""
+    """The masks, flattened to one axis of integers: 1 where a colour is evaluated. Raises InputError."""
     shown = np.asarray(masks)
     if shown.shape != batch:
         raise InputError(f"masks: got shape {shown.shape}, expected {batch}")

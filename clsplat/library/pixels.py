@@ -30,9 +30,9 @@ Array = NDArray[Any] | DeviceArray
 
 @dataclass(frozen=True, eq=False)
 class Listed:
-    """Projected Gaussians in the lists of an image's tiles.
+    """Projected Gaussians, and the lists of Gaussians in an image's tiles.
 
-    first_slots: (n,), the slot at which each Gaussian's pairs begin.
+    first_slots: (n,), the first slot of each Gaussian.
     """
 
     projected: Projected
@@ -48,9 +48,9 @@ class PixelGradients:
     conics: (n, 3).
     opacities: (n,).
     colours: (n, D).
-    absolute: (n, 2), sums over pixels of the absolute gradients of means2d, or None.
+    absolute: (n, 2), sums over pixels of the absolute gradients with respect to means2d, or None.
 
-    `Hosted.array` is the array on the device, `Hosted.get` copies it to the host.
+    `Hosted.array` is the array on the device; `Hosted.get` returns it on the host.
     """
 
     means2d: Hosted
@@ -61,10 +61,10 @@ class PixelGradients:
 
 
 class ListedPixels:
-    """An image from lists of projected Gaussians. It keeps the device memory for its gradient until it is dropped.
+    """An image from projected Gaussians and tile lists. Until it is deleted, it keeps memory for its gradient.
 
-    listing: function that fills the tile lists, in arrays of the workspace that it is called with.
-    The other arguments are the same as in `PixelPass`.
+    listing: function that makes the tile lists, in arrays of the workspace that it is given.
+    The other arguments are those of `PixelPass`.
     """
 
     def __init__(
@@ -96,18 +96,18 @@ class ListedPixels:
             if depth > SPLAT_VALUES:
                 rows = (listed.projected, gaussians.values, self._background, blended)
                 values(capped, ValuePass(listed.lists, *rows), self._image.array)
-            # host memory must live until the device is done
+            # host memory must live until the device has finished
             device.under_way.append((gaussians, self._background, self._image, self._alpha))
 
     @property
     def image(self) -> Float32:
-        """(H, W, D): the image over the background, the same memory each time. Waits for the device."""
+        """(H, W, D): the image over the background; not a copy. Waits for the device."""
         with self._session.lock:
             return self._image.get()
 
     @property
     def alpha(self) -> Float32:
-        """(H, W): alpha, 0 to 1, the same memory each time. Waits for the device."""
+        """(H, W): alpha, 0 to 1; not a copy. Waits for the device."""
         with self._session.lock:
             return self._alpha.get()
 
@@ -122,11 +122,11 @@ class ListedPixels:
     ) -> dict[str, Float32]:
         """Compute the vector-Jacobian product.
 
-        d_image: (H, W, D), the loss's gradient with respect to the image.
+        d_image: (H, W, D), the gradient of the loss with respect to the image.
         d_alpha: (H, W), with respect to alpha; None means 0.
-        absolute: also sum absolute gradients.
+        absolute: also compute sums over pixels of absolute gradients.
         Returns means2d (n, 2), conics (n, 3), opacities (n,), colours (n, D), and background (D,) if there is one.
-        With `absolute` it also returns absolute (n, 2): the sums over pixels of the absolute gradients of means2d.
+        With `absolute` also absolute (n, 2): sums over pixels of the absolute gradients with respect to means2d.
         """
         found = self.gradient_on_device(d_image, d_alpha, absolute=absolute)
         with self._session.lock:
@@ -136,7 +136,7 @@ class ListedPixels:
         return arrays
 
     def background_gradient(self, d_image: NDArray[Any]) -> Float32:
-        """(D,): the loss's gradient with respect to the background."""
+        """(D,): the gradient of the loss with respect to the background."""
         left = np.float32(1) - self.alpha
         by_row = np.matmul(left[:, None, :], np.asarray(d_image, np.float32))  # (H, 1, D)
         by_background: Float32 = by_row.sum(axis=(0, 1), dtype=np.float64).astype(np.float32)
@@ -145,9 +145,9 @@ class ListedPixels:
     def gradient_on_device(
         self, d_image: NDArray[Any], d_alpha: NDArray[Any] | None = None, *, absolute: bool = False
     ) -> PixelGradients:
-        """Compute the arrays of `gradient`, without background, and leave them on the device.
+        """Compute the arrays of `gradient`, except for the background, and leave them on the device.
 
-        The arguments must not change before the device is done.
+        The arguments must not change before the device has finished.
         """
         session, gaussians, listed = self._session, self._gaussians, self._listed
         n, depth = gaussians.count, gaussians.width
@@ -184,13 +184,13 @@ class ListedPixels:
 
 
 class PixelPass(ListedPixels):
-    """One camera's pixels from projected Gaussians. It keeps the device memory for its gradient until it is dropped.
+    """The image of a camera from projected Gaussians. It keeps the device memory for its gradient until it is deleted.
 
     gaussians: Gaussians on the session's device. Their values must not change before the last `gradient`.
     size: width and height, pixels.
     background: (D,) float32, or None for black.
     alpha_max: the cap of alpha, below 1.
-    backward: True if `gradient` will probably be called, which is then faster.
+    backward: True keeps data by which `gradient` is faster.
 
     A Gaussian contributes to a pixel if its alpha there is at least 1/255. Blending ends before the Gaussian that would
     leave a transmittance of 1e-4 or less. A Gaussian is culled if its mean is over 1e9 pixels away, or if a or c of
@@ -216,13 +216,13 @@ class PixelPass(ListedPixels):
 def screen_gaussians(
     device: Device, means2d: Array, conics: Array, opacities: Array, colours: Array, depths: Array, radii: Array
 ) -> ScreenGaussians:
-    """Projected Gaussians on the device, from device or host arrays. Callers hold the session's lock.
+    """Projected Gaussians on the device, from device or host arrays. The caller must hold the session's lock.
 
     means2d: (n, 2), pixels; the first pixel's centre is at 0.5.
     conics: (n, 3), a, b, c of the inverse covariance.
     opacities: (n,), 0 to 1.
     colours: (n, D), D at least 1.
-    depths: (n,), the sort key; ties are sorted by index.
+    depths: (n,), by which Gaussians are sorted, ties by index.
     radii: (n, 2) int32; a radius of 0 culls the Gaussian.
 
     C-contiguous float32 host arrays are not copied.
@@ -232,12 +232,12 @@ def screen_gaussians(
 
 
 def placed(device: Device, array: Array, dtype: DTypeLike = np.float32) -> DeviceArray:
-    """A device array unchanged, or a host array on the device, without a copy if possible."""
+    """The array on the device: a device array unchanged, a host array without a copy if possible."""
     return array if isinstance(array, DeviceArray) else from_host(device, np.asarray(array, dtype))
 
 
 def listed_by_depth(device: Device, work: Workspace, gaussians: ScreenGaussians, width: int, height: int) -> Listed:
-    """Fill the tile lists of an image, each from front to back. Waits for the device. Raises CapacityError."""
+    """Make the tile lists of an image, each front to back. Waits for the device. Raises CapacityError."""
     projected = splats(device, work, gaussians, width, height)
     counted = count(device, work, projected)
     most = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS_PER_BAND)

@@ -30,15 +30,15 @@ from clsplat.stages.ewa import (
 )
 
 _PROJECTED_ARRAY_WIDTHS = {"means2d": 2, "depths": None, "conics": 3, "compensations": None}
-"""Outputs that have gradients, and how many numbers each has per Gaussian; None for a scalar."""
+"""Outputs that have gradients, and the length of their last axis; None for one number per Gaussian."""
 
 
 class ProjectedView:
-    """Gaussians projected to one camera's image. It keeps the device memory for its gradient until it is dropped.
+    """Gaussians projected to a camera's image. It keeps the device memory for its gradient until it is deleted.
 
     gaussians: arrays on the session's device, which must not change before the last `gradient`.
 
-    `arrays` has the results on the device. Callers hold the session's lock.
+    `arrays` has the results on the device. The caller must hold the session's lock.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class ProjectedView:
         ewa(device, gaussians, self._camera, self.arrays)
 
     def get(self, name: str) -> NDArray[Any]:
-        """One of the results on the host, by its name in `Ewa`; the same memory each time. Waits for the device."""
+        """A result on the host, by its name in `Ewa`; not a copy. Waits for the device."""
         return self._hosted[name].get()
 
     def gradient(
@@ -71,7 +71,7 @@ class ProjectedView:
 
 
 def image_gradients(device: Device, by: Mapping[str, Float32]) -> EwaImageGradients:
-    """Gradients on the device, from host arrays keyed by their names in `Ewa`."""
+    """Gradients on the device, from host arrays by their names in `Ewa`."""
 
     def at(name: str) -> DeviceArray | None:
         return from_host(device, by[name]) if name in by else None
@@ -80,14 +80,14 @@ def image_gradients(device: Device, by: Mapping[str, Float32]) -> EwaImageGradie
 
 
 class HostedGradients(NamedTuple):
-    """Gradients of Gaussians: device arrays for `EwaGradients`, and their host copies, keyed by argument name."""
+    """Gradients with respect to Gaussians: the device arrays, and their host copies by argument name."""
 
     arrays: EwaGradients
     hosted: dict[str, Hosted]
 
 
 def hosted_gradients(device: Device, count: int, *, covariances: bool) -> HostedGradients:
-    """Allocate gradients of `count` Gaussians."""
+    """Allocate gradients for `count` Gaussians."""
     means = hosted(device, (count, 3))
     if covariances:
         covars = hosted(device, (count, 6))
@@ -138,16 +138,16 @@ class Projection:
         Parameters
         ----------
         means2d, depths, conics, compensations : array_like, optional
-            Gradients of the loss with respect to the outputs, of the outputs' shapes. None means 0. A conic has
-            three numbers a, b, c: its b counts once.
+            Gradients of the loss with respect to the outputs, in their shapes. None means 0. The entry b of a conic
+            fills two places of a matrix, but counts as one variable.
 
         Returns
         -------
         dict
-            float32 gradients, keyed by argument name: "means" (N, 3); "quaternions" (N, 4) and "scales" (N, 3), or
-            "covars" in the given shape. Also "viewmats" (C, 4, 4), the numbers of whose first three rows are treated as
-            independent, and "intrinsics" (C, 3, 3) for fx, fy, cx and cy. Culled Gaussians have no gradient. In covars
-            (N, 6) an off-diagonal number has its whole gradient; in (N, 3, 3) each of its two places has half of it.
+            float32 gradients by argument name: "means" (N, 3); "quaternions" (N, 4) and "scales" (N, 3), or "covars" in
+            the given shape; "viewmats" (C, 4, 4), where all entries of the first three rows count as independent
+            variables; "intrinsics" (C, 3, 3) for fx, fy, cx and cy. Gradients of culled Gaussians are zero. In covars
+            (N, 6), an off-diagonal entry has its whole gradient; in (N, 3, 3), each of its two places has half.
 
         Raises
         ------
@@ -203,7 +203,7 @@ def fully_fused_projection(
     opacities: ArrayLike | None = None,
     device: Device | str | None = None,
 ) -> Projection:
-    """Project Gaussians to the images of C cameras, with the conventions of gsplat's function of this name.
+    """Project Gaussians to the images of C cameras, with the conventions of gsplat's `fully_fused_projection`.
 
     Parameters
     ----------
@@ -288,16 +288,16 @@ def checked_cameras(
     height: int | Sequence[int],
     planes: CameraPlanes,
 ) -> list[EwaCamera]:
-    """The cameras of viewmats (C, 4, 4) and intrinsics (C, 3, 3), or of one (4, 4) and one (3, 3).
+    """The cameras of viewmats (C, 4, 4) and intrinsics (C, 3, 3), or the camera of (4, 4) and (3, 3).
 
-    width, height: pixels; one number for all cameras, or one for each.
+    width, height: pixels; a number for all cameras, or one for each.
     Raises InputError, which names the argument.
     """
     poses = matrices("viewmats", viewmats, 4, "C")
     count = len(poses)
     lenses = matrices("intrinsics", intrinsics, 3, count)
     if len(lenses) != count:
-        raise InputError(f"intrinsics has {len(lenses)} matrices, expected {count}, one for each of viewmats")
+        raise InputError(f"intrinsics has {len(lenses)} matrices, expected {count}, one for each matrix of viewmats")
     if not (lenses[:, [0, 1], [0, 1]] != 0).all():
         raise InputError("intrinsics: a focal length is 0, expected numbers other than 0")
     listed = zip(poses, lenses, sizes("width", width, count), sizes("height", height, count), strict=True)
@@ -328,7 +328,7 @@ def checked_planes(
 
 
 def check_given(covars: object, quaternions: object, scales: object) -> None:
-    """Raise InputError unless there are either covars, or quaternions and scales. It names the argument."""
+    """Raise InputError unless either covars, or quaternions and scales, are given. It names the argument."""
     if covars is None and (quaternions is None or scales is None):
         missing = "quaternions" if quaternions is None else "scales"
         raise InputError(f"{missing} is None, expected an array unless covars is given")
@@ -338,9 +338,9 @@ def check_given(covars: object, quaternions: object, scales: object) -> None:
 
 @dataclass(frozen=True, eq=False)
 class GivenShapes:
-    """The checked shapes of n Gaussians: quaternions (n, 4) and scales (n, 3), or covariances (n, 6).
+    """Checked quaternions (n, 4) and scales (n, 3) of Gaussians, or covariances (n, 6).
 
-    covariance_layout: layout of the caller's covariances, "upper" for (n, 6) or "full" for (n, 3, 3); empty for none.
+    covariance_layout: layout of the caller's covariances: "upper" for (n, 6), "full" for (n, 3, 3), or empty.
     """
 
     quaternions: Float32 | None = None
@@ -375,15 +375,15 @@ class GivenShapes:
 
 
 def full_gradient(upper: Float32) -> Float32:
-    """Gradients of all nine numbers of symmetric matrices, from the gradients of their upper triangles."""
+    """Gradients with respect to all nine entries of symmetric matrices, from those of their upper triangles."""
     halves = upper * np.array([1, 0.5, 0.5, 1, 0.5, 1], np.float32)
     return np.asarray(halves[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3), np.float32)
 
 
 def stacked(arrays: list[NDArray[Any]], each: NDArray[Any] | None = None) -> NDArray[Any]:
-    """Stack one array per camera. A single camera's array is not copied.
+    """Stack the arrays of the cameras. The array of a single camera is not copied.
 
-    each: an array with the shape and dtype of each camera's, for calls that may have no camera.
+    each: an example of such an array, from which shape and dtype are taken if there are no cameras.
     """
     if len(arrays) == 1:
         return arrays[0][None]

@@ -20,15 +20,15 @@ from clsplat.library.session import session_of
 from clsplat.rendering.build_flags import DEFAULT_ALPHA_MAX
 
 RASTERIZE_RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-"""Colour, depth, expected depth, and colour with either depth. The depth is the last channel."""
+"""Colour, depth, expected depth, and colour followed by one of the depths."""
 RASTERIZE_FILTER_MODES = ("classic", "antialiased")
 
 
 class Rasterization:
     """Images of C cameras, and the projected Gaussians, on the host.
 
-    The first access to an array waits for the device. The object holds device memory for the vector-Jacobian products
-    until it is dropped. In every array, rows of Gaussians that are not visible are 0.
+    The first access to an array waits for the device. The object keeps device memory for the vector-Jacobian products
+    until it is deleted. In every array, rows of Gaussians that are not visible are 0.
 
     Attributes
     ----------
@@ -119,10 +119,10 @@ class Rasterization:
         Returns
         -------
         dict
-            float32 gradients: "means2d" (C, N, 2); "conics" (C, N, 3), whose b counts once; "opacities" (C, N), after
-            compensation. Also "colors2d" (C, N, D); "depths" (C, N) if the images have depth; "backgrounds" (C, D)
-            if they were given. Also "absolute" (C, N, 2) with `absolute_gradients`: sums over pixels of absolute
-            gradients of means2d.
+            float32 gradients: "means2d" (C, N, 2); "conics" (C, N, 3), whose entry b counts as one variable;
+            "opacities" (C, N), after compensation; "colors2d" (C, N, D); "depths" (C, N) if the images have depth;
+            "backgrounds" (C, D) if they were given; with `absolute_gradients` also "absolute" (C, N, 2), sums over
+            pixels of absolute gradients with respect to means2d.
 
         Raises
         ------
@@ -162,8 +162,9 @@ class Rasterization:
         -------
         dict
             "means" (N, 3); "quaternions" (N, 4) and "scales" (N, 3), or "covars" in the given shape; "opacities" (N,);
-            "colors" in the given shape, all float32. With `cameras` also float64 "viewmats" (C, 4, 4), the numbers of
-            whose first three rows are treated as independent, and "intrinsics" (C, 3, 3) for fx, fy, cx and cy.
+            "colors" in the given shape, all float32. With `cameras` also float64 "viewmats" (C, 4, 4), where all
+            entries of the first three rows count as independent variables, and "intrinsics" (C, 3, 3) for fx, fy, cx
+            and cy.
 
         Raises
         ------
@@ -281,7 +282,7 @@ def rasterize(
     intrinsics : (C, 3, 3) or (3, 3) array_like
         Pixels.
     width, height : int or sequence of int
-        Pixels; one number for all cameras, or one for each.
+        Pixels; a number for all cameras, or one for each.
     near_plane, far_plane : float
         World units. Gaussians whose depth is not strictly between these are not drawn.
     radius_clip : float
@@ -305,8 +306,8 @@ def rasterize(
     absolute_gradients : bool
         Also compute sums of the absolute gradients of means2d.
     differentiable : bool
-        False if only images are needed; it saves time and memory. A gradient can still be computed, with the same
-        bits, but takes longer.
+        False saves time and memory if only images are needed. A gradient can still be computed, with the same bits, but
+        takes longer.
     device : Device or str, optional
         An open device, or a name as `clsplat devices` lists them.
 
@@ -344,7 +345,7 @@ def rasterize(
 
 
 def _backgrounds(given: ArrayLike | None, count: int, channels: int) -> list[Float32 | None]:
-    """The background (D,) of each camera, from one or several. Raises InputError."""
+    """The background (D,) of each camera, from one for all or one for each. Raises InputError."""
     if given is None:
         return [None] * count
     rows = floats("backgrounds", given, (count, channels), (channels,))

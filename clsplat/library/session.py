@@ -19,13 +19,13 @@ from clsplat.rendering.build_flags import kernel_defines
 
 _PAIR_ARRAY_NAMES = ("ranges", "gaussian_from_sorted", "slot_from_sorted", "cells_from_sorted")
 BACKWARD_ARRAY_NAMES = frozenset(("splats", "tile_counts", "first_slots", "transmittance", "stops", *_PAIR_ARRAY_NAMES))
-"""Arrays of a forward pass that its gradient reads; each pass has its own. Passes share all other arrays."""
+"""Names of the arrays of a forward pass that its gradient reads. Each pass has its own; all other arrays are shared."""
 MAX_IDLE_WORKSPACES = 4
-"""Largest number of workspaces of finished passes that are kept for later passes."""
+"""Maximum number of workspaces of deleted passes that are kept for later passes."""
 
 
 class PassWorkspace(Workspace):
-    """The arrays of one pass that its gradient reads; other arrays are in the session's workspace."""
+    """The arrays of a pass that its gradient reads. Other arrays are in the session's workspace."""
 
     def __init__(self, device: Device, scratch: Workspace) -> None:
         super().__init__(device)
@@ -34,16 +34,16 @@ class PassWorkspace(Workspace):
     def array(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
     ) -> DeviceArray:
-        """An array by its name. Those of BACKWARD_ARRAY_NAMES are this workspace's own; others are the scratch's."""
+        """The array of this name: of this workspace if in BACKWARD_ARRAY_NAMES, otherwise of the shared workspace."""
         if name in BACKWARD_ARRAY_NAMES:
             return super().array(name, shape, dtype, kept=kept)
         return self._scratch.array(name, shape, dtype, kept=kept)
 
 
 class LibrarySession:
-    """A device and its working memory. Calls come from one thread at a time, which holds the `lock`.
+    """A device and its working memory. Only the thread that holds the `lock` may use it.
 
-    Kernels, their arguments and the scratch arrays are shared by all calls, in the order of the device's queue.
+    All calls share kernels and scratch arrays. This is safe, as the device's queue runs in order.
     """
 
     def __init__(self, device: Device) -> None:
@@ -53,20 +53,18 @@ class LibrarySession:
         self._idle: list[PassWorkspace] = []
 
     def workspace(self, owner: object) -> PassWorkspace:
-        """A workspace for a pass. When `owner` is garbage-collected, later passes may use the workspace."""
+        """A workspace for a pass. When `owner` is deleted, later passes may use the workspace."""
         with self.lock:
             work = self._idle.pop() if self._idle else PassWorkspace(self.device, self.scratch)
         finalize(owner, self._take_back, work).atexit = False
         return work
 
     def _take_back(self, work: PassWorkspace) -> None:
-        if len(self._idle) < MAX_IDLE_WORKSPACES:  # append is atomic: no lock, as a finalizer runs in any thread
+        if len(self._idle) < MAX_IDLE_WORKSPACES:  # no lock: append is atomic, and a finalizer may run in any thread
             self._idle.append(work)
 
     def capped(self, alpha_max: float) -> Device:
-        """The device with kernels that cap alpha at this value, for blending and its gradient. Other kernels ignore the
-        cap.
-        """
+        """The device, with this cap of alpha in the kernels of blending and its gradient."""
         defines = kernel_defines(RasterizerConfig(), alpha_max=alpha_max)
         return self.device.with_switches(defines) if defines else self.device
 
@@ -88,11 +86,9 @@ def _named(selector: str | None, _variables: tuple[str | None, ...]) -> LibraryS
 def session_of(device: Device | str | None = None) -> LibrarySession:
     """The session of an open device, or of the device that a string selects (see `clsplat devices`).
 
-    There is one session per device.
-
-    Raises DeviceError.
+    Each device has one session. Raises DeviceError.
     """
     if isinstance(device, Device):
         return _session(device)
-    # the variables are part of the cache's key; listing all drivers again takes as long as projecting 500,000 Gaussians
+    # cached, as listing the devices takes as long as projecting 500,000 Gaussians; the variables may change the list
     return _named(device, tuple(os.environ.get(name) for name in _DEVICE_CHOICE_VARIABLES))

@@ -26,7 +26,7 @@ from clsplat.stages.splats import ScreenGaussians, splats
 
 @dataclass(frozen=True, eq=False)
 class RasterizedPixels:
-    """Blended images, one per set of tile lists.
+    """Blended images, one for each set of tile lists.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class RasterizedPixels:
         colors, alphas : array_like, optional
             Gradients of the loss with respect to the attributes of these names. None means 0.
         absolute : bool
-            Also sum the absolute gradients of means2d over the pixels.
+            Also compute sums over pixels of the absolute gradients with respect to means2d.
 
         Returns
         -------
@@ -108,7 +108,7 @@ def rasterize_to_pixels(
     Parameters
     ----------
     means2d : (..., N, 2) array_like
-        Pixels; the first pixel's centre is at 0.5. Packed: (M, 2), and M replaces ..., N below.
+        Pixels; the first pixel's centre is at 0.5. In packed arrays, here and below, M replaces "..., N".
     conics : (..., N, 3) array_like
         a, b, c of the inverse covariance, 1 / px^2.
     colors : (..., N, D) array_like
@@ -122,7 +122,7 @@ def rasterize_to_pixels(
     isect_offsets : (..., tile_height, tile_width) array_like of int
         Start of each tile's list in flatten_ids.
     flatten_ids : (pairs,) array_like of int
-        Indices of Gaussians, counted over all images; front to back in each list.
+        Indices of Gaussians, counted over all images. In each list they are front to back.
     backgrounds : (..., D) array_like, optional
         Black if None.
     masks : (..., tile_height, tile_width) array_like of bool, optional
@@ -172,9 +172,9 @@ def rasterize_to_pixels(
 
 @dataclass(frozen=True, eq=False)
 class _GivenSplats:
-    """Checked splats, their leading axes flattened to one: (rows, 2), (rows, 3), (rows, D) and (rows,).
+    """Checked splats, with leading axes flattened to one: (rows, 2), (rows, 3), (rows, D) and (rows,).
 
-    batch: the leading sizes of the arguments; the last is N.
+    batch: the sizes of the leading axes; the last is N.
     """
 
     batch: tuple[int, ...]
@@ -197,7 +197,7 @@ class _GivenSplats:
 
     @property
     def depth(self) -> int:
-        """D, the number of values per splat."""
+        """D, the number of values of a splat."""
         return int(self.colors.shape[1])
 
     def rows(self, own: slice) -> _GivenSplats:
@@ -208,20 +208,20 @@ class _GivenSplats:
 
 @dataclass(frozen=True, eq=False)
 class _ImageLists:
-    """The tile lists of one image: the start and the length of each list in `gaussians`, the array of listed rows."""
+    """The tile lists of an image: where each list starts in `gaussians`, its length, and `gaussians`, the rows."""
 
     begins: Int64
     counts: Int64
     gaussians: Int64
 
     def from_row(self, first: int) -> _ImageLists:
-        """The lists with rows counted from `first`."""
+        """The lists with `first` subtracted from all rows."""
         return _ImageLists(self.begins, self.counts, self.gaussians - first)
 
 
 @dataclass(frozen=True, eq=False)
 class _GivenLists:
-    """Checked tile lists of all images: the start of each list (..., tile_height, tile_width) in `ids` (pairs,)."""
+    """Checked tile lists of all images: where each list (..., tile_height, tile_width) starts in `ids` (pairs,)."""
 
     offsets: Int64
     ids: Int64
@@ -239,11 +239,11 @@ class _GivenLists:
 
     @property
     def images(self) -> tuple[int, ...]:
-        """The leading sizes of the offsets. Their product is the number of images."""
+        """The sizes of the offsets' leading axes. Their product is the number of images."""
         return self.offsets.shape[:-2]
 
     def of_image(self, image: int, shown: NDArray[np.bool_]) -> _ImageLists:
-        """The lists of one image, empty where a tile is not shown."""
+        """The lists of one image; the list of a masked tile is empty."""
         tiles = prod(self.offsets.shape[-2:])
         flat, end = self.offsets.reshape(-1), (image + 1) * tiles
         starts = np.append(flat[end - tiles : end], flat[end] if end < len(flat) else len(self.ids))
@@ -290,7 +290,7 @@ def _pixels(
 def _listed(
     device: Device, work: Workspace, gaussians: ScreenGaussians, lists: _ImageLists, size: tuple[int, int]
 ) -> Listed:
-    """Convert the caller's lists to the form that `library.pixels.listed_by_depth` returns."""
+    """Convert the caller's lists to the result of `library.pixels.listed_by_depth`."""
     drawn, listed = splats(device, work, gaussians, *size, listed=True), lists.gaussians
     by_gaussian = np.bincount(listed, minlength=gaussians.count)
     slots = np.empty(len(listed), np.uint32)
@@ -304,12 +304,12 @@ def _listed(
 
 
 def _shapes_of(values: ArrayLike, last: int) -> list[tuple[int | str, ...]]:
-    """The shape (..., N, last) with as many axes as the array has."""
+    """The expected shape (..., N, last), with the same number of axes as the array."""
     return [(*(f"axis {axis}" for axis in range(max(np.ndim(values) - 1, 1))), last)]
 
 
 def _lists(isect_offsets: ArrayLike, flatten_ids: ArrayLike, tiles: tuple[int, int], count: int) -> tuple[Int64, Int64]:
-    """The lists as integers. Raises InputError if they do not fit the number of tiles and Gaussians."""
+    """The lists as integers. Raises InputError if they do not match the numbers of tiles and Gaussians."""
     offsets, ids = np.asarray(isect_offsets), np.asarray(flatten_ids)
     if offsets.ndim < 2 or offsets.shape[-2:] != tiles or offsets.dtype.kind not in "iu":
         wanted = f"integers (..., {tiles[0]}, {tiles[1]})"
@@ -336,7 +336,7 @@ def _masks(masks: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.bool_]
 
 
 def _own_of(listed: Int64, batch: tuple[int, ...], image: int) -> slice:
-    """The rows of one image's Gaussians. In packed arrays, the range of rows that the image's lists contain."""
+    """The rows of an image's Gaussians; in packed arrays, the range of the rows in the image's lists."""
     if len(batch) > 1:
         return slice(image * batch[-1], (image + 1) * batch[-1])
     return slice(int(listed.min()), int(listed.max()) + 1) if len(listed) else slice(0, 0)

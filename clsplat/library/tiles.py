@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lists of the tiles that projected Gaussians reach, with the conventions of gsplat's functions of these names."""
+"""Lists of the tiles that projected Gaussians reach: functions with the names and conventions of gsplat's."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from clsplat.errors import InputError
 from clsplat.library.checks import floats, whole
 
 ISECT_ID_DEPTH_BITS = 32
-"""Low bits of an id, which hold the depth as a float32."""
+"""Number of low bits of an id, which hold the depth as a float32."""
 
 
 def isect_tiles(
@@ -28,7 +28,7 @@ def isect_tiles(
     image_ids: ArrayLike | None = None,
     n_images: int | None = None,
 ) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]]:
-    """List the (tile, Gaussian) pairs whose tile overlaps the Gaussian's box: its mean plus and minus the radii.
+    """List the (tile, Gaussian) pairs in which the tile overlaps the Gaussian's bounding box, its mean +- its radii.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def isect_tiles(
     tiles_per_gauss : (..., N) or (M,) int32
         Number of tiles of each Gaussian; 0 if one of its radii is not above 0.
     isect_ids : (pairs,) int64
-        From the high bits down: the image, the tile in row-major order, the 32 bits of the depth.
+        From high to low bits: the image, the tile in row-major order, and the 32 bits of the depth.
     flatten_ids : (pairs,) int32
         Index of the Gaussian, counted over all images.
 
@@ -92,7 +92,7 @@ def isect_tiles(
 def _tiles_of_boxes(
     means: Float32, reach: Float32, tile_size: int, tiles: tuple[int, int]
 ) -> tuple[Int64, Int64, Int64]:
-    """The number of tiles of each Gaussian's box, and the Gaussian and the tile of each pair.
+    """The number of tiles in each Gaussian's bounding box, then the Gaussian and the tile of each pair.
 
     tiles: number of tiles across and down.
     """
@@ -143,7 +143,7 @@ def isect_offset_encode(isect_ids: ArrayLike, n_images: int, tile_width: int, ti
 
 
 def _lengths(**given: int) -> list[int]:
-    """The arguments as integers. Raises InputError if one is not an integer of at least 1."""
+    """The arguments as integers. Raises InputError unless all are integers of at least 1."""
     found = [whole(value) for value in given.values()]
     lengths = [length for length in found if length is not None and length >= 1]
     if len(lengths) < len(found):
@@ -152,7 +152,7 @@ def _lengths(**given: int) -> list[int]:
 
 
 def _batched(*row: int | str, of: ArrayLike) -> list[tuple[int | str, ...]]:
-    """The expected shape: the leading axes of the array in any size, then `row`."""
+    """The expected shape: the leading axes of the array, in any size, and then `row`."""
     more = max(np.ndim(of) - len(row), 0)
     return [(*(f"axis {axis}" for axis in range(more)), *row)]
 

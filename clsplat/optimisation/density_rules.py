@@ -13,17 +13,17 @@ import numpy as np
 from clsplat.arrays import Float32
 
 FRESH = np.uint32(1 << 31)
-"""Bit of an entry in a list of rows: the row is a copy whose moments start from zero."""
+"""Bit of an entry in a row list: the row is a copy of a Gaussian, and its moments start at zero."""
 UNWANTED, USELESS = -1.0, -2.0
-"""Scores of Gaussians that are not densified, and of Gaussians that are pruned because they contribute too little."""
+"""Score of Gaussians that are not densified, and of Gaussians that are pruned because they contribute too little."""
 
 
 @dataclass(frozen=True)
 class MarkRules:
-    """Thresholds, computed with `edge`, by which Gaussians are densified or pruned; the defaults change nothing.
+    """Thresholds by which Gaussians are densified or pruned, each computed with `edge`. The defaults change nothing.
 
-    A Gaussian is densified if its mean gradient is over `gradient` and it passes `cut_off`. It is split if the log of
-    its largest scale is over `large`, else cloned.
+    A Gaussian is densified if its mean gradient norm is over `gradient` and it passes `cut_off`. It is split if the log
+    of its largest scale is over `large`, otherwise cloned.
 
     A Gaussian is pruned in any of these cases:
 
@@ -32,7 +32,7 @@ class MarkRules:
     - It is not new and its radius is over `radius`.
     - It contributes at most `contribution` to every view.
 
-    cut_off: (value, row). A Gaussian passes if its score is over `value`, or equal to it and its row is at most `row`.
+    cut_off: (value, row). A Gaussian passes if its score is over `value`; a score equal to `value` passes up to `row`.
     """
 
     gradient: float = inf
@@ -46,9 +46,9 @@ class MarkRules:
 
 
 def edge(holds: Callable[[Float32], Any]) -> float:
-    """The largest float32 for which `holds` is false, so that x > edge is equivalent to holds(x).
+    """The largest float32 x for which holds(x) is false. So x > edge is the same as holds(x).
 
-    `holds` must be false for small numbers and true for large ones. The result is infinite if `holds` is constant.
+    `holds` must be false for small numbers and true for large numbers. If it is constant, the result is infinite.
     """
     low, high = _ordered(-inf), _ordered(inf)
     with np.errstate(over="ignore", under="ignore"):
@@ -63,11 +63,11 @@ def edge(holds: Callable[[Float32], Any]) -> float:
 
 
 def _ordered(value: float) -> int:
-    """An integer for a float32 number; integers have the order of the numbers."""
+    """The position of a float32 number in the order of all float32 numbers."""
     bits = int(np.float32(value).view(np.uint32))
     return -(bits & 0x7FFFFFFF) if bits >> 31 else bits
 
 
 def _number(order: int) -> Float32:
-    """The inverse of `_ordered`, as an array (1,), so that NumPy compares it like other arrays of float32."""
+    """The inverse of `_ordered`: an array (1,) of float32, so that NumPy compares it in float32."""
     return np.array([order if order >= 0 else -order | 0x80000000], np.uint32).view(np.float32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thinning of the model in a training step (DropGaussian): its parameters for the projection."""
+"""Thinning of the model in a training step (DropGaussian): parameters for the projection kernels."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ THINNING_KEY_OFFSET = 0x5EED
 
 @dataclass(frozen=True)
 class Thinning:
-    """The Gaussians that one step drops.
+    """Random choice of the Gaussians that a step drops.
 
-    rate: the fraction of all Gaussians that is dropped.
-    key: two 32-bit words. Key and row give a Gaussian's random word, which decides if it is dropped.
+    rate: the fraction of Gaussians that are dropped.
+    key: two 32-bit words. They and a Gaussian's row determine its random word, which decides if it is dropped.
     """
 
     rate: float
@@ -35,9 +35,9 @@ class Thinning:
 
 
 def thinning_of(config: TrainConfig, step: int) -> Thinning | None:
-    """The thinning of step number `step`; None if it is off.
+    """The thinning in step number `step`; None if it is off.
 
-    The rate grows linearly to the configured one over the run's steps, each of `config.batch` views.
+    The rate grows linearly over the steps of the run, up to the configured rate.
     """
     if config.thinning == 0:
         return None

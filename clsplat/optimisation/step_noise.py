@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Penalties and noise of a training step: their parameters for the kernels."""
+"""Penalties and noise of a training step: parameters for the kernels."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from clsplat.config.training import TrainConfig
 
 @dataclass(frozen=True)
 class Exploration:
-    """Penalties and noise of one step.
+    """Penalties and noise of a step.
 
-    opacity, scale: weights of two penalties, whose gradients are added to the loss's. They are the sums of opacities
-    and of scales (three a Gaussian, world units) over the Gaussians in view.
-    amount: factor of the noise, in 1 / world units. The noise is this factor times the covariance, which is in squared
-    world units.
+    opacity, scale: weights of two loss terms: the sum of opacities and the sum of scales (three per Gaussian, world
+    units) over the visible Gaussians.
+    amount: factor of the noise, in 1 / world units. The noise is proportional to the covariance, in squared world
+    units.
     dead: opacity at which half of the noise is added.
-    key: two 32-bit words that no other step has. Key and row give a Gaussian's noise.
+    key: two 32-bit words, different for each step. They and a Gaussian's row determine its noise.
     """
 
     opacity: float = 0.0
@@ -36,11 +36,11 @@ class Exploration:
         return weights if any(weight > 0 for weight in weights) else ()
 
     def of_view(self) -> Exploration:
-        """The terms that each view of a batch applies: the penalties, without noise."""
+        """The part that each view of a batch applies: penalties without noise."""
         return replace(self, amount=0.0)
 
     def scaled(self, factor: float) -> Exploration:
-        """The same with `factor` times the noise."""
+        """A copy with `factor` times the noise."""
         return replace(self, amount=factor * self.amount)
 
 
@@ -51,7 +51,7 @@ NO_EXPLORATION = Exploration()
 def exploration_of(config: TrainConfig, step: int, means_rate: float, count: int, length_unit: float) -> Exploration:
     """Penalties and noise of step number `step`, of `count` Gaussians.
 
-    There is noise only with growth mcmc and before the cooldown. It is scaled as if the scene's length unit were 1.
+    Noise is added only with growth mcmc and before the cooldown. Its amount is relative to the scene's length unit.
     means_rate, length_unit: world units.
     """
     density = config.density
@@ -68,7 +68,7 @@ def exploration_of(config: TrainConfig, step: int, means_rate: float, count: int
 
 
 def _penalties(opacity: float, scale: float, count: int, length_unit: float) -> Exploration:
-    """Weights of the sums over the Gaussians in view, from weights of the means over all `count`.
+    """Weights for sums over the visible Gaussians, from weights for means over all `count` Gaussians.
 
     Scales are relative to the scene's length unit (docs/gradients.md, (91)).
     """
@@ -76,6 +76,6 @@ def _penalties(opacity: float, scale: float, count: int, length_unit: float) -> 
 
 
 def step_key(seed: int, step: int) -> tuple[int, int]:
-    """The two random words of a step in a training run with this seed."""
+    """The two random words of a step, in a training with this seed."""
     first, second = np.random.SeedSequence(seed, spawn_key=(step,)).generate_state(2)
     return int(first), int(second)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One step of Adam, and a batch's sum of gradients: float64 twin of kernels/adam.cl."""
+"""A step of Adam, and the sum of gradients over a batch: float64 twin of kernels/adam.cl."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def adam(
     beta2: float = 0.999,
     epsilon: float = 1e-15,
 ) -> tuple[Float64, Float64, Float64]:
-    """Eq. (42): the new parameters and both moments, arrays of one shape; `step` counts from 1."""
+    """Eq. (42): the new parameters and both moments, arrays of the same shape. `step` counts from 1."""
     first = beta1 * first + (1 - beta1) * gradients
     second = beta2 * second + (1 - beta2) * gradients**2
     mean = first / (1 - beta1**step)
@@ -31,7 +31,7 @@ def adam(
 
 
 def add_views(gradients: Sequence[Float64], seen: Sequence[NDArray[np.bool_]]) -> Float64:
-    """Sum the gradients (n, ...) of several views. Each view adds the rows that it shows, where `seen` (n,) is True."""
+    """Sum the gradients (n, ...) of several views. Each view adds the rows of its visible Gaussians (`seen`, (n,))."""
     total = np.zeros_like(gradients[0])
     for gradient, rows in zip(gradients, seen, strict=True):
         total[rows] += gradient[rows]

@@ -17,7 +17,7 @@ from clsplat.reference.project import ALPHA_MIN, BOX_SLACK, Footprint, Seen
 
 BLEND_ALPHA_MAX = float(np.float32(0.99))
 TRANSMITTANCE_MIN = float(np.float32(1e-4))
-"""The kernels' constants to the bit. In decimals, two layers at the cap would leave (1 - 0.99)^2, exactly the limit."""
+"""The kernels' constants, in float32. In float64, two layers at the cap would leave (1 - 0.99)^2, exactly the limit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,11 +26,11 @@ class BlendedTwin:
 
     image: (H, W, 3).
     transmittance: (H, W), the fraction of the background's light that reaches the camera.
-    last: (H, W), position in `order` of the last Gaussian added, -1 for none.
+    last: (H, W), position in `order` of the last Gaussian added; -1 if none is.
     count: (H, W), number of Gaussians added.
     nearness: (H, W), the sum of weight / depth.
-    margin: (H, W), the smallest relative distance of a decision to its threshold (alpha to 1/255 and 0.99, T to 1e-4),
-    clamped to 0.05.
+    margin: (H, W), the smallest relative distance of a compared value to its threshold, at most 0.05: of alpha to 1/255
+    and 0.99, of T to 1e-4. Where it is small, rounding may change the pixel.
     """
 
     image: Float64
@@ -45,8 +45,8 @@ class BlendedTwin:
 class BlendGradients:
     """Gradients with respect to the projected Gaussians.
 
-    means2d: (N, 2), per pixel of displacement; for rays per radian along the axes of the tangent plane.
-    abs_means2d: (N, 2), the same sums over pixels, of absolute values.
+    means2d: (N, 2), per pixel; for models along rays, per radian along the axes of the tangent plane.
+    abs_means2d: (N, 2), as means2d, but summed over pixels as absolute values.
     conics: (N, 3), with respect to a, b, c.
     opacities: (N,).
     colors: (N, 3).
@@ -65,12 +65,12 @@ class BlendGradients:
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """One Gaussian on the pixels of its box.
+    """A Gaussian on the pixels of its box.
 
     position: position in the order of depth.
-    before, after: transmittance in front of it and behind it.
-    added: the pixels to which it is added.
-    margin: as in `BlendedTwin`; infinite in pixels that have already ended.
+    before, after: transmittance in front of the Gaussian and behind it.
+    added: mask of the pixels to which it is added.
+    margin: as in `BlendedTwin`; infinite in pixels that are already saturated.
     """
 
     position: int
@@ -84,7 +84,7 @@ class Layer:
 
 
 def layers(projected: Seen, width: int, height: int) -> Iterator[Layer]:
-    """Eqs. (14) to (16): the visible Gaussians front to back."""
+    """Yield the visible Gaussians front to back: eqs. (14) to (16)."""
     transmittance, alive = np.ones((height, width)), np.ones((height, width), np.bool_)
     for position, gaussian in enumerate(projected.order):
         splat = projected.footprint(int(gaussian), width, height)
@@ -170,7 +170,7 @@ def blend_grad(
             continue
         alpha = np.where(added, alpha, 0.0)
         color = projected.colors[gaussian]
-        transmittance[box] /= 1 - alpha  # now the transmittance in front of this Gaussian
+        transmittance[box] /= 1 - alpha  # the transmittance in front of this Gaussian
         weight = transmittance[box] * alpha
         gradients.contributions[gaussian] = weight.sum()
         d_alpha = transmittance[box] * (d_image[box] * (color - behind[box])).sum(axis=2)
@@ -190,7 +190,7 @@ def blend_grad(
 def _set_shape_gradients(
     gradients: BlendGradients, projected: Seen, gaussian: int, splat: Footprint, d_alpha: Float64, alpha: Float64
 ) -> None:
-    """Eqs. (25) to (29): gradients of one Gaussian's mean, conic and opacity, from d_alpha (h, w) on its box."""
+    """Eqs. (25) to (29): set the gradients of a Gaussian's mean, conic and opacity, from d_alpha (h, w) on its box."""
     g = d_alpha * alpha
     dx, dy = splat.dx, splat.dy
     by_x, by_y = (g * along for along in projected.by_mean(gaussian, splat))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From pixel to ray and from world to pixel in float64. The camera's model (clsplat/cameras/) defines both.
+"""Rays of pixels and pixels of points in float64, as the camera's model (clsplat/cameras/) defines them.
 
 Equation numbers refer to docs/cameras.md.
 """
@@ -17,7 +17,7 @@ def cam_from_pixel(camera: Camera, pixels: Float64) -> tuple[Float64, Float64]:
 
     pixels: (0.5, 0.5) is the centre of the first pixel.
 
-    NaN for a pixel without a ray: beyond half a turn in a fisheye, or beyond a pole in an equirectangular image.
+    Pixels beyond 180 degrees from a fisheye's axis, or beyond a pole of an equirectangular image, get NaN.
     """
     pixels = np.asarray(pixels, np.float64)
     a = (pixels[:, 0] - camera.cx) / camera.fx
@@ -28,9 +28,8 @@ def cam_from_pixel(camera: Camera, pixels: Float64) -> tuple[Float64, Float64]:
 def pixel_from_cam(camera: Camera, points: Float64) -> tuple[Float64, Float64]:
     """Pixels (N, 2) and depths (N,) of points (N, 3) in the camera's axes: eqs. (2) to (5).
 
-    NaN for a point without a pixel: behind a perspective or orthographic camera, beyond a fisheye's fold-over, or
-    straight behind a fisheye, which shows such a point as a circle. The near and far planes are ignored, and a pixel
-    may lie outside the image.
+    Points without a pixel get NaN: behind a perspective or orthographic camera, beyond the angle at which a fisheye
+    folds over, or straight behind a fisheye. The near and far planes are ignored, and pixels may lie outside the image.
     """
     a, b, depths = camera.model.places_of(camera, np.asarray(points, np.float64))
     u = camera.model.wrapped(camera, camera.cx + camera.fx * a)
@@ -43,7 +42,7 @@ def pixel_from_world(camera: Camera, points: Float64) -> tuple[Float64, Float64]
 
 
 def pixel_grid(camera: Camera) -> Float64:
-    """The centres of all pixels, (height * width, 2), row by row; relative to the frame if the camera has a window."""
+    """The centres of all pixels (height * width, 2), row by row. For a window, they are relative to the whole frame."""
     x, y = (camera.window.x, camera.window.y) if camera.window else (0, 0)
     u, v = np.meshgrid(x + np.arange(camera.width) + 0.5, y + np.arange(camera.height) + 0.5)
     return np.stack([u.ravel(), v.ravel()], axis=1)

@@ -21,12 +21,12 @@ from clsplat.reference.render import parameters
 
 @dataclass(frozen=True, eq=False)
 class ChannelsTwin:
-    """Channels, eqs. (60) to (67). In pixels without Gaussians all are 0, except for index, which is -1.
+    """Channels, eqs. (60) to (67). In pixels without Gaussians, index is -1 and the others are 0.
 
     normal, position: (H, W, 3).
     motion, backward: (H, W, 2).
-    doubt: (H, W), the smallest distance of a decision to its threshold: the difference of the transmittance from one
-    half, or of the largest weight from the second largest.
+    doubt: (H, W), a margin: the distance of the transmittance to one half, or of the largest weight to the second
+    largest, whichever is smaller. Where it is small, rounding may change depth_median or index.
     The other arrays are (H, W).
     """
 
@@ -43,21 +43,21 @@ class ChannelsTwin:
 
 
 def normals(means: Float64, quaternions: Float64, log_scales: Float64, camera: Camera) -> Float64:
-    """Eq. (62): each Gaussian's axis of the smallest scale (the first if some are equal), facing the camera, (N, 3)."""
+    """Eq. (62): normals (N, 3), each along the axis of the smallest scale (the first of equals), towards the camera."""
     axes = rotation_matrices(quaternions)[np.arange(len(means)), :, np.argmin(log_scales, axis=1)]
     away = (view_directions(means, camera)[0] * axes).sum(axis=1)
     return np.where(away[:, None] > 0, -axes, axes)
 
 
 def motions(means: Float64, camera: Camera, after: Camera, moved: Float64 | None = None) -> Float64:
-    """Eq. (64): motion (N, 2) in pixels, for any projection; in a panorama the shorter way around.
+    """Eq. (64): motion (N, 2) in pixels, for any projection; in a panorama, the shorter way around.
 
-    moved: the means after the motion; None if they do not move.
+    moved: the means after the motion; None if they are at rest.
     """
     to = means if moved is None else moved
     (here, _), (there, depths) = pixel_from_world(camera, means), pixel_from_world(after, to)
     if camera.model.wraps:
-        # the place of a mean may depend on the image's middle; a window uses the middle of its frame
+        # a panorama's pixels depend on the middle of the image; a window has the middle of its frame
         frame = camera.window or camera
         here[:, 0] = camera.model.wrapped(replace(camera, width=frame.width), here[:, 0])
         turned = (there[:, 0] - after.cx) / after.fx - (here[:, 0] - camera.cx) / camera.fx

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame in slices by depth in float64: twin of kernels/deep.cl. Equation numbers refer to docs/pictures.md."""
+"""Deep pictures (frames in slices by depth): float64 twin of kernels/deep.cl. Equations are in docs/pictures.md."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from clsplat.reference.blend import Layer, layers
 from clsplat.reference.project import ProjectedTwin
 
 SLACKS_PER_WALK = 8
-"""Number of steps in each of the coarse and the fine search for a pixel's slack."""
+"""Number of steps of the coarse search for a pixel's slack, and of the fine search."""
 
 
 @dataclass(frozen=True, eq=False)
 class Deep:
-    """A frame in slices by depth.
+    """A deep picture.
 
     slices: (bins, H, W, 5), eqs. (70) to (72): red, green, blue, alpha, depth.
     slack: (H, W), the slack s of each pixel, (74).
-    margin: (H, W), the smallest distance of a decision to its threshold, a difference of transmittance.
+    margin: (H, W), the smallest distance of a transmittance to the threshold that it is compared with.
     """
 
     slices: Float64
@@ -33,7 +33,7 @@ class Deep:
 
 
 class _Cut:
-    """The walk of (73) with one slack per pixel, starting from the light `whole`."""
+    """The loop (73) over layers, with a slack for each pixel. It starts with the light `whole`."""
 
     def __init__(self, slack: Float64, whole: Float64) -> None:
         self.slack, self.count = slack, np.ones(slack.shape, np.int64)
@@ -41,7 +41,7 @@ class _Cut:
         self.margin = np.full(slack.shape, np.inf)
 
     def begins(self, layer: Layer, may: NDArray[np.bool_] | bool = True) -> NDArray[np.bool_]:
-        """True in pixels in which the layer begins a slice. may: False in pixels in which it must not begin one."""
+        """Mask of the pixels in which the layer begins a slice. may: False where it must not begin one."""
         box = layer.box
         opened, placed, slack, added = self.open[box], self.placed[box], self.slack[box], layer.added
         in_front = opened - layer.before - slack
@@ -59,10 +59,10 @@ class _Cut:
 
 
 def slacks(taken: Sequence[Layer], whole: Float64, total: Float64, bins: int) -> tuple[Float64, Float64]:
-    """Eq. (74): the smallest of DEEP_LEVELS slacks (H, W) with at most `bins` slices in each pixel; and the margin.
+    """Eq. (74): the smallest of DEEP_LEVELS slacks (H, W) that gives each pixel at most `bins` slices; and the margin.
 
     whole: the light in front of the layers.
-    total: the light that they absorb.
+    total: the light that the layers absorb.
     """
     unit, level, margin = total / (DEEP_LEVELS * bins), np.zeros(total.shape), np.full(total.shape, np.inf)
     for step in (DEEP_LEVELS // SLACKS_PER_WALK, 1):
@@ -81,7 +81,7 @@ def sliced(
 ) -> Deep:
     """Cut layers into slices: eqs. (70) to (74).
 
-    colours: (h, w, 3), colour of each layer on its box, premultiplied with the light that the layer absorbs.
+    colours: (h, w, 3), colour of each layer on its box, times the light that the layer absorbs.
     depths: (h, w), depth of each layer on its box.
     whole: (H, W), the light in front of all layers.
     """
@@ -105,7 +105,7 @@ def sliced(
 
 
 def deep(projected: ProjectedTwin, width: int, height: int, bins: int) -> Deep:
-    """The frame in slices by depth."""
+    """The deep picture of a frame."""
     taken = list(layers(projected, width, height))
     colours = [(layer.before * layer.alpha)[:, :, None] * projected.colors[layer.gaussian] for layer in taken]
     depths = [np.full(layer.alpha.shape, np.float64(np.float32(projected.depths[layer.gaussian]))) for layer in taken]

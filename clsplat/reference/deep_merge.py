@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Deep pictures merged into one in float64: twin of kernels/deep_merge.cl.
+"""The merge of several deep pictures: float64 twin of kernels/deep_merge.cl.
 
 Equation numbers refer to docs/pictures.md.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Marks and lists of density control: NumPy twin of kernels/density.cl, in float32 like its decisions."""
+"""Scores and row lists of density control: NumPy twin of kernels/density.cl, in float32 like the kernel."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from clsplat.optimisation.density_rules import FRESH, UNWANTED, USELESS, MarkRul
 
 
 def scores(rules: MarkRules, statistics: Mapping[str, Float32]) -> Float32:
-    """Mean gradients (n,) of the Gaussians that may be densified; UNWANTED or USELESS for other Gaussians.
+    """Mean gradient norms (n,) of the Gaussians that may be densified; UNWANTED or USELESS for the others.
 
-    statistics: arrays keyed by their names in a checkpoint.
+    statistics: arrays by their names in a checkpoint.
     """
     with np.errstate(all="ignore"):
         means = statistics["gradient_sums"] / np.maximum(statistics["seen"], np.float32(1))
@@ -34,9 +34,9 @@ def rows(
     log_scales: Float32,
     opacity_logits: Float32,
 ) -> tuple[NDArray[np.uint32], int]:
-    """The source row of each new row, and the number of halves. Clones and halves have the bit FRESH.
+    """The source rows of the new model, and the number of halves of split Gaussians. Clones and halves are FRESH.
 
-    The order of new rows is: remaining rows, clones, first halves, second halves.
+    The order is: remaining Gaussians, clones, first halves, second halves.
     """
     found, largest = scores(rules, statistics), log_scales.max(axis=1)
     value, row = rules.cut_off

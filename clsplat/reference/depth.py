@@ -13,7 +13,7 @@ from clsplat.camera import Camera
 
 
 def depth_loss(nearness: Float64, aims: Float64, weights: Float64, factor: float) -> tuple[float, Float64]:
-    """Eq. (121): factor times the sum of weighted |N - n|, and its gradient with respect to N; arrays are (H, W)."""
+    """Eq. (121): the depth loss, factor times the weighted sum of |N - n|, and its gradient in N. Arrays are (H, W)."""
     difference = weights * (nearness - aims)
     return float(factor * np.abs(difference).sum()), factor * weights * np.sign(difference)
 
@@ -21,7 +21,7 @@ def depth_loss(nearness: Float64, aims: Float64, weights: Float64, factor: float
 def nearness_grad(means: Float64, camera: Camera, d_nearness: Float64) -> Float64:
     """Eq. (122): the gradient (N, 3) with respect to the means.
 
-    d_nearness: (N,), the gradient with respect to one over the depth, or over the distance for models along rays.
+    d_nearness: (N,), the gradient with respect to 1 / depth, or 1 / distance for models along rays.
     """
     local = means @ camera.rotation.T + camera.translation
     if not camera.model.along_rays:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of any projection in float64, with every Gaussian evaluated at every pixel: no tiles, boxes or bounds.
+"""Pictures of any projection in float64. Every Gaussian is evaluated at every pixel, without tiles or bounding boxes.
 
 Equation numbers refer to docs/gradients.md (14 to 16) and docs/channels.md (60 to 64).
 """
@@ -37,7 +37,7 @@ class Picture(ChannelsTwin):
 
 
 class _Unbounded(ProjectedTwin):
-    """Gaussians on the image plane, whose boxes are the whole image."""
+    """Gaussians on the image plane, each with the whole image as its box."""
 
     def footprint(self, gaussian: int, width: int, height: int) -> Footprint:
         pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=2).reshape(-1, 2)
@@ -55,9 +55,9 @@ def render(
     background: Sequence[float] | Float64 = BLACK_BACKGROUND,
     after: Camera | None = None,
 ) -> Picture:
-    """Render front to back by depth. A pixel without a ray shows the background.
+    """The picture, blended front to back. A pixel without a ray shows the background.
 
-    after: the camera after the motion, for the channel motion.
+    after: the camera after the motion, for the channel `motion`.
     """
     seen: Seen
     if not camera.model.along_rays:
@@ -85,7 +85,7 @@ def render_grad(
     d_image: (H, W, 3), dL/dimage.
     d_nearness: (H, W), dL/dnearness.
 
-    For rays, gradients with respect to the means on the image are per pixel along the axes of the tangent plane.
+    For models along rays, gradients with respect to means on the image are per pixel, along the tangent plane's axes.
     """
     if not camera.model.along_rays:
         return on_plane.render_grad(gaussians, camera, d_image, background, d_nearness=d_nearness)

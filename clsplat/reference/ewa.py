@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """EWA projection with gsplat's conventions, and its gradient: float64 twin of kernels/ewa.cl and kernels/ewa_grad.cl.
 
-Equation numbers refer to docs/gradients.md. The view matrix need not be a rotation: its gradient is with respect
-to its twelve numbers, not only to rotations.
+Equation numbers refer to docs/gradients.md. The gradient with respect to the view matrix is with respect to its upper
+twelve entries, which need not be a rotation and a translation.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from clsplat.arrays import Float64
 from clsplat.reference.project import ALPHA_MIN
 
 BOX_STANDARD_DEVIATIONS = 3.33
-"""Half size of a Gaussian's box in standard deviations, if its opacity does not make it smaller."""
+"""Half size of a Gaussian's box in standard deviations, unless its opacity makes the box smaller."""
 TWIN_EWA_CLAMP_FRACTION = 0.15
-"""Distance beyond an edge up to which the Jacobian is evaluated, as a fraction of the image's side.
+"""For the Jacobian, means are clamped this far beyond the image's edges: a fraction of its side.
 
-`stages.ewa` has its own: a twin takes no number of a formula from the code that it checks."""
+`stages.ewa` has the same constant. A twin shares no constant of a formula with the code that it checks."""
 SERIES_TANGENT_SQUARED = 1e-3
-"""Largest (r / z)^2 of a fisheye at which differences are computed by their series."""
+"""Largest (r / z)^2 of a fisheye for which differences that cancel are computed as a series."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +31,11 @@ class EwaViewTwin:
     """A camera of the EWA projection.
 
     viewmat: (4, 4), camera from world.
-    intrinsics: (3, 3); the skew is ignored.
+    intrinsics: (3, 3); skew is ignored.
     model: pinhole, ortho or fisheye.
     near, far: world units; Gaussians whose depth is not strictly between these are culled.
     eps2d: px^2, added to the diagonal of the projected covariance.
-    radius_clip: pixels; Gaussians without a larger radius are culled.
+    radius_clip: pixels; Gaussians with this radius or a smaller one are culled.
     """
 
     viewmat: Float64
@@ -70,7 +70,7 @@ class EwaProjectedTwin:
     compensations: (N,).
     points: (N, 3), in the camera's axes.
     jacobians: (N, 2, 3).
-    clamped: (N, 2), True for a ratio that the Jacobian clamps.
+    clamped: (N, 2), True where x/z or y/z is clamped in the Jacobian.
     covariances: (N, 2, 2), with the low-pass.
     determinants: (N,), of the covariances without the low-pass.
     """
@@ -110,7 +110,7 @@ def covariances_of(quaternions: Float64, scales: Float64) -> Float64:
 
 
 def covariances_grad(quaternions: Float64, scales: Float64, gradients: Float64) -> tuple[Float64, Float64]:
-    """Gradients of quaternions (N, 4) and scales (N, 3), from symmetric gradients of covariances (N, 3, 3)."""
+    """Gradients with respect to quaternions (N, 4) and scales (N, 3), from symmetric ones of covariances (N, 3, 3)."""
     rotations = rotations_of(quaternions)
     d_m = 2 * gradients @ (rotations * scales[:, None, :])
     d_scales = (rotations * d_m).sum(axis=1)
@@ -138,7 +138,7 @@ def full_covariances(upper: Float64) -> Float64:
 
 
 def upper_gradients(full: Float64) -> Float64:
-    """Gradients (N, 6) of upper triangles from symmetric gradients (N, 3, 3), in which off-diagonals occur twice."""
+    """Gradients (N, 6) with respect to upper triangles, whose off-diagonals count twice, from symmetric (N, 3, 3)."""
     return np.asarray(full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]] * np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0]), np.float64)
 
 
@@ -167,7 +167,7 @@ def project(
 ) -> EwaProjectedTwin:
     """Project means (N, 3) and covariances (N, 3, 3): equations (150) to (156).
 
-    opacities: (N,), 0 to 1, after compensation if it is used. With opacities, boxes end where alpha is 1/255.
+    opacities: (N,), 0 to 1, times the compensations if these are used. With opacities, boxes end where alpha is 1/255.
     """
     rotation, translation = view.viewmat[:3, :3], view.viewmat[:3, 3]
     fx, fy = view.focal
@@ -220,10 +220,10 @@ def project(
 
 
 def _fisheye_grad(view: EwaViewTwin, points: Float64, d_means2d: Float64, d_j: Float64) -> tuple[Float64, Float64]:
-    """For a fisheye, the gradient (N, 3) of the points in the camera's axes, and the gradient (2,) of the focal lengths
-    through the means on the image.
+    """For a fisheye, gradients with respect to the points in the camera's axes (N, 3) and, through the means on the
+    image, to the focal lengths (2,).
 
-    d_j: (N, 2, 3), the gradient of the Jacobians.
+    d_j: (N, 2, 3), the gradient with respect to the Jacobians.
     """
     x, y, z = points.T
     fx, fy = view.focal
@@ -250,8 +250,8 @@ def _pinhole_grad(
     d_means2d: Float64,
     d_j: Float64,
 ) -> tuple[Float64, Float64, Float64]:
-    """For a pinhole camera, the gradients of the points and focal lengths as in `_fisheye_grad`, and the part (2,) of
-    the principal point's gradient that the clamp removes.
+    """For a pinhole camera, the gradients of `_fisheye_grad`, and the part (2,) of the principal point's gradient that
+    the clamp removes.
     """
     z = points[:, 2]
     jx, jy = jacobians[:, 0, 0], jacobians[:, 1, 1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bilateral grids of photographs, their gradient and Adam's step: float64 twin of kernels/grid.cl."""
+"""Bilateral grids of photographs, their gradient and their update by Adam: float64 twin of kernels/grid.cl."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ import numpy as np
 from clsplat.arrays import Float64
 
 LUMINANCE_WEIGHTS = np.array([0.299, 0.587, 0.114])
-"""Weights of red, green and blue in the luminance that selects a pixel's level."""
+"""Weights of red, green and blue in the luminance, by which a pixel's level is found."""
 
 
 def identity(shape: tuple[int, int, int]) -> Float64:
-    """A grid (levels, rows, columns, 3, 4) that changes no colour."""
+    """The identity, a grid (levels, rows, columns, 3, 4) that changes no colour."""
     return np.broadcast_to(np.eye(3, 4), (*shape, 3, 4)).copy()
 
 
 def _hats(places: Float64, count: int) -> Float64:
-    """Weights (..., count) of the grid's vertices in linear interpolation at each coordinate."""
+    """Weights (..., count) of the grid's vertices along an axis, for linear interpolation at each coordinate."""
     weights: Float64 = np.maximum(1 - np.abs(places[..., None] - np.arange(count)), 0)
     return weights
 
 
 def _weights(image: Float64, shape: tuple[int, ...]) -> tuple[Float64, Float64, Float64, Float64]:
-    """Weights of rows, columns and levels for each pixel, and derivatives of the level weights in luminance."""
+    """For each pixel, the weights of rows, columns and levels, and the derivatives of the levels' in luminance."""
     (height, width, _), (levels, rows, columns) = image.shape, shape
     down = _hats((np.arange(height) + 0.5) / height * (rows - 1), rows)
     along = _hats((np.arange(width) + 0.5) / width * (columns - 1), columns)
@@ -44,7 +44,7 @@ def apply(image: Float64, grid: Float64) -> Float64:
 
 
 def gradient(image: Float64, grid: Float64, by_seen: Float64) -> tuple[Float64, Float64]:
-    """Gradients of the image and of the grid, from the gradient of the transformed image."""
+    """Gradients with respect to the image and the grid, from that with respect to the transformed image."""
     down, along, levels, slopes = _weights(image, grid.shape[:3])
     whole = np.concatenate([image, np.ones_like(image[..., :1])], axis=-1)
     by_grid: Float64 = np.einsum("yj,xi,yxl,yxa,yxb->ljiab", down, along, levels, by_seen, whole, optimize=True)
@@ -72,7 +72,7 @@ def variation_gradient(grid: Float64) -> Float64:
 
 
 def centre(grids: Float64) -> Float64:
-    """The grids (photographs, levels, rows, columns, 3, 4), shifted so that their mean changes no colour."""
+    """The grids (photographs, levels, rows, columns, 3, 4), shifted so that their mean is the identity."""
     centred: Float64 = grids - grids.mean(axis=0) + np.eye(3, 4)
     return centred
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame held out by surfaces in float64: twin of kernels/holdout.cl. Equation numbers refer to docs/pictures.md."""
+"""A frame without the parts behind surfaces: float64 twin of kernels/holdout.cl. Equations are in docs/pictures.md."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clsplat.reference.blend import layers
 from clsplat.reference.project import ProjectedTwin
 
 Surface = tuple[Float64, Float64, Float64]
-"""Depths (H, W) at which a surface begins and ends, infinite in pixels without it, and its alpha (H, W)."""
+"""Depths (H, W) where a surface begins and ends, infinite in pixels that it does not cover; and its alpha (H, W)."""
 
 
 def let_through(surfaces: Sequence[Surface], depth: float) -> Float64:
@@ -33,7 +33,7 @@ def held_out(
     surfaces: Sequence[Surface],
     background: Sequence[float] | Float64 = (0.0, 0.0, 0.0),
 ) -> tuple[Float64, Float64]:
-    """Eqs. (76), (77): colour (H, W, 3) and alpha (H, W) of the frame that the surfaces hold out."""
+    """Eqs. (76), (77): colour (H, W, 3) and alpha (H, W) of the frame without the parts behind the surfaces."""
     image, seen, left = np.zeros((height, width, 3)), np.zeros((height, width)), np.ones((height, width))
     for layer in layers(projected, width, height):
         through = let_through(surfaces, float(np.float32(projected.depths[layer.gaussian])))[layer.box]

@@ -22,7 +22,7 @@ def window() -> Float64:
 
 
 def blur(image: Float64) -> Float64:
-    """The windowed mean with zeros beyond the edge, (H, W, C) -> (H, W, C). Symmetric, so it is its own adjoint."""
+    """The weighted mean in the window, zeros beyond the edge, (H, W, C) -> (H, W, C). It is its own adjoint."""
     height, width = image.shape[:2]
     reach = LOSS_WINDOW_PX // 2
     weights = window()

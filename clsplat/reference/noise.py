@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise on means, and penalties on opacity and scale: float64 twin of kernels/noise.cl and of project_grad.cl's
-penalties."""
+"""Noise on means, and penalties on opacity and scale: float64 twin of kernels/noise.cl and of the penalties in
+project_grad.cl."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ HALF_WORDS_PER_NORMAL = 8
 
 
 def mixed(words: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """A permutation of 32-bit words (kernels/shared/random.h)."""
+    """Pseudorandom words, by a permutation of all 32-bit words (kernels/shared/random.h)."""
     words = (words ^ (words >> np.uint32(16))) * np.uint32(0x7FEB352D)
     words = (words ^ (words >> np.uint32(15))) * np.uint32(0x846CA68B)
     return words ^ (words >> np.uint32(16))
@@ -46,12 +46,12 @@ def displacements(
 
 
 def penalty(explore: Exploration, log_scales: Float64, opacity_logits: Float64) -> float:
-    """The loss's penalties on the opacities and scales of Gaussians in view."""
+    """The loss terms on opacities and scales of the Gaussians, all of which count as visible."""
     opacities = 1 / (1 + np.exp(-opacity_logits))
     return float(explore.opacity * opacities.sum() + explore.scale * np.exp(log_scales).sum())
 
 
 def penalty_grad(explore: Exploration, log_scales: Float64, opacity_logits: Float64) -> tuple[Float64, Float64]:
-    """Gradients of the penalties by log scales (n, 3) and opacity logits (n,): eq. (91)."""
+    """Gradients of the penalties with respect to log scales (n, 3) and opacity logits (n,): eq. (91)."""
     opacities = 1 / (1 + np.exp(-opacity_logits))
     return explore.scale * np.exp(log_scales), explore.opacity * opacities * (1 - opacities)

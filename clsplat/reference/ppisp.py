@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A photograph's gains and colour mixes, its lens's vignette, and the gradient with respect to them.
+"""Gains and colour mixes of a photograph, the vignette of its lens, and their gradient.
 
-Float64 twin of kernels/ppisp.cl. It is a reduced PPISP (NVIDIA 2026), whose homography keeps grey and acts on light.
+Float64 twin of kernels/ppisp.cl. It is a part of PPISP (NVIDIA 2026), with a colour matrix that keeps grey.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from clsplat.arrays import Float64
 
 
 def unmixing(mixes: Float64) -> Float64:
-    """The matrix (3, 3) that removes the mixes (6,): two fractions per channel c, of channels c + 1 and c + 2."""
+    """The matrix (3, 3) that removes the mixes (6,): for each channel c, the fractions of channels c + 1 and c + 2."""
     matrix = np.eye(3)
     for c in range(3):
         for k in range(2):
@@ -42,9 +42,9 @@ def developed(photograph: Float64, entries: Float64, vignette: Float64, squared:
 
 
 def gradient(image: Float64, by_image: Float64, squared: Float64) -> Float64:
-    """Gradient (12,) of the entries and the vignette, at 0, for a loss of the image to which they are applied.
+    """Gradient (12,) of a loss with respect to the entries and the vignette, where these are 0.
 
-    by_image: (H, W, 3), the loss's gradient with respect to the resulting image.
+    by_image: (H, W, 3), the gradient of the loss with respect to the image after they are applied.
     """
     each = image * by_image
     others = [image[:, :, (c + 1 + k) % 3] - image[:, :, c] for c in range(3) for k in range(2)]

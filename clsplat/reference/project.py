@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Projection of Gaussians to the image plane, and its gradient: float64 twin of kernels/project*.cl.
 
-Equation numbers refer to docs/gradients.md. The arithmetic has the precision of the parameters: np.longdouble shows the
-twin's own rounding errors.
+Equation numbers refer to docs/gradients.md. The arithmetic is in the precision of the parameters: with np.longdouble,
+the twin's own rounding errors can be measured.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ LOW_PASS_ANTIALIASED_PX2 = 0.1
 MIN_COMPENSATION = 0.005
 COLOUR_LIMIT = 1e9
 BOX_SLACK = 0.1
-"""Added to the reach q <= 2 ln(255 o) of a Gaussian's box. So alphas down to 5 % below 1/255 are evaluated, and margins
-up to that are correct."""
+"""Added to the bound q <= 2 ln(255 o) of a Gaussian's box. So alphas down to 5 % below 1/255 are evaluated, and margins
+up to 5 % are correct."""
 
 PARAMETER_NAMES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 """The arrays of `Gaussians` that `project` takes, in its order."""
@@ -35,9 +35,9 @@ PARAMETER_NAMES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 @dataclass(frozen=True, eq=False)
 class Footprint:
-    """One Gaussian on the pixels of a box that contains all pixels showing it.
+    """A Gaussian on a box of pixels, outside of which it has no effect.
 
-    dx, dy: broadcastable to (h, w), pixel centre minus mean; for rays the same on the tangent plane.
+    dx, dy: broadcastable to (h, w), pixel centre minus mean; for models along rays, on the tangent plane.
     falloff: (h, w), exp(-q / 2).
     raw: (h, w), opacity times falloff, before the clamp.
     """
@@ -51,9 +51,9 @@ class Footprint:
 
 @dataclass(frozen=True, eq=False)
 class Seen(ABC):
-    """N Gaussians as seen by a camera of any projection.
+    """N projected Gaussians, for a camera of any projection.
 
-    depths: (N,), z in the camera, or the distance.
+    depths: (N,), z in the camera's axes, or the distance for models along rays.
     opacities: (N,), 0 to 1.
     colors: (N, 3).
     visible: (N,).
@@ -71,21 +71,21 @@ class Seen(ABC):
 
     @abstractmethod
     def footprint(self, gaussian: int, width: int, height: int) -> Footprint | None:
-        """One Gaussian on the image; None if it misses the image."""
+        """The footprint of a Gaussian on the image; None if it is outside."""
 
     @abstractmethod
     def conic(self, gaussian: int) -> Float64:
-        """Conic a, b, c of one Gaussian, with q = a dx^2 + 2 b dx dy + c dy^2."""
+        """Conic a, b, c of a Gaussian: q = a dx^2 + 2 b dx dy + c dy^2."""
 
     def by_mean(self, gaussian: int, splat: Footprint) -> tuple[Float64, Float64]:
-        """Derivatives of -q / 2 in each pixel with respect to the mean, along the axes of dx and dy: eq. (25)."""
+        """Derivatives of -q / 2 at each pixel with respect to the mean, along the axes of dx and dy: eq. (25)."""
         a, b, c = self.conic(gaussian)
         return a * splat.dx + b * splat.dy, b * splat.dx + c * splat.dy
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectedTwin(Seen):
-    """N Gaussians on the image plane; rows that are not visible are zero.
+    """N Gaussians on the image plane. Rows of Gaussians that are not visible are zero.
 
     means2d: (N, 2), pixels.
     covariances: (N, 3), sxx, sxy, syy in px^2.
@@ -106,13 +106,13 @@ class ProjectedTwin(Seen):
         return found
 
     def footprint(self, gaussian: int, width: int, height: int) -> Footprint | None:
-        """Footprint of a Gaussian: the box in which its alpha can reach 1/255, by Eqs. (9) and (14)."""
+        """The footprint of a Gaussian, on the box in which its alpha can reach 1/255: eqs. (9) and (14)."""
         opacity = self.opacities[gaussian]
         reach = 2 * np.log(opacity / ALPHA_MIN) + BOX_SLACK
         half = np.sqrt(reach * self.covariances[gaussian, [0, 2]])
         mean = self.means2d[gaussian]
         size = np.array([width, height])
-        # clipped as floats: a mean far off the image may not fit an integer
+        # clipped before conversion: a mean far off the image may overflow an integer
         first = np.clip(np.ceil(mean - half - 0.5), 0, size).astype(np.int64)
         stop = np.clip(np.floor(mean + half - 0.5) + 1, 0, size).astype(np.int64)
         if (first >= stop).any():
@@ -153,7 +153,7 @@ def rotation_matrices(quaternions: Float64) -> Float64:
 
 
 def _geometry(means: Float64, quaternions: Float64, log_scales: Float64, camera: Camera) -> _Geometry:
-    """Eqs. (1), (3), (4), (5); orthographic: (16) of docs/cameras.md."""
+    """Compute the `_Geometry`: eqs. (1), (3), (4), (5); orthographic: (16) of docs/cameras.md."""
     p = means @ camera.rotation.T + camera.translation
     plane = camera.model.projected(camera, p)
     rotations = rotation_matrices(quaternions)
@@ -163,9 +163,9 @@ def _geometry(means: Float64, quaternions: Float64, log_scales: Float64, camera:
 
 
 def view_directions(means: Float64, camera: Camera) -> tuple[Float64, Float64]:
-    """Unit vectors from the camera to the means (N, 3), and the distances (N, 1).
+    """Unit vectors (N, 3) from the camera to the means, and the distances (N, 1).
 
-    For parallel rays every direction is the axis of the camera, as from infinitely far: (17) of docs/cameras.md.
+    For parallel rays every direction is the camera's axis, as from infinitely far away: (17) of docs/cameras.md.
     """
     if camera.model.parallel:
         return np.tile(camera.rotation[2], (len(means), 1)), np.full((len(means), 1), np.inf)
@@ -183,7 +183,7 @@ def _pixels_of(p: Float64, camera: Camera) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class _Ellipses:
-    """N Gaussians' ellipses on the image, as in `ProjectedTwin`.
+    """Ellipses of N Gaussians on the image, with fields as in `ProjectedTwin`.
 
     plain_determinants, determinants: (N,), of the covariances without and with the low-pass.
     """
@@ -196,7 +196,7 @@ class _Ellipses:
 
 
 def _ellipses(half: Float64, low_pass: float) -> _Ellipses:
-    """Eqs. (6) to (8), from M (N, 2, 3) of eq. (5)."""
+    """Compute the ellipses from M (N, 2, 3) of eq. (5): eqs. (6) to (8)."""
     m1, m2 = half[:, 0], half[:, 1]
     length1, length2 = (m1 * m1).sum(axis=1), (m2 * m2).sum(axis=1)
     sxx, sxy, syy = length1 + low_pass, (m1 * m2).sum(axis=1), length2 + low_pass
@@ -220,7 +220,7 @@ def project(
     *,
     antialiased: bool = False,
 ) -> ProjectedTwin:
-    """Eqs. (1) to (13); for an orthographic camera (15) to (17) of docs/cameras.md.
+    """Project Gaussians: eqs. (1) to (13), and for an orthographic camera (15) to (17) of docs/cameras.md.
 
     The arrays are those of `Gaussians`, in float64.
 
@@ -269,12 +269,12 @@ def project(
 
 
 def compensation(det0: Float64, det: Float64) -> Float64:
-    """Eq. (83), from the determinants (N,) of the covariances without and with the low-pass."""
+    """Eq. (83): factors of the opacities, from the determinants (N,) of the covariances without and with low-pass."""
     return np.maximum(np.sqrt(det0 / det), MIN_COMPENSATION)
 
 
 def compensation_grad(plain: Float64, filtered: Float64, d_logs: Float64) -> tuple[Float64, Float64]:
-    """Eq. (84): the compensation's terms (N, 2, 2) of dL/dSigma, for the covariances without and with the low-pass.
+    """Eq. (84): terms of dL/dSigma (N, 2, 2) that the compensation adds, for the covariances without and with low-pass.
 
     d_logs: (N,), dL/d(ln of the opacity).
     """
@@ -289,7 +289,7 @@ def covariance_grad(conics: Float64, d_conics: Float64) -> Float64:
     """Eq. (30), dL/dSigma = -A G A with A the conic matrix: (N, 3), (N, 3) -> (N, 3).
 
     d_conics is the derivative with respect to a, b and c (b occurs twice in the matrix). The result is xx, xy, yy of
-    the symmetric matrix G with dL = sum_ij G_ij dSigma_ij, so dL/dsxy as one number is twice its xy.
+    the symmetric matrix G with dL = sum_ij G_ij dSigma_ij. So the derivative with respect to sxy as a variable is 2 xy.
     """
     a, b, c = conics.T
     matrix = np.stack([np.stack([a, b], axis=1), np.stack([b, c], axis=1)], axis=1)
@@ -300,7 +300,7 @@ def covariance_grad(conics: Float64, d_conics: Float64) -> Float64:
 
 
 def quaternion_grad(quaternions: Float64, d_rotations: Float64) -> Float64:
-    """Eqs. (34), (35): raw quaternions (N, 4), dL/dR (N, 3, 3) -> dL/dq (N, 4), orthogonal to q."""
+    """Eqs. (34), (35): dL/dq (N, 4), orthogonal to q, from raw quaternions q (N, 4) and dL/dR (N, 3, 3)."""
     norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
     unit = quaternions / norms
     w, x, y, z = unit.T
@@ -323,7 +323,7 @@ def colour_grad(
 ) -> tuple[Float64, Float64, Float64]:
     """Eqs. (38) to (40): the SH basis (N, K), and two gradients (N, 3).
 
-    The first is that of the colour before its clamp, the second that of the mean through its viewing direction.
+    They are with respect to the colour before its clamp, and to the mean, through the viewing direction.
     """
     directions, distances = view_directions(means, camera)
     basis = sh_basis(directions, sh_degree)
@@ -353,9 +353,9 @@ class ProjectedGradients:
 def _jacobian_grad(
     geometry: _Geometry, camera: Camera, d_covariances: Float64, by_log_opacity: Float64 | None
 ) -> tuple[Float64, Float64, Float64]:
-    """Eqs. (31), (32): dL/dM (N, 2, 3), the Gaussians' R S (N, 3, 3), dL/dJ (N, 2, 3).
+    """Eqs. (31), (32): dL/dM (N, 2, 3), the matrices R S of the Gaussians (N, 3, 3), and dL/dJ (N, 2, 3).
 
-    by_log_opacity: (N,), given if opacities are compensated.
+    by_log_opacity: (N,), dL/d(ln of the opacity) if opacities are compensated.
     """
     gxx, gxy, gyy = d_covariances.T
     d_covariance = np.stack([np.stack([gxx, gxy], axis=1), np.stack([gxy, gyy], axis=1)], axis=1)
@@ -377,7 +377,7 @@ def lens_grad(
     *,
     antialiased: bool = False,
 ) -> Float64:
-    """Eqs. (144), (145): gradient (4,) of ln fx, ln fy, cx and cy. Arguments are as in `project_grad`."""
+    """Eqs. (144), (145): gradient (4,) with respect to ln fx, ln fy, cx and cy. Arguments are as in `project_grad`."""
     assert not camera.model.along_rays
     rows = np.flatnonzero(projected.visible)
     geometry = _geometry(means[rows], quaternions[rows], log_scales[rows], camera)
@@ -405,13 +405,13 @@ def project_grad(
     *,
     antialiased: bool = False,
 ) -> dict[str, Float64]:
-    """Eqs. (31) to (41), antialiased with (84): gradients of the five parameters, keyed by name; zero where culled.
+    """Gradients with respect to the five parameters, by name; zero where culled. Eqs. (31) to (41), and (84).
 
     arrays: the parameters, keyed by their names in `project`.
     projected: the result of `project`.
 
-    For an orthographic camera J is constant, and no colour depends on the mean. `reference.rays` has the gradients for
-    rays.
+    For an orthographic camera J is constant, and colours do not depend on the means. `reference.rays` has the gradients
+    for models along rays.
     """
     assert not camera.model.along_rays
     rows = np.flatnonzero(projected.visible)

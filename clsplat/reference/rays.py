@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gaussians evaluated along the rays of pixels in float64, and their gradient.
 
-Twin of kernels/project_rays.cl, of a ray's alphas, and of project_grad.cl with RAYS. Equation numbers refer to
+Twin of kernels/project_rays.cl, and of blending and project_grad.cl with RAYS. Equation numbers refer to
 docs/cameras.md.
 """
 
@@ -36,12 +36,12 @@ from clsplat.spherical_harmonics import sh_basis
 
 @dataclass(frozen=True, eq=False)
 class Tangents(Seen):
-    """Gaussians on the planes tangent to the unit sphere at their directions.
+    """Gaussians on tangent planes of the unit sphere around the camera, each at the direction of its mean.
 
-    directions: (N, 3), of the means, in the camera's axes.
-    right, down: (N, 3), the axes of the tangent plane.
-    covariances: (N, 2, 2), on the tangent plane, with the low-pass.
-    rays: (P, 3), unit directions of the camera's pixels, 0 for a pixel without a ray.
+    directions: (N, 3), unit directions of the means in the camera's axes.
+    right, down: (N, 3), the axes of the tangent planes.
+    covariances: (N, 2, 2), on the tangent planes, with the low-pass.
+    rays: (P, 3), unit directions of the camera's pixels; 0 for a pixel without a ray.
     """
 
     directions: Float64
@@ -51,7 +51,7 @@ class Tangents(Seen):
     rays: Float64
 
     def footprint(self, gaussian: int, width: int, height: int) -> Footprint:
-        """Eq. (14), at every pixel of the image."""
+        """The footprint on the whole image: eq. (14)."""
         along = self.rays @ self.directions[gaussian]
         ahead = along > 0
         safe = np.where(ahead, along, 1.0)
@@ -66,7 +66,7 @@ class Tangents(Seen):
         return np.array([a, b, c])
 
     def by_mean(self, gaussian: int, splat: Footprint) -> tuple[Float64, Float64]:
-        """Eq. (21): the tangent plane turns with the mean, so that points far from the mean move by more."""
+        """Eq. (21). The tangent plane rotates with the mean, so points far from the mean move more."""
         by_x, by_y = super().by_mean(gaussian, splat)
         q = splat.dx * by_x + splat.dy * by_y
         return by_x + q * splat.dx, by_y + q * splat.dy
@@ -100,13 +100,13 @@ def tangents(gaussians: Gaussians, camera: Camera) -> Tangents:
 
 
 def pixel_sides(pixels: Float64) -> Float64:
-    """Sides (N, 2) of a pixel along the tangent plane's axes, from (10). They convert its gradients to pixels."""
+    """Sides (N, 2) of a pixel on the tangent plane, in radians along its axes, from (10)."""
     sides: Float64 = np.linalg.norm(pixels, axis=2)
     return sides
 
 
 def tangents_grad(gaussians: Gaussians, camera: Camera, seen: Tangents, screen: BlendGradients) -> dict[str, Float64]:
-    """Eqs. (22) to (29): gradients of the five parameter arrays, keyed by their names; zero where culled."""
+    """Eqs. (22) to (29): gradients with respect to the five parameters, by name; zero where culled."""
     rows = np.flatnonzero(seen.visible)
     arrays = parameters(gaussians)
     means, quaternions = arrays["means"][rows], arrays["quaternions"][rows]

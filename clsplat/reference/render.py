@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole forward pass and its gradient in float64, with which the kernels are compared."""
+"""The forward pass and its gradient in float64, to which the kernels are compared."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class Forward:
 
 @dataclass(frozen=True, eq=False)
 class GradientsTwin(BlendGradients):
-    """Gradients of the projected Gaussians and of the parameters.
+    """Gradients with respect to the projected Gaussians and to the parameters.
 
-    parameters: gradients keyed by the arrays' names in `Gaussians`, with the arrays' shapes.
+    parameters: gradients by the names of the arrays in `Gaussians`, with their shapes.
     visible: (N,).
     """
 
@@ -47,7 +47,7 @@ class GradientsTwin(BlendGradients):
 
 
 def parameters(gaussians: Gaussians) -> dict[str, Float64]:
-    """The five arrays, keyed by name, in float64; means in world coordinates."""
+    """The five parameter arrays by name, in float64, with means in world coordinates."""
     fields = dict.fromkeys(group.field for group in PARAMETER_GROUPS.values())
     arrays = {name: np.asarray(getattr(gaussians, name), np.float64) for name in fields}
     return {**arrays, "means": arrays["means"] + gaussians.origin}
@@ -74,7 +74,7 @@ def forward(
     background: Sequence[float] | Float64 = BLACK_BACKGROUND,
     sh_degree: int | None = None,
 ) -> Forward:
-    """Project, sort, blend; sh_degree None uses all available bands."""
+    """Project, sort and blend. sh_degree: None uses all bands of the model."""
     degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
     projected = project_model(gaussians, camera, degree)
     return Forward(projected, blend(projected, camera.width, camera.height, background))
@@ -116,7 +116,7 @@ def render_grad(
 
 
 def projected_gradients(projected: ProjectedTwin, screen: BlendGradients) -> ProjectedGradients:
-    """Replace the gradients of conics by gradients of covariances."""
+    """The gradients of blending, as the input of projection's gradient: covariances replace conics."""
     by_covariance = covariance_grad(projected.conics, screen.conics)
     return ProjectedGradients(screen.means2d, by_covariance, screen.opacities, screen.colors)
 
@@ -124,7 +124,7 @@ def projected_gradients(projected: ProjectedTwin, screen: BlendGradients) -> Pro
 def render_lens_grad(
     gaussians: Gaussians, camera: Camera, d_image: Float64, background: Sequence[float] | Float64 = BLACK_BACKGROUND
 ) -> Float64:
-    """Gradient (4,) with respect to ln fx, ln fy, cx and cy. d_image: (H, W, 3), dL/dimage."""
+    """Gradient (4,) of a loss with respect to ln fx, ln fy, cx and cy. d_image: (H, W, 3), dL/dimage."""
     arrays, camera = parameters(gaussians), camera.before(gaussians.near)
     projected = project_model(gaussians, camera, gaussians.sh_degree)
     screen = blend_grad(projected, camera.width, camera.height, background, d_image)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sampling limits of photographs in float64: twin of kernels/sampling.cl. Equation numbers refer to
-docs/gradients.md."""
+"""Lower limits of the scales, from the sampling rate of photographs: float64 twin of kernels/sampling.cl. Equation
+numbers refer to docs/gradients.md."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SAMPLING_WIDTH_FACTOR = np.sqrt(0.2)
 
 
 def sampling_limits(means: Float64, cameras: Sequence[Camera]) -> Float64:
-    """Eq. (88): natural logs of the smallest standard deviations that the cameras can show at means (N, 3).
+    """Eq. (88): natural logs (N,) of the smallest standard deviations that the cameras resolve at the means (N, 3).
 
     The result is -inf where no camera sees a mean.
     """
@@ -27,5 +27,5 @@ def sampling_limits(means: Float64, cameras: Sequence[Camera]) -> Float64:
 
 
 def pixel_widths(means: Float64, camera: Camera) -> Float64:
-    """The width of a camera's pixel at each mean (N, 3), in world units; infinite where the camera does not see it."""
+    """The width of a pixel at each mean (N, 3), in world units; infinite for means that the camera does not see."""
     return camera.model.pixel_widths(camera, means @ camera.rotation.T + camera.translation)

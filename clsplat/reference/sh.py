@@ -10,10 +10,10 @@ from clsplat.spherical_harmonics import SH_C1, SH_C2, SH_C3, SH_C4
 
 
 def sh_basis_grad(directions: Float64, degree: int) -> Float64:
-    """dY_k / d(x, y, z) with x, y, z independent: (N, 3) -> (N, (degree + 1)^2, 3).
+    """dY_k / d(x, y, z), with x, y, z as independent variables: (N, 3) -> (N, (degree + 1)^2, 3).
 
-    The polynomials of `sh_basis` are evaluated off the unit sphere as they are written. Any other continuation differs
-    only along the direction, which eq. (40) projects out.
+    The polynomials are differentiated as `sh_basis` writes them. Off the unit sphere they could be written otherwise,
+    but the derivatives would differ only along the direction, and eq. (40) removes this component.
     """
     x, y, z = directions.T
     zero = np.zeros_like(x)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tiles that a Gaussian reaches, by evaluating every pixel: float64 twin of the tile test in kernels/."""
+"""Tiles that a Gaussian reaches, found by evaluating every pixel: float64 twin of the tile test in kernels/."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ def touched_tiles(
 ) -> list[Int64]:
     """For each Gaussian, the ascending row-major indices of tiles that contain a pixel centre with alpha >= threshold.
 
-    The kernels' tile set must be a superset of this: a missing tile is a hole in the image, a spare one costs only
-    time. The kernels test the ellipse against the tile's rectangle of pixel centres, which it may cut between two
-    centres. A float32 test can also round the other way within about 1e-5 of the threshold: compare at threshold =
-    ALPHA_MIN * (1 + 1e-5).
+    The tiles that the kernels find must include these. A missing tile is a hole in the image; an additional tile only
+    costs time. The kernels test the ellipse against the rectangle of the tile's pixel centres, so it may reach a tile
+    between two centres. The float32 test may also err within 1e-5 of the threshold: compare with threshold = ALPHA_MIN
+    * (1 + 1e-5).
     """
     tiles_x = -(-width // tile)
     result = []

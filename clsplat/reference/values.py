@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blending of any number of values per Gaussian and its gradient, with every Gaussian evaluated at every pixel.
+"""Blending of any number of values per Gaussian, and its gradient. Every Gaussian is evaluated at every pixel.
 
 Float64 twin of kernels/values.cl and values_grad.cl. Equation numbers refer to docs/gradients.md.
 """
@@ -41,7 +41,7 @@ class FlatGaussians:
 
     @property
     def order(self) -> list[int]:
-        """The drawn Gaussians, front to back, ties by index."""
+        """Indices of the drawn Gaussians, front to back, ties by index."""
         return [int(i) for i in np.argsort(self.depths, kind="stable") if self.drawn[i]]
 
 
@@ -51,8 +51,8 @@ class ValuesBlended:
 
     image: (H, W, D), over the background.
     transmittance: (H, W).
-    margin: (H, W), the smallest relative distance of a decision to its threshold (alpha to 1/255 and the cap, T to
-    1e-4), clamped to MAX_VALUES_MARGIN.
+    margin: (H, W), the smallest relative distance of a compared value to its threshold, at most MAX_VALUES_MARGIN: of
+    alpha to 1/255 and to the cap, of T to 1e-4.
     """
 
     image: Float64
@@ -64,7 +64,7 @@ class ValuesBlended:
 class ValueGradients:
     """Gradients with respect to means2d (n, 2), conics (n, 3), opacities (n,), values (n, D) and background (D,).
 
-    absolute: (n, 2), sums over pixels of the absolute gradients of means2d.
+    absolute: (n, 2), sums over pixels of the absolute gradients with respect to means2d.
     """
 
     means2d: Float64
@@ -77,12 +77,12 @@ class ValueGradients:
 
 @dataclass(frozen=True, eq=False)
 class _Layer:
-    """A Gaussian on all pixels, (H, W) each.
+    """A Gaussian on all pixels; arrays are (H, W).
 
     dx, dy: the mean minus the pixel centre.
     raw: alpha before the cap.
-    alpha: 0 where it is not added.
-    before: transmittance in front of it.
+    alpha: 0 where the Gaussian is not added.
+    before: transmittance in front of the Gaussian.
     """
 
     gaussian: int
@@ -95,7 +95,7 @@ class _Layer:
 
 
 def _layers(gaussians: FlatGaussians, width: int, height: int, alpha_max: float) -> Iterator[_Layer]:
-    """Eqs. (14) to (16): front to back."""
+    """Yield the Gaussians front to back: eqs. (14) to (16)."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     transmittance, alive = np.ones((height, width)), np.ones((height, width), np.bool_)
     for i in gaussians.order:
@@ -117,7 +117,7 @@ def _layers(gaussians: FlatGaussians, width: int, height: int, alpha_max: float)
 def blend_values(
     gaussians: FlatGaussians, width: int, height: int, background: Float64, alpha_max: float = BLEND_ALPHA_MAX
 ) -> ValuesBlended:
-    """Eq. (177): the picture."""
+    """Blend the values to a picture: eq. (177)."""
     image = np.zeros((height, width, gaussians.values.shape[1]))
     left, margin = np.ones((height, width)), np.full((height, width), MAX_VALUES_MARGIN)
     for layer in _layers(gaussians, width, height, alpha_max):
@@ -136,7 +136,7 @@ def blend_values_grad(
     d_alpha: Float64,
     alpha_max: float = BLEND_ALPHA_MAX,
 ) -> ValueGradients:
-    """Eqs. (178) to (180), back to front. d_image: (H, W, D); d_alpha: (H, W)."""
+    """Gradients of blending, back to front: eqs. (178) to (180). d_image: (H, W, D); d_alpha: (H, W)."""
     layers = list(_layers(gaussians, width, height, alpha_max))
     n, depth = gaussians.values.shape
     means2d, absolute, conics = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 3))

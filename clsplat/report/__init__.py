@@ -13,11 +13,11 @@ from clsplat.errors import InputError
 from clsplat.files.atomic import check_new
 
 REPORT_FILE_NAME = "report.html"
-"""File name of the report in a run's folder."""
+"""Name of the report's file in a run folder."""
 
 
 def check_page(path: Path, *, overwrite: bool) -> None:
-    """Raise InputError if no page may be written to `path`: for `check_new`'s reasons, or because of its ending."""
+    """Raise InputError if a page cannot be written to `path`: for the reasons of `check_new`, or for its ending."""
     check_new(path, overwrite=overwrite)
     if path.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: its ending is {path.suffix or 'none'}, expected .html or .htm for a web page")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Charts as inline SVG. The page's style sheet defines their colours.
+"""Charts as inline SVG. The style sheet of the page defines their colours.
 
-Text is escaped. Elements of lines contain their data, which the page's script displays.
+Text is escaped. The SVG elements of lines contain their data, which the script of the page displays.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CHART_WIDTH_PX, CHART_HEIGHT_PX = 420, 250
 PLOT_LEFT_PX, PLOT_RIGHT_PX, PLOT_TOP_PX, PLOT_BOTTOM_PX = 52, 412, 22, 214
 MAX_LINE_POINTS = 400
 SERIES_COLOUR_COUNT = 8
-"""Number of colour classes in the style sheet: c0 to c7."""
+"""Number of colour classes in the style sheet, c0 to c7."""
 
 FILLED_KINDS = ("area", "bars")
 
@@ -30,13 +30,13 @@ Points = Sequence[tuple[float, float]]
 
 @dataclass(frozen=True)
 class ChartSeries:
-    """Points sorted by x, and the kind of drawing.
+    """Points sorted by x, and how they are drawn (`kind`).
 
     line: a line.
     faint: a faint line behind the others.
     dots: a line with dots.
     area: stacked areas, the first series lowest; all series have the same x.
-    bars: x is the lower edge of a bin, and the last point ends the last bin.
+    bars: bars of a histogram; x is the lower edge of a bin, and the last point is the end of the last bin.
     """
 
     name: str
@@ -47,7 +47,7 @@ class ChartSeries:
 
 @dataclass(frozen=True)
 class Axis:
-    """Axis that maps values from `low` to `high` to pixels from `start` to `end`.
+    """Axis that maps values in [low, high] to pixels in [start, end].
 
     ticks: value and label of each tick.
     """
@@ -73,7 +73,7 @@ def chart(
     powers: bool = False,
     note: str = "",
 ) -> Markup:
-    """Figure with a legend, a title and axis labels; "" if there are no points to draw.
+    """A figure with legend, title and axis labels; "" if there are no points to draw.
 
     log_y: logarithmic y axis. Values that are not positive are left out.
     from_zero: y begins at zero.
@@ -109,7 +109,7 @@ def chart(
             note=note,
             label=f"{title}: {y} against {x}. "
             + " ".join(_described(curve) for curve in drawn if curve.kind != "faint"),
-            # shapes drawn later are in front: means over faint curves, and the lower areas of a stack
+            # later shapes are in front: means before faint curves, lower areas of a stack before higher
             shapes=sorted(shapes[:: -1 if drawn[0].kind == "area" else 1], key=lambda shape: shape["kind"] != "faint"),
             width=CHART_WIDTH_PX,
             height=CHART_HEIGHT_PX,
@@ -120,7 +120,7 @@ def chart(
 
 @cache
 def templates() -> Environment:
-    """Environment of the page templates. Templates escape everything that is not Markup."""
+    """Jinja environment of the page templates. It escapes everything that is not Markup."""
     return Environment(
         loader=PackageLoader("clsplat.report", "templates"),
         autoescape=True,
@@ -140,7 +140,7 @@ def short(value: float) -> str:
 
 
 def thinned(points: Points, limit: int = MAX_LINE_POINTS) -> Points:
-    """Thin out points to about `limit`. The lowest and highest of each interval are kept, so that no peak is lost."""
+    """About `limit` of the points: the lowest and highest of each interval, so that peaks are kept."""
     if len(points) <= limit:
         return points
     stretch = math.ceil(2 * len(points) / limit)
@@ -152,13 +152,13 @@ def thinned(points: Points, limit: int = MAX_LINE_POINTS) -> Points:
 
 
 def _kept(curve: ChartSeries, log_y: bool) -> Points:
-    """Points that can be drawn. Lines are thinned to the visible resolution."""
+    """Points that can be drawn; of long lines, only as many as are visible."""
     points = [point for point in curve.points if all(map(math.isfinite, point)) and (not log_y or point[1] > 0)]
     return points if curve.kind in FILLED_KINDS else thinned(points)
 
 
 def _heights(drawn: Sequence[ChartSeries], log_y: bool) -> list[list[float]]:
-    """Values at which each series' points are drawn on the y axis. Areas are stacked."""
+    """Values of each series on the y axis. For areas, they are the sums of the stack."""
     heights = [[math.log10(y) if log_y else y for _, y in curve.points] for curve in drawn]
     stacked: list[list[float]] = np.cumsum(heights, axis=0).tolist() if drawn[0].kind == "area" else heights
     return stacked
@@ -184,16 +184,17 @@ def _power(value: float) -> str:
 
 
 def _step(span: float, count: int) -> float:
-    """Distance between ticks for about `count` ticks in the span. It is 1, 2 or 5 times a power of ten."""
+    """Distance between about `count` ticks in the span: 1, 2 or 5 times a power of ten."""
     rough = span / count
     power = 10.0 ** math.floor(math.log10(rough))
     return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough * 0.999)
 
 
 def _shape(curve: ChartSeries, pixels: Points, floor: float) -> dict[str, Any]:
-    """Template data of a series.
+    """Data of a series for the template.
 
-    shown: values that the page's script displays, in the order of `places`, the pixels of the points along x.
+    shown: values that the script of the page displays.
+    places: pixels of the same points along x.
     """
     step = "H{:.1f}V{:.1f}" if curve.kind == "bars" else "L{:.1f} {:.1f}"
     path = "M{:.1f} {:.1f}".format(*pixels[0]) + "".join(step.format(*pixel) for pixel in pixels[1:])

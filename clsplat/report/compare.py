@@ -19,12 +19,12 @@ from clsplat.runs.run import Run
 
 MAX_COMPARED_RUNS = 24
 MAX_COMPARED_VIEWS = 100
-"""Largest number of views in the table."""
+"""Maximum number of views in the table."""
 
 
 @dataclass
 class Comparison:
-    """The compared runs. The keys of `runs` are unique labels.
+    """A comparison of runs. The keys of `runs` are unique labels.
 
     notes: reasons why the numbers are hard to compare.
     """
@@ -114,7 +114,7 @@ def comparison_page(comparison: Comparison) -> str:
 
 
 def charts(comparison: Comparison) -> list[Markup]:
-    """Charts: PSNR against time first, then the curves of a run's report, against the step."""
+    """Charts: first PSNR against time, then the curves of a run's report against the step."""
     drawn = []
     for x, title, x_label in (
         ("seconds", "Time against error", "seconds of training"),
@@ -145,7 +145,7 @@ def charts(comparison: Comparison) -> list[Markup]:
 
 
 def view_rows(comparison: Comparison) -> list[tuple[str, list[float | None], float | None]]:
-    """Rows for the views that at least two runs share: name, PSNR in each run, best PSNR."""
+    """Rows of the views that at least two runs share: name, PSNR of each run, best PSNR."""
     views = [numbers.evaluation["views"] if numbers.evaluation else [] for numbers in comparison.runs.values()]
     scores = [{view["name"]: view.get("psnr") for view in listed} for listed in views]
     rows = []
@@ -173,7 +173,7 @@ def comparison_table(comparison: Comparison) -> str:
 
 
 def _labels(paths: Sequence[Path]) -> list[str]:
-    """Folder names, with as many parent folders as needed to make them unique."""
+    """Folder names as labels, with parent folders where the names are not unique."""
     parts = [path.resolve().parts for path in paths]
     for length in range(1, max(map(len, parts)) + 1):
         names = ["/".join(part[-length:]) for part in parts]

@@ -39,11 +39,11 @@ from clsplat.version import package_version
 MAX_PICTURED_VIEWS = 8
 """Default number of held-out views with pictures."""
 MAX_EMBEDDED_RECORDS = 2000
-"""Largest number of metrics.jsonl records whose numbers are embedded in the page."""
+"""Maximum number of records of metrics.jsonl whose numbers are embedded in the page."""
 MAX_TABLE_VIEWS = 200
-"""Largest number of views in the table."""
+"""Maximum number of views in the table."""
 MAX_COLOURED_STAGES = 7
-"""Largest number of stages with separate colours. The smaller stages are drawn together."""
+"""Maximum number of stages with a colour each. Smaller stages are drawn together."""
 SCORE_TITLES = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS (VGG)"}
 
 
@@ -55,11 +55,11 @@ def write_report(
     model: Gaussians | None = None,
     views: int = MAX_PICTURED_VIEWS,
 ) -> RunNumbers:
-    """Write the page atomically to `path`, or into the run's folder. Returns the run's numbers.
+    """Write the page atomically to `path`, or into the run folder. Returns the numbers of the run.
 
-    scene: the run's scene, or the reason why there is none. By default, the scene is loaded if it is needed.
-    model: content of model.ply, if already loaded.
-    views: largest number of held-out views with pictures.
+    scene: the run's scene, or the reason why there is none. None loads the scene if it is needed.
+    model: contents of model.ply, if already loaded.
+    views: maximum number of held-out views with pictures.
     Raises InputError if metrics cannot be read, and OSError if the page cannot be written.
     """
     numbers = read_run_numbers(run, model)
@@ -69,7 +69,7 @@ def write_report(
 
 
 def write_last(run: Run, scene: Scene, model: Gaussians) -> None:
-    """Write the report of a finished training. Any failure only causes a warning, so that no hours of training fail."""
+    """Write the report of a finished training. A failure only causes a warning, so that the training does not fail."""
     try:
         write_report(run, scene=scene, model=model)
     except Exception as error:  # noqa: BLE001
@@ -138,7 +138,7 @@ def report_page(numbers: RunNumbers, scene: Scene | str | None = None, views: in
 
 
 def render_page(name: str, **values: Any) -> str:
-    """Fill in a template. Every value that is not Markup is escaped."""
+    """The text of a template with these values. Values that are not Markup are escaped."""
     pages = templates()
     pages.filters.update(short=short, duration=duration, score=score, count="{:,.0f}".format, amount=amount)
     folder = Path(__file__).parent / "templates"
@@ -179,7 +179,7 @@ def charts(numbers: RunNumbers) -> list[Markup]:
 
 
 def stage_chart(numbers: RunNumbers) -> Markup:
-    """Stacked chart of milliseconds per stage, with the small stages together. Empty if there are fewer than two
+    """Stacked chart of milliseconds per stage; small stages are added together. Empty for fewer than two
     measurements."""
     if len(numbers.stages) < 2:
         return Markup("")
@@ -196,7 +196,7 @@ def stage_chart(numbers: RunNumbers) -> Markup:
 
 
 def stage_rows(numbers: RunNumbers) -> list[tuple[str, float, float, float]]:
-    """Rows of the stages, largest first: name, median and last milliseconds, fraction of the last step."""
+    """Rows of the stages, largest first: name, median milliseconds, last milliseconds, fraction of the last step."""
     if not numbers.stages:
         return []
     last = numbers.stages[-1]["ms"]
@@ -246,18 +246,18 @@ def duration(seconds: float | None) -> str:
 
 
 def score(value: float, name: str) -> str:
-    """Text of a score with its significant digits."""
+    """Text of a score: PSNR with two decimals, others with four."""
     return f"{value:.2f}" if name == "psnr" else f"{value:.4f}"
 
 
 def _mask_words(use: MaskUse) -> list[str]:
-    """Legend for the colours that are drawn over photographs with masks."""
+    """Legend of the colours that mark masked areas of photographs."""
     words = {"ignore": "red is ignored", "transparent": "blue is transparent"}
     return [text for meaning, text in words.items() if meaning in (use.masks, use.alpha)]
 
 
 def _data(numbers: RunNumbers) -> dict[str, Any]:
-    """Data for programs that read the page: the numbers before rounding."""
+    """Numbers without rounding, for programs that read the page."""
     length = len(numbers.curves["step"])
     every = -(-length // MAX_EMBEDDED_RECORDS) or 1
     kept: Sequence[int] = sorted({*range(0, length, every), *([length - 1] if length else [])})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of a report about photographs: their masks, and their learnt exposures."""
+"""Parts of a report on photographs: their masks, and their exposures as learnt."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from clsplat.scenes.analysis.sanity_checks import spread
 from clsplat.scenes.scene import Scene, View
 
 MAX_MASKED_PHOTOGRAPHS = 6
-"""Largest number of masked photographs that are shown."""
+"""Maximum number of masked photographs in a report."""
 SMALL_PICTURE_SIDE_PX = 320
 """Longer side of small pictures in pixels."""
 
 
 @dataclass(frozen=True)
 class MaskedPhotograph:
-    """Photograph as a data URI, with the masked-out areas drawn over it.
+    """A photograph as a data URI, with masked areas drawn over it.
 
-    left_out: fraction of its pixels that are masked out.
+    left_out: fraction of its pixels that are masked.
     """
 
     name: str
@@ -41,7 +41,7 @@ class MaskedPhotograph:
 
 
 def masked_photographs(scene: Scene, *, only_files: bool) -> tuple[list[MaskedPhotograph], int]:
-    """Evenly spaced photographs with masks, and the number of all photographs with masks. Skips unreadable ones.
+    """Evenly spaced photographs with masks, and the number of all photographs with masks. Unreadable files are skipped.
 
     only_files: do not count alpha channels as masks.
     """
@@ -86,7 +86,7 @@ def exposure_chart(run: Run) -> Markup:
 
 
 def _corners(photographs: Mapping[str, Any]) -> str:
-    """Text on the fraction of light in the corners according to the learnt vignettes; "" if there are none."""
+    """Text on the light in the corners of the picture, from the learnt vignettes; "" if there are none."""
     vignettes = {tuple(_three(row["vignette"])) for row in photographs.values() if "vignette" in row}
     octaves = sorted(min(sum(vignette), 16.0) for vignette in vignettes if any(vignette))
     left = dict.fromkeys(f"{2.0**value:.0%}" for value in octaves)
@@ -94,7 +94,7 @@ def _corners(photographs: Mapping[str, Any]) -> str:
 
 
 def _gains(record: Any) -> Sequence[float]:
-    """Three gains in stops. Raises ValueError, KeyError or TypeError if the record has no such numbers."""
+    """Three gains in stops. Raises ValueError, KeyError or TypeError if the record does not contain them."""
     return _three(record["log2_gains"])
 
 

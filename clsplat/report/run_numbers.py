@@ -22,9 +22,9 @@ SCORE_NAMES = ("psnr", "ssim", "lpips")
 CURVE_KEYS = ("step", "loss", "psnr", "gaussians", "seconds")
 """Keys of every record in metrics.jsonl."""
 MAX_NAME_CHARACTERS = 200
-"""Largest number of displayed characters of the name of a view, a stage or a device."""
+"""Maximum number of characters of a displayed name of a view, stage or device."""
 MAX_EVALUATED_VIEWS, MAX_STAGES, MAX_SESSIONS, MAX_SAMPLES = 10_000, 40, 100, 2000
-"""Limits for files from elsewhere; files that clsplat writes have fewer entries. The last entries are kept."""
+"""Maximum numbers of entries that are read, for files of other origin: clsplat writes fewer. The last are kept."""
 MAX_DRAWN_VALUE = 1e30
 
 
@@ -32,15 +32,15 @@ MAX_DRAWN_VALUE = 1e30
 class RunNumbers:
     """Numbers of a run, from its files.
 
-    curves: for each key of the records, the list of its values; all lists have equal length.
+    curves: the list of values of each key of the records; all lists have the same length.
     stages: records of a step and the milliseconds of each of its stages.
     evaluations: held-out scores during training and at its end, in the order of steps.
-    evaluation: content of eval.json.
+    evaluation: contents of eval.json.
     sessions: start, device, driver and versions of each training session.
-    elapsed: seconds of wall time.
+    elapsed: elapsed seconds.
     model: description of model.ply, without its Gaussians.
-    histograms: edges and counts of each histogram, with its name as the key.
-    notes: sentences on missing or damaged data, and other caveats.
+    histograms: edges and counts of each histogram, by name.
+    notes: sentences on missing or damaged data, and other remarks.
     """
 
     run: Run
@@ -89,10 +89,10 @@ class RunNumbers:
 
 
 def read_run_numbers(run: Run, model: Gaussians | None = None, *, describe: bool = True) -> RunNumbers:
-    """Read all numbers of a run's folder.
+    """Read all numbers of a run folder.
 
-    model: content of model.ply, if already loaded.
-    describe: True to read and describe the model.
+    model: contents of model.ply, if already loaded.
+    describe: read and describe the model.
     Raises InputError if metrics.jsonl cannot be read. Other missing or damaged data is reported as a note.
     """
     records = [
@@ -133,7 +133,7 @@ def read_run_numbers(run: Run, model: Gaussians | None = None, *, describe: bool
 
 
 def number(value: object) -> float | None:
-    """The value as a float in the range of the charts; None for anything else."""
+    """The value as a float if charts can show it, otherwise None."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     return float(value) if -MAX_DRAWN_VALUE <= value <= MAX_DRAWN_VALUE else None
@@ -169,7 +169,7 @@ def _numbers(values: Mapping[str, Any], limit: int) -> dict[str, float]:
 
 
 def _evaluation(value: object) -> Record | None:
-    """Valid parts of an evaluation in the format of eval.json; None for anything else."""
+    """The valid parts of an evaluation in the format of eval.json; None if it is no evaluation."""
     if not isinstance(value, dict) or not isinstance(value.get("views"), list):
         return None
     views = []
@@ -205,7 +205,7 @@ def _session(value: Mapping[str, Any]) -> Record:
 
 
 def _elapsed(records: list[Record]) -> float | None:
-    """Seconds of wall time until the last record, summed over all sessions."""
+    """Elapsed seconds until the last record, summed over all sessions."""
     total, last = 0.0, None
     for record in records:
         if "session" in record and last is not None:

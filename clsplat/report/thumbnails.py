@@ -33,14 +33,14 @@ from clsplat.scenes.supervision.masks import after_sfm
 MAX_PICTURE_SIDE_PX = 640
 """Maximum longer side in pixels of a picture in a page."""
 MAX_PNG_SIDE_PX = 160
-"""Maximum longer side in pixels of a picture that is stored as PNG and displayed with square pixels."""
+"""Maximum longer side in pixels of a picture that is stored as PNG and enlarged without smoothing."""
 REPORT_JPEG_QUALITY = 85
 MAX_COLOURED_ERROR = 0.25
-"""Mean absolute error of a pixel's channels at which the colour map ends."""
+"""Mean absolute error of a pixel's channels at the end of the colour map."""
 INFERNO_RGB = np.array(
     [(0, 0, 0), (40, 11, 84), (101, 21, 110), (159, 42, 99), (212, 72, 66), (245, 125, 21), (250, 193, 39)], np.float32
 )
-"""Colour map of the error, from 0 to MAX_COLOURED_ERROR: matplotlib's inferno in even steps of lightness."""
+"""Colour map of the error, from 0 to MAX_COLOURED_ERROR: matplotlib's inferno, in equal steps of lightness."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,12 @@ class Shown:
 
     @property
     def small(self) -> bool:
-        """True for a small picture, whose pixels are displayed as squares."""
+        """True for a small picture, which is enlarged without smoothing."""
         return max(self.width, self.height) <= MAX_PNG_SIDE_PX
 
 
 def scene_of(run: Run) -> Scene | str:
-    """Load the run's scene, or return the reason why there is none. A report never reconstructs a scene."""
+    """The run's scene, or the reason why there is none. A report never reconstructs a scene from photographs."""
     source = run.scene
     if source is None:
         return "config.toml does not name the scene"
@@ -94,7 +94,7 @@ def scene_of(run: Run) -> Scene | str:
 
 
 def chosen(scores: Sequence[float | None], limit: int) -> list[int]:
-    """Indices of at most `limit` views to show, ascending: the worst, the best, and others evenly spaced in rank."""
+    """Indices of at most `limit` views to show, ascending: the worst, the best, and others at even ranks between."""
     if len(scores) <= limit:
         return list(range(len(scores)))
     order = sorted(range(len(scores)), key=lambda index: (scores[index] is None, scores[index] or 0.0, index))
@@ -110,13 +110,13 @@ def show(
     background: ArrayLike,
     side: int = MAX_PICTURE_SIDE_PX,
 ) -> list[Shown]:
-    """Pictures of the views `names[index]` for the indices in `wanted`, if their renders are in the run's test/.
+    """Pictures of the views `names[index]` for each index in `wanted`, if their renders are in test/ of the run folder.
 
     side: maximum longer side in pixels.
     """
     try:
         paths = picture_names(names)
-    except ValueError:  # a name that no file can have, such as ""
+    except ValueError:  # no file can have this name, for example ""
         return []
     views = {view.name: view for view in scene.views} if scene is not None else {}
     space = photos_space(view.path for view in views.values())
@@ -157,7 +157,7 @@ def data_uri(image: NDArray[Any]) -> str:
     spec = oiio.ImageSpec(width, height, 3, oiio.UINT8)
     if not small:
         spec.attribute("Compression", f"jpeg:{REPORT_JPEG_QUALITY}")
-    with tempfile.TemporaryDirectory() as folder:  # OpenImageIO's Python binding can only write to files
+    with tempfile.TemporaryDirectory() as folder:  # OpenImageIO for Python can only write to files
         path = Path(folder) / f"picture.{kind}"
         write_spec(path, [pixels], [spec], kind)
         data = path.read_bytes()
@@ -165,7 +165,7 @@ def data_uri(image: NDArray[Any]) -> str:
 
 
 def _is_within(path: Path, folder: Path) -> bool:
-    """True if the path lies in the folder, after resolving links."""
+    """True if the path is in the folder, after links are resolved."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError):

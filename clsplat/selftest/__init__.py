@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The self-test, which finds out if a driver can be trusted."""
+"""The self-test, which checks if the results of a driver can be trusted."""

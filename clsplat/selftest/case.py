@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stage beside its float64 twin: its inputs, its launch, the values that the twin wants and the bounds of errors.
+"""Cases: comparisons of a stage with its float64 twin. Each has inputs, a launch, the twin's values, and error bounds.
 
-The self-test runs cases on the frozen scenes, and `tests/stages/test_cases.py` at the seams of sizes on every driver.
-`tools/stress/run kernels` runs them on random inputs by the thousand, and `tools/ci/check_memory.py` on small ones.
+The self-test runs cases on the frozen scenes, and `tests/stages/test_cases.py` at edge sizes on every driver.
+`tools/stress/run kernels` runs them on thousands of random inputs, and `tools/ci/check_memory.py` on small inputs.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Arrays = dict[str, Array]
 Read = Callable[[], Arrays]
 """Function that reads the results of a launch, by name."""
 Sure = NDArray[np.bool_] | EllipsisType
-"""Elements that are compared."""
+"""Mask of the elements that are compared; `...` compares all."""
 
 
 class Inputs(SimpleNamespace):
@@ -37,18 +37,18 @@ class Inputs(SimpleNamespace):
         return self.image.shape[1], self.image.shape[0]
 
     def wide(self, *names: str) -> list[NDArray[np.float64]]:
-        """These arrays in float64."""
+        """The named arrays in float64."""
         return [getattr(self, name).astype(np.float64) for name in names]
 
 
 @dataclass(frozen=True, eq=False)
 class Wanted:
-    """The twin's values of a result.
+    """The twin's values of a result, and how to compare them.
 
-    bound: the largest error; its reason is beside it.
-    of: magnitude that an error is relative to. None: the error is that of all values together, in the 2-norm.
-    sure: the elements that are compared, where rounding decides the others.
-    exact: True for results without an error, such as integers.
+    bound: the largest error allowed. The reason for it is a comment beside it.
+    of: magnitudes that errors are relative to. None compares by the relative error in the 2-norm of all values.
+    sure: mask of the elements that are compared; the others depend on rounding.
+    exact: True for results that must be equal, such as integers.
     """
 
     values: Array
@@ -58,7 +58,7 @@ class Wanted:
     exact: bool = False
 
     def error_of(self, got: Array) -> float:
-        """The largest error, relative to `of`; of exact results the number of wrong elements."""
+        """The largest error, relative to `of`. For exact results, the number of wrong elements."""
         if got.shape != self.values.shape:
             return float("inf")
         found, wanted = got[self.sure], self.values[self.sure]
@@ -75,34 +75,35 @@ class Wanted:
 
 
 def exactly(values: Array) -> Wanted:
-    """Values without an error."""
+    """Values to which a result must be equal."""
     return Wanted(values, 0.0, exact=True)
 
 
 class Deviation(NamedTuple):
-    """An error, and the largest that there may be."""
+    """An error and its bound."""
 
     error: float
     bound: float
 
 
 def faults(found: Mapping[str, Deviation]) -> list[str]:
-    """Errors over their bounds, in words."""
+    """A text for each error that exceeds its bound."""
     return [f"{name} {error:.2g} over {bound:g}" for name, (error, bound) in found.items() if not error <= bound]
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One stage.
+    """The comparison of a stage with its float64 twin.
 
-    sizes: sizes at the seams of its kernels, each a number of rows or (width, height).
-    random: inputs of a size.
-    launch: function that launches the kernels, and returns the function that reads the results.
-    twin: the wanted values by name, from the inputs and the results, as for a gradient of what the device projected.
-    frozen: inputs from a frozen scene, each of which the self-test launches; None if it has no such stage.
+    sizes: edge sizes for its kernels, such as a group plus one: numbers of rows, or (width, height).
+    random: function that makes random inputs of a size.
+    launch: function that launches the kernels, and returns a function that reads the results.
+    twin: function from inputs and results to the wanted values by name. It gets the device's results because a
+    gradient, for example, depends on the device's projection.
+    frozen: function from a frozen scene to a list of inputs for the self-test; None if this is not a self-test stage.
     digested: names of the results in the self-test's digest, in order.
     by_shape: True if the kernels or their launches depend on the kernel shape.
-    own_bits_of_groups: True if shapes of several items have a digest of their own.
+    own_bits_of_groups: True if kernel shapes of several items have another digest than shapes of one item.
     """
 
     sizes: Sequence[Any]
@@ -115,17 +116,17 @@ class Case:
     own_bits_of_groups: bool = False
 
     def errors(self, device: Device, given: Inputs, work: Workspace | None = None) -> dict[str, Deviation]:
-        """Launch the kernels on the inputs; the errors by name."""
+        """Launch the kernels on the inputs. Returns errors and bounds by name."""
         got = self.launch(device, work or Workspace(device), given)()
         return {name: Deviation(of.error_of(got[name]), of.bound) for name, of in self.twin(given, got).items()}
 
     def outcome(self, bench: CaseBench) -> StageOutcome:
-        """Outcome of the self-test's stage."""
+        """The outcome of this case as a stage of the self-test."""
         assert self.frozen is not None
         return joined([self._outcome(bench, given) for given in self.frozen(bench)])
 
     def _outcome(self, bench: CaseBench, given: Inputs) -> StageOutcome:
-        work = Workspace(bench.device)  # later stages need the results of earlier ones
+        work = Workspace(bench.device)  # a workspace of its own: later stages need the results in the bench's
         got: Arrays = {}
 
         def take(read: Read) -> list[Array]:
@@ -145,5 +146,5 @@ def read_of(**arrays: DeviceArray) -> Read:
 
 
 def fresh_readback(device: Device) -> DeviceArray:
-    """The counts of a step in which nothing has stopped."""
+    """A READBACK array of zeros: the step has not stopped."""
     return upload(device, np.zeros(len(READBACK), np.uint32))

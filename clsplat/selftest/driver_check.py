@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trust in a driver: the self-test in a worker process that the driver may crash, and the driver records.
+"""Check of a driver: the self-test, in a worker process that the driver may crash, and the driver records.
 
-A record applies to one device, driver, kernel shape and set of kernels. `clsplat selftest` ignores the records: it
-always tests, and forgets a failure if the test passes.
+A record is keyed by device, driver version, kernel shape and kernel sources. `clsplat selftest` does not use the
+records: it always tests, and deletes a recorded failure if the test passes.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ class DriverReport:
     """The self-test result of a device.
 
     digests: digest of each stage's output, by "scene/stage".
-    build_seconds: None if the kernels were not built first.
-    end: description of the process's end if it came before the work was done, or empty.
-    crashed: True if the driver caused that.
-    hung: True if the process did not come back.
+    build_seconds: seconds to build all kernels; None if they were not built before the test.
+    end: description of how the worker process ended if it did not finish its work, or empty.
+    crashed: True if the driver ended the process.
+    hung: True if the process did not answer in time.
     kernels: the kernels that were built and launched, named as in `device.sandbox`.
-    remembered: a recorded failure in this shape that this test could not clear, or empty.
+    remembered: a recorded failure in this shape that this test did not clear, or empty.
     """
 
     results: list[Result] = field(default_factory=list)
@@ -66,7 +66,7 @@ class DriverReport:
 
     @property
     def other_bits(self) -> list[str]:
-        """Stages that passed, but with bits other than the stored ones."""
+        """Stages that passed, but with other bits than the stored digests."""
         return [result.stage for result in self.results if result.same_bits is False and result.passed]
 
     @property
@@ -86,8 +86,8 @@ class DriverReport:
 
 
 def examine(index: int, shape: Shape, stages: Sequence[str] = SELFTEST_STAGES, *, quick: bool = False) -> DriverReport:
-    """Test the `index`-th device in a worker process. stages: in the order of SELFTEST_STAGES, including
-    FORWARD_STAGES."""
+    """Test the `index`-th device in a worker process. stages: a part of SELFTEST_STAGES in the same order, which
+    includes FORWARD_STAGES."""
     report = DriverReport(wanted=tuple(stages))
     begun, seconds = "starting", driver_timeout()
     words = [str(index), shape.label, ",".join(stages), *(["quick"] if quick else [])]
@@ -111,13 +111,13 @@ def examine(index: int, shape: Shape, stages: Sequence[str] = SELFTEST_STAGES, *
 
 
 def require(device: Device, stages: Sequence[str] = TRAINING_STAGES) -> Device:
-    """Test a device on its first use, in about a second plus the build of its kernels, and record that it passed.
+    """Test a device on its first use and record that it passed. It takes a second, and the time to build kernels.
 
-    Nothing is tested if it has a record, or if CLSPLAT_TRUST_DRIVER=1.
+    Nothing is tested if there is a record of these stages, or if CLSPLAT_TRUST_DRIVER=1.
 
-    stages: the stages that will be used, of SELFTEST_STAGES; the stages of a frame are tested as well.
-    Returns the device; in another kernel shape, with a warning, if its driver aborts or hangs in the present one.
-    Raises DriverError if it does so in every shape, and DeviceError if its numbers cannot be trusted.
+    stages: the stages of SELFTEST_STAGES that will be used; the stages of a frame are tested in any case.
+    Returns the device. If its driver crashes or hangs in the present kernel shape, it warns and returns the device in
+    another shape. Raises DriverError if this happens in every shape, and DeviceError if results are wrong.
     """
     if regardless():
         return device
@@ -152,12 +152,12 @@ _ADVICE = (
 def _short_test(device: Device, stages: Sequence[str]) -> str:
     """Run the short test, and record the stages that passed.
 
-    Returns how the driver aborted or hung in the device's shape, or an empty string. Raises DriverError if the test
-    itself failed, and DeviceError like `require`.
+    Returns a description if the driver crashed or hung in the device's shape, otherwise an empty string. Raises
+    DriverError if the test could not run, and DeviceError if results are wrong.
     """
     wanted = [name for name in SELFTEST_STAGES if name in FORWARD_STAGES or name in stages]
     report = examine(device.index, device.shape, wanted, quick=True)
-    if report.crashed and not report.hung:  # the driver's linker may have been killed
+    if report.crashed and not report.hung:  # another program may have killed the driver's linker
         report = examine(device.index, device.shape, wanted, quick=True)
     if report.crashed:
         return report.end
@@ -172,9 +172,9 @@ def _short_test(device: Device, stages: Sequence[str]) -> str:
 
 
 def examine_device(index: int) -> DriverReport:
-    """Run the whole test in the device's wanted shape.
+    """Run the whole test in the device's preferred shape.
 
-    If that passes, and so does the kernel that failed before, if any, the shape is used again.
+    If it passes, a recorded failure in this shape is deleted, unless the kernel that failed then fails again.
     """
     device = all_devices()[index]
     shape = wanted_shape(device)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Test harness of the self-test: a frozen scene on a device, errors and digests."""
+"""Harness of the self-test: a frozen scene on a device, errors and digests."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ Array = NDArray[Any]
 
 WHITENING_FACTOR = np.sqrt(0.5 * np.log2(np.e))
 MIN_DECISION_MARGIN = 1e-4
-"""Relative distance of alpha or transmittance to a threshold below which a pixel is not compared, as rounding decides
-it. It is a hundred times the effect of rounding."""
+"""Relative distance of alpha or transmittance to a threshold, below which a pixel depends on rounding and is not
+compared. It is a hundred times the rounding error."""
 
 
 @dataclass(frozen=True)
 class StageOutcome:
-    """The outcome of one stage on one scene.
+    """The outcome of a stage on a scene.
 
     arrays: the arrays in the digest.
     errors: absolute error and error in ulp, by the name of the compared quantity.
-    trouble: a fault in words, or empty.
+    trouble: description of a fault, or empty.
     otherwise: operations that do not round like IEEE 754.
     """
 
@@ -52,15 +52,15 @@ class StageOutcome:
     otherwise: tuple[str, ...] = ()
 
     def compared(self, parts: Mapping[str, tuple[Array, Array]], **wrong: int) -> StageOutcome:
-        """Return the outcome with the errors of each (got, wanted) pair, by name. wrong: numbers of wrong integers, by
-        name."""
+        """The outcome with the errors of each pair (got, wanted). wrong: for results of integers, the numbers of wrong
+        elements by name."""
         errors = {name: error_of(got, wanted) for name, (got, wanted) in parts.items()}
         counts = ", ".join(f"{count} {name.replace('_', ' ')} wrong" for name, count in wrong.items() if count)
         return replace(self, errors=errors, trouble=self.trouble or counts)
 
 
 def joined(outcomes: Sequence[StageOutcome]) -> StageOutcome:
-    """The outcome of a stage that runs in several ways: every array, the worst errors, the first fault."""
+    """The outcome of a stage that was run in several ways: all arrays, the worst errors, and the first fault."""
     every = [item for outcome in outcomes for item in outcome.errors.items()]
     return StageOutcome(
         [array for outcome in outcomes for array in outcome.arrays],
@@ -71,10 +71,10 @@ def joined(outcomes: Sequence[StageOutcome]) -> StageOutcome:
 
 
 def error_of(got: Array, wanted: Array) -> tuple[float, float]:
-    """(worst absolute error, worst error in ulp).
+    """The largest absolute error, and the largest error in ulp; infinite if a value is not finite.
 
-    The ulp is of the wanted value or, if larger, of the array's root mean square: the result of a sum that cancels has
-    no accurate digits. Infinite if a value is not finite.
+    An ulp is that of the wanted value or of the array's root mean square, whichever is larger: a sum that cancels has
+    no accurate digits.
     """
     if wanted.size == 0:
         return 0.0, 0.0
@@ -96,7 +96,7 @@ def digest_of(arrays: Sequence[Array]) -> str:
 
 
 def cropped(planes: Array, size: Camera | tuple[int, int]) -> Array:
-    """Crop padded planes to (H, W) or (H, W, fields). size: (width, height), or a camera with it."""
+    """Crop padded planes to (H, W) or (H, W, fields). size: a camera, or (width, height)."""
     width, height = (size.width, size.height) if isinstance(size, Camera) else size
     inside = planes[..., :height, :width]
     return inside.transpose(1, 2, 0) if inside.ndim == 3 else inside
@@ -111,7 +111,7 @@ def planes_of(image: Array, beside: float = 0.0) -> Float32:
 
 
 class CaseBench:
-    """One frozen scene on one device, with the results of the stages so far."""
+    """A frozen scene on a device, with the results of the stages so far."""
 
     def __init__(self, device: Device, frozen: Frozen) -> None:
         self.device, self.frozen = device, frozen
@@ -131,9 +131,9 @@ class CaseBench:
         self.slices: DeviceArray
 
     def twice(self, launch: Callable[[], T], take: Callable[[T], list[Array]]) -> tuple[T, StageOutcome]:
-        """Run the stage twice; return the second value, and its host arrays and milliseconds.
+        """Run a stage twice. Returns its second result, and the outcome with the arrays on the host and milliseconds.
 
-        A difference from the first run, which included the kernel builds, is reported as trouble.
+        A difference from the first run, which includes the kernel builds, is reported as trouble.
         """
         first = take(launch())
         value, ms = self.device.timed(launch)
@@ -144,7 +144,7 @@ class CaseBench:
 
     @property
     def inputs(self) -> ImageInputs:
-        """Input of the image's stages."""
+        """Input of the stages that process pixels."""
         return ImageInputs(self.projected.splats, self.background, self.camera.width, self.camera.height)
 
     @property
@@ -153,10 +153,10 @@ class CaseBench:
         return shown
 
     def splats(self) -> reference_project.ProjectedTwin:
-        """The device's splats in the reference's form."""
+        """The device's splats, in the form of the reference."""
         visible = self.visible
         raw = self.projected.splats.get()
-        raw[~visible] = 1.0  # memory that was never written
+        raw[~visible] = 1.0  # replaces uninitialised memory
         splats = raw.astype(np.float64)
         field = {name: splats[:, index] for index, name in enumerate(SPLAT)}
         means = np.stack([field["PIXEL_X"] + field["SUB_X"], field["PIXEL_Y"] + field["SUB_Y"]], axis=1)
@@ -176,7 +176,7 @@ class CaseBench:
         )
 
     def blend_reference(self) -> tuple[reference_blend.BlendedTwin, NDArray[np.bool_]]:
-        """The reference frame of the device's splats, and the pixels that are compared (MIN_DECISION_MARGIN)."""
+        """The reference's frame from the device's splats, and the mask of pixels to compare (MIN_DECISION_MARGIN)."""
         splats = self.splats()
         camera, background = self.camera, self.frozen.background.astype(np.float64)
         frame = reference_blend.blend(splats, camera.width, camera.height, background)

@@ -6,73 +6,73 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 FORWARD_STAGES = ("arithmetic", "project", "duplicate", "sort", "ranges", "blend")
-"""Stages that a frame needs."""
+"""Stages that render a frame."""
 CHANNEL_STAGES = ("features", "channels")
-"""Stages that a frame with channels other than colour and alpha needs in addition to FORWARD_STAGES."""
+"""Further stages for a frame with channels other than colour and alpha."""
 DEEP_STAGES = ("deep", "deep_merge")
-"""Stages of a frame in slices by depth, and of a merge of several."""
+"""Further stages for deep pictures, and for a merge of several."""
 HOLDOUT_STAGES = ("holdout",)
-"""The stage of a frame behind the surfaces of CG elements."""
+"""Further stage for a frame with holdout surfaces."""
 RAY_STAGES = ("rays",)
-"""The stage of a frame of an equirectangular or fisheye camera."""
+"""Further stage for cameras that evaluate Gaussians along rays, such as equirectangular and fisheye cameras."""
 MASK_STAGES = ("masks",)
-"""Stages for training photographs with masks or alpha, in addition to TRAINING_STAGES."""
+"""Further stages for training with masks or alpha."""
 BACKWARD_STAGES = ("loss", "blend_grad", "project_grad", "penalties", "adam", "noise", "statistics")
-"""Stages that training needs in addition to a frame's."""
+"""Stages that training needs in addition to FORWARD_STAGES."""
 APPEARANCE_STAGES = ("appearance", "ppisp", "grid")
-"""Stages that training with learnt appearance needs, in addition to TRAINING_STAGES."""
+"""Further stages for training with an appearance model."""
 DEPTH_STAGES = ("depth",)
-"""Stages that training with depth comparison needs."""
+"""Further stages for training with known depths."""
 POSE_STAGES = ("pose",)
-"""Stages that training with pose refinement needs."""
+"""Further stages for training with pose refinement."""
 LENS_STAGES = ("lens",)
-"""Stages that training with lens refinement needs."""
+"""Further stages for training with lens refinement."""
 LIBRARY_STAGES = ("ewa", "harmonics", "splats", "values")
-"""Stages of the library's calls, in addition to a frame's."""
+"""Further stages for the library's calls."""
 TRAINING_STAGES = (*FORWARD_STAGES, *BACKWARD_STAGES)
 SELFTEST_STAGES = (
     *(*FORWARD_STAGES, *CHANNEL_STAGES, *DEEP_STAGES, *HOLDOUT_STAGES, *RAY_STAGES, *MASK_STAGES, *BACKWARD_STAGES),
     *(*APPEARANCE_STAGES, *DEPTH_STAGES, *POSE_STAGES, *LENS_STAGES, *LIBRARY_STAGES),
 )
 INDEX_STAGES = ("project", "duplicate", "sort", "ranges")
-"""Stages whose counts and lists index the arrays of later stages."""
+"""Stages whose results are indices into the arrays of later stages."""
 
 STAGE_BOUNDS_ULP: dict[str, tuple[float, str]] = {
-    "arithmetic": (3.01, "what OpenCL 1.2 allows a square root, 3 ulp; a division may have 2.5"),
-    "project": (256, "30 found, at opacities near 1; six times that for roots and divisions of 3 ulp, not 0.5"),
+    "arithmetic": (3.01, "OpenCL 1.2 allows 3 ulp for a square root and 2.5 for a division"),
+    "project": (256, "30 measured, at opacities near 1; six times as many if roots and divisions are off by 3 ulp"),
     "duplicate": (0, "whole numbers"),
     "sort": (0, "whole numbers"),
     "ranges": (0, "whole numbers"),
-    "blend": (256, "11 found; 256 are 1.5e-5 of a colour of 0.5, under the 2e-5 that a frame may be off"),
-    "features": (64, "6 found; two divisions and a root one after the other"),
-    "channels": (256, "13 found, of normals that cancel; else as blend"),
-    "deep": (256, "27 found; as blend"),
-    "deep_merge": (256, "4 found; as blend"),
-    "holdout": (256, "8 found; as blend"),
-    "rays": (512, "47 found; directions and rays have several quotients and roots of 3 ulp, not 0.5"),
+    "blend": (256, "11 measured; 256 ulp of a colour of 0.5 are 1.5e-5, and a frame may be off by 2e-5"),
+    "features": (64, "6 measured; two divisions and a root in sequence"),
+    "channels": (256, "13 measured, in normals that cancel; otherwise as blend"),
+    "deep": (256, "27 measured; as blend"),
+    "deep_merge": (256, "4 measured; as blend"),
+    "holdout": (256, "8 measured; as blend"),
+    "rays": (512, "47 measured; directions and rays have several quotients and roots, which may be off by 3 ulp"),
     "masks": (128, "as loss"),
-    "loss": (128, "9 found; the SSIM's quotients may have six times that"),
-    "blend_grad": (1024, "32 found; up to 64 divisions one after the other recover the transmittance"),
-    "project_grad": (512, "39 found, at opacities near 1; six times that for sloppy divisions"),
-    "penalties": (32, "2 found; an exponential and a product"),
-    "adam": (32, "2 found; one root and one division"),
-    "noise": (256, "15 found; of 100 (o - dead) a digit of o is 16 ulp, and turned axes cancel"),
-    "statistics": (32, "1 found; one root"),
-    "appearance": (1024, "202 found; beta2 in float32 is 1e-5 off in 1 - beta2, 84 ulp, and a picture is added up"),
+    "loss": (128, "9 measured; six times as many if the quotients of SSIM are off by 3 ulp"),
+    "blend_grad": (1024, "32 measured; up to 64 divisions in sequence recover the transmittance"),
+    "project_grad": (512, "39 measured, at opacities near 1; six times as many if divisions are off by 3 ulp"),
+    "penalties": (32, "2 measured; an exponential and a product"),
+    "adam": (32, "2 measured; one root and one division"),
+    "noise": (256, "15 measured; an ulp of o is 16 ulp of 100 (o - dead), and rotated axes cancel"),
+    "statistics": (32, "1 measured; one root"),
+    "appearance": (1024, "202 measured; beta2 in float32 is off by 1e-5 of 1 - beta2, 84 ulp; sums of a picture"),
     "ppisp": (1024, "as appearance"),
-    "grid": (1024, "227 found; as appearance"),
+    "grid": (1024, "227 measured; as appearance"),
     "depth": (1024, "as blend_grad"),
-    "pose": (1024, "as appearance; terms of either sign are added up"),
-    "lens": (1024, "19 found; as pose"),
-    "ewa": (1024, "95 found, by quaternions, whose terms cancel; quotients and roots as in project_grad"),
-    "harmonics": (64, "10 found; one root and one division"),
-    "splats": (64, "2 found; a root and two quotients"),
-    "values": (1024, "71 found; as blend_grad"),
+    "pose": (1024, "as appearance; sums of terms of both signs"),
+    "lens": (1024, "19 measured; as pose"),
+    "ewa": (1024, "95 measured, in the gradient of quaternions, whose terms cancel; else as project_grad"),
+    "harmonics": (64, "10 measured; one root and one division"),
+    "splats": (64, "2 measured; a root and two quotients"),
+    "values": (1024, "71 measured; as blend_grad"),
 }
 """Error bound of each stage in ulp, and the reason for it.
 
-Each bound is the error measured where every operation rounds like IEEE 754, with room for a GPU whose divisions and
-roots do not. A wrong operation is off by thousands.
+The errors are measured where every operation rounds like IEEE 754. The bounds leave room for GPUs whose divisions and
+roots do not. With a wrong operation, a result is off by thousands.
 """
 
 
@@ -80,12 +80,12 @@ roots do not. A wrong operation is off by thousands.
 class Result:
     """The result of a stage over all frozen scenes.
 
-    absolute, ulp: the worst error.
+    absolute, ulp: the largest absolute error, and the largest error in ulp.
     bound: the error bound in ulp.
-    same_bits: True if the bits match the stored digest; None if none is stored for this shape.
+    same_bits: True if the bits match the stored digest; None if no digest is stored for this shape.
     ms: milliseconds of all scenes.
-    trouble: a fault other than the error, in words, or empty.
-    where: the place of the worst error in ulp.
+    trouble: description of a fault other than the error, or empty.
+    where: the place of the largest error in ulp.
     otherwise: operations that do not round like IEEE 754.
     """
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frozen scenes of the self-test: numbers that are the same on every machine, to the last bit.
+"""Frozen scenes of the self-test, which are the same on every machine, to the last bit.
 
-All come from one integer hash and are multiples of a power of two, independent of NumPy's generators and of
-mathematical libraries. The digests in digests.json belong to these scenes.
+All numbers come from an integer hash and are multiples of a power of two. They do not depend on NumPy's generators or
+on mathematical libraries. The digests in digests.json are of these scenes.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from clsplat.gaussians import Gaussians
 from clsplat.stages.device_camera import padded_size
 
 HASH_STEPS = 1 << 12
-"""Number of equidistant values in a range."""
+"""Number of different values, equally spaced, in a range of `evenly`."""
 
 
 def hashed(seed: int, count: int) -> NDArray[np.uint64]:
-    """(count,) uint64: SplitMix64 (Steele, Lea and Flood 2014) at `count` places of its sequence."""
+    """Random numbers (count,) uint64: a part of the sequence of SplitMix64 (Steele, Lea and Flood 2014)."""
     with np.errstate(over="ignore"):
         z = (np.arange(1, count + 1, dtype=np.uint64) + np.uint64(seed << 32)) * np.uint64(0x9E3779B97F4A7C15)
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -31,13 +31,13 @@ def hashed(seed: int, count: int) -> NDArray[np.uint64]:
 
 
 def evenly(seed: int, shape: tuple[int, ...], low: float, high: float, steps: int = HASH_STEPS) -> NDArray[np.float64]:
-    """Numbers in [low, high), which have few binary digits: each is exactly a float32."""
+    """Random numbers in [low, high) with few binary digits, so that each is exact in float32."""
     values = (hashed(seed, int(np.prod(shape))) >> np.uint64(20)) % np.uint64(steps)
     return low + (high - low) / steps * values.astype(np.float64).reshape(shape)
 
 
 def keys(seed: int, count: int, bits: int) -> NDArray[np.uint32]:
-    """Sort keys (count,) of `bits` bits, each about three times."""
+    """Sort keys (count,) of `bits` bits; each occurs about three times."""
     pool = (hashed(seed, count // 3 + 1) >> np.uint64(64 - bits)).astype(np.uint32)
     return pool[(hashed(seed + 1, count) % np.uint64(len(pool))).astype(np.int64)]
 
@@ -65,10 +65,10 @@ def padded(camera: Camera, seed: int, low: float, high: float) -> Float32:
 
 
 def cloud(name: str, count: int, width: int, height: int, seed: int) -> Frozen:
-    """Gaussians of every size, direction and opacity in and around the view of a tilted camera.
+    """Gaussians of all sizes, orientations and opacities, inside and around the view of a tilted camera.
 
-    Its principal point is off the middle. Some Gaussians are behind it, some at its near plane, and some fainter than
-    1/255. The SH degree is 3.
+    The principal point is not in the middle. Some Gaussians are behind the camera, some at its near plane, and some
+    fainter than 1/255. The SH degree is 3.
     """
     unit = 0.125
     z = evenly(seed, (count,), 1.5, 8.5)
@@ -88,9 +88,9 @@ def cloud(name: str, count: int, width: int, height: int, seed: int) -> Frozen:
 
 
 def wall() -> Frozen:
-    """Nearly opaque layers, two at each depth.
+    """A scene of nearly opaque layers, two at each depth.
 
-    Alpha is at its cap, pixels end after a few layers, and Gaussians of equal depth are ordered by index.
+    Alpha reaches its cap, pixels saturate after a few layers, and Gaussians of equal depth are ordered by index.
     """
     count, width, height = 64, 40, 36
     depths = 1.5 + 0.0625 * (np.arange(count) // 2)
@@ -107,7 +107,7 @@ def wall() -> Frozen:
 
 
 def scenes(*, quick: bool) -> list[Frozen]:
-    """The frozen scenes that the stages run on."""
+    """The frozen scenes on which the stages run."""
     few = [cloud("cloud", 240, 70, 45, 1), wall()]
     return few if quick else [*few, cloud("crowd", 1500, 120, 75, 41)]
 
@@ -122,5 +122,5 @@ def _gaussians(*arrays: NDArray[np.float64]) -> Gaussians:
 
 
 def _rotation() -> NDArray[np.float64]:
-    """The rotation of the quaternion (15, 2, -3, 1), w first: every entry is one division of whole numbers."""
+    """The rotation matrix of the quaternion (15, 2, -3, 1), w first. Each entry is a quotient of whole numbers."""
     return np.array([[219, -42, -86], [18, 229, -66], [94, 54, 213]]) / 239

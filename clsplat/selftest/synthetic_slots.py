@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Synthetic slots of pairs, and the gradients that they imply, to test stages independently of blending's gradient."""
+"""Synthetic slots of pairs and the gradients that follow from them, to test stages without the gradient of blending."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def slot_sums(bench: CaseBench, slots: Array) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class MadeUpSlots:
-    """Synthetic gradients, one slot for each pair, and their float64 sums (n, 9) for each Gaussian."""
+    """Synthetic slots, one for each pair, and their float64 sums (n, 9) for each Gaussian."""
 
     slots: Slots
     sums: Float64
@@ -43,14 +43,14 @@ class MadeUpSlots:
         return cls(Slots(upload(bench.device, values), bench.counted.first_slots), slot_sums(bench, values))
 
     def d_means(self, bench: CaseBench) -> Float64:
-        """Gradients (n, 2) by the means on the image, per pixel: docs/gradients.md (50)."""
+        """Gradients (n, 2) with respect to the means on the image, per pixel: docs/gradients.md (50)."""
         l11, l12, l22 = (WHITENING_FACTOR * bench.splats().whitening).T
         _, u, v, *_ = self.sums[:, SLOT_MOMENTS].T
         found: Float64 = -np.stack([l11 * u, l12 * u + l22 * v], axis=1) / WHITENING_FACTOR**2
         return found
 
     def on_image(self, bench: CaseBench) -> reference_project.ProjectedGradients:
-        """Gradients by what the twin projects of the scene."""
+        """Gradients with respect to the twin's projected Gaussians of the scene."""
         l11, l12, l22 = (WHITENING_FACTOR * bench.splats().whitening).T
         *_, uu, uv, vv = self.sums[:, SLOT_MOMENTS].T
         entries = [l11 * l11 * uu, l11 * (l12 * uu + l22 * uv), l12 * l12 * uu + 2 * l12 * l22 * uv + l22 * l22 * vv]

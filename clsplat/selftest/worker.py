@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every stage on frozen scenes against the float64 reference and stored digests: a test of a driver's results.
+"""The self-test: compares every stage on frozen scenes with the float64 reference and with stored digests.
 
-As a program it is the worker process of `clsplat.selftest.driver_check`, as a driver may crash or hang. It reports each
-step and its result in lines of JSON.
+Run as a program, this is the worker process of `clsplat.selftest.driver_check`, as a driver may crash or hang. It
+reports steps and results in lines of JSON.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ DEFAULT_DEFINES: dict[str, dict[str, object]] = {
     "values": {"VALUES": 3},
     "values_grad": {"VALUES": 3, "GEOMETRY": True},
 }
-"""Defines of the kernels that cannot be built without them."""
+"""Defines without which these kernel files cannot be built."""
 
 
 @cache
@@ -54,7 +54,7 @@ def stored_digests() -> dict[str, str | dict[str, str]]:
 
 
 def shape_label(device: Device) -> str:
-    """The shape label, with the items that the gradient's sums use."""
+    """The shape's label for digests: with the number of work-items that share a tile, and without sub-groups."""
     return replace(device.shape, items=tile_items(device), subgroups=False).label
 
 
@@ -66,12 +66,12 @@ def run(
     say: Callable[[str], None] = lambda name: None,
     digests: dict[str, str] | None = None,
 ) -> Iterator[Result]:
-    """Run the stages in order, each on all scenes.
+    """Run the stages in order, each on all scenes, and yield their results.
 
-    It stops early if the next stage would read or write outside its arrays.
+    The run ends early if wrong results could make the next stage read or write outside its arrays.
 
     say: function that is called with the name of each stage before it runs.
-    digests: dictionary that receives the digests of this run, by "scene/stage".
+    digests: dictionary to fill with the digests of this run, by "scene/stage".
     """
     benches = [CaseBench(device, frozen) for frozen in scenes(quick=quick)]
     for name in stages:
@@ -80,7 +80,7 @@ def run(
         for bench in benches:
             try:
                 outcomes.append(OUTCOMES_BY_STAGE[name](bench))
-            except DriverError:  # another shape may work
+            except DriverError:  # the caller may try another shape
                 raise
             except Exception as error:  # noqa: BLE001  # drivers, and sizes from a wrong kernel, raise anything
                 text = " ".join(str(error).split())[:300]
@@ -117,7 +117,7 @@ def _result(name: str, benches: list[CaseBench], outcomes: list[StageOutcome]) -
 
 
 def _child(index: int, shape: str, stages: Sequence[str], *, quick: bool) -> None:
-    """Build and run on the `index`-th device; print a line of JSON before each step, and one for its result."""
+    """Build and run the stages on the `index`-th device. Prints JSON before each step and for each result."""
     end_with_parent()
     tell(begins="opening the device")
     device = Device(all_devices()[index]).with_shape(shape)

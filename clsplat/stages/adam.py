@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches adam.cl for every parameter group. In a step of one view, `stages.project.project_step` takes Adam's step
-instead."""
+"""Launches adam.cl for every parameter group. In a step of one view, `stages.project.project_step` updates the
+parameters instead."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ def adam(
     tile_counts: DeviceArray,
     readback: DeviceArray | None = None,
 ) -> None:
-    """Take a step along the gradients, and set the gradients to zero.
+    """Update the parameters by Adam, and set the gradients to zero.
 
-    tile_counts: (n,) uint32, 0 where the view does not show a Gaussian, for `OptimiserConfig.sparse`.
-    readback: (READBACK_SIZE,) uint32. Its last four entries count the elements whose step was refused, by reason
+    tile_counts: (n,) uint32, 0 for a Gaussian that is not visible in the view; used by `OptimiserConfig.sparse`.
+    readback: (READBACK_SIZE,) uint32. Its last four entries count the elements that were not updated, by reason
     (`columns.REFUSED`).
     """
     readback = readback or allocate(device, (len(READBACK),), np.uint32)
-    counts = readback.buffer  # an array would count as traffic, but this is written only on a fault
+    counts = readback.buffer  # passed as a buffer, so that the profile counts no traffic: it is written only on a fault
     config = step.config
     beta1, beta2, epsilon = config.beta1, config.beta2, config.epsilon
     abreast = max(device.shape.lanes, 4)  # ABREAST in adam.h
@@ -75,7 +75,7 @@ def adam(
             launch_items(device, kernel, -(-rows // abreast), rows, *constants, tile_counts, *arrays)
         else:
             kernel = device.kernels("adam").adam
-            # SH coefficients need an index of more than 32 bits from 95 million Gaussians.
+            # With 95 million Gaussians or more, an index of an SH coefficient needs more than 32 bits.
             launch_items(device, kernel, -(-size // abreast), np.uint64(size), *constants, *arrays)
 
 
@@ -89,10 +89,10 @@ def add_view(
     *,
     sh_rest: bool = True,
 ) -> None:
-    """Add the rows of `gradients` that a view shows to the sums over the earlier views.
+    """Add the gradients of the Gaussians visible in a view to the sums over the earlier views.
 
-    tile_counts: (n,) uint32, of the view.
-    shown: (n,) uint32, if given; becomes nonzero where any of the views shows a Gaussian.
+    tile_counts: (n,) uint32, of the view; 0 for a Gaussian that is not visible.
+    shown: (n,) uint32, optional; set to nonzero for each Gaussian that is visible in the view.
     sh_rest: also add the higher SH bands.
     """
     rows = tile_counts.shape[0]

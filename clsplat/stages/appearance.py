@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches appearance.cl: a photograph's gains, their gradient and Adam's step."""
+"""Launches appearance.cl: a photograph's gains, their gradient and their update by Adam."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 GAINS_PIXEL_BYTES = 2
-"""Bytes of the partial sums, per pixel with padding."""
+"""Bytes of the partial sums per pixel, padding included."""
 APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON = 0.9, 0.999, 1e-15
 
 
 @dataclass(frozen=True)
 class GainEntries:
-    """Entries of gains, and how they learn.
+    """The column sums from which gains are updated, and settings of the update by Adam.
 
     first_row: row of the first entry in the column sums.
     mix_rate: learning rate of mixes, as a fraction of the rate of gains.
@@ -44,13 +44,13 @@ PLAIN_GAINS = GainEntries()
 class Gains:
     """Gains of all photographs, (photographs, entries) float32 each.
 
-    logs: logarithms of the gains to base 2 in the first three entries; further entries are mixes.
+    logs: the first three entries are the base-2 logarithms of the gains; the others are colour mixes.
     start: initial values of `logs`.
     first, second: Adam's moments.
     gains: 2^logs.
     moved: scratch.
-    begins (photographs + 1,), others, weights (n,): a matrix, stored like a `csr_array`. The matrix times `logs -
-    start` is added to the gradient, which pulls the gains to their start.
+    begins (photographs + 1,), others, weights (n,): a sparse matrix, stored like a `csr_array`. The matrix times
+    `logs - start` is added to the gradient, so that the gains are pulled towards their initial values.
     """
 
     logs: DeviceArray
@@ -65,7 +65,7 @@ class Gains:
 
     @classmethod
     def on(cls, device: Device, logs: NDArray[np.float32], pull: csr_array | None = None) -> Gains:
-        """Gains that start with these logs, and zero moments. pull: the matrix; zero if not given."""
+        """Gains with these initial logs, and zero moments. pull: the sparse matrix; zero if not given."""
         zeros = np.zeros_like(logs)
         gains = np.exp2(logs.astype(np.float64)).astype(np.float32)
         held, start, first, second, factors = (upload(device, value) for value in (logs, logs, zeros, zeros, gains))
@@ -74,7 +74,7 @@ class Gains:
 
 
 def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[str, DeviceArray]:
-    """The begins, others and weights of a matrix; None gives a zero matrix."""
+    """The arrays `begins`, `others` and `weights` of a sparse matrix; None gives a zero matrix."""
     from scipy.sparse import csr_array
 
     matrix = csr_array((photographs, photographs), dtype=np.float32) if pull is None else pull
@@ -104,10 +104,10 @@ def gain_gradient(
     height: int,
     place: int = 0,
 ) -> DeviceArray:
-    """Column sums (3, stride) of the image times the loss's gradient with respect to it.
+    """Column sums (3, stride) of the image times the gradient of the loss with respect to the image.
 
-    ln 2 times their sum over x is the gradient with respect to the photograph's logs. Each `place` in a batch has its
-    own array.
+    Summed over the columns and multiplied by ln 2, they are the gradient with respect to the photograph's logs.
+    place: the view's number in the batch; each has its own array.
     """
     _, rows, stride = image.shape
     down = rows // TILE
@@ -133,9 +133,9 @@ def step_gains(
     readback: DeviceArray,
     entries: GainEntries = PLAIN_GAINS,
 ) -> None:
-    """Adam's step number `step` (from 1) along the column sums of the entries.
+    """Update the gains by Adam, from their column sums. step: the number of this update, from 1.
 
-    If the step's pass has stopped (kernels/duplicate.cl), nothing changes.
+    Nothing changes if the step's pass has stopped for lack of capacity (kernels/duplicate.cl).
     """
     kernels, (photographs, width) = device.kernels("appearance", {"LANES": 1}), gains.logs.shape
     count = photographs * width

@@ -19,22 +19,22 @@ from clsplat.stages.device_camera import padded_size
 from clsplat.stages.ranges import TileLists
 
 BLEND_PIXEL_BYTES = 20
-"""Bytes per pixel with padding: image, transmittance, stop."""
+"""Bytes per pixel, padding included: image, transmittance, stop."""
 
 
 def gradient_pair_bytes(fields: SlotFields) -> int:
-    """Bytes per pair for the gradient: cells and a slot."""
+    """Bytes per pair that the gradient needs: cells and a slot."""
     return 4 + 4 * fields.floats
 
 
 @dataclass(frozen=True, eq=False)
 class ImageInputs:
-    """Input of the stages that work on pixels, in addition to the tile lists.
+    """Input of the stages that process pixels, in addition to the tile lists.
 
     splats: (n, SPLAT), of `Projected`.
     background: (3,).
     width, height: pixels.
-    camera_array: the packed camera, for cameras that draw along the rays of pixels.
+    camera_array: the packed camera, for cameras that evaluate Gaussians along the rays of pixels.
     """
 
     splats: DeviceArray
@@ -60,7 +60,7 @@ class Blended:
 
 
 def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
-    """Image, transmittance and stops of a frame, in the workspace. kept: keep their contents from the last call."""
+    """Arrays for the image, transmittance and stops of a frame. kept: keep their contents from the last call."""
     rows, stride = padded_size(width, height)
     return (
         work.array("image", (3, rows, stride), kept=kept),
@@ -70,11 +70,11 @@ def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[De
 
 
 _MIN_TILE_ITEMS = 8
-"""The fewest work-items that share a tile, if more than one does: a row of a block (kernels/shared/blocks.h)."""
+"""The fewest work-items that share a tile, if several do: one row of a block of pixels (kernels/shared/blocks.h)."""
 
 
 def tile_items(device: Device) -> int:
-    """Number of work-items that share a tile: at most its number of pixels, and one if vectors have several pixels."""
+    """Number of work-items that share a tile: at most one per pixel, and 1 if a vector holds several pixels."""
     if device.shape.lanes > 1 or device.shape.items == 1:
         return 1
     return min(max(device.shape.items, _MIN_TILE_ITEMS), TILE * TILE)
@@ -139,13 +139,13 @@ def count_pairs(
     background: DeviceArray,
     camera: Camera,
 ) -> tuple[int, int]:
-    """Count pairs of a Gaussian and a pixel, by a build of blend.cl that counts them: (contributing, evaluated).
+    """Numbers of contributing and of evaluated pairs of a Gaussian and a pixel, from a counting build of blend.cl.
 
-    A pair contributes if its colour is added to the pixel. It is evaluated if its alpha is computed; a vector computes
-    the alpha of all its lanes.
+    A pair contributes if the Gaussian's colour is added to the pixel. It is evaluated if its alpha is computed; a
+    vector computes the alpha of all its lanes.
     """
     width, height = camera.width, camera.height
-    planes = _planes(work, width, height, kept=True)  # the planes that `blend` wrote, which get the same values again
+    planes = _planes(work, width, height, kept=True)  # the planes of `blend`, rewritten with the same values
     counts = work.array("counts", (lists.band.tiles * tile_items(device), 2), np.uint32)
     arrays = (lists.ranges, lists.gaussian_from_sorted, splats, background, *planes, counts)
     launch_tiles(device, "blend", {"COUNT_PAIRS": True}, lists, -(-width // TILE), width, height, *arrays)
@@ -164,10 +164,10 @@ def blend_grad(
     *,
     fields: SlotFields = PLAIN_SLOTS,
 ) -> DeviceArray:
-    """Partial gradients of every pair of the lists at its slot, (pairs, fields.floats).
+    """Partial gradients (pairs, fields.floats): the row of each pair is its slot.
 
-    image_gradient: (3, rows, stride). A fourth plane is the loss's gradient with respect to the transmittance. A last
-    plane is the gradient with respect to nearness, if the fields include it.
+    image_gradient: (3, rows, stride). A fourth plane is the gradient of the loss with respect to the transmittance.
+    If the fields include nearness, the last plane is the gradient with respect to it.
     """
     rows, stride = blended.transmittance.shape
     pairs = lists.gaussian_from_sorted.shape[0]

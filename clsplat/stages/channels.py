@@ -26,7 +26,7 @@ from clsplat.stages.ranges import TileLists
 FEATURE_WIDTHS = floats_of("features")
 """Floats of each feature."""
 DEPTH_PLANES, WHOLE_NUMBER_PLANES = tuple(floats_of("depths")), tuple(floats_of("whole"))
-"""Planes after the blended features, and the integer planes, in the order of channels.cl."""
+"""Names of the planes that follow the blended features, and of the integer planes, in the order of channels.cl."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Features:
         return {"FEATURES": self.floats, **{f"FEATURE_{name.upper()}": at for name, at in self.offsets.items()}}
 
     def named(self, means: NDArray[Any], whole: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Split host planes of `Channels`, with the plane axis last, into named channels: (H, W), or (H, W, floats)."""
+        """Channels by name, (H, W) or (H, W, floats), from the planes of `Channels` on the host, plane axis last."""
         planes = {name: means[:, :, at : at + FEATURE_WIDTHS[name]] for name, at in self.offsets.items()}
         planes = {name: plane if plane.shape[2] > 1 else plane[:, :, 0] for name, plane in planes.items()}
         planes |= {name: means[:, :, at] for at, name in enumerate(DEPTH_PLANES, self.floats)}
@@ -93,12 +93,12 @@ class Channels:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Cameras and means at the times to which motion and backward motion lead.
+    """Cameras and means at the end of forward motion and of backward motion.
 
-    after: the packed camera of motion.
-    before: the packed camera of backward motion; None means `after`.
-    moved, earlier: the Gaussians with their means at the times of `after` and `before`, on the device or the host like
-    the model; None if they do not move.
+    after: the packed camera at the end of forward motion.
+    before: the packed camera at the end of backward motion; None means `after`.
+    moved, earlier: the Gaussians at the times of `after` and `before`, on the device or host like the model; None if
+    they do not move.
     """
 
     after: DeviceArray

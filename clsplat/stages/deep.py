@@ -25,9 +25,9 @@ def deep(
     inputs: ImageInputs,
     blended: Blended,
 ) -> DeviceArray:
-    """Slices (bins, DEEP_FLOATS, rows, stride) of the lists' tiles; `blended` must be of the same tiles.
+    """Slices (bins, DEEP_FLOATS, rows, stride) of the tiles in the lists; `blended` must be of the same tiles.
 
-    bins: largest number of slices of a pixel.
+    bins: maximum number of slices per pixel.
     """
     plane_rows, stride = blended.stops.shape
     planes = work.array("deep", (bins, DEEP_FLOATS, plane_rows, stride), kept=lists.band.first > 0)

@@ -14,15 +14,15 @@ from clsplat.stages.deep import DEEP_FLOATS
 
 
 def merge_bytes(pictures: int, bins: int) -> int:
-    """Bytes per pixel for a merge: the pictures, their weights, the order, the result."""
+    """Bytes per pixel for a merge: the pictures, their weights, the order of their slices, and the result."""
     return pictures * (4 + bins * (4 * DEEP_FLOATS + 5)) + 4 * DEEP_FLOATS * bins
 
 
 @stage("deep_merge")
 def deep_merge(device: Device, work: Workspace, pictures: DeviceArray, weights: DeviceArray) -> DeviceArray:
-    """Merge deep pictures into (bins, DEEP_FLOATS, pixels), an array of the workspace.
+    """The merged deep picture (bins, DEEP_FLOATS, pixels), an array of the workspace.
 
-    pictures: (P, bins, DEEP_FLOATS, pixels), at most DEEP_PICTURES of them.
+    pictures: (P, bins, DEEP_FLOATS, pixels), P at most DEEP_PICTURES.
     weights: (P, pixels), not negative, with a sum near 1.
     """
     count, bins, _, pixels = pictures.shape

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches density.cl: the statistics for density control, and the moves of rows that density control plans."""
+"""Launches density.cl: statistics for density control, and copies of the rows that density control keeps or clones."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from clsplat.stages.scan import scan
 
 
 def gaussian_bytes(*, contributions: bool) -> int:
-    """Bytes of each Gaussian's statistics: sum, views, radius; with contributions, two for each of two epochs."""
+    """Bytes of each Gaussian's statistics: sum, views, radius; with contributions, two values in each of two epochs."""
     return 4 * (3 + 4 * contributions)
 
 
@@ -36,16 +36,16 @@ CONTRIBUTION_STATISTICS = ("current_totals", "current_largest", "whole_totals", 
 class DensityStatistics:
     """Statistics per Gaussian, (n,) each.
 
-    Since the last densification:
+    These count since the last densification:
 
     gradient_sums: sums of gradient norms.
     seen: number of views that show the Gaussian.
     radii: largest radius in pixels.
 
-    CONTRIBUTION_STATISTICS are contributions to the images of the training views, in pixels. They are counted per
-    epoch, whether or not Gaussians are densified. There is the total over the views and the largest in one view, each
-    for the current epoch and for the last complete epoch. They are infinite for Gaussians that did not exist, or were
-    not measured, in some view of the epoch. They are None if no rule uses them.
+    CONTRIBUTION_STATISTICS are sums of blending weights in the images of the training views, in pixels. They count per
+    epoch, whether or not Gaussians are densified. `totals` is the sum over the views, `largest` the maximum of one
+    view; `current` is the current epoch, `whole` the last complete epoch. They are infinite for a Gaussian that was
+    not measured in some view of the epoch, for example a new one. They are None if no rule uses them.
     """
 
     gradient_sums: DeviceArray
@@ -63,7 +63,7 @@ class DensityStatistics:
         return DensityStatistics(**{name: array.rows(start, stop) for name, array in self.named().items()})
 
     def named(self) -> dict[str, DeviceArray]:
-        """Every array by its name, also used in a checkpoint."""
+        """The arrays by name; a checkpoint uses the same names."""
         return {name: array for name, array in vars(self).items() if array is not None}
 
     def load(self, values: Mapping[str, Float32]) -> None:
@@ -79,7 +79,7 @@ class DensityStatistics:
                 array.fill(np.inf)
 
     def next_epoch(self) -> DensityStatistics:
-        """Statistics in which the current epoch becomes the last complete epoch, and a new epoch begins."""
+        """Statistics at the start of a new epoch: the current epoch becomes the last complete epoch."""
         if self.whole_totals is None or self.whole_largest is None:
             return self
         self.whole_totals.fill(0.0)
@@ -110,7 +110,7 @@ def add_statistics(
     projected: Projected,
     screen: Screen,
 ) -> None:
-    """Add one view: the norm of the gradient with respect to each visible mean in NDC, as for the paper's threshold."""
+    """Add a view to the statistics. Gradient norms are with respect to means in NDC, as is the paper's threshold."""
     n = projected.tile_counts.shape[0]
     rays = camera.model.along_rays
     kernels = device.kernels("density", {"RAYS": True} if rays else {})
@@ -124,9 +124,9 @@ def add_statistics(
 def add_contributions(
     device: Device, statistics: DensityStatistics, projected: Projected, contributions: DeviceArray, area: float
 ) -> None:
-    """Add the contributions of one view's Gaussians, (n,), to the current epoch.
+    """Add the contributions (n,) that the Gaussians make to a view to the statistics of the current epoch.
 
-    area: number of full-resolution pixels per pixel, by which contributions in a reduced image are multiplied.
+    area: number of full-resolution pixels per pixel of a reduced image; contributions are multiplied by it.
     """
     n = projected.tile_counts.shape[0]
     kernel, view = device.kernels("density").contribution_statistics, (projected.tile_counts, contributions)
@@ -135,9 +135,10 @@ def add_contributions(
 
 @dataclass(frozen=True, eq=False)
 class DeviceRowList:
-    """The rows of a model after density control, on the device: (m,) uint32, each a source row and FRESH.
+    """The rows of a model after density control, on the device: (m,) uint32, a source row each, plus FRESH if new.
 
-    halves: the number of halves at the end: first one half of each split Gaussian, then the other halves.
+    halves: the number of halves of split Gaussians, which are the last rows. The first halves of all split Gaussians
+    precede the second halves.
     """
 
     rows: DeviceArray
@@ -153,8 +154,8 @@ class DeviceRowList:
 class DeviceMarker:
     """Marks the Gaussians of a model by their statistics.
 
-    Its output takes the memory of `work` that holds a frame's splats. So no frame may be in use meanwhile, and the
-    lists are valid until the next frame.
+    The results overwrite a frame's splats in `work`. So no frame may be in use then, and the results are valid only
+    until the next frame is rendered.
     """
 
     device: Device
@@ -163,7 +164,7 @@ class DeviceMarker:
     statistics: DensityStatistics
 
     def scores(self, rules: MarkRules) -> Float32:
-        """Mean gradients (n,) of the Gaussians that may be densified; negative for the rest."""
+        """Mean gradient norms (n,) of the Gaussians that may be densified; negative for the others."""
         return _scored(self.device, self, rules).scores.get()
 
     def rows(self, rules: MarkRules) -> DeviceRowList:
@@ -212,14 +213,14 @@ def _listed(device: Device, marker: DeviceMarker, rules: MarkRules) -> DeviceRow
 
 
 def list_rows(device: Device, rows: NDArray[np.uint32], fresh: NDArray[np.bool_] | None) -> DeviceRowList:
-    """Upload a list from the host: row j is a copy of row rows[j], marked FRESH where `fresh` is set."""
+    """Upload a list of source rows from the host; entries where `fresh` is set are marked FRESH."""
     entries = rows.astype(np.uint32) if fresh is None else np.where(fresh, rows | FRESH, rows).astype(np.uint32)
     return DeviceRowList(upload(device, entries), halves=0)
 
 
 def try_gather(device: Device, count: int, source: AnyGaussians) -> None:
-    """Launch the kernels of `gather` on existing arrays, which would overwrite them; only inside
-    `launch.only_tried`."""
+    """Try the kernels of `gather` on existing arrays. Call it only inside `launch.only_tried`: a real launch would
+    overwrite the arrays."""
     if isinstance(source, DeviceGaussians):
         array = source["opacity_logits"]
         _gather_array(device, array.reshaped(min(count, source.count)), array, array, None)
@@ -229,9 +230,9 @@ def try_gather(device: Device, count: int, source: AnyGaussians) -> None:
 def gather(
     device: Device, rows: DeviceArray | NDArray[np.uint32], source: AnyGaussians, *, renews: bool = False
 ) -> AnyGaussians:
-    """Gather rows into new arrays, on the device or host of the source: row j is row rows[j] of the source.
+    """New arrays, on the device or host of the source, whose row j is row rows[j] of the source.
 
-    renews: True if FRESH rows become zero, as for moments; False copies them too, as for parameters.
+    renews: True sets FRESH rows to zero, for moments; False copies them too, for parameters.
     """
     count = rows.shape[0]
     if isinstance(rows, DeviceArray):
@@ -252,9 +253,9 @@ def gather(
 def carry(
     device: Device, rows: DeviceArray, source: DensityStatistics, to: DensityStatistics, *, densified: bool
 ) -> None:
-    """Carry statistics over to arrays of new sizes: row j is row rows[j] of the source, infinite if FRESH.
+    """Copy statistics to arrays of new sizes: row j is row rows[j] of the source, or infinite if FRESH.
 
-    Contributions are always carried over, the other statistics only if nothing was densified.
+    Contributions are always copied, the other statistics only if nothing was densified.
     """
     for name, array in to.named().items():
         if name in CONTRIBUTION_STATISTICS or not densified:
@@ -262,7 +263,7 @@ def carry(
 
 
 def _gather_array(device: Device, rows: DeviceArray, source: DeviceArray, to: DeviceArray, fresh: float | None) -> None:
-    """Gather rows of an array. fresh: the value of FRESH rows; None copies them too."""
+    """Gather rows of an array. fresh: the value for FRESH rows; None copies them like the others."""
     count, width = rows.shape[0], int(np.prod(source.shape[1:]))
     kernel = device.kernels("density").gather_rows
     if width:
@@ -270,7 +271,7 @@ def _gather_array(device: Device, rows: DeviceArray, source: DeviceArray, to: De
 
 
 def widen(device: Device, source: AnyGaussians, coefficients: int) -> AnyGaussians:
-    """Copy a model with room for more SH coefficients, which are zero, on the same device or host."""
+    """The model with more SH coefficients, on the same device or host; the additional ones are zero."""
     rest = np.zeros(group_shapes(source.count, coefficients)["sh_rest"], np.float32)
     rest[:, : source.coefficients - 1] = source["sh_rest"].get()
     if isinstance(source, HostGaussians):

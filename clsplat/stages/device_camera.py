@@ -15,15 +15,15 @@ assert CAMERA[len(_CAMERA_FIELDS) :] == tuple(
     f"{name}_LOW" for name in _CAMERA_FIELDS[: len(CAMERA) - len(_CAMERA_FIELDS)]
 )
 FARTHEST_PLANE = float(np.finfo(np.float32).max)
-"""Far plane, in world units, of a camera that has none. It is finite because infinity, split into two floats, would
-give NaN."""
+"""Far plane, in world units, for a camera without one. It is finite, because infinity split into two floats would give
+NaN."""
 _TRANSLATION_FIELDS, _POSITION_FIELDS = ("T0", "T1", "T2"), ("PX", "PY", "PZ")
 _ROTATION_FIELDS = tuple(tuple(f"R{row}{column}" for column in range(3)) for row in range(3))
 
 
 def pack_camera(camera: Camera) -> NDArray[np.float32]:
-    """Pack a camera in the order of `columns.CAMERA`: its values as float32, and their rounding errors in the fields
-    whose names end in _LOW.
+    """The camera's values as float32 in the order of `columns.CAMERA`; fields ending in _LOW hold their rounding
+    errors.
 
     Raises InputError for a panorama of more than a full turn.
     """
@@ -37,7 +37,7 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
         "FY": camera.fy,
         "CX": camera.cx,
         "CY": camera.cy,
-        "NEAR": max(camera.near, 0.0),  # points behind the camera have no order by depth
+        "NEAR": max(camera.near, 0.0),  # depth does not order points behind the camera
         "FAR": min(camera.far, FARTHEST_PLANE),
         "HAND": float(np.copysign(1.0, np.linalg.det(camera.rotation))),
         "XMIN": -camera.cx / camera.fx - window.clamp * half_w,

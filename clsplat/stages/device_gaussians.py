@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters, gradients and moments on the device, or on the host and streamed in parts."""
+"""Parameters, gradients and moments: on the device, or on the host and streamed to the device in parts."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ A = TypeVar("A")
 
 @dataclass(frozen=True, eq=False)
 class _ByGroup(Generic[A]):
-    """Parameters, gradients or moments: arrays by group name, with a first axis of length `count`."""
+    """Parameters, gradients or moments: arrays by group name, whose first axis has length `count`."""
 
     count: int
     coefficients: int
@@ -52,7 +52,7 @@ class _ByGroup(Generic[A]):
         return self.arrays[group]
 
     def only(self, *groups: str) -> Self:
-        """An object with only the arrays of these groups."""
+        """A copy of this object that has only the arrays of these groups."""
         return replace(self, arrays={group: self.arrays[group] for group in groups})
 
 
@@ -60,7 +60,7 @@ class _ByGroup(Generic[A]):
 class DeviceGaussians(_ByGroup[DeviceArray]):
     """Gaussians on the device.
 
-    In a model that is only rendered (`ShStorage`), sh_rest may be float16, and sh_degrees (count) uint8 may be present.
+    In a model that is only rendered (`ShStorage`), sh_rest may be float16, and there may be sh_degrees (count) uint8.
     """
 
 
@@ -79,7 +79,7 @@ class HostArray:
         return self.values.copy()
 
     def set(self, values: NDArray[Any]) -> None:
-        """Copy from another array."""
+        """Copy the values of another array into this one."""
         self.values[...] = values
 
     def get_rows(self, start: int, stop: int) -> NDArray[Any]:
@@ -87,7 +87,7 @@ class HostArray:
         return self.values[start:stop].copy()
 
     def set_rows(self, start: int, values: NDArray[Any]) -> None:
-        """Copy another array to the rows that begin at `start`."""
+        """Copy another array into the rows that begin at `start`."""
         self.values[start : start + len(values)] = values
 
     def fill(self, value: float) -> None:
@@ -97,7 +97,7 @@ class HostArray:
 
 @dataclass(frozen=True, eq=False)
 class HostGaussians(_ByGroup[HostArray]):
-    """Gaussians on the host, uploaded `rows` at a time for use (`parts`)."""
+    """Gaussians on the host; `parts` uploads `rows` of them at a time."""
 
     rows: int
 
@@ -108,9 +108,9 @@ AnyGaussians = DeviceGaussians | HostGaussians
 def parts(
     work: Workspace, *models: AnyGaussians, keep: bool = False
 ) -> Iterator[tuple[int, int, tuple[DeviceGaussians, ...]]]:
-    """Yield (start, stop, the models' rows [start, stop) on the device) for each part of the rows in turn.
+    """Yield (start, stop, the models' rows [start, stop) on the device) for each part in turn.
 
-    Models on the device have a single part. A part of a host model is valid until the next part is requested.
+    Models on the device have a single part. Each part of a host model is valid until the next part is requested.
 
     keep: copy changes of the part back to the host.
     """
@@ -174,8 +174,8 @@ def host_gaussians(gaussians: Gaussians, rows: int, sh: ShStorage | None = None)
 
 
 def host_model(arrays: Mapping[str, NDArray[Any]], kind: str) -> HostGaussians:
-    """Gaussians on the host from a checkpoint's arrays `kind`/means and so on. Raises ValueError if names, shapes or
-    dtypes are wrong."""
+    """Gaussians on the host, from the arrays of a checkpoint whose names begin with `kind`/. Raises ValueError for a
+    wrong name, shape or dtype."""
     if missing := [group for group in PARAMETER_GROUPS if f"{kind}/{group}" not in arrays]:
         raise ValueError(f"has no {kind}/{missing[0]}")
     host = {group: HostArray(arrays[f"{kind}/{group}"]) for group in PARAMETER_GROUPS}
@@ -188,7 +188,7 @@ def host_model(arrays: Mapping[str, NDArray[Any]], kind: str) -> HostGaussians:
 
 
 def host_zeros(count: int, coefficients: int, rows: int) -> HostGaussians:
-    """Zero arrays, the initial moments."""
+    """Arrays of zeros on the host: the initial moments of Adam."""
     shapes = group_shapes(count, coefficients)
     arrays = {name: HostArray(np.zeros(shape, np.float32)) for name, shape in shapes.items()}
     return HostGaussians(count, coefficients, arrays, rows)

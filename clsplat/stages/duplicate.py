@@ -21,11 +21,11 @@ from clsplat.stages.scan import Elements, chunking, scan
 from clsplat.stages.sort import SORT_KEY_BYTES, sort
 
 MAX_PAIRS_PER_BAND = 2**31 - 1024
-"""The most pairs in one band: stops are signed 32-bit integers, and kernels read slightly beyond the last pair."""
+"""Maximum number of pairs in a band: stops are signed 32-bit integers, and kernels read slightly past the last pair."""
 
 
 DUPLICATE_GAUSSIAN_BYTES = 3 * 4 + SORT_KEY_BYTES + 3 * 4
-"""Bytes per Gaussian: first slots; visible Gaussians and their keys; both sorted, with counts and offsets."""
+"""Bytes per Gaussian: first slots, visible Gaussians, their keys; Gaussians and keys sorted; counts and offsets."""
 BAND_GAUSSIAN_BYTES = 4
 """Additional bytes per Gaussian if there are several bands: its number of tiles in the current band."""
 BAND_TILE_BYTES = 4
@@ -33,8 +33,8 @@ BAND_TILE_BYTES = 4
 
 
 def pair_bytes(*, sorts_pairs: bool) -> int:
-    """Bytes per pair: tile, slot and Gaussian. If pairs are sorted by depth, this includes the tile, Gaussian and depth
-    of each slot, and the sort."""
+    """Bytes per pair: tile, slot and Gaussian. sorts_pairs: add the tile, Gaussian and depth of each slot, and a sort
+    of the pairs by depth."""
     return 12 + (12 + SORT_KEY_BYTES if sorts_pairs else 0)
 
 
@@ -55,16 +55,16 @@ class Band:
 class Counted:
     """The visible Gaussians and the number of their pairs.
 
-    tile_counts, first_slots: (n), a Gaussian's number of tiles, and the prefix sums.
-    gaussian_from_visible, depth_keys: (visible), in order of the Gaussians.
-    visible, pairs: the totals; pairs are capped at 2^32 - 1.
+    tile_counts, first_slots: (n), the number of tiles of each Gaussian, and its first slot, a prefix sum of these.
+    gaussian_from_visible, depth_keys: (visible), in the order of the Gaussians' rows.
+    visible, pairs: the numbers of visible Gaussians and of pairs; pairs are capped at 2^32 - 1.
     least_key: a lower bound of the depth keys.
-    key_bits: the number of low bits that can be set in a key minus least_key.
+    key_bits: sufficient number of bits for all keys minus least_key.
     refused: the counts of `adam`.
 
     In a pass launched by capacity (`PairCapacity`), `visible` and `pairs` are upper bounds, and these fields are set:
 
-    on_device: the READBACK array in which its kernels find the totals.
+    on_device: the READBACK array from which its kernels read these numbers.
     arriving: function that waits for the host's copy of that array, and returns it.
     """
 
@@ -81,9 +81,9 @@ class Counted:
     arriving: Callable[[], NDArray[Any]] | None = None
 
     def elements(self, most: int, name: str) -> Elements:
-        """The number that READBACK calls `name`, as a count of elements for kernels.
+        """The field `name` of READBACK, as the number of elements of a kernel.
 
-        most: the number itself, or its upper bound in a pass by capacity.
+        most: the number itself, or an upper bound of it in a pass by capacity.
         """
         return Elements(most, self.on_device, READBACK.index(name))
 
@@ -111,12 +111,12 @@ def count(
     all_bits: bool = False,
     readback: DeviceArray | None = None,
 ) -> Counted:
-    """Find the visible Gaussians, the number of their pairs, and the bits in which their depths differ.
+    """The visible Gaussians, the number of their pairs, and the bits in which their depths differ.
 
     Waits for the device.
 
     all_bits: assume that depths differ in all 32 bits.
-    readback: (READBACK_SIZE,) uint32, the array that is read back. The array that `adam` uses also gives its counts.
+    readback: (READBACK_SIZE,) uint32, the array that is read back. If `adam` used it, its counts are in the result.
     """
     readback = readback or work.array("readback", (len(COUNTED),), np.uint32)
     first_slots, gaussian_from_visible, depth_keys = _compact(device, work, projected, readback)
@@ -144,12 +144,12 @@ def count_by_capacity(
     capacity: int,
     host: NDArray[np.uint32],
 ) -> Counted:
-    """Like `count`, without waiting, for at most `capacity` pairs: with more the pass stops (kernels/duplicate.cl).
+    """Like `count`, but without waiting. With more than `capacity` pairs the pass stops (kernels/duplicate.cl).
 
-    readback: (READBACK_SIZE,) uint32, the array that `project_step` gets too.
-    host: host memory for its copy.
+    readback: (READBACK_SIZE,) uint32, the same array that `project_step` gets.
+    host: host memory for a copy of `readback`.
 
-    Depths are sorted by all 32 bits. On a GPU that takes as many passes as the bits in which depths differ.
+    Depths are sorted by all 32 bits. On a GPU this takes no more passes than a sort by the bits that differ.
     """
     (n,) = projected.tile_counts.shape
     arrays = (projected.tile_counts, *_compact(device, work, projected, readback, capacity))
@@ -188,7 +188,7 @@ def count_band(
     *,
     all_bits: bool = False,
 ) -> Counted:
-    """Like `count`, for the band's tiles only. It overwrites the results of an earlier count in the workspace."""
+    """Like `count`, for the tiles of the band only. Overwrites the results of an earlier count in the workspace."""
     n = projected.tile_counts.shape[0]
     band_counts = work.array("band_counts", (n,), np.uint32)
     kernel, arrays = device.kernels("duplicate").band_counts, (projected.tile_counts, projected.splats, band_counts)
@@ -200,7 +200,7 @@ def count_band(
 def plan_bands(
     device: Device, work: Workspace, projected: Projected, counted: Counted, tiles: tuple[int, int], capacity: int
 ) -> tuple[Band, ...]:
-    """The fewest bands of at most `capacity` pairs each. Raises CapacityError if one tile has more."""
+    """The fewest bands that have at most `capacity` pairs each. Raises CapacityError if a single tile has more."""
     if counted.pairs <= capacity:
         return (Band(0, tiles[0] * tiles[1]),)
     n = projected.tile_counts.shape[0]
@@ -250,9 +250,9 @@ def duplicate(
 def duplicate_and_sort(
     device: Device, work: Workspace, splats: DeviceArray, counted: Counted, tiles: tuple[int, int], band: Band
 ) -> Pairs:
-    """The same pairs as from `duplicate`, made by sorting all pairs by depth, as in the code of Kerbl et al.
+    """The same pairs as from `duplicate`, but by a sort of all pairs by depth, as in the code of Kerbl et al.
 
-    It is the lower half of a sort by 64-bit keys, whose upper half is the sort by tile that follows.
+    With the sort by tile that follows, this equals one sort by 64-bit keys: tile in the upper half, depth in the lower.
     """
     visible, pairs = counted.visible, counted.pairs
     kernels = device.kernels("duplicate")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches ewa.cl and ewa_grad.cl: Gaussians to means, conics, depths and radii on the image, and the gradient back.
+"""Launches ewa.cl and ewa_grad.cl: the EWA projection of Gaussians to the image plane, and its gradient.
 
 The kernels follow gsplat's conventions. They can also compute the gradient with respect to the camera.
 """
@@ -23,11 +23,11 @@ from clsplat.stages.device_camera import FARTHEST_PLANE
 from clsplat.stages.sums import padded, row_sums
 
 EWA_CAMERA_DEFINES = {model.gsplat: model.ewa for model in CAMERA_MODELS if model.gsplat}
-"""Defines of the camera models, by gsplat's names of the models."""
+"""Kernel define of each camera model, by gsplat's name of the model."""
 EWA_CAMERA_MODELS = tuple(EWA_CAMERA_DEFINES)
 
 EWA_CLAMP_FRACTION = 0.15
-"""Fraction of the image's side: how far beyond an edge a mean may lie in the Jacobian of a pinhole camera."""
+"""For the Jacobian of a pinhole camera, means are clamped this far beyond the image's edges: a fraction of its side."""
 
 _TWO_FLOAT_FIELDS = tuple(name.removesuffix("_LOW") for name in EWA_CAMERA if name.endswith("_LOW"))
 
@@ -36,12 +36,12 @@ _TWO_FLOAT_FIELDS = tuple(name.removesuffix("_LOW") for name in EWA_CAMERA if na
 class EwaCamera:
     """A camera of the EWA projection.
 
-    viewmat: (4, 4), camera from world. Its first three rows need not be a rotation and a translation.
-    intrinsics: (3, 3), fx, fy, cx and cy in pixels; a skew is ignored.
+    viewmat: (4, 4), camera from world. Its upper left 3x3 matrix need not be a rotation.
+    intrinsics: (3, 3), with fx, fy, cx and cy in pixels; skew is ignored.
     width, height: pixels.
     near, far: world units; Gaussians whose depth is not strictly between these are culled.
     eps2d: px^2, added to the diagonal of the projected covariance.
-    radius_clip: pixels; Gaussians with no larger radius are culled.
+    radius_clip: pixels; Gaussians with this radius or a smaller one are culled.
     model: one of EWA_CAMERA_MODELS.
     """
 
@@ -68,12 +68,12 @@ class EwaCamera:
         try:
             inverse = np.linalg.inv(self.viewmat)
         except np.linalg.LinAlgError:
-            raise InputError("viewmats: a matrix has no inverse, expected the pose of a camera") from None
+            raise InputError("viewmats: a matrix is singular, expected camera poses") from None
         return np.asarray(inverse[:3, 3], np.float64)
 
     def position_gradient(self, by_position: Float64) -> Float64:
-        """The gradient (4, 4) with respect to the view matrix, whose sixteen numbers all count as variables, from the
-        gradient (3,) with respect to the centre."""
+        """The gradient (4, 4) with respect to the view matrix, from the gradient (3,) with respect to the camera's
+        centre. All sixteen entries of the matrix count as independent variables."""
         inverse = np.linalg.inv(self.viewmat)
         by_inverse = np.zeros((4, 4))
         by_inverse[:3, 3] = by_position
@@ -109,7 +109,7 @@ class EwaCamera:
 
 @dataclass(frozen=True, eq=False)
 class PlacedEwaCamera:
-    """A camera, and its fields on the device in the order of `columns.EWA_CAMERA`."""
+    """A camera, with its fields on the device in the order of `columns.EWA_CAMERA`."""
 
     camera: EwaCamera
     fields: DeviceArray
@@ -128,7 +128,7 @@ class EwaInputs:
     quaternions: (n, 4), w x y z, of any nonzero length.
     scales: (n, 3), world units.
     covariances: (n, 6), instead of quaternions and scales: upper triangles xx, xy, xz, yy, yz, zz.
-    opacities: (n,), 0 to 1, if they should make the boxes smaller.
+    opacities: (n,), 0 to 1, optional; with them, the radii of faint Gaussians are smaller.
     """
 
     means: DeviceArray
@@ -155,7 +155,7 @@ class EwaInputs:
 
 @dataclass(frozen=True, eq=False)
 class Ewa:
-    """Gaussians on the image. Rows of culled Gaussians are zero.
+    """Projected Gaussians. Rows of culled Gaussians are zero.
 
     radii: (n, 2) int32, whole pixels, 0 where culled.
     means2d: (n, 2), pixels.
@@ -173,9 +173,9 @@ class Ewa:
 
 @dataclass(frozen=True, eq=False)
 class EwaImageGradients:
-    """Gradients with respect to the arrays of `Ewa`, with the same shapes. None counts as 0.
+    """Gradients with respect to the arrays of `Ewa`, with the same shapes. None means zero.
 
-    The b of a conic stands for two entries of a symmetric matrix, but counts as one variable.
+    The entry b of a conic fills two places of a symmetric matrix, but counts as one variable.
     """
 
     means2d: DeviceArray | None = None
@@ -188,7 +188,7 @@ class EwaImageGradients:
 class EwaGradients:
     """Gradients with respect to the arrays of EwaInputs, with the same shapes.
 
-    The gradient with respect to an off-diagonal entry of a covariance is the sum over its two places in the matrix.
+    The gradient with respect to an off-diagonal entry of a covariance is the sum over both places in the matrix.
     """
 
     means: DeviceArray
@@ -205,10 +205,9 @@ class EwaGradients:
 
 @stage("ewa")
 def ewa(device: Device, gaussians: EwaInputs, camera: PlacedEwaCamera, projected: Ewa) -> None:
-    """Project all Gaussians to a camera's image: fill `projected`.
+    """Project all Gaussians to a camera's image, into `projected`. Equations (150) to (158) of docs/gradients.md.
 
-    If compensations are requested and opacities given, the compensations reduce the boxes. Equations (150) to (158) of
-    docs/gradients.md.
+    If opacities are given and compensations requested, the radii are computed from opacity times compensation.
     """
     n = gaussians.count
     defines = _defines(gaussians, camera.camera, compensated=projected.compensations is not None)
@@ -240,9 +239,9 @@ def ewa_grad(
     add: bool = False,
     by_camera: bool = False,
 ) -> DeviceArray | None:
-    """Fill `gradients` from the `given` gradients with respect to the projected arrays. Equations (159) to (166).
+    """Fill `gradients` from the gradients `given` with respect to the projected arrays. Equations (159) to (166).
 
-    add: add to the existing gradients, such as those of earlier cameras.
+    add: add to existing gradients, such as those of earlier cameras.
     by_camera: return the gradient (16,) with respect to the camera, in the order of `columns.EWA_GRADIENT`;
     `camera_gradients` turns it into matrices.
 
@@ -274,9 +273,9 @@ def ewa_grad(
 
 
 def camera_gradients(by_camera: NDArray[np.floating]) -> tuple[Float64, Float64]:
-    """Split the gradient (16,) of `ewa_grad` into gradients for the view matrix (4, 4) and the intrinsics (3, 3).
+    """Split the gradient (16,) of `ewa_grad` into those of the view matrix (4, 4) and of the intrinsics (3, 3).
 
-    The last row of the view matrix has no gradient.
+    The gradient of the view matrix's last row is zero.
     """
     values = dict(zip(EWA_GRADIENT, np.asarray(by_camera, np.float64), strict=True))
     viewmat, intrinsics = np.zeros((4, 4)), np.zeros((3, 3))

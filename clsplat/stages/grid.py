@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches grid.cl: a photograph's bilateral grid, its gradient and Adam's step."""
+"""Launches grid.cl: a photograph's bilateral grid, its gradient and its update by Adam."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from clsplat.device.profile import stage
 from clsplat.stages.appearance import APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON
 
 GRID_SHAPE = (8, 16, 16, 3, 4)
-"""Levels, rows and columns of a grid, and the shape of its colour transforms."""
+"""Levels, rows and columns of a grid, then the shape of the colour transform in each cell."""
 GRID_FLOATS = int(np.prod(GRID_SHAPE))
 
 
@@ -41,9 +41,9 @@ def _spans(width: int, height: int) -> tuple[float, float]:
 
 
 def device_bytes(photographs: int, sizes: Sequence[tuple[int, int]]) -> int:
-    """Bytes per pixel with padding: the planes of the transformed image, and the fixed arrays divided over the pixels.
+    """Bytes per pixel, padding included: the planes of the transformed image, and a share of the fixed arrays.
 
-    The fixed arrays are the grids with their moments, and the line sums in the largest of the `sizes` (width, height).
+    The fixed arrays are the grids, their moments, and the line sums for the largest of the `sizes` (width, height).
     """
     lines = max((height for _, height in sizes), default=0) * GRID_SHAPE[2] * 12 * GRID_SHAPE[0]
     held = 4 * (3 * GRID_FLOATS * photographs + GRID_FLOATS + lines)
@@ -54,7 +54,7 @@ def device_bytes(photographs: int, sizes: Sequence[tuple[int, int]]) -> int:
 def apply_grid(
     device: Device, work: Workspace, grids: Grids, photograph: int, image: DeviceArray, width: int, height: int
 ) -> DeviceArray:
-    """The image, of width x height pixels, with the colours of the photograph: planes (3, rows, stride)."""
+    """Planes (3, rows, stride) of the image, width x height pixels, with the colour transforms of the photograph."""
     _, rows, stride = image.shape
     seen = work.array("appearance_seen", image.shape)
     sizes = (photograph, stride, rows * stride, *_spans(width, height))
@@ -76,10 +76,10 @@ def grid_gradient(
     weight: float,
     place: int = 0,
 ) -> DeviceArray:
-    """Convert, in place, the gradient with respect to the transformed image to that with respect to the image.
+    """Replace the gradient with respect to the transformed image by the gradient with respect to the image.
 
-    Returns the gradient with respect to the photograph's grid, plus `weight` times the gradient of its variation. Each
-    `place` in a batch has its own array.
+    Returns the gradient with respect to the photograph's grid, plus `weight` times the gradient of its total variation.
+    place: the view's number in the batch; each has its own array.
     """
     _, rows, stride = image.shape
     plane, (across, down) = rows * stride, _spans(width, height)
@@ -106,9 +106,9 @@ def step_grid(
     rate: float,
     readback: DeviceArray,
 ) -> None:
-    """Take Adam's step number `visit` (from 1) for the photograph's grid.
+    """Update the photograph's grid by Adam. visit: the number of this update of the grid, from 1.
 
-    If the step's pass has stopped (kernels/duplicate.cl), nothing changes.
+    Nothing changes if the step's pass has stopped for lack of capacity (kernels/duplicate.cl).
     """
     kernel = device.kernels("grid", {"LANES": 1}).move_grid
     constants = (
@@ -124,6 +124,6 @@ def step_grid(
 
 @stage("appearance")
 def centre_grids(device: Device, grids: Grids, readback: DeviceArray) -> None:
-    """Make the mean of all grids the identity. If the step's pass has stopped, nothing changes."""
+    """Shift the grids so that their mean is the identity. Nothing changes if the step's pass has stopped."""
     kernel = device.kernels("grid", {"LANES": 1}).centre_grids
     launch_items(device, kernel, GRID_FLOATS, grids.grids.shape[0], readback, grids.grids)

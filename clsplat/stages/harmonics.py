@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches harmonics.cl and harmonics_grad.cl: colours from spherical harmonics, and the gradient back.
+"""Launches harmonics.cl and harmonics_grad.cl: colours from spherical harmonics, and the gradient.
 
-The directions are an input, or point from a camera to the means.
+The directions are given, or are computed from a camera's centre to the means.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ class Harmonics:
     """Input for n colours.
 
     directions: (n, 3), of any length.
-    sh: (n, K, 3), K at least (degree + 1)^2; the rest is ignored.
+    sh: (n, K, 3), K at least (degree + 1)^2; further coefficients are ignored.
     mask: (n,) or (n, 2), int32; rows that are not positive are skipped.
-    centre: (6,), a camera's `centre_array`. If it is given, `directions` has means instead, and colours are offset by
-    0.5 and clamped at 0.
+    centre: (6,), a camera's `centre_array`. With it, `directions` holds the means, and colours are increased by 0.5
+    and clamped at 0.
     """
 
     directions: DeviceArray
@@ -66,7 +66,7 @@ class Harmonics:
 
     @property
     def arguments(self) -> tuple[object, ...]:
-        """Arguments of both kernels that come after the number of colours."""
+        """The kernels' arguments after the number of colours."""
         centre = () if self.centre is None else (self.centre,)
         mask = () if self.mask is None else (self.mask.size // max(self.count, 1), self.mask)
         return (self.sh.shape[1], self.used, *centre, self.directions, self.sh, *mask)
@@ -81,14 +81,14 @@ class HarmonicsGradients:
 
 
 def centre_array(device: Device, position: Float64) -> DeviceArray:
-    """A camera's centre (3,) in the world, on the device, each coordinate in two floats."""
+    """A camera's centre in the world on the device, (6,): two floats for each coordinate."""
     high = np.asarray(position, np.float32)
     return from_host(device, np.concatenate([high, (np.asarray(position, np.float64) - high).astype(np.float32)]))
 
 
 @stage("harmonics")
 def harmonics(device: Device, given: Harmonics, colours: DeviceArray) -> None:
-    """Fill colours (n, 3), with 0 for masked rows. Equation (167) of docs/gradients.md."""
+    """Compute colours (n, 3); masked rows become 0. Equation (167) of docs/gradients.md."""
     n = given.count
     kernel = device.kernels("harmonics", given.defines).harmonics
     launch_items(device, kernel, -(-n // device.shape.lanes), n, *given.arguments, colours)
@@ -107,9 +107,9 @@ def harmonics_grad(
     add_directions: bool = False,
     by_centre: bool = False,
 ) -> DeviceArray | None:
-    """Fill `gradients` from d_colours (n, 3) and the colours of `harmonics`.
+    """Compute `gradients` from d_colours (n, 3) and the colours of `harmonics`.
 
-    add, add_directions: add to existing gradients (of earlier cameras, or of the means) instead of replacing them.
+    add, add_directions: add to existing gradients, of earlier cameras or of the means, instead of replacing them.
     by_centre: return the gradient (3,) with respect to the camera's centre.
 
     Equations (38) to (40) and (168).

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches holdout.cl: a frame behind the surfaces of CG elements (docs/pictures.md)."""
+"""Launches holdout.cl: a frame without the parts that surfaces of CG elements hide (docs/pictures.md)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HELD_PIXEL_BYTES = 4 + 4 * len(HOLDOUT_SURFACE_FIELDS)
 class Held:
     """Holdout surfaces on the device.
 
-    starts: (rows * stride + 1) uint32, the index of the first surface of each pixel of a padded plane, then the end.
+    starts: (rows * stride + 1) uint32, the index of each padded pixel's first surface, then the number of surfaces.
     surfaces: (S, 4) float32.
     """
 
@@ -34,12 +34,12 @@ class Held:
 
     @property
     def arguments(self) -> tuple[DeviceArray, DeviceArray]:
-        """The arguments for a kernel that leaves out everything behind the surfaces."""
+        """The arguments of a kernel that omits everything behind the surfaces."""
         return self.starts, self.surfaces
 
 
 def held_bytes(surfaces: Surfaces | None) -> int:
-    """Bytes per pixel of an image for its surfaces."""
+    """Bytes per pixel that the surfaces of an image take."""
     return 0 if surfaces is None else 4 + 4 * len(HOLDOUT_SURFACE_FIELDS) * surfaces.dense
 
 
@@ -54,7 +54,7 @@ def upload_held(device: Device, surfaces: Surfaces) -> Held:
 
 @stage("holdout")
 def holdout(device: Device, held: Held, lists: TileLists, inputs: ImageInputs, blended: Blended) -> None:
-    """Reduce image and transmittance of `blended` to what the surfaces let through, in the lists' tiles."""
+    """Remove the light behind the surfaces from image and transmittance of `blended`, in the tiles of the lists."""
     tiles_x, listed = blended.stops.shape[1] // TILE, (lists.ranges, lists.gaussian_from_sorted)
     planes = (blended.stops, blended.image, blended.transmittance)
     arrays = (*listed, inputs.splats, inputs.background, *planes, *held.arguments)

@@ -20,22 +20,22 @@ from clsplat.stages.loss_terms import Compared, LossTerm
 from clsplat.stages.target import is_photograph, sample_defines
 
 LOSS_PIXEL_BYTES = 12
-"""Bytes of the image's gradient, per pixel with padding."""
+"""Bytes of the image's gradient per pixel, padding included."""
 
 _MIN_BLOCK_ROWS = 32
-"""The fewest rows of a block. Blocks should not be smaller, because each computes ten rows of its neighbours again."""
+"""Minimum number of rows in a block. In smaller blocks the ten rows shared with its neighbours cost too much."""
 
 
 @dataclass(frozen=True)
 class _Blocks:
-    """Blocks of pixels that the groups work on.
+    """Blocks of pixels that groups process.
 
     rows, columns: size of a block, pixels.
-    groups: number of groups, or of blocks across, down and of all channels, if each has a group.
+    groups: number of groups; if each block has its own group: the numbers of blocks across and down, and of channels.
     field: floats between two derivatives of a row, in groups that keep derivatives.
-    partials, sums: floats of these arrays.
+    partials, sums: lengths of the arrays of partial derivatives and of partial sums, in floats.
 
-    The order of the sums depends only on the number of columns; no other result depends on the blocks.
+    The order of the sums depends on the number of columns. No other result depends on the blocks.
     """
 
     rows: int
@@ -58,7 +58,7 @@ def _blocks(device: Device, height: int, stride: int) -> _Blocks:
     rows = max(-(-height * across // shape.chunks), _MIN_BLOCK_ROWS)  # gives at most three blocks per chunk
     blocks = 3 * -(-height // rows) * across
     groups = blocks if blocks < 3 * shape.chunks else shape.chunks
-    field = 16 * ((columns // 16 + 2) | 1)  # odd: rows a power of two apart evict each other from a cache
+    field = 16 * ((columns // 16 + 2) | 1)  # odd: rows at power-of-two distances evict each other from a cache
     return _Blocks(rows, columns, groups, field, partials=groups * LOSS_RING * 3 * field, sums=9 * height * across)
 
 
@@ -73,12 +73,12 @@ class Loss:
     """A loss and its gradient.
 
     gradient: (3, rows, stride), with an additional plane for each of the alpha and depth terms.
-    sums: (3, ...), partial sums of SSIM, of |x - y| and of its square. With further terms the array has one axis, and
-    the sums of these terms follow.
+    sums: (3, ...), partial sums of SSIM, of |x - y| and of (x - y)^2. With further terms the array has one axis, and
+    the partial sums of these terms follow.
     samples: the number of samples that count.
-    masked: the number of masked samples, whose windows still count in SSIM.
-    copy: function that returns the sums, if a copy to the host has been started.
-    further: weight, divisor and number of sums of each further term.
+    masked: the number of masked samples; their windows still count in SSIM.
+    copy: function that waits for a copy to the host and returns the sums; None if none has been started.
+    further: weight, divisor and number of partial sums of each further term.
     """
 
     gradient: DeviceArray
@@ -94,7 +94,7 @@ class Loss:
         return self.copied(self.sums.begin_get())
 
     def copied(self, copy: Callable[[], NDArray[Any]]) -> Loss:
-        """The same loss, with a function that waits for the sums on the host."""
+        """The same loss, whose sums come from `copy`."""
         return Loss(self.gradient, self.sums, self.samples, self.weight, copy, self.masked, self.further)
 
     def read(self) -> tuple[float, float]:
@@ -127,11 +127,11 @@ def loss(
 ) -> Loss:
     """Compute (1 - weight) L1 + weight (1 - SSIM) of planes (3, rows, stride), whose padding must be zero.
 
-    target: such planes, or where several items share a tile a photograph (height, width, 3), uint8 or float32.
-    turn: number of the array of sums to use, so that earlier sums can still be read.
-    kept: number of pixels that count; the means are over these, and other pixels are zero in both images.
-    blended: the render, which is needed only if there are terms.
-    terms: loss terms to add. Each has a plane of the gradient after the colours, and its own partial sums.
+    target: such planes; or a photograph (height, width, 3), uint8 or float32, if several items share a tile.
+    turn: number of the array for the sums; with another array, earlier sums can still be read.
+    kept: number of pixels that count: the means are over these. Other pixels are zero in both images.
+    blended: the render; needed only if there are terms.
+    terms: loss terms to add. Each has a plane of the gradient, after the colours, and its own partial sums.
     """
     _, rows, stride = image.shape
     every, blocks, items = 3 * width * height, _blocks(device, height, stride), tile_items(device)

@@ -15,17 +15,17 @@ from clsplat.layouts.columns import TILE
 from clsplat.stages.blend import Blended
 
 ALPHA_PIXEL_BYTES = 9
-"""Bytes of the alpha loss, per pixel with padding: alpha, its gradient and, rounded up, its sums."""
+"""Bytes of the alpha loss per pixel, padding included: alpha, its gradient and, rounded up, its sums."""
 DEPTH_PIXEL_BYTES = 17
-"""Bytes of the depth loss, per pixel with padding: nearness, its gradient, target and weight, and the sums."""
+"""Bytes of the depth loss per pixel, padding included: nearness, its gradient, target and weight, and the sums."""
 
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """A render and its photograph, as `stages.loss.loss` hands them to a term.
+    """A render and its photograph, the inputs and outputs of a loss term.
 
-    target: planes (3 or 4, rows, stride) of the photograph; the fourth is its alpha. Terms that do not want it may get
-    the photograph itself.
+    target: planes (3 or 4, rows, stride) of the photograph; the fourth is its alpha. If no term reads alpha, this may
+    be the photograph itself, (height, width, 3).
     gradient: planes (3 + terms, rows, stride); each term writes its own plane.
     sums: all partial sums of the loss; each term writes `rows / TILE * stride` of them.
     pixels: number of pixels that count.
@@ -48,7 +48,7 @@ class LossTerm:
 
     @property
     def key(self) -> object:
-        """Values on which the launch depends, for replays by a command buffer; None if it cannot be replayed."""
+        """Settings of the launch. A command buffer replays it only if they are unchanged; None prevents replays."""
         return None
 
     def scale(self, pixels: float) -> tuple[float, float]:
@@ -56,7 +56,7 @@ class LossTerm:
         raise NotImplementedError
 
     def launch(self, compared: Compared, plane: int, first: int) -> None:
-        """Write plane number `plane` of the gradient, and the partial sums from number `first`."""
+        """Write plane number `plane` of the gradient, and the partial sums from index `first` on."""
         raise NotImplementedError
 
 
@@ -77,8 +77,8 @@ class AlphaTerm(LossTerm):
         return self.weight, pixels
 
     def launch(self, compared: Compared, plane: int, first: int) -> None:
-        """Launch alpha_loss.cl, whose plane is the fourth."""
-        assert plane == compared.target.shape[0] - 1 == 3, "alpha comes right behind the colours"
+        """Launch alpha_loss.cl, which writes the fourth plane."""
+        assert plane == compared.target.shape[0] - 1 == 3, "alpha is the plane after the colours"
         _, rows, stride = compared.target.shape
         blended, kernel = compared.blended, compared.device.kernels("alpha_loss").alpha_loss
         planes = (blended.stops, blended.transmittance, compared.target, compared.gradient, compared.sums)
@@ -102,7 +102,7 @@ class DepthTerm(LossTerm):
         return self.factor, 1.0
 
     def launch(self, compared: Compared, plane: int, first: int) -> None:
-        """Send the known depths, and launch depth_loss.cl."""
+        """Upload the known depths, and launch depth_loss.cl."""
         blended, (_, rows, stride) = compared.blended, compared.gradient.shape
         assert blended.nearness is not None, "blended with nearness"
         aims = compared.work.array("depth_aims", (2, rows, stride))

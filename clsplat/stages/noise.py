@@ -16,11 +16,11 @@ from clsplat.optimisation.step_noise import Exploration
 from clsplat.stages.device_gaussians import DeviceGaussians
 
 NOISE_OPACITY_RANGE = 0.16
-"""No noise for opacities that exceed `dead` by more than this: it would be under 1.2e-7 of a dead Gaussian's noise."""
+"""No noise where the opacity exceeds `dead` by more: it would be less than 1.2e-7 of the noise at opacity `dead`."""
 
 
 def highest_logit(dead: float) -> float:
-    """Logit of the opacity from which no noise is added."""
+    """Logit of the opacity above which no noise is added."""
     highest = dead + NOISE_OPACITY_RANGE
     return log(highest / (1 - highest)) if highest < 1 else inf
 
@@ -28,9 +28,9 @@ def highest_logit(dead: float) -> float:
 def noise(
     device: Device, explore: Exploration, gaussians: DeviceGaussians, first_row: int, readback: DeviceArray
 ) -> None:
-    """Add a step's noise to the means of these Gaussians, unless the step's pass by capacity has stopped (`readback`).
+    """Add a step's noise to the means. Nothing changes if `readback` says that the step's pass has stopped.
 
-    first_row: row in the model of the first of these Gaussians.
+    first_row: row of the first of these Gaussians in the model.
     """
     if explore.amount != 0:
         _add_noise(device, explore, gaussians, first_row, readback)
@@ -40,7 +40,7 @@ def noise(
 def _add_noise(
     device: Device, explore: Exploration, gaussians: DeviceGaussians, first_row: int, readback: DeviceArray
 ) -> None:
-    """Launch add_noise. This is a separate stage, so that a step without noise does not record one."""
+    """Launch add_noise. This is a function of its own so that a step without noise records no stage `noise`."""
     highest, limit2 = min(highest_logit(explore.dead), 1e30), PARAMETER_GROUPS["means"].limit ** 2
     launch_items(
         device,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches peak.cl: the device's peak rates, with which the stages are compared."""
+"""Launches peak.cl: the device's peak rates, to which the stages are compared."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from clsplat.stages.blend import tile_items
 
 _PEAK_SPLATS = 64
 _GROUPS_PER_COMPUTE_UNIT = {"cpu": 4, "gpu": 32, "other": 32}
-"""Groups per compute unit: enough to keep it busy to the end."""
+"""Groups per compute unit: enough to keep all compute units busy until the end."""
 _COPY_BYTES = 256 * 2**20
 
 
@@ -25,8 +25,8 @@ _COPY_BYTES = 256 * 2**20
 class Limits:
     """The peak rates of a device.
 
-    pairs_per_second, gradient_pairs_per_second: the arithmetic of blending and of its gradient alone, with every lane
-    in use.
+    pairs_per_second, gradient_pairs_per_second: rates of the arithmetic of blending and of its gradient, without
+    memory traffic and with every lane in use.
     copy_bytes_per_second: bytes read plus bytes written by a copy too large for the caches.
     lanes, items: the kernel shape of all measurements.
     """
@@ -41,9 +41,9 @@ class Limits:
 def measure_limits(
     device: Device, *, seconds: float = 0.1, repeat: int = 5, copy_bytes: int = _COPY_BYTES, widened: bool = True
 ) -> Limits:
-    """Measure each rate as the best of `repeat` runs; runs of arithmetic last about `seconds`.
+    """Measure the best rate of `repeat` runs; each run of arithmetic takes about `seconds`.
 
-    widened: use vectors of 16 lanes if blending does. False always uses the kernel shape's lanes.
+    widened: use vectors of 16 lanes where blending does. False always uses the lanes of the kernel shape.
     """
     items = tile_items(device)
     defines = {} if widened else {"NARROW": True}
@@ -57,7 +57,7 @@ def measure_limits(
 
 
 def _splats() -> NDArray[np.float32]:
-    """Wide, faint, different Gaussians that reach every pixel of a tile."""
+    """Splats that differ, are faint, and are wide enough to cover every pixel of a tile."""
     index = np.arange(_PEAK_SPLATS)
     splats = np.zeros((_PEAK_SPLATS, len(SPLAT)), np.float32)
     columns = {"L11": 0.02, "L12": 0.005, "L22": 0.02, "RED": 0.3, "GREEN": 0.5, "BLUE": 0.7}
@@ -89,11 +89,11 @@ def _pairs_per_second(
 
 
 def _copy_rate(device: Device, nbytes: int, repeat: int) -> float:
-    copied = max(device.shape.lanes, 4)  # elements per work-item: on GPUs it takes 16 bytes to keep memory busy
+    copied = max(device.shape.lanes, 4)  # elements per work-item: a GPU needs 16 bytes to keep memory busy
     n = min(nbytes, device.max_allocation // 4, device.budget // 4) // 4 // copied * copied
     source, copy = allocate(device, (n,), np.float32), allocate(device, (n,), np.float32)
     source.fill(1.0)
-    copy.fill(0.0)  # so that the host maps its pages before the measurement
+    copy.fill(0.0)  # the host maps the pages now, and not in the measurement
     kernel = device.kernels("peak", {"ITEMS": tile_items(device), "NARROW": True}).limit_copy
     runs = [device.timed(lambda: launch_items(device, kernel, n // copied, n, source, copy)) for _ in range(repeat + 1)]
     return 8e3 * n / min(ms for _, ms in runs)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches pixels.cl: conversion between blending's planes and arrays with interleaved pixel values."""
+"""Launches pixels.cl: conversion between the planes of blending and arrays of pixels with interleaved values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from clsplat.stages.device_camera import padded_size
 
 @stage("pixels")
 def pixels_from_planes(device: Device, blended: Blended, pixels: DeviceArray, alpha: DeviceArray) -> None:
-    """Fill the first values, at most three, of pixels (height, width, depth), and alpha (height, width)."""
+    """Fill alpha (height, width) and the first three values, or fewer, of pixels (height, width, depth)."""
     height, width, depth = pixels.shape
     kernel, stride = device.kernels("pixels").pixels_from_planes, blended.transmittance.shape[1]
     planes = (blended.image, blended.transmittance)
@@ -24,9 +24,9 @@ def pixels_from_planes(device: Device, blended: Blended, pixels: DeviceArray, al
 def planes_from_pixels(
     device: Device, work: Workspace, d_pixels: DeviceArray, d_alpha: DeviceArray | None = None
 ) -> DeviceArray:
-    """The image gradient (3, rows, stride) of `blend_grad` from d_pixels (height, width, depth), depth 1 to 3.
+    """The image gradient (3, rows, stride) for `blend_grad`, from d_pixels (height, width, depth), depth 1 to 3.
 
-    d_alpha: (height, width), gives a fourth plane, the gradient with respect to the transmittance.
+    d_alpha: (height, width); adds a fourth plane, the gradient with respect to the transmittance.
     The padding is not written.
     """
     height, width, depth = d_pixels.shape

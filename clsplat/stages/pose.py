@@ -11,14 +11,14 @@ from clsplat.layouts.columns import POSE_ROWS
 from clsplat.stages.device_gaussians import DeviceGaussians
 
 POSE_NUMBERS, LENS_NUMBERS = 6, 4
-"""Parameters of a pose: a rotation and a translation; and of a lens: logs of its focal lengths, and its principal
-point."""
+"""Number of parameters of a pose (rotation, translation) and of a lens (logs of the focal lengths, principal
+point)."""
 
 
 def sums_of(work: Workspace, count: int, numbers: int = POSE_NUMBERS) -> DeviceArray:
-    """Allocate partial sums for the gradient of a pose or a lens: one row for each POSE_ROWS of `count` Gaussians.
+    """An array for partial sums of the gradient of a pose or lens: a row for every POSE_ROWS of the `count` Gaussians.
 
-    `pose_rows` or `lens_rows` fills them.
+    `pose_rows` or `lens_rows` fills it.
     """
     return work.array(f"rows_of_{numbers}", (-(-count // POSE_ROWS), numbers))
 
@@ -35,8 +35,8 @@ def pose_rows(
 ) -> None:
     """Sum the pose gradient of these Gaussians into `sums` (ceil(n / POSE_ROWS), 6).
 
-    device: the device with the switches of the camera's projection.
-    first_row: row in the model of the first of these Gaussians, a multiple of POSE_ROWS.
+    device: the device with the kernel switches of the camera model.
+    first_row: row of the first of these Gaussians in the model, a multiple of POSE_ROWS.
     """
     launch_items(
         device,
@@ -65,9 +65,9 @@ def lens_rows(
 
 @stage("pose")
 def sum_of(device: Device, work: Workspace, sums: DeviceArray) -> DeviceArray:
-    """The total (1, numbers) of the partial sums (m, numbers).
+    """The sum (1, numbers) of the rows of partial sums (m, numbers).
 
-    It is the gradient with respect to the rotation and translation of `Camera.moved`, or to ln fx, ln fy, cx and cy.
+    This is the gradient with respect to the rotation and translation of `Camera.moved`, or to ln fx, ln fy, cx, cy.
     """
     kernel, numbers, level = device.kernels("pose", {"LANES": 1}).pose_sums, sums.shape[1], 0
     while sums.shape[0] > 1:

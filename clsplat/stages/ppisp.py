@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches ppisp.cl: a photograph's gains and colour mixes, its lens's vignette, and the gradient of all these."""
+"""Launches ppisp.cl: the gains and colour mixes of a photograph, the vignette of its lens, and their gradients."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from clsplat.layouts.columns import TILE
 from clsplat.stages.appearance import GainEntries, Gains
 
 COLOUR_ENTRIES, VIGNETTE_ENTRIES = 9, 3
-"""Entries of a photograph, three gains and six mixes; entries of a lens."""
+"""Number of entries of a photograph, which are three gains and six mixes; and of a lens."""
 VIGNETTE_GAINS = GainEntries(first_row=COLOUR_ENTRIES, centred=False)
-"""Entries of a lens, which follow the photograph's in column sums."""
+"""Entries of a lens. In column sums they follow those of the photograph."""
 PPISP_PIXEL_BYTES = 8
-"""Bytes of the partial sums, per pixel with padding."""
+"""Bytes of the partial sums per pixel, padding included."""
 
 
 @dataclass(frozen=True)
 class PhotoLens:
-    """Photograph and lens of a view, as the kernels need them.
+    """Photograph and lens of a view, for the kernels.
 
     photograph, lens: rows in the arrays of their entries.
     centre: the principal point, as fractions of the image's width and height.
-    flat: False for a panorama, which has no vignette.
+    flat: False for a panorama, which cannot have a vignette.
     """
 
     photograph: int
@@ -35,7 +35,7 @@ class PhotoLens:
     flat: bool = True
 
     def place(self, width: int, height: int) -> tuple[float, float, float]:
-        """The principal point in pixels, and one over the square of half the image's diagonal, or 0 for a panorama."""
+        """The principal point in pixels; then 1 / (half the image's diagonal)^2, or 0 for a panorama."""
         scale = 4 / (width**2 + height**2) if self.flat else 0.0
         return self.centre[0] * width, self.centre[1] * height, scale
 
@@ -44,12 +44,11 @@ class PhotoLens:
 def develop(
     device: Device, colours: Gains, vignettes: Gains, taken: PhotoLens, target: DeviceArray, width: int, height: int
 ) -> None:
-    """Remove gains, mixes and vignette from the planes (3 or more, rows, stride) of a photograph, width x height
-    pixels.
+    """Remove gains, mixes and vignette from a photograph of width x height pixels, in place.
 
     colours: (photographs, COLOUR_ENTRIES).
     vignettes: (lenses, VIGNETTE_ENTRIES).
-    target: its first three planes are colours.
+    target: planes (3 or more, rows, stride) of the photograph, the first three of which are colours.
     """
     _, rows, stride = target.shape
     kernel = device.kernels("ppisp").develop
@@ -77,10 +76,10 @@ def camera_gradient(
     height: int,
     place: int = 0,
 ) -> DeviceArray:
-    """Column sums (COLOUR_ENTRIES + VIGNETTE_ENTRIES, stride) of the gradient; each `place` in a batch has its own
-    array.
+    """Column sums (COLOUR_ENTRIES + VIGNETTE_ENTRIES, stride) of the gradient.
 
-    Their sums over x are the gradients with respect to the entries, divided by ln 2 except for the mixes.
+    Summed over the columns, and multiplied by ln 2 except for mixes, they are the gradient with respect to the entries.
+    place: the view's number in the batch; each has its own array.
     """
     _, rows, stride = image.shape
     down, sums = rows // TILE, COLOUR_ENTRIES + VIGNETTE_ENTRIES

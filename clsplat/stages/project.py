@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches project.cl and project_grad.cl: Gaussians to ellipses on the image, and the gradient back."""
+"""Launches project.cl and project_grad.cl: the projection of Gaussians to ellipses on the image, and its gradient."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
 
 CPU_STEP_ROWS = 128
-"""Number of Gaussians in a group of `project_step` on a CPU. Their gradients, 30 KiB, stay in the cache, and the part
-of each array is long enough for the processor to prefetch. With groups of one vector a step takes 1.5 times as long."""
+"""Number of Gaussians per group of `project_step` on a CPU. Their gradients, 30 KiB, stay in the cache, and each array
+is read in runs long enough for prefetching. With groups of a single vector a step takes 1.5 times as long."""
 
 STEP_REGISTERS = 96
-"""Registers of an item of `project_step` where the driver takes a limit. Adam waits for memory, so more items at a time
-are worth more than registers; clang's code for NVIDIA spills nothing even at 80."""
+"""Maximum registers per item of `project_step`, where the driver accepts a limit. Adam is bound by memory latency, so
+more items at a time help more than registers. Code by clang for NVIDIA spills nothing even with 80."""
 
 SCREEN_GRADIENT_BYTES = 8
 """Bytes per Gaussian of the screen-space gradient; 4 more if contributions are kept."""
 
 
 def gaussian_bytes(*, keeps_culled: bool) -> int:
-    """Bytes per Gaussian: splat and tile count; `shown` too if culling is switched off."""
+    """Bytes per Gaussian: splat and tile count, and `shown` if culling is switched off."""
     return 4 * (len(SPLAT) + 1 + keeps_culled)
 
 
@@ -45,7 +45,7 @@ class Projected:
 
     splats: (n, SPLAT).
     tile_counts: (n), 0 where culled.
-    shown: (n), 0 where there is no splat. None unless culling is switched off: otherwise tile_counts shows the same.
+    shown: (n), 0 where a Gaussian has no splat, if culling is switched off. Otherwise None: tile_counts is 0 there.
     """
 
     splats: DeviceArray
@@ -76,10 +76,7 @@ def project(
     camera_array: DeviceArray,
     thinning: Thinning | None = None,
 ) -> Projected:
-    """Project all Gaussians (Kerbl et al. 2023, section 4), except those that thinning drops.
-
-    It also counts the tiles that each Gaussian reaches.
-    """
+    """Project all Gaussians that thinning does not drop, and count their tiles (Kerbl et al. 2023, section 4)."""
     n = gaussians.count
     splats = work.array("splats", (n, len(SPLAT)))
     tile_counts = work.array("tile_counts", (n,), np.uint32)
@@ -138,7 +135,7 @@ class Slots:
 
 @dataclass(frozen=True, eq=False)
 class Screen:
-    """Screen-space results of one view; only rows of visible Gaussians are written.
+    """Screen-space results of one view. Only the rows of visible Gaussians are written.
 
     gradients: (n, 2), with respect to the means on the image, in pixels.
     contributions: (n,), sums of the blending weights over the image's pixels, or None.
@@ -156,8 +153,8 @@ def add_slots(
     slots: Slots,
     sums: DeviceArray | None,
 ) -> DeviceArray:
-    """Add one band's slots to the sums by Gaussian (n, floats). Bands must come in order; `sums` is None for the
-    first."""
+    """Add the slots of one band to the sums per Gaussian, (n, floats), and return the sums. Bands must come in order;
+    for the first, `sums` is None."""
     (n,) = tile_counts.shape
     if sums is None:
         sums = work.array("slot_sums", (n, slots.values.shape[1]))
@@ -181,11 +178,11 @@ def project_grad(
     explore: Exploration = NO_EXPLORATION,
     by_lens: DeviceArray | None = None,
 ) -> None:
-    """Fill the visible Gaussians' rows of `gradients` and `screen` from the pairs' slots.
+    """Compute `gradients` and `screen` of the visible Gaussians from the slots of their pairs.
 
-    sh_rest: also compute the higher SH bands.
+    sh_rest: also compute the gradient of the higher SH bands.
     explore: its penalties are added.
-    by_lens: (n, 4), receives each Gaussian's gradient with respect to the lens of a flat camera.
+    by_lens: (n, 4), filled with each Gaussian's gradient with respect to the lens of a camera with an image plane.
     """
     weights, build = explore.weights, _build(device)
     defines = {**_defines(gaussians, slots, sh_rest=sh_rest), **build.defines}
@@ -206,8 +203,8 @@ def project_grad(
 
 
 def step_numbers(step: AdamStep, explore: Exploration) -> tuple[float, ...]:
-    """Arguments of `project_step` that change with the step: penalty weights, two roots of Adam, and each group's
-    rate."""
+    """Arguments of `project_step` that change with the step: penalty weights, two roots for Adam, and each group's
+    learning rate."""
     by_group = {
         group: (0.0, 0.0) if group == "sh_rest" and not step.updates_sh_rest else step.corrected(group)
         for group in PARAMETER_GROUPS
@@ -229,9 +226,9 @@ def project_step(
     *,
     explore: Exploration = NO_EXPLORATION,
 ) -> None:
-    """`project_grad` and `stages.adam.adam` in one kernel, without gradients in memory.
+    """`project_grad` and `stages.adam.adam` in one kernel, which keeps no gradients in memory.
 
-    model: parameters, first and second moments. The two functions document the other arguments.
+    model: parameters, first and second moments. The other arguments are those of the two functions.
     """
     parameters, config = model[0], step.config
     defines = {**_defines(parameters, slots, sh_rest=step.updates_sh_rest), "ADAM": True}
@@ -249,7 +246,7 @@ def project_step(
         *(config.beta1, config.beta2, config.epsilon),
         *numbers[weights:],
         *(PARAMETER_GROUPS["means"].limit ** 2, PARAMETER_GROUPS["sh_dc"].limit ** 2),
-        readback.buffer,  # an array would count as traffic, but this is written only on a fault
+        readback.buffer,  # a buffer, so that the profile counts no traffic: it is written only on a fault
         *(arrays[group] for arrays in model for group in PARAMETER_GROUPS),
     )
     build = _build(device)
@@ -263,15 +260,14 @@ def project_step(
 
 
 class _Build(NamedTuple):
-    """Gaussians per work-item of the gradient, and defines if this differs from the kernel shape."""
+    """Gaussians per work-item of the gradient, and a define if this differs from the lanes of the kernel shape."""
 
     lanes: int
     defines: dict[str, object]
 
 
 def _build(device: Device) -> _Build:
-    """The build of the gradient. For cameras that draw along rays a work-item has one Gaussian, as in the
-    projection."""
+    """The build of the gradient. If Gaussians are evaluated along rays, a work-item has one, as in the projection."""
     return _Build(1, {"LANES": 1}) if device.switched("RAYS") else _Build(device.shape.lanes, {})
 
 

@@ -15,16 +15,16 @@ from clsplat.stages.duplicate import Band, Pairs
 from clsplat.stages.sort import SORT_KEY_BYTES, sort
 
 TILE_SORT_PAIR_BYTES = SORT_KEY_BYTES + 8
-"""Bytes per pair: its sort by tile, and the two lists."""
+"""Bytes per pair: its key and position in the sort by tile, and the two lists."""
 RANGE_TILE_BYTES = 8
 """Bytes per tile: the begin and end of its list."""
 
 
 @dataclass(frozen=True, eq=False)
 class TileLists:
-    """The lists of a band's tiles.
+    """The tile lists of a band.
 
-    ranges: (tiles, 2), begin and end in gaussian_from_sorted and slot_from_sorted (pairs).
+    ranges: (tiles, 2), begin and end of each tile's pairs in gaussian_from_sorted and slot_from_sorted, (pairs) each.
     """
 
     band: Band
@@ -35,9 +35,9 @@ class TileLists:
 
 @stage("ranges")
 def tile_lists(device: Device, work: Workspace, pairs: Pairs, band: Band, *, all_bits: bool = False) -> TileLists:
-    """Sort depth-ordered pairs by tile, stably, so that each tile's Gaussians are front to back.
+    """Sort pairs, already in order of depth, by tile. The sort is stable: each tile's Gaussians are front to back.
 
-    The sort is by as many bits as the tiles need, or with `all_bits` by 32.
+    all_bits: sort by 32 bits. False sorts by the bits that tile numbers need.
     """
     count, elements = pairs.tile_keys.shape[0], pairs.elements
     bits = 32 if all_bits else max(band.tiles - 1, 1).bit_length()

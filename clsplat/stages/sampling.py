@@ -42,10 +42,10 @@ def upload_cameras(device: Device, cameras: Sequence[Camera]) -> list[UploadedCa
 def sampling_limits(
     device: Device, work: Workspace, gaussians: AnyGaussians, cameras: Sequence[UploadedCameras], least: DeviceArray
 ) -> None:
-    """Fill `least` (n,): the natural log of the smallest standard deviation that the photographs can show, in world
-    units.
+    """Fill `least` (n,) with the natural log of the smallest standard deviation, in world units, that the photographs
+    resolve.
 
-    See Yu et al. 2024, Mip-Splatting, section 5.1. It is -1e30 for a Gaussian that no camera sees.
+    See Yu et al. 2024, Mip-Splatting, section 5.1. A Gaussian that no camera sees gets -1e30.
     """
     for start, stop, (part,) in parts(work, gaussians):
         for index, group in enumerate(cameras):
@@ -56,7 +56,7 @@ def sampling_limits(
 
 @stage("sampling", limit_scales=1)
 def limit_scales(device: Device, work: Workspace, gaussians: AnyGaussians, least: DeviceArray) -> None:
-    """Raise log scales below `least` (n,) to that value."""
+    """Raise log scales below `least` (n,) to `least`."""
     kernel = device.kernels("sampling", {"LANES": 1}).limit_scales
     for start, stop, (part,) in parts(work, gaussians, keep=True):
         launch_items(device, kernel, part.count, part.count, least.rows(start, stop), part["log_scales"])

@@ -13,21 +13,20 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
 
 CHUNK_ELEMENTS_PER_ITEM = 16
-"""A chunk has this many elements per work-item of a group, or a multiple of that."""
+"""A chunk has this many elements per work-item of a group, or a multiple of this."""
 MIN_CHUNK_ELEMENTS, MAX_SINGLE_CHUNK_ELEMENTS = 1024, 1 << 14
-"""For groups of one item: the fewest elements of a chunk, and the number of elements up to which a single chunk takes
-all. A chunk of that size is done before a second launch would begin."""
+"""For groups of one item: minimum elements of a chunk, and the most elements that are scanned as a single chunk. A
+second launch would cost more time than that chunk."""
 MAX_SCAN_GROUPS = 2048
-"""The most groups (of more than one item each) that share a scan or sort, because each reads the counts of all earlier
-groups."""
+"""Maximum number of groups in a scan or sort, for groups of several items. It is limited because each group reads the
+counts of all groups before it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Elements:
-    """The number of elements that a kernel processes (kernels/shared/count.h).
+    """The number of elements that a kernel processes: `most`, or if `counts` is given counts[place], at most `most`.
 
-    The number is `most`. If `counts` is given, the number is counts[place] instead, which must be at most `most`.
-    Launches are sized for `most`.
+    Launches are sized for `most` (kernels/shared/count.h).
     """
 
     most: int
@@ -36,7 +35,7 @@ class Elements:
 
     @property
     def arguments(self) -> tuple[Any, ...]:
-        """The kernel arguments for the number."""
+        """The kernel arguments that give the number."""
         return (self.most,) if self.counts is None else (self.counts.buffer, self.place)
 
     @property
@@ -46,7 +45,7 @@ class Elements:
 
 
 def chunking(device: Device, n: int, items: int = 0) -> tuple[int, int]:
-    """(groups, chunk): the number of groups that share n elements, and the elements of each.
+    """The number of groups that share n elements, and the number of elements in the chunk of each group.
 
     items: work-items of a group, if different from the kernel shape.
     """
@@ -67,9 +66,9 @@ def scan(
     total: DeviceArray,
     elements: Elements | None = None,
 ) -> None:
-    """Compute out[i] = sum of values[:i] and total[0] = sum of all, in one launch if one group is enough, else two.
+    """Compute out[i] = sum of values[:i] and total[0] = sum of values, in one launch if one group is enough, else two.
 
-    elements: the number of values that count, if it is not all of them.
+    elements: the number of values to scan; None scans all.
     """
     elements = elements or Elements(values.shape[0])
     groups, chunk = chunking(device, elements.most)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches sort_radix.cl and sort_bitonic.cl: stable sorts of uint32 keys that also return each key's origin."""
+"""Launches sort_radix.cl and sort_bitonic.cl: stable sorts of uint32 keys, with the keys' positions in the input."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clsplat.device.launch import launch_groups
 from clsplat.stages.scan import Elements, chunking
 
 MAX_BITONIC_KEYS = 2048
-"""Number of keys that, with their positions, fill 16 KiB of local memory: half of every device's minimum."""
+"""Maximum number of keys for bitonic sort. With positions they take 16 KiB of local memory. Every device has 32 KiB."""
 
 BITONIC_KEYS_BY_KIND = {"cpu": 512, "gpu": 1024, "other": 1024}
 """Number of keys up to which bitonic sort is faster than the launches of radix sort."""
@@ -25,8 +25,8 @@ SORT_KEY_BYTES = 16
 WIDE_DIGIT_BITS, MIN_WIDE_DIGIT_KEYS = 13, 1 << 17
 """Bits of a wide digit, and the number of keys from which it is used, for groups of one item.
 
-Its counters fill the 32 KiB of local memory. From that number of keys, fewer passes save more time than the larger
-histograms cost. An item that sorts alone has a single histogram, and always uses wide digits.
+The counters of a wide digit fill 32 KiB of local memory. From this number of keys on, fewer passes save more time than
+the larger histograms cost.
 """
 
 
@@ -35,11 +35,11 @@ def _widest_digit(device: Device, n: int) -> int:
 
 
 def scratch_bytes(device: Device, n: int) -> int:
-    """Upper bound of the scratch bytes for sorts and scans of up to `n` elements, except for the named arrays."""
+    """Upper bound of the scratch bytes of sorts and scans of up to `n` elements, sorted keys and positions excluded."""
     groups = max(chunking(device, n, device.shape.sort_items)[0], device.shape.chunks)
     return (
         4 * (1 << _widest_digit(device, n)) * (groups + 1) + 8 * groups
-    )  # histograms and totals, then the scans' sums
+    )  # histograms and totals, then the sums of scans
 
 
 def radix_sort(
@@ -51,12 +51,12 @@ def radix_sort(
     base: int = 0,
     elements: Elements | None = None,
 ) -> tuple[DeviceArray, DeviceArray]:
-    """Sort by the lowest `bits` of the keys minus `base`. Returns (sorted keys, positions), in workspace arrays under
-    `name`.
+    """Sort by the lowest `bits` of the keys minus `base`. Returns sorted keys and their positions in the input, as
+    workspace arrays under `name`.
 
-    elements: the number of keys that count, if it is not all of them.
+    elements: the number of keys to sort; None sorts all.
 
-    It makes as few passes as the widest digit allows, with digits of equal width.
+    The sort makes as few passes as the widest digit allows, with digits of equal width.
     """
     n, items = keys.shape[0], device.shape.sort_items
     elements = elements or Elements(n)
@@ -95,9 +95,9 @@ def radix_sort(
 def bitonic_sort(
     device: Device, work: Workspace, name: str, keys: DeviceArray, elements: Elements | None = None
 ) -> tuple[DeviceArray, DeviceArray]:
-    """Sort at most MAX_BITONIC_KEYS keys in one launch; return (sorted keys, positions).
+    """Sort at most MAX_BITONIC_KEYS keys in one launch. Returns sorted keys and their positions in the input.
 
-    elements: the number of keys that count, if not all do.
+    elements: the number of keys to sort; None sorts all.
     """
     n = keys.shape[0]
     if n > MAX_BITONIC_KEYS:
@@ -122,11 +122,11 @@ def sort(
     base: int = 0,
     elements: Elements | None = None,
 ) -> tuple[DeviceArray, DeviceArray]:
-    """Sort by the faster of the two sorts for this number of keys.
+    """Sort by the method that is faster for this number of keys. Returns sorted keys and their positions in the input.
 
     bits: number of low bits that can be set in a key minus `base`.
     base: not larger than any key.
-    elements: the number of keys that count, if not all do.
+    elements: the number of keys to sort; None sorts all.
     """
     if keys.shape[0] <= BITONIC_KEYS_BY_KIND[device.kind]:
         return bitonic_sort(device, work, name, keys, elements)

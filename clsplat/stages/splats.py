@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches splats.cl and splats_grad.cl: projected Gaussians given as arrays, and the gradient back to them."""
+"""Launches splats.cl and splats_grad.cl: splats from arrays of projected Gaussians, and the gradient."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from clsplat.layouts.columns import SLOT, SPLAT, TILE
 from clsplat.stages.project import Projected, Slots
 
 SPLAT_VALUES = 3
-"""Values in a splat, which blend.cl blends."""
+"""Number of values in a splat, which blend.cl blends."""
 SLOT_MOMENT_FIELDS = SLOT.index("RED")
-"""Number of fields in a slot before the gradients with respect to values."""
+"""Number of fields in a slot before those for the gradients with respect to values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +52,9 @@ class ScreenGaussians:
 
 @dataclass(frozen=True, eq=False)
 class ScreenGradients:
-    """Gradients for the arrays of `ScreenGaussians`: means2d (n, 2), conics (n, 3), opacities (n,), values (n, width).
+    """Gradients with respect to means2d (n, 2), conics (n, 3), opacities (n,) and values (n, width).
 
-    absolute: (n, 2), the absolute gradients with respect to means2d, or None if not requested.
+    absolute: (n, 2), sums over pixels of the absolute gradient with respect to means2d; None if not requested.
     """
 
     means2d: DeviceArray
@@ -70,7 +70,7 @@ def splats(
 ) -> Projected:
     """Compute splats and tile counts for an image of width x height pixels.
 
-    listed: make a splat for every Gaussian, even if it is culled, because the caller's tile lists may contain any.
+    listed: make splats of culled Gaussians too, because the caller's tile lists may contain them.
     """
     n = gaussians.count
     projected = Projected(work.array("splats", (n, len(SPLAT))), work.array("tile_counts", (n,), np.uint32))
@@ -103,9 +103,9 @@ def splats_grad(
     *,
     kept: int = SPLAT_VALUES,
 ) -> None:
-    """Fill every row of the gradients from the pairs' slots, which may include absolute gradients.
+    """Fill every row of the gradients from the slots of the pairs, which may include absolute gradients.
 
-    kept: number of leading values whose gradients the slots hold.
+    kept: the slots hold gradients of the first `kept` values only.
     """
     assert slots.first_slots is not None, "there are no bands here"
     n, width = gradients.values.shape
@@ -133,7 +133,7 @@ def splats_grad(
 def add_values(
     device: Device, projected: Projected, slots: Slots, d_values: DeviceArray, first: int, count: int
 ) -> None:
-    """Fill `count` columns of d_values (n, width), beginning at `first`, with the sums of slots (pairs, count)."""
+    """Fill `count` columns of d_values (n, width), from column `first` on, with sums of the slots (pairs, count)."""
     n, width = d_values.shape
     kernel = device.kernels("splats_grad", {"LANES": 1, "VALUES": count}).add_values
     counts = (projected.tile_counts, slots.first_slots)

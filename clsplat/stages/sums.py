@@ -11,15 +11,15 @@ from clsplat.layouts.columns import SUM_ROWS
 
 
 def padded(count: int) -> int:
-    """Columns that `row_sums` needs for `count` numbers: whole blocks, padded with zeros."""
+    """Number of columns that `row_sums` needs for `count` numbers: whole blocks. The rest must be zeros."""
     return -(-count // SUM_ROWS) * SUM_ROWS
 
 
 @stage("sums")
 def row_sums(device: Device, work: Workspace, name: str, parts: DeviceArray) -> DeviceArray:
-    """The sum of each row of `parts` (rows, columns), float32, as (rows,), in workspace arrays under `name`.
+    """Sums (rows,) of the rows of `parts` (rows, columns), float32, in workspace arrays under `name`.
 
-    columns: a result of `padded`; the sums of no columns are 0.
+    The number of columns must be a result of `padded`; without columns the sums are 0.
     """
     rows, columns = parts.shape
     kernel, level = device.kernels("sums").row_sums, 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches target.cl: a photograph in the layout of blending."""
+"""Launches target.cl: the planes of a photograph, in the layout of a blended image."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from clsplat.stages.blend import Blended, tile_items
 from clsplat.stages.device_camera import padded_size
 
 SOURCE_PIXEL_BYTES = 16
-"""Bytes per pixel of a photograph: at most RGBA in floats."""
+"""Maximum bytes per pixel of a photograph: RGBA in floats."""
 MASK_PIXEL_BYTES = 4
-"""The most bytes per pixel of a photograph's mask."""
+"""Maximum bytes per pixel of a photograph's mask."""
 TARGET_PIXEL_BYTES = 12 + SOURCE_PIXEL_BYTES
-"""Bytes per pixel with padding: three planes, and the photograph."""
+"""Bytes per pixel, padding included: three planes, and the photograph."""
 
 
 def is_photograph(array: DeviceArray) -> bool:
-    """True for a photograph (H, W, 3), which has colours only. Planes are at least a tile wide."""
+    """True for a photograph (H, W, 3), False for planes (3, rows, stride), whose last axis is at least a tile."""
     return array.shape[-1] == 3
 
 
@@ -45,21 +45,21 @@ def target(
     alpha: bool = False,
     in_planes: bool = True,
 ) -> DeviceArray:
-    """Convert image (H, W, 3 to 5), uint8 or float32 with straight alpha, to planes (3, rows, stride) over the
-    background.
+    """Composite an image (H, W, 3 to 5), uint8 or float32 with straight alpha, over the background, and return planes
+    (3, rows, stride).
 
     alpha: add a fourth plane, the alpha.
-    in_planes: False if only `stages.loss.loss` reads the result. It is then the photograph itself, on the device, where
-    the loss can read that: where several items share a tile (`tile_items`), without alpha and mask.
+    in_planes: False if only `stages.loss.loss` reads the result. It is then the photograph itself if that has no alpha
+    or mask and several items share a tile (`tile_items`).
 
-    A fifth channel is a mask, 0 where a pixel does not count. Such pixels become zero in the planes and also in the
-    render `blended`, which this changes, and the gradient of blending skips them. An image on the host is uploaded
-    without waiting: it must not change until the host has waited for the device.
+    A fifth channel is a mask, 0 where a pixel does not count. These pixels become zero in the planes, and in the render
+    `blended` too; the gradient of blending skips them. An image on the host is uploaded without waiting: it must not
+    change until the host has waited for the device.
     """
     if isinstance(image, DeviceArray):
         device.under_way.append(
             image.buffer
-        )  # the buffer may be the host's memory, which must live until the kernel has run
+        )  # the buffer may use the host's memory, which must live until the kernel has run
         source = image
     else:
         source = work.array("target_source", image.shape, image.dtype)
@@ -72,7 +72,7 @@ def target(
     defines = sample_defines(source)
     render: tuple[DeviceArray, ...] = ()
     if channels == 5:
-        assert blended is not None, "a mask also changes the render"
+        assert blended is not None, "a mask needs the render, which it changes"
         defines["MASKED"], render = True, (blended.image, blended.stops)
     if alpha:
         defines["ALPHA"] = True

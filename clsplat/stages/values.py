@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches values.cl and values_grad.cl: any number of values per Gaussian, blended with the weights of an image."""
+"""Launches values.cl and values_grad.cl: values of Gaussians, any number, blended with the weights of an image."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ from clsplat.stages.ranges import TileLists
 from clsplat.stages.splats import SLOT_MOMENT_FIELDS, SPLAT_VALUES, ScreenGradients, add_values, splats_grad
 
 MAX_VALUES_PER_PASS = 32
-"""The most values per pass if one work-item has a whole tile. If several share it, fewer sums fit in registers."""
+"""Maximum values per pass if one work-item has a whole tile. If several share a tile, fewer sums fit in registers."""
 _MAX_REGISTER_SUMS = 64
-"""The most sums of a work-item in the forward pass of a group: values times pixels."""
+"""Maximum sums of a work-item that shares its tile, in the forward pass: values times pixels of the work-item."""
 _MAX_LOCAL_SUMS = 2048
-"""The most values per pass times items per group in the gradient: their sums must fit in local memory."""
+"""Maximum sums of a group in the gradient, values times work-items: they must fit in local memory."""
 
 
 def passes(first: int, depth: int, most: int) -> Iterator[tuple[int, int]]:
-    """(first, count) of each pass over the values [first, depth)."""
+    """First value and number of values of each pass over the values [first, depth). most: values per pass."""
     for begin in range(first, depth, most):
         yield begin, min(most, depth - begin)
 
 
 def most_values(device: Device) -> int:
-    """Values per forward pass."""
+    """Maximum number of values per forward pass."""
     items = tile_items(device)
     return MAX_VALUES_PER_PASS if items == 1 else min(max(_MAX_REGISTER_SUMS * items // (TILE * TILE), 2), 16)
 
 
 def most_gradients(device: Device) -> int:
-    """Values per pass of the gradient."""
+    """Maximum number of values per pass of the gradient."""
     items = tile_items(device)
     return MAX_VALUES_PER_PASS if items == 1 else min(_MAX_LOCAL_SUMS // items, 16)
 
 
 @dataclass(frozen=True, eq=False)
 class ValuePass:
-    """Values (n, depth) of all Gaussians; an image's lists, splats and blending; the values' background (depth,)."""
+    """Values (n, depth) of all Gaussians, their background (depth,), and the tile lists and results of an image."""
 
     lists: TileLists
     projected: Projected
@@ -54,9 +54,9 @@ class ValuePass:
 
 @stage("values")
 def values(device: Device, of: ValuePass, pixels: DeviceArray, *, first: int = SPLAT_VALUES) -> None:
-    """Blend the values from index `first` over the background, with the weights of the image.
+    """Blend the values from index `first` on over their background, with the weights of the image.
 
-    pixels: (height, width, depth), receives them.
+    pixels: (height, width, depth), filled with the result.
     """
     height, width, depth = pixels.shape
     lists, cells = of.lists, of.blended.cells_from_sorted
@@ -81,7 +81,7 @@ def values_grad(
 ) -> None:
     """Fill every row of the gradients from d_pixels (height, width, depth) and d_alpha (height, width).
 
-    first_slots: (n,), where each Gaussian's pairs begin.
+    first_slots: (n,), the first slot of each Gaussian.
     fields: includes absolute gradients if `gradients` has room for them.
     """
     height, width, depth = d_pixels.shape
@@ -107,7 +107,7 @@ def values_grad(
 def _gradient_by_cell(
     device: Device, work: Workspace, of: ValuePass, d_pixels: DeviceArray, d_alpha: DeviceArray | None
 ) -> DeviceArray:
-    """The image's gradient (tiles, depth + 1, pixels of a tile), in the order in which `values_grad` reads it."""
+    """The image's gradient in the order in which `values_grad` reads it, (tiles, depth + 1, pixels of a tile)."""
     height, width, depth = d_pixels.shape
     by_cell = work.array("gradient_by_cell", (of.lists.band.tiles, depth + 1, TILE * TILE))
     given = [] if d_alpha is None else [d_alpha]

@@ -37,7 +37,7 @@ __all__ = [
     "spherical_harmonics",
 ]
 GSPLAT_STRATEGIES = ("DefaultStrategy", "MCMCStrategy")
-"""gsplat's own classes, imported on first use."""
+"""Classes that are imported from gsplat on first use."""
 
 
 def __getattr__(name: str) -> Any:

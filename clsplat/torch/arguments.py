@@ -19,7 +19,7 @@ from clsplat.errors import InputError, warn
 from clsplat.library.checks import plain, whole
 
 _CONVERSIONS_REPORTED: set[str] = set()
-"""Kinds of tensors, dtype and device, for which `as_array` has already warned."""
+"""Kinds of tensors (dtype and device) for which `as_array` has already warned."""
 
 
 def refuse(name: str, found: object, expected: str) -> InputError:
@@ -29,7 +29,7 @@ def refuse(name: str, found: object, expected: str) -> InputError:
 
 @contextmanager
 def renamed(**names: str) -> Iterator[None]:
-    """In errors raised inside, replace the library's name of an argument: `library_name="name_here"`."""
+    """Inside the block, replace the library's argument names in error messages: `library_name="name_here"`."""
     try:
         yield
     except InputError as error:
@@ -43,8 +43,7 @@ def renamed(**names: str) -> Iterator[None]:
 def check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
     """Raise InputError unless the argument is a dense tensor of real numbers with one of `shapes`.
 
-    A string in a shape stands for any size. Tensors of torch.func are refused too, since kernels cannot read their
-    numbers.
+    A string in a shape stands for any size. Tensors of torch.func are refused too, since kernels cannot read them.
     """
     if isinstance(value, Tensor) and (is_gradtrackingtensor(value) or is_batchedtensor(value)):
         raise refuse(name, "a tensor of torch.func", "a plain tensor: clsplat.torch supports torch.autograd only")
@@ -52,7 +51,7 @@ def check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
 
 
 def _check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
-    """Check like `check_shape`, but accept tensors of torch.func, for functions in pure PyTorch."""
+    """Like `check_shape`, but accept tensors of torch.func, for functions in pure PyTorch."""
     expected = f"a tensor {' or '.join(_named(shape) for shape in shapes)}"
     if not isinstance(value, Tensor):
         raise refuse(name, f"a {type(value).__name__}", expected)
@@ -66,7 +65,7 @@ def _check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
 def check(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
     """Raise InputError like `check_shape`, and for NaN. Tensors of torch.func are accepted."""
     _check_shape(name, value, *shapes)
-    # a NaN makes the sum NaN; a sum takes one pass and no extra array
+    # a NaN makes the sum NaN, and the sum needs no additional array
     if torch.isnan(value.detach().sum()) and bool((broken := torch.isnan(value.detach())).any()):
         first = tuple(broken.nonzero()[0].tolist())
         raise InputError(f"{name} has {int(broken.sum())} NaN values, the first at {first}; expected numbers")
@@ -95,7 +94,7 @@ def check_size(name: str, value: object) -> int:
 
 
 def check_number(name: str, value: object, least: float = -math.inf, most: float = math.inf) -> float:
-    """The argument as a float; it may be a tensor of one element. Raises InputError if it is out of range."""
+    """The argument as a float, from a number or a tensor of one element. Raises InputError if it is out of range."""
     number = plain(value)
     if isinstance(number, bool) or not isinstance(number, int | float) or not least <= number <= most:
         limits = [f"at least {least}"] * (least > -math.inf) + [f"at most {most}"] * (most < math.inf)
@@ -104,9 +103,10 @@ def check_number(name: str, value: object, least: float = -math.inf, most: float
 
 
 def as_array(value: Tensor) -> Float32:
-    """A tensor's numbers as a C-contiguous float32 array.
+    """The values of a tensor as a C-contiguous float32 array.
 
-    It shares the memory of a dense float32 tensor on the CPU. Other tensors are copied, with one warning for each kind.
+    The array shares memory with a dense float32 tensor on the CPU. Other tensors are copied, with one warning for each
+    kind.
     """
     if value.dtype != torch.float32 or value.device.type != "cpu":
         kind = f"{str(value.dtype).removeprefix('torch.')} on {value.device.type}"
@@ -119,7 +119,7 @@ def as_array(value: Tensor) -> Float32:
 
 
 def as_tensor(array: NDArray[Any], like: Tensor) -> Tensor:
-    """An array as a tensor on the device of `like`. Real numbers get the dtype of `like`. Copied only if necessary."""
+    """The array as a tensor on the device of `like`, copied only if necessary. Real numbers get the dtype of `like`."""
     if not array.flags.writeable or not array.flags.c_contiguous:
         array = array.copy()
     tensor = torch.from_numpy(array)

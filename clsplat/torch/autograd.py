@@ -29,7 +29,7 @@ RASTERIZATION_INPUTS = ("means", "quaternions", "scales", "covars", "opacities",
 
 
 class Batches:
-    """A tensor as one array per batch. Every item is None if the tensor is None."""
+    """A tensor as a sequence of arrays, one for each batch; all None if the tensor is None."""
 
     def __init__(self, value: Tensor | None, batch: tuple[int, ...]) -> None:
         array = None if value is None else as_array(value)
@@ -40,9 +40,9 @@ class Batches:
 
 
 class BatchResults:
-    """Results of one call: one library result per batch, and the indices of the splats in view.
+    """Results of a call: the library's result for each batch, and the indices of the splats in view.
 
-    A splat's index is its place in a flattened array (B, C, N): by batch, then camera, then Gaussian.
+    A splat's index is its position in a flattened array (B, C, N): by batch, then camera, then Gaussian.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class BatchResults:
         """Indices of the splats in view; None unless packed."""
         if not self.packed:
             return None
-        radii = self.stacked("radii")  # two comparisons: np.all over an axis of length 2 takes ten times as long
+        radii = self.stacked("radii")  # compared one by one: np.all over an axis of length 2 takes ten times as long
         return np.flatnonzero((radii[..., 0] > 0) & (radii[..., 1] > 0))
 
     def splats(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -75,7 +75,7 @@ class BatchResults:
         return means2d, conics, depths, opacities
 
     def radii(self) -> NDArray[np.int32]:
-        """Radii in the layout of `meta`. Every call returns a copy, since the gradient reads the library's array."""
+        """A copy of the radii in the layout of `meta`; the gradient still reads the library's array."""
         radii = self.laid_out(self.stacked("radii"))
         return radii if self.packed else radii.copy()
 
@@ -92,11 +92,11 @@ class BatchResults:
         return first, second, third
 
     def stacked(self, name: str) -> NDArray[Any]:
-        """The array `name` of the results of all batches, (B, ...)."""
+        """The array `name` from the results of all batches, (B, ...)."""
         return stacked([getattr(result, name) for result in self.results])
 
     def by_camera(self, name: str) -> NDArray[Any]:
-        """The array `name` of the results of all batches, in the shape of the call's batches: (..., C, ...)."""
+        """The array `name` from the results of all batches, with the call's batch sizes: (..., C, ...)."""
         array = self.stacked(name)
         return array.reshape(*self.batch, *array.shape[1:])
 
@@ -105,7 +105,7 @@ class BatchResults:
         return as_tensor(self.by_camera("images"), like), as_tensor(self.by_camera("alphas"), like)
 
     def of_rows(self, gradient: Tensor) -> Tensor:
-        """A gradient (N, ...) as a COO tensor of the rows in view, each row once."""
+        """A gradient (N, ...) as a COO tensor with the rows in view, each row once."""
         assert self.in_view is not None
         rows = torch.from_numpy(np.unique(self.in_view % self.sizes[2])).to(gradient.device)
         return torch.sparse_coo_tensor(
@@ -113,7 +113,7 @@ class BatchResults:
         )
 
     def laid_out(self, array: NDArray[Any]) -> NDArray[Any]:
-        """An array (B, C, N, ...) in the layout of `meta`: (..., C, N, ...), or (nnz, ...) if packed."""
+        """Convert an array (B, C, N, ...) to the layout of `meta`: (..., C, N, ...), or (nnz, ...) if packed."""
         if self.in_view is None:
             return array.reshape(*self.batch, *array.shape[1:])
         return array.reshape(-1, *array.shape[3:]).take(self.in_view, axis=0)
@@ -121,8 +121,8 @@ class BatchResults:
     def whole(self, name: str, value: Tensor | None) -> Any:
         """Convert a gradient from the layout of `meta` to (B, C, N, ...).
 
-        If the tensor came from `in_layout` and PyTorch's version counter shows no change, return the array that it was
-        packed from.
+        If `in_layout` made the tensor, and PyTorch's version counter shows no change, this returns the array from which
+        the tensor was made.
         """
         packed, version, array = self._handed_on.pop(name, (None, 0, None))
         if value is None:
@@ -135,13 +135,13 @@ class BatchResults:
         rows = array
         if len(array) < math.prod(self.sizes):
             rows = np.zeros((math.prod(self.sizes), *array.shape[1:]), np.float32)
-            # copying each row as one item takes half the time
+            # a copy of whole rows as single items takes half the time
             one = np.dtype((np.void, array.itemsize * math.prod(array.shape[1:])))
             rows.reshape(-1).view(one)[self.in_view] = array.reshape(-1).view(one)
         return rows.reshape(*self.sizes, *array.shape[1:])
 
     def gradient(self, each: list[dict[str, Any]], name: str, like: Tensor | None) -> Tensor | None:
-        """Gradients of an argument from all batches, in the argument's shape and dtype."""
+        """The gradient with respect to an argument, from all batches, in the argument's shape and dtype."""
         if like is None or any(found.get(name) is None for found in each):
             return None
         arrays = [found[name] for found in each]
@@ -167,10 +167,10 @@ class BatchResults:
         ]
 
     def in_layout(self, each: list[dict[str, Any]], name: str, like: Tensor, *, hand_on: bool) -> Tensor:
-        """Gradients of splats from all batches, in the layout of `meta`.
+        """The gradient with respect to an array of splats, from all batches, in the layout of `meta`.
 
-        hand_on: keep the array, so that `whole` need not unpack the tensor. Tensors with hooks are excluded: a hook
-        could change the tensor without a new version.
+        hand_on: keep the array, so that `whole` can return it. It is not kept if `like` has hooks, as a hook could
+        change the tensor without a new version.
         """
         arrays = [found[name] for found in each]
         array = stacked(arrays)
@@ -233,7 +233,7 @@ class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torc
                 depths=item(depths, index),
                 cameras=cameras,
             )
-            if "covars" in found:  # an off-diagonal number is in two places of the matrix, each with half its gradient
+            if "covars" in found:  # an off-diagonal entry has half of its gradient in each of its two places
                 found["covars"] = found["covars"][:, UPPER_TRIANGLE_INDICES[0], UPPER_TRIANGLE_INDICES[1]] * np.array(
                     [1, 2, 2, 1, 2, 1], np.float32
                 )
@@ -257,11 +257,11 @@ class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch ha
     ) -> tuple[Tensor, Tensor]:
         """Images (..., C, H, W, X) and alphas (..., C, H, W, 1).
 
-        values: blended values (..., N, D) or (..., C, N, D), or None.
+        values: values to blend, (..., N, D) or (..., C, N, D), or None.
         """
         ctx.call = call
         images, alphas = call.pixels(means2d)
-        # the gradient reads these outputs too; as they are saved, PyTorch raises an error after an in-place change
+        # the gradient reads these outputs; since they are saved, PyTorch reports changes in place
         read = (images, alphas) if call.expected_depth else (alphas,)
         ctx.save_for_backward(means2d, conics, depths, opacities, values, backgrounds, *read)
         ctx.set_materialize_grads(False)

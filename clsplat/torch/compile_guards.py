@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decorators that keep functions out of `torch.compile` graphs: kernels are launched between the graphs."""
+"""Decorators that keep functions out of the graphs of `torch.compile`. Kernels are launched between the graphs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def differentiable_once(function: Callable[_P, _R]) -> Callable[_P, _R]:
 def outside_graphs(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """The function, excluded from tracing by `torch.compile`.
 
-    `torch.compiler.disable` imports the compiler, which takes seconds. It is therefore called only after other code has
+    `torch.compiler.disable` imports the compiler, which takes seconds. So it is called only after other code has
     imported the compiler.
     """
     disabled: list[Callable[_P, _R]] = []
@@ -36,6 +36,6 @@ def outside_graphs(function: Callable[_P, _R]) -> Callable[_P, _R]:
             disabled.append(torch.compiler.disable(function))
         return disabled[0](*args, **kwargs)
 
-    # the compiler checks this mark when a compiled function calls this one
+    # the compiler checks this mark when a compiled function calls `call`
     call._torchdynamo_disable = True  # type: ignore[attr-defined]  # noqa: SLF001
     return call

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Covariances of Gaussians, and their inverses: plain PyTorch, on the tensors' own device."""
+"""Covariances of Gaussians, and their inverses: pure PyTorch, on the device of the tensors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clsplat.torch.arguments import check
 from clsplat.torch.compile_guards import differentiable_once
 
 UPPER_TRIANGLE_INDICES = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
-"""Rows and columns of the upper triangle of a 3x3 matrix, in the order of the flattened form."""
+"""Row and column of each entry in the upper triangle of a 3x3 matrix, row by row."""
 
 
 def quat_scale_to_covar_preci(
@@ -73,7 +73,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 def sparse_upper(covars: Tensor) -> Tensor:
     """The upper triangles (N, 6) of matrices (N, 3, 3).
 
-    If their gradient is a COO tensor of rows, the gradient of the matrices is a COO tensor too.
+    If the gradient with respect to the triangles is a COO tensor, that with respect to the matrices is one too.
     """
     upper: Tensor = _SparseUpper.apply(covars)
     return upper

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tensors and settings of a call of `rasterization`: their checks, and the library's call for each batch."""
+"""Tensors and settings of a call of `rasterization`: checks, and the call of the library for each batch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from clsplat.torch.autograd import Batches
 
 @dataclass(frozen=True)
 class RasterizationSettings:
-    """The settings of a call, checked and under the names of `clsplat.rasterize`."""
+    """The checked settings of a call, by their names in `clsplat.rasterize`."""
 
     width: int
     height: int
@@ -39,7 +39,7 @@ class RasterizationSettings:
 
 @dataclass(frozen=True, eq=False)
 class GivenTensors:
-    """The tensors of a call, under gsplat's names."""
+    """The tensors of a call, by gsplat's names."""
 
     means: Tensor
     quats: Tensor | None
@@ -69,7 +69,7 @@ class GivenTensors:
     def check(self, sh_degree: int | None) -> tuple[int, ...]:
         """Check the tensors, and return the sizes of the batches.
 
-        Raises InputError for a shape that does not fit `rasterization`, and for NaN in backgrounds.
+        Raises InputError for a wrong shape, and for NaN in backgrounds.
         """
         means, viewmats, colors = self.means, self.viewmats, self.colors
         leading = means.shape[:-2] if isinstance(means, Tensor) and means.dim() >= 2 else ()
@@ -87,14 +87,14 @@ class GivenTensors:
             raise refuse("viewmats", f"of shape {tuple(viewmats.shape)}", "at least one camera in each batch")
         check_shape("Ks", self.Ks, (*batch, cameras, 3, 3))
         _check_colors(colors, batch, cameras, count, sh_degree)
-        if self.backgrounds is not None:  # if only depth is rendered, no other code checks them
+        if self.backgrounds is not None:  # the library does not check backgrounds if only depth is rendered
             shape = (*batch, cameras, colors.shape[-1])
             check_shape("backgrounds", self.backgrounds, shape)
             check("backgrounds", self.backgrounds, shape)
         return batch
 
     def used(self, *, depth_alone: bool) -> GivenTensors:
-        """The tensors that the result depends on: covars replace quats and scales, and depth has no background."""
+        """The tensors that the result depends on. covars replace quats and scales; depth has no background."""
         given = self if self.covars is None else replace(self, quats=None, scales=None)
         return replace(given, backgrounds=None) if depth_alone else given
 

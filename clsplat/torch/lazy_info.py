@@ -10,10 +10,10 @@ from clsplat.torch.compile_guards import outside_graphs
 
 
 class Meta(dict[str, Any]):
-    """A dictionary with lazy entries. Each function runs once, on the first access to one of its names.
+    """A dictionary whose entries may be computed on first access, by a function that runs once.
 
-    It behaves like a dictionary with all entries computed, with one exception: if an entry is changed in place, entries
-    that are later computed from it use the changed values.
+    It behaves like a dictionary with all entries, with one exception: if an entry is changed in place, entries that are
+    computed from it later use the changed values.
     """
 
     def __init__(self, entries: dict[str, Any]) -> None:
@@ -21,7 +21,7 @@ class Meta(dict[str, Any]):
         self._makers: dict[str, Callable[[], dict[str, Any]]] = {}
 
     def later(self, names: tuple[str, ...], make: Callable[[], dict[str, Any]]) -> None:
-        """Register `make`, which returns an entry for each of `names`, to run on the first access to one of them."""
+        """Let `make` return the entries `names` on the first access to one of them."""
         for name in names:
             super().__setitem__(name, None)
             self._makers[name] = make

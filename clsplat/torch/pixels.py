@@ -41,7 +41,7 @@ def rasterize_to_pixels(
     Parameters
     ----------
     means2d : (..., N, 2) Tensor
-        Pixels; the first pixel's centre is at 0.5. With `packed`, (nnz, 2): nnz replaces ..., N in all tensors.
+        Pixels; the first pixel's centre is at 0.5. With `packed`, nnz replaces "..., N" in all tensors.
     conics : (..., N, 3) Tensor
         xx, xy, yy of the inverse covariance, 1 / px^2.
     colors : (..., N, D) Tensor
@@ -61,7 +61,7 @@ def rasterize_to_pixels(
     masks : (..., tile_height, tile_width) Tensor of bool, optional
         Tiles that are False show only the background.
     packed : bool
-        True if the splats of all images are along one axis.
+        True if a single axis holds the splats of all images.
     absgrad : bool
         Let the backward pass set `means2d.absgrad` to the sums over pixels of absolute gradients.
     alpha_max : float

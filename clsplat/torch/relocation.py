@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Relocation of Gaussians to the place of another Gaussian: plain PyTorch, on the tensors' own device."""
+"""Relocation of Gaussians to the place of another Gaussian: pure PyTorch, on the device of the tensors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clsplat.torch.arguments import check, refuse
 def compute_relocation(
     opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, *, min_opacity: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """Compute opacities and scales with which n Gaussians at one place look like a single Gaussian.
+    """Compute the opacities and scales with which n Gaussians at the same place look like the original Gaussian.
 
     Follows gsplat 1.5.3's function of this name.
 
@@ -23,11 +23,11 @@ def compute_relocation(
     scales : (N, 3) Tensor
         Standard deviations.
     ratios : (N,) Tensor
-        Number n of Gaussians that share each place. Any dtype; clamped to 1 to n_max.
+        Number n of Gaussians that share the place of each Gaussian. Any dtype; clamped to 1 to n_max.
     binoms : (n_max, n_max) Tensor
         binoms[n, k] is the binomial coefficient n over k.
     min_opacity : float
-        Smallest new opacity, an argument of gsplat 1.6.
+        Lower limit of the new opacities, an argument of gsplat 1.6.
 
     Returns
     -------

@@ -31,7 +31,7 @@ PACKED_ID_NAMES = ("batch_ids", "camera_ids", "gaussian_ids")
 
 
 class RollingShutterType(Enum):
-    """gsplat's types of shutters. clsplat supports only GLOBAL."""
+    """gsplat's shutter types. clsplat supports only GLOBAL."""
 
     ROLLING_TOP_TO_BOTTOM = 0
     ROLLING_LEFT_TO_RIGHT = 1
@@ -179,8 +179,8 @@ def rasterization(
 
     Notes
     -----
-    Kerbl et al. 2023; gsplat 1.5.3, https://docs.gsplat.studio. If OpenCL runs on the CPU, it reads
-    float32 tensors on the CPU in place. Tensors of other types or devices are copied to them and back, with a warning.
+    Kerbl et al. 2023; gsplat 1.5.3, https://docs.gsplat.studio. If OpenCL runs on the CPU, float32 tensors on the CPU
+    are not copied. Tensors of other types or devices are copied, and results are copied back, with a warning.
     """
     _refuse_missing(
         distributed=distributed,
@@ -233,7 +233,7 @@ def rasterization(
         results = given.rasterized(settings, batch, differentiable=differentiable)
     expected = render_mode.endswith("ED")
     call = BatchResults(results, batch, packed=packed, sparse=sparse_grad, absolute=absgrad, expected_depth=expected)
-    if not differentiable and not given.have_tangents:  # with dual tensors, PyTorch raises an error below
+    if not differentiable and not given.have_tangents:  # for dual tensors, PyTorch will raise an error
         return *call.pixels(means), _meta(call, means, None, width, height, tile_size)
     splats, images, alphas = _with_gradient(call, given, settings.sh_degree, depth_alone=depth_alone)
     return images, alphas, _meta(call, means, splats, width, height, tile_size)
@@ -242,7 +242,7 @@ def rasterization(
 def _with_gradient(
     call: BatchResults, given: GivenTensors, sh_degree: int | None, *, depth_alone: bool
 ) -> tuple[list[Tensor], Tensor, Tensor]:
-    """The arrays PROJECTED_SPLAT_NAMES, the images and the alphas, connected to their gradients."""
+    """The arrays PROJECTED_SPLAT_NAMES, the images and the alphas, as differentiable tensors."""
     covars, colors = given.covars, given.colors
     if covars is not None:
         covars = (
@@ -290,11 +290,11 @@ def _meta(
 ) -> Meta:
     """The dictionary `meta` of `rasterization`, with gsplat's entries in gsplat's order.
 
-    like: a tensor whose device and dtype the entries get.
-    splats: the arrays PROJECTED_SPLAT_NAMES. If None, they have no gradient and are computed on first access.
+    like: a tensor from which the entries take device and dtype.
+    splats: the arrays PROJECTED_SPLAT_NAMES; None computes them on first access, without gradient.
     """
     batches, cameras, _ = call.sizes
-    like = like.new_empty(0)  # an empty tensor: the dictionary must not keep the caller's tensor alive
+    like = like.new_empty(0)  # empty, so that the dictionary does not keep the caller's tensor alive
     columns, rows = math.ceil(width / tile_size), math.ceil(height / tile_size)
 
     def ids() -> dict[str, Any]:
@@ -306,7 +306,7 @@ def _meta(
     def all_splats() -> dict[str, Any]:
         return dict(zip(PROJECTED_SPLAT_NAMES, call.splats(like) if splats is None else splats, strict=True))
 
-    # `tiles` must not refer to the dictionary that holds it: the cycle would keep memory until garbage is collected.
+    # `tiles` must not refer to the dictionary: this cycle would keep memory until the garbage collector runs.
     def tiles() -> dict[str, Any]:
         batch_ids, camera_ids, gaussian_ids = (None, None, None) if call.in_view is None else call.ids(like.device)
         means2d, _, depths, _ = call.splats(like)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adam on the rows in view: plain PyTorch, on the tensors' own device."""
+"""Adam on the rows in view: pure PyTorch, on the device of the tensors."""
 
 from __future__ import annotations
 

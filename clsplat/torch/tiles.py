@@ -32,9 +32,9 @@ def isect_tiles(
     conics: Tensor | None = None,
     opacities: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """List the (tile, splat) pairs whose tile overlaps the splat's box, like gsplat 1.5.3's function of this name.
+    """List the (tile, splat) pairs in which the tile overlaps the splat's bounding box, like gsplat 1.5.3.
 
-    The box is the mean plus and minus the radii. No result has a gradient.
+    The box is the mean plus and minus the radii. The results have no gradient.
 
     Parameters
     ----------
@@ -53,13 +53,13 @@ def isect_tiles(
     segmented : bool
         Ignored; it changes no result.
     packed : bool
-        True if the splats of all images are along one axis. Then image_ids, gaussian_ids and n_images are required.
+        True if a single axis holds the splats of all images. Then image_ids, gaussian_ids and n_images are required.
     n_images : int, optional
         Number of images. Required with `packed`.
     image_ids : (nnz,) Tensor of int, optional
         Image of each splat, below n_images.
     gaussian_ids : (nnz,) Tensor of int, optional
-        Not used for any result.
+        Not used.
     conics, opacities : None
         Only None is supported. gsplat 1.6 uses these arguments to skip tiles.
 
@@ -68,7 +68,7 @@ def isect_tiles(
     tiles_per_gauss : (..., N) or (nnz,) Tensor of int32
         Number of tiles of each splat.
     isect_ids : (n_isects,) Tensor of int64
-        From the high bits down: the image, the tile in row-major order, the 32 bits of the depth.
+        From high to low bits: the image, the tile in row-major order, and the 32 bits of the depth.
     flatten_ids : (n_isects,) Tensor of int32
         Index of the splat, counted over all images.
 
@@ -122,8 +122,7 @@ def _checked_ids(n_images: int | None, image_ids: Tensor | None, gaussian_ids: T
 
 @outside_graphs
 def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int) -> Tensor:
-    """Find the start of each tile's pairs in the sorted ids of `isect_tiles`, like gsplat 1.5.3's function of this
-    name.
+    """Find the start of each tile's pairs in the sorted ids of `isect_tiles`, like gsplat 1.5.3.
 
     Parameters
     ----------

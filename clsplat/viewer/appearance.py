@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Appearance of a model on a page: edits of the Gaussians, display channel and colour map. Uses no OpenCL or viser."""
+"""Appearance of a model on a page: edits of the Gaussians, displayed channel, colour map. Uses no OpenCL or viser."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ Image = NDArray[np.uint8]
 Mode = Literal["colour", "depth", "alpha", "count"]
 VIEWER_MODES: tuple[Mode, ...] = get_args(Mode)
 Box = tuple[float, float, float, float, float, float]
-"""Smallest x, y, z in the world, then largest x, y, z."""
+"""Box in the world: smallest x, y, z, then largest x, y, z."""
 
 MAX_EDITED_OPACITY = 0.999
-"""Upper limit of a raised opacity, as the logit of 1 is infinite."""
+"""Upper limit of an increased opacity. It is below 1, whose logit is infinite."""
 SIZE_FACTOR_RANGE = (0.05, 2.0)
 OPACITY_FACTOR_RANGE = (0.0, 3.0)
 VIRIDIS_RGB = np.array(
@@ -53,13 +53,13 @@ class Look:
     crop: Box | None = None
 
     def changes(self, degree: int) -> Look | None:
-        """Settings that edit a model of this SH degree, with the default mode; None if they do not change the model."""
+        """The settings that edit a model of this SH degree, with the default mode; None if they change nothing."""
         asked = replace(self, mode="colour", degree=min(self.degree, degree))
         return None if asked == Look(degree=degree) else asked
 
 
 def read_look(mode: Any, degree: Any, size: Any, opacity: Any, crop: Any = None) -> Look:
-    """Look from the values of a page's controls. Numbers outside a slider's range are clamped."""
+    """The look for the values of a page's controls. Numbers outside a slider's range are clamped."""
     box = None
     if crop is not None:
         corners = np.asarray(crop, np.float64).reshape(2, 3)
@@ -80,7 +80,7 @@ def _within(value: Any, low: float, high: float, usual: float) -> float:
 
 
 def edited(gaussians: Gaussians, look: Look) -> Gaussians:
-    """The model edited by a look. Unchanged arrays are shared with the input."""
+    """The model with the edits of a look. Unchanged arrays are shared with the input."""
     model = drop_sh(gaussians, look.degree) if look.degree < gaussians.sh_degree else replace(gaussians)
     if look.size != 1:
         model.log_scales = gaussians.log_scales + np.float32(math.log(look.size))

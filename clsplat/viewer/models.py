@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models that the viewer shows: a fixed one, or one in training. `clsplat.rendering.rasterizer` renders them.
+"""Models that the viewer shows: from a file, or in training. `clsplat.rendering.rasterizer` renders them.
 
 Only the thread that created a model may render its pictures, because a device has one queue.
 """
@@ -25,13 +25,13 @@ from clsplat.viewer.appearance import Image, Look, alpha_picture, colour_picture
 from clsplat.viewer.pose import MAX_PAGE_PICTURE_PIXELS
 
 MAX_MODELS_ON_DEVICE = 2
-"""Maximum number of models on the device: the model of the file, and one that is edited by a look."""
+"""Maximum number of models on the device: the model of the file, and an edited model."""
 CHANNEL_FLOATS_PER_GAUSSIAN = 3
-"""Minimum number of floats per Gaussian that the channels need besides colour."""
+"""Minimum number of floats per Gaussian for channels other than colour."""
 
 
 def draft(config: RasterizerConfig) -> RasterizerConfig:
-    """Rasterizer settings for pictures in motion: approximations that save time, but the same SH settings."""
+    """Rasterizer settings for pictures in motion: approximations that save time. SH settings are unchanged."""
     fast = RASTERIZER_PRESETS["fast"]
     return replace(
         config,
@@ -41,7 +41,7 @@ def draft(config: RasterizerConfig) -> RasterizerConfig:
 
 
 class HeldModel:
-    """Model from a file. The device stores it unchanged and as edited by the last look."""
+    """Model from a file. The device holds the unchanged model, and the model with the edits of the last look."""
 
     version = 0
     """Version number of the model. It is constant, as the model does not change."""
@@ -61,11 +61,11 @@ class HeldModel:
 
     @property
     def pixels(self) -> int:
-        """Largest number of pixels of a picture on a page."""
+        """Maximum number of pixels of a picture on a page."""
         return min(MAX_PAGE_PICTURE_PIXELS, frame_pixels(self.device, CHANNEL_FLOATS_PER_GAUSSIAN))
 
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
-        """Render a picture (H, W, 3) uint8. Returns it with a remark. Raises CapacityError and InputError."""
+        """Render a picture (H, W, 3) uint8, and return it with a remark. Raises CapacityError and InputError."""
         key = look.changes(self.gaussians.sh_degree)
         try:
             return self._picture(key, camera, look, exact=exact)
@@ -79,7 +79,7 @@ class HeldModel:
         gaussians, renderers = self._held.pop(key)
         while len(self._held) >= MAX_MODELS_ON_DEVICE:
             del self._held[next(iter(self._held))]
-        self._held[key] = (gaussians, renderers)  # the most recently used comes last
+        self._held[key] = (gaussians, renderers)  # the most recently used is last
         renderer = renderers.get(exact)
         if renderer is None:
             renderer = renderers[exact] = Renderer(self.device, self._rasterizers[exact])
@@ -87,7 +87,7 @@ class HeldModel:
 
 
 class LiveModel:
-    """Model in training, shown between two steps. Rendering uses the trainer's memory but keeps the step's data."""
+    """Model in training, which is rendered between two steps, in the trainer's memory. The step's data are kept."""
 
     def __init__(self, trainer: Trainer, background: Sequence[float]) -> None:
         self.trainer, self.background = trainer, background
@@ -103,11 +103,11 @@ class LiveModel:
 
     @property
     def pixels(self) -> int:
-        """Largest number of pixels for which the training has memory."""
+        """Maximum number of pixels of a picture, for which the training has memory."""
         return max(view.camera.width * view.camera.height for view in self.trainer.views)
 
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:  # noqa: ARG002  # always exact
-        """Render a picture. Returns it with a remark. Raises InputError if a training with limited memory leaves too
+        """Render a picture, and return it with a remark. Raises InputError if a training with limited memory leaves too
         little memory."""
         trainer = self.trainer
         trainer.settle()
@@ -137,7 +137,7 @@ def render_picture(
     background: Sequence[float],
     space: str,
 ) -> tuple[Image, str]:
-    """Render a picture of a model on the host or on the device. Returns it with a remark."""
+    """Render a picture of a model that is on the host or the device, and return it with a remark."""
     if isinstance(model, Gaussians) and not len(model):
         raise InputError("nothing remains of the model: the crop box contains no Gaussian")
     if look.mode in ("depth", "count"):

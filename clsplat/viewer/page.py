@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One page of the viewer: its controls and their actions, made with viser. `appearance` applies the settings."""
+"""A page of the viewer in viser: its controls and their actions. `appearance` applies the settings."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ if TYPE_CHECKING:
     from clsplat.viewer.models import Model
 
 PAGE_PHOTO_SIDE_PX = 240
-"""Longest side in pixels of a photograph on the page."""
+"""Maximum longer side in pixels of a photograph on the page."""
 FRUSTUM_SCALE = 0.05
-"""Size of a drawn camera, relative to the distance between the start position and its target."""
+"""Size of a drawn camera, relative to the distance from the start position to the orbit centre."""
 UP_CHOICES = ("as the scene", "y", "-y", "z", "-z", "x", "-x")
 """Choices for the up direction."""
 CAMERA_DISPLAY_CHOICES = ("hidden", "frames", "photos")
@@ -53,9 +53,9 @@ DEFAULT_PICTURE_SIZE_PX = (1280, 720)
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Data with which every page starts.
+    """Data that all pages share.
 
-    origin: (3,), point that is subtracted from world positions for the browser, which computes in float32.
+    origin: (3,), subtracted from world positions for the browser, because it computes in float32.
     box: two corners (3,), the range of the crop sliders.
     degree: the model's SH degree.
     """
@@ -69,11 +69,11 @@ class World:
 
 
 COARSE_PICTURE_REMARK = "coarse"
-"""Remark on a picture that is not exact, because the camera moves or refinement is in progress."""
+"""Remark on a picture that is not exact, because the camera moves or the refinement is not finished."""
 
 
 class ViserPage:
-    """One viewer's page with its controls. The thread that owns the device calls the methods that render."""
+    """The page of a viewer, with its controls. Methods that render are called by the thread that owns the device."""
 
     def __init__(self, client: Any, viewing: Viewing, world: World, paths: Path | None) -> None:
         self.client, self.viewing, self.world, self.paths = client, viewing, world, paths
@@ -87,7 +87,7 @@ class ViserPage:
         """Show a picture (H, W, 3) with a remark."""
         self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=level.quality)
         self._shown += 1
-        if self._shown == 2:  # controls keep a browser busy, so they are added after the first picture
+        if self._shown == 2:  # added after the first picture, because controls keep a browser busy
             self._build()
         height, width = image.shape[:2]
         self._say(
@@ -95,7 +95,7 @@ class ViserPage:
         )
 
     def tell(self, message: str) -> None:
-        """Show a message, such as the reason why there is no picture."""
+        """Show a message, for example why there is no picture."""
         self._build()
         self.client.add_notification("clsplat", plain(message), auto_close_seconds=10.0)
         self._say(plain(message))
@@ -177,7 +177,7 @@ class ViserPage:
             hint="Blue: training; orange: held out. Click a camera to look through it.",
         )
 
-        def changed(_: Any) -> None:  # runs in one of viser's threads, since reading photos takes a while
+        def changed(_: Any) -> None:  # runs in a thread of viser, since photographs take time to read
             self._drawing += 1
             mine = self._drawing
             with self._drawn:  # only the latest request draws all cameras; earlier ones stop
@@ -232,7 +232,7 @@ class ViserPage:
         def add() -> None:
             if (pose := self.viewer.pose) is not None:
                 add_key(self.keys, pose)
-                # thin lines, as the camera is still at this pose, and the frustum's lines surround the page
+                # thin lines: the camera is still at this pose, so they are along the page's edges
                 name = f"/keys/{len(self.keys) - 1}"
                 self._add_frustum(name, pose, "key", thickness=2.0, thickness_units="screen")
 
@@ -294,7 +294,7 @@ class ViserPage:
         return add_side("Width", DEFAULT_PICTURE_SIZE_PX[0]), add_side("Height", DEFAULT_PICTURE_SIZE_PX[1])
 
     def screenshot(self, model: Model, size: tuple[int, int]) -> None:
-        """Send an exact picture of this size, equal to the one from `clsplat render`. Raises InputError."""
+        """Send an exact picture of this size, with the bits of `clsplat render`. Raises InputError."""
         pose = self.viewer.pose
         if pose is None:
             return
@@ -329,7 +329,7 @@ def png(image: Image) -> bytes:
 
 @cache
 def thumbnail(view: View) -> Image | None:
-    """Small picture (H, W, 3) of a photograph, with masked areas in red and blue; None if the file cannot be read."""
+    """A small picture (H, W, 3) of a photograph, masked areas in red and blue; None if the file cannot be read."""
     camera = view.camera
     scale = min(PAGE_PHOTO_SIDE_PX / max(camera.width, camera.height), 1.0)
     try:

@@ -30,7 +30,7 @@ class KeyFrame(TypedDict):
 
 
 class CameraFileHead(TypedDict):
-    """Head of a camera file. loop_frames: number of frames until a closed path is back at its first key."""
+    """Head of a camera file. loop_frames: number of frames after which a closed path is back at its first key."""
 
     clsplat_cameras: int
     width: int
@@ -60,7 +60,7 @@ def path_document(
     fps: float = DEFAULT_VIDEO_FPS,
     loop: bool = False,
 ) -> str:
-    """Camera file of the key frames.
+    """The camera file of the key frames, as JSON.
 
     size: width and height of the frames.
     apart: seconds between keys, rounded to whole frames.
@@ -92,7 +92,7 @@ def path_document(
 
 
 def save_path(folder: Path, document: str) -> Path:
-    """Write the document to the first unused name of path-001.json, path-002.json, ... A page cannot choose the name.
+    """Write the document to path-001.json, or to the next number that is unused. A page cannot choose the name.
 
     Raises OSError, and InputError if no name is free.
     """

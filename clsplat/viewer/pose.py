@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose of a page's camera, and its start pose."""
+"""The pose of a page's camera, and its start."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from clsplat.scenes.outliers import stray_cameras
 from clsplat.shots.viewpoints import COLMAP_UP, extent_of, focus_point, look_at, up_axis
 
 MAX_PAGE_PICTURE_PIXELS = 4096 * 2304
-"""Largest number of pixels of a picture on a page, whatever size the browser requests."""
+"""Maximum number of pixels of a picture on a page, for any size that a browser requests."""
 MAX_PAGE_SIDE_PX = MAX_VIDEO_SIDE_PX
-"""Largest side in pixels of a page and its pictures: that of a video, since a recorded path may become one."""
+"""Maximum side in pixels of a page and its pictures. It is that of a video, as a recorded path may become a video."""
 DEFAULT_FOV_Y_RADIANS = math.radians(60)
 """Vertical field of view in radians if no camera of the scene defines it."""
 MAX_START_FOV_Y_RADIANS = math.radians(120)
-"""Largest vertical field of view in radians at the start of a narrow page. More would only add top and bottom."""
+"""Maximum vertical field of view in radians at the start of a narrow page. More would only add top and bottom."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +44,9 @@ class Pose:
     height: int
 
     def camera(self, width: int | None = None, height: int | None = None) -> Camera:
-        """Camera for the page's size or another one. `angle` defines its field of view.
+        """The camera for the size of the page, or for another size. `angle` defines its field of view.
 
-        It has the same bits as the camera that is read from a camera file (`path_document`), which stores a quaternion
-        and degrees.
+        Its numbers have the same bits as if they were written to a camera file (`path_document`) and read again.
         """
         across, down = width or self.width, height or self.height
         focal = focal_length(math.radians(math.degrees(self.angle(across, down))), down)
@@ -56,10 +55,10 @@ class Pose:
         return Camera(across, down, focal, focal, across / 2, down / 2, turn, -turn @ self.position)
 
     def angle(self, width: int, height: int) -> float:
-        """Vertical field of view in radians for a picture of this size. It is usually that of the page.
+        """Vertical field of view in radians for a picture of this size, usually that of the page.
 
-        On an upright page, a picture with a larger aspect ratio than the page's keeps the horizontal field of view
-        instead. The picture's aspect ratio counts as 1 if it is larger.
+        On an upright page, a picture with a larger aspect ratio than the page has the horizontal field of view of the
+        page instead. An aspect ratio over 1 counts as 1 here.
         """
         page, picture = self.width / self.height, min(width / height, 1.0)
         return self.fov if page >= picture else 2 * math.atan(math.tan(0.5 * self.fov) * page / picture)
@@ -77,7 +76,7 @@ def read_pose(
     size: tuple[int, int],
     origin: Float64,
 ) -> Pose | None:
-    """Check a pose that a browser sent, as it may send anything. Returns None for values that no camera can have.
+    """The pose for values that a browser sent, which may be arbitrary; None if no camera can have these values.
 
     wxyz: quaternion of the rotation from the camera's axes (COLMAP's) to the world's.
     position: camera position relative to `origin` (3,).
@@ -101,9 +100,9 @@ def read_pose(
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Start of a page: camera position, orbit centre and up direction in the world.
+    """The start of a page: camera position, orbit centre and up direction in the world.
 
-    aspect: width / height of the picture that shall be visible, whose vertical field of view is `fov`.
+    fov, aspect: vertical field of view, and width / height, of a picture that must be visible as a whole.
     """
 
     position: Float64
@@ -115,28 +114,28 @@ class Start:
     def fov_on(self, width: int, height: int) -> float:
         """Vertical field of view on a page of this size.
 
-        It is `fov`, or larger on a narrow page, such as that of an upright phone, to show the whole width.
+        It is `fov`, or more on a narrow page, such as on an upright phone, to show the whole width.
         """
         return wide_enough(self.fov, self.aspect, width, height)
 
 
 def wide_enough(fov: float, aspect: float, width: int, height: int) -> float:
-    """Vertical field of view in radians on a page of this size that shows a whole picture.
+    """Vertical field of view in radians with which a page of this size shows a whole picture.
 
     fov: vertical field of view of the picture.
     aspect: its width / height.
-    The result is at least `fov`, and at most MAX_START_FOV_Y_RADIANS if `fov` is smaller.
+    The result is at least `fov`. If it is larger than `fov`, it is at most MAX_START_FOV_Y_RADIANS.
     """
     more = aspect * height / max(width, 1)
     return max(fov, min(2 * math.atan(math.tan(0.5 * fov) * more), MAX_START_FOV_Y_RADIANS)) if more > 1 else fov
 
 
 def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
-    """The viewer's start: the pose of the first camera that is no outlier.
+    """The viewer's start: the pose of the first camera that is not an outlier.
 
-    The view orbits a point at the depth of the cameras' common focus.
+    The orbit centre is in front of it, at the depth of the point that all cameras look at.
 
-    Without cameras, the start is in front of the points (N, 3), with y down, looking along z as in a COLMAP scene.
+    Without cameras, the start is in front of the points (N, 3), with y down and z forward as in a COLMAP scene.
     All vectors are in world coordinates.
     """
     if cameras:
@@ -158,10 +157,10 @@ def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
 
 
 def leaning(up: Float64, ahead: Float64, degrees: float) -> Float64 | None:
-    """Up direction (3,), of unit length, for a camera that looks `ahead` and is rolled clockwise by `degrees`.
+    """Up direction (3,), of unit length, of a camera that looks `ahead` and is rolled clockwise by `degrees`.
 
-    It is `up` rotated about the viewing direction. Clockwise is as seen from behind. None for a camera that looks along
-    `up`.
+    It is `up` rotated about the viewing direction, clockwise as seen from behind the camera. None if the camera looks
+    along `up`.
     """
     length = float(np.linalg.norm(ahead) * np.linalg.norm(up))
     if not float(np.linalg.norm(np.cross(ahead, up))) > 1e-3 * length:
@@ -177,6 +176,6 @@ def looking(start: Start, size: tuple[int, int]) -> Pose:
 
 
 def fitted(width: int, height: int, scale: float, most: float = MAX_PAGE_PICTURE_PIXELS) -> tuple[int, int]:
-    """Width and height of a picture that has the page's size times `scale`, and at most `most` pixels."""
+    """Width and height of a picture: the page's size times `scale`, reduced to at most `most` pixels."""
     scale = min(scale, math.sqrt(most / (width * height)))
     return max(1, round(width * scale)), max(1, round(height * scale))

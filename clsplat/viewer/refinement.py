@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Refinement of a viewer's pictures, which are coarse in motion and exact at rest, and use a fraction of training time.
+"""Refinement of a viewer's pictures: coarse in motion, exact at rest. In training they take a fraction of its time.
 
-This module uses neither OpenCL nor viser. Times are seconds of any monotonic clock.
+This module uses neither OpenCL nor viser. Times are in seconds, from any monotonic clock.
 """
 
 from __future__ import annotations
@@ -10,21 +10,21 @@ import math
 from dataclasses import dataclass
 
 SETTLE_SECONDS_RANGE = (0.2, 1.0)
-"""Seconds without a change before refinement: minimum, and maximum, for a slow browser whose camera moves in jumps."""
+"""Seconds without a change before refinement begins: the minimum, and the maximum, for browsers with slow updates."""
 FIRST_SETTLE_SECONDS = 0.5
-"""Seconds before the first refinement, while the browser gets ready to show pictures."""
+"""Seconds before the first refinement, in which the browser gets ready to show pictures."""
 REST_INTERVAL_RATIO = 3.0
-"""A camera is at rest if it has not changed for this many times the usual interval between its changes."""
+"""A camera is at rest if it has not changed for this multiple of the usual interval between changes."""
 MOTION_PICTURE_SECONDS = 0.04
-"""Time budget in seconds of a picture in motion, with encoding but without the browser's time."""
+"""Time limit in seconds of a picture in motion, including its encoding and excluding the browser."""
 MAX_UNPREPARED_EXACT_SECONDS = 0.6
-"""Maximum seconds of an exact picture that is not preceded by intermediate pictures of growing size."""
+"""Maximum seconds of an exact picture that follows a coarse one directly, without pictures of growing size between."""
 MIN_MOTION_SCALE = 1 / 8
-"""Smallest size of a picture relative to the page. A coarser picture would be unrecognisable."""
+"""Minimum size of a picture relative to the page. A smaller picture would not be recognisable."""
 PAGE_JPEG_QUALITIES = (60, 95)
 """JPEG quality in motion and at rest."""
 VIEWER_TIME_FRACTIONS = (0.2, 0.05)
-"""Fractions of a training's time that pictures may take while a viewer moves, and while all viewers are at rest."""
+"""Maximum fractions of a training's time for pictures: while a viewer moves, and while all are at rest."""
 
 
 @dataclass(frozen=True)
@@ -45,16 +45,16 @@ class Level:
 
 
 def next_scale(scale: float, seconds: float) -> float:
-    """Next scale of pictures in motion, after a picture of `scale` took `seconds`.
+    """Scale of the next picture in motion, after a picture of `scale` took `seconds`.
 
-    Scales approach the time budget step by step, because part of the time does not depend on the number of pixels.
+    The time limit is approached in steps, because a part of the time does not depend on the number of pixels.
     """
     factor = math.sqrt(MOTION_PICTURE_SECONDS / max(seconds, 1e-4))
     return min(max(scale * min(max(factor, 0.6), 1.2), MIN_MOTION_SCALE), 1.0)
 
 
 class Refinement:
-    """State of one viewer's refinement. Pictures are coarse in motion, finer at rest, and exact in the end."""
+    """State of a viewer's refinement. Pictures are coarse in motion, finer at rest, and finally exact."""
 
     def __init__(self, now: float) -> None:
         self.scale = 0.25
@@ -94,7 +94,7 @@ class Refinement:
         return Level(2 * self._level.scale, exact=False)
 
     def wait(self, now: float, model: int = 0) -> float | None:
-        """Seconds until a picture is due; None if no picture is due until something changes."""
+        """Seconds until a picture is due; None if no picture is due before a change."""
         if self.moving:
             return 0.0
         if self._level.exact and self._model == model:
@@ -114,7 +114,7 @@ class Refinement:
 
 
 class Share:
-    """Limiter of the fraction of a training's time that pictures take."""
+    """Limit on the fraction of a training's time that pictures take."""
 
     def __init__(self, shares: tuple[float, float] = VIEWER_TIME_FRACTIONS) -> None:
         self._moving, self._still = shares

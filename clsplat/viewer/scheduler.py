@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scheduler for all viewers on one thread: order of pictures, and other requests. Uses neither OpenCL nor viser.
+"""Scheduler of the pictures and other requests of all viewers, on a single thread. Uses neither OpenCL nor viser.
 
 Any thread may report a viewer's changes. Only `work` renders, on the thread that owns the device.
 """
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Page(Protocol):
-    """Display of a viewer's pictures, remarks and messages, such as `page.ViserPage`."""
+    """A display of pictures, remarks and messages, such as `page.ViserPage`."""
 
     def show(self, image: Image, level: Level, text: str) -> None: ...
     def tell(self, message: str) -> None: ...
@@ -31,7 +31,7 @@ class Page(Protocol):
 
 @dataclass(eq=False)
 class Viewer:
-    """One viewer: page, refinement, look and pose.
+    """A viewer: its page, refinement, look and pose.
 
     trouble: the last error message on the page; "" after a picture was shown.
     """
@@ -81,7 +81,7 @@ class Viewing:
                 self.wake()
 
     def looks(self, viewer: Viewer, look: Look) -> None:
-        """Set the look with which a viewer displays the model."""
+        """Set a viewer's look."""
         with self._news:
             if look != viewer.look:
                 viewer.look = look
@@ -89,7 +89,7 @@ class Viewing:
                 self.wake()
 
     def ask(self, viewer: Viewer, job: Callable[[Model], None]) -> None:
-        """Schedule a job for the thread that owns the device. The page shows its ClsplatError or OSError."""
+        """Schedule a job for the thread that owns the device. The page shows a ClsplatError or OSError of the job."""
         with self._news:
             self._jobs.append((viewer, job))
             self.wake()
@@ -115,7 +115,7 @@ class Viewing:
     def work(self, share: Share | None = None) -> bool:
         """Do one job, or render one picture for the viewer that has waited longest. Returns True if there was work.
 
-        share: limiter of the fraction of a training's time that pictures take.
+        share: limit on the fraction of a training's time that pictures take.
         """
         if (model := self.model) is None or not (self._viewers or self._jobs):
             return False
@@ -131,7 +131,7 @@ class Viewing:
         return bool(job or turn)
 
     def _turn(self, version: int, share: Share | None) -> tuple[Viewer, Level] | None:
-        """Viewer that has waited longest among viewers with a picture due, and the picture's level; or None."""
+        """Of the viewers whose picture is due, the one that has waited longest, and the picture's level; or None."""
         now = self.clock()
         if share is not None and not (share.ready(now, moving=True) or share.ready(now, moving=False)):
             return None
@@ -148,7 +148,7 @@ class Viewing:
         try:
             image, text = model.picture(camera, look, exact=level.exact)
             if viewer in self._viewers:
-                # the view may have changed meanwhile, so that the picture is outdated
+                # the camera may have moved during the rendering, so that the picture is outdated
                 moved_on = level.exact and viewer.refinement.changes != begun
                 viewer.page.show(image, Level(level.scale, exact=False) if moved_on else level, text)
             viewer.trouble = ""

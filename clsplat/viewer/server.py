@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The viewer's server, made with viser (the extra `view`): connections of viewers, and everything that they share.
+"""The viewer's server in viser (the extra `view`): connections of viewers, and everything that they share.
 
-It serves viser's own page and its web socket messages, but no files of this machine.
+It serves viser's page and web socket messages, and no files of this machine.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from clsplat.viewer.pose import read_pose
 from clsplat.viewer.scheduler import Viewer, Viewing
 
 LOCAL_HOST_PATTERN = r"(?i:localhost|127(\.\d+){3}|\[::1\])(:\d+)?"
-"""Pattern of the host names that a server accepts if only this machine can reach it."""
+"""Pattern of the host names to which a server answers if only this machine can reach it."""
 VISER_FAR_PLANE = 1000.0
-"""viser's default far plane. It applies to the cameras and boxes that viser draws."""
+"""viser's default far plane, for the cameras and boxes that viser draws."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Address:
     def check(self) -> None:
         """Raise InputError if viser or the folder is missing, or if nothing can listen at the address.
 
-        viser itself would silently take the next free port.
+        If the port is in use, viser would silently take the next free port.
         """
         try:
             import viser  # noqa: F401
@@ -98,14 +98,14 @@ class Server:
         import viser
 
         self.viewing, self.world, self.address = viewing, world, address
-        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # of viewers that have left
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # when a viewer has left
         with _quiet(), _guarded(address):
             self._server: Any = viser.ViserServer(host=address.host, port=address.port, label="clsplat", verbose=False)
         server = self._server
         server.request_share_url = lambda *_, **__: None  # pages must not open a tunnel from this machine
         server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="medium")
         server.scene.set_up_direction(world.start.up)
-        # nothing in the scene needs light: an environment map and shadows would only slow down browsers without a GPU
+        # the scene needs no light: an environment map and shadows would only slow down browsers without a GPU
         server.scene.configure_environment_map(hdri=None)
         server.scene.configure_default_lights(cast_shadow=False)
         begin, start = server.initial_camera, world.start
@@ -126,7 +126,7 @@ class Server:
             async def moved(camera: Any) -> None:
                 nonlocal fov, before
                 size = (camera.image_width, camera.image_height)
-                # a resize refits the start's field of view, but not that of a camera that the user clicked
+                # a resize fits the field of view of the start again, but not that of a camera that the user clicked
                 if size != before and min(size) > 0 and math.isclose(camera.fov, fov, rel_tol=1e-6):
                     fov = camera.fov = start.fov_on(*size)
                 before = size
@@ -146,7 +146,7 @@ class Server:
 
     @property
     def url(self) -> str:
-        """URL for a browser: with localhost if only this machine can reach the server, else with the host's name."""
+        """URL for a browser. Its host is localhost if only this machine can reach the server, else the host's name."""
         host = self.address.host
         name = "localhost" if self.address.local else f"[{host}]" if ":" in host else host
         return f"http://{name}:{self._server.get_port()}"
@@ -184,10 +184,10 @@ def _quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _guarded(address: Address) -> Iterator[None]:
-    """Make servers that start inside the context refuse requests from other servers' pages in a local browser.
+    """Make servers that start inside the block refuse requests from pages of other servers.
 
-    An invalid message ends its connection, with one line on standard error.
-    viser has no setting for either, but its websocket library has.
+    An invalid message ends its connection, with a line on standard error.
+    viser has no settings for these, but its websocket library has.
     """
     from websockets.asyncio import server
 
@@ -221,7 +221,7 @@ def _guarded(address: Address) -> Iterator[None]:
 
 
 def _tell(_: Any, context: dict[str, Any]) -> None:
-    """Print one line in place of a traceback. The arguments match asyncio's exception handler."""
+    """Print a line instead of a traceback. The arguments are those of an asyncio exception handler."""
     error = context.get("exception")
     words = f"{type(error).__name__}: {error}" if error is not None else str(context.get("message", ""))
     message = plain(" ".join(words.split()))[:200].rstrip(": ")
@@ -231,10 +231,10 @@ def _tell(_: Any, context: dict[str, Any]) -> None:
 def refused(headers: Any, *, local: bool) -> str:
     """Reason why a request is refused; '' if it is accepted.
 
-    A request from another server's page is refused.
-    A server that only this machine can reach also refuses other host names, as after DNS rebinding.
-    Host and origin must have equal ports. Any port is accepted, since a tunnel (ssh -L) may change it.
-    A request without an origin does not come from a page.
+    A request from a page of another server is refused: its origin and host differ in name or port.
+    Any port is accepted, since a tunnel (ssh -L) may change it.
+    A server that only this machine can reach also refuses other host names, against DNS rebinding.
+    A request without an origin does not come from a page, and is accepted.
     """
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     if len(hosts) != 1 or len(origins) > 1:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Viewer of a training. It renders pictures between training steps, within a fraction of the training's time."""
+"""The viewer of a training. It renders pictures between steps, in a limited fraction of the training's time."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 
 STATUS_INTERVAL_SECONDS = 0.5
-"""Seconds between updates of a training's state on its page."""
+"""Seconds between updates of the training's state on the pages."""
 
 
 class TrainingView:
     """Viewer hook of `clsplat.api.train`, called between two steps.
 
-    It renders for all viewers, within the fraction of the training's time that pictures may take.
+    It renders for all viewers, in a limited fraction of the training's time.
     """
 
     def __init__(self, viewing: Viewing, server: Server, background: tuple[float, float, float], last: int) -> None:

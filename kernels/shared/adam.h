@@ -1,15 +1,14 @@
-// Adam's step, (42) of docs/gradients.md (Kingma and Ba 2015, algorithm 1), for one element and for ABREAST consecutive
+// Adam, (42) of docs/gradients.md (Kingma and Ba 2015, algorithm 1), for one element and for ABREAST consecutive
 // elements.
 //
-// No parameter and no moment becomes NaN or infinite here. An element stays unchanged if its new values would be NaN or
-// infinite, or if the square of its new parameter would reach `limit2`. Such refusals are counted in the last four
-// entries of `readback` (the first four belong to compact_visible). They count by cause: the old parameter, the
-// gradient, the moments, or only the step itself. Broken moments restart from zero. In the other cases the second
-// moment becomes infinite and the first 0: every step is then refused until the host has repaired the row
-// (docs/decisions/0016-never-a-nan.md).
+// No parameter and no moment becomes NaN or infinite here. The step of an element is refused if its new values would be
+// NaN or infinite, or if the square of its new parameter would reach `limit2`. The last four entries of `readback`
+// count refusals by cause: the old parameter, the gradient, the moments, or only the new values. Moments that are not
+// finite restart at zero. In the other cases the second moment becomes infinite and the first 0, so that all later
+// steps are refused until the host repairs the row (docs/decisions/0016-never-a-nan.md).
 
-// Elements that a work-item steps at once: a vector of the shape, or else four. Memory is then read 16 bytes at a time,
-// three times before the first use, because a GPU waits here for memory.
+// Number of elements that a work-item updates together: a vector of the shape, otherwise four. A GPU then reads 16
+// bytes at a time, and issues three reads before it waits for the first.
 #if LANES > 1
 #define ABREAST LANES
 #define fmaA fmaL
@@ -26,8 +25,8 @@
 typedef CAT(float, ABREAST) floatA;
 typedef CAT(int, ABREAST) intA;
 
-// Constants of a step, and the counters of refused elements. rate: the learning rate / (1 - beta1^t); root: 1 / sqrt(1
-// - beta2^t).
+// Constants of a step, and the counters of refusals. rate: the learning rate / (1 - beta1^t); root: 1 / sqrt(1 -
+// beta2^t).
 typedef struct {
   float rate, root, beta1, beta2, epsilon, limit2;
   __global uint *readback;
@@ -52,15 +51,15 @@ static inline void refuse(size_t i, Step s, float p, float g, float m, float v, 
                                        : READBACK_REFUSED_STEPS));
 }
 
-// With vectors, single elements are stepped only where one is refused. That is rare, and inlining this function
-// everywhere made one compiler take half a minute.
+// With vectors, single elements are updated only where one is refused. That is rare, and a compiler took half a minute
+// to inline this function everywhere.
 #if LANES > 1
 #define RARE __attribute__((noinline)) static
 #else
 #define RARE static inline
 #endif
 
-// Takes Adam's step for element i along its gradient g.
+// Updates element i by Adam, with the gradient g.
 RARE void step_element(size_t i, float g, Step s, Stepped model) {
   const float before = model.parameters[i], m_before = model.first[i], v_before = model.second[i];
   const float m = fma1(s.beta1, m_before, (1.0f - s.beta1) * g);
@@ -77,9 +76,9 @@ RARE void step_element(size_t i, float g, Step s, Stepped model) {
   model.parameters[i] = p;
 }
 
-// The step of the `taken` ones of ABREAST elements from i on, a multiple of 4 unless LANES > 1. Returns 0 and stores
-// nothing if any has to be refused. The second moment is a square like p * p, so one test of their sum checks both. It
-// is inlined at once, as AMD's compiler else leaves Step in memory.
+// Updates those of ABREAST elements from i on that are `taken`; i is a multiple of 4 unless LANES > 1. Returns 0 and
+// stores nothing if one must be refused. The second moment and p * p are not negative, so a test of their sum checks
+// both. Always inlined, because AMD's compiler would otherwise keep Step in memory.
 __attribute__((always_inline)) static inline int step_vector(size_t i, floatA g, intA taken, Step s, Stepped model) {
   const floatA before = LOADA(model.parameters + i), m_before = LOADA(model.first + i);
   const floatA v_before = LOADA(model.second + i);

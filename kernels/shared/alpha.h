@@ -1,7 +1,7 @@
-// A Gaussian's alpha in a tile's pixels. blend and blend_grad must agree to the last bit: otherwise the gradient, which
-// recovers the transmittance by division, would not use the transmittance of the image.
+// A Gaussian's alpha in a tile's pixels. blend and blend_grad must agree to the last bit, because the gradient recovers
+// the transmittance of the image by division.
 
-// A Gaussian's nearness, 1 / depth, which is blended like a colour (docs/gradients.md, (120)).
+// A Gaussian's nearness, 1 / depth, is blended like a colour (docs/gradients.md, (120)).
 #ifdef NEARNESS
 #define NEAR_PARAMETER , float c_near
 #define NEAR_ARGUMENT , c_near
@@ -32,7 +32,7 @@ static inline void add_moments(floatS g, floatS u, floatS v, floatS *sums) {
   add_moments_by(g, u, v, g * u, g * v, sums);
 }
 
-// A Gaussian's values for a loop over cells, and log2 of its uncapped alpha in cell `cell`.
+// Variables of a Gaussian for a loop over cells, and log2 of its uncapped alpha in cell `cell`.
 #ifdef RAYS
 #include "shared/camera.h"
 #include "shared/rays.h"
@@ -58,7 +58,7 @@ static inline void add_moments(floatS g, floatS u, floatS v, floatS *sums) {
 // log2 of the uncapped alpha from the mean's offset in (u, v).
 static inline floatL log2_alpha(floatL u, floatL v, float log2o) { return fmaL(-u, u, fmaL(-v, v, (floatL)(log2o))); }
 
-// Alpha from the log2 of the uncapped alpha; 0 in the lanes that do not take the Gaussian.
+// Alpha from the log2 of the uncapped alpha; 0 in lanes that are not `taken`.
 static inline floatL alpha_where(intL taken, floatL power) {
   floatL alpha = exp2L(power);
   alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);

@@ -1,8 +1,8 @@
-// cells.h for a group of ITEMS work-items that share a tile. A cell is one pixel of a block of 8 x 4 pixels. Each block
-// has 32 items, one per pixel, so that items that run together skip a block together; groups of fewer items have lower
-// blocks. Item i owns pixel i % 32 of the blocks i / 32, i / 32 + ITEMS / 32, ...: its cells 0, 1, ... Splats pass
-// through local memory in batches, each with the blocks that its ellipse reaches. Items that own the same blocks are a
-// warp here, whether or not the device runs 32 items together.
+// cells.h for groups of ITEMS work-items that share a tile. A cell is one pixel of a block of 8 x 4 pixels. Each block
+// has 32 items, one per pixel, so that items that run together skip a block together; groups of fewer items have blocks
+// of fewer rows. Item i owns pixel i % 32 of the blocks i / 32, i / 32 + ITEMS / 32, ...: its cells 0, 1, ... Splats
+// are fetched to local memory in batches, each with the blocks that its ellipse reaches. A warp here means the items
+// that own the same blocks, even if the device does not run 32 items together.
 #if LANES > 1
 #error "a group of work-items has one pixel a vector"
 #endif
@@ -33,7 +33,7 @@
 #define LOAD_CELL(type, p, stride) (*(p))
 #define STORE_CELL(type, x, p, stride) (*(p) = (x))
 
-#if TILE * TILE / ITEMS <= 8 // few enough for registers, with constant indices
+#if TILE * TILE / ITEMS <= 8 // cells that fit in registers, with constant indices
 #define UNROLLED _Pragma("unroll")
 #else
 #define UNROLLED
@@ -44,15 +44,15 @@ typedef int Open; // number of the item's cells with an open pixel
 #define OPEN_CELL(open, cell) (++(open))
 #define CLOSE_CELL(open, cell) (--(open))
 
-// A set of blocks, with one bit for each block, from the item's first block on.
+// A set of blocks: one bit for each block, beginning with the item's first block.
 typedef uint Reach;
 #define BLOCKS (BLOCK_COLUMNS * BLOCK_ROWS)
 #define ALL_BLOCKS (0xffffffffu >> (32 - BLOCKS))
-#define OF_FIRST_WARP (ALL_BLOCKS / ((1u << WARPS) - 1)) // every WARPS-th bit
+#define OF_FIRST_WARP (ALL_BLOCKS / ((1u << WARPS) - 1)) // the first warp's blocks: every WARPS-th bit
 #define FROM_OWN(blocks) ((blocks) >> WARP)
 #define FOR_CELLS(cell, reach) ALL_CELLS(cell) if ((reach) >> (cell * WARPS) & 1)
 
-// All blocks, without a test: for kernels that take one splat at a time, where testing would cost more than the pixels.
+// All blocks: in kernels that read one splat at a time, a test would cost more than the pixels.
 static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y) { return ALL_BLOCKS; }
 
 #if defined(RAYS) || (defined(NO_ROW_SKIP) && defined(NO_COLUMN_SKIP))
@@ -60,8 +60,8 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
 static inline uint blocks_of(__global const float *splat, int tile_x, int tile_y) { return ALL_BLOCKS; }
 #else
 #define ALL_REACHED 0
-// The right edge of an ellipse, relative to its mean, over the offsets [d0, d1] in y (docs/gradients.md, (47)). It may
-// be slightly too large, as the square root is up to 0.2 % too large.
+// The right edge of an ellipse, relative to its mean, over the offsets [d0, d1] in y (docs/gradients.md, (47)). The
+// square root, and so the edge, may be up to 0.2 % too large.
 static inline float block_edge(float d0, float d1, float tangent, float half_w, float l12, float l22, float inverse_l11,
                                float budget) {
   const float dy = tangent < d0 ? d0 : d1, v = l22 * dy;
@@ -105,21 +105,21 @@ static inline uint blocks_of(__global const float *splat, int tile_x, int tile_y
 }
 #endif
 
-// A batch: splats that the group's items fetch together and all read. Every item fetches the same number, repeating the
-// last splat at the list's end: a compiler that vectorises across items may read memory for idle items too.
+// A batch: splats that the items of a group fetch together, and that all of them read. At the end of a list items fetch
+// the last splat again, instead of none: a compiler that vectorises across items may read memory for idle items too.
 #define BATCH (ITEMS < 64 ? 64 : ITEMS)
 typedef struct {
-  float mx, my, l11, l12; // mx, my: from the tile's first pixel to the mean
+  float mx, my, l11, l12; // mx, my: the mean, relative to the tile's first pixel
   float l22, log2o, red, green;
   float blue;
   uint blocks, gaussian, slot;
 #ifdef NEARNESS
   float near;     // nearness, 1 / depth
-  uint unused[3]; // padding to 16 bytes, set so that copies read no unwritten memory
+  uint unused[3]; // padding to 16 bytes; set, so that copies read no uninitialised memory
 #endif
 } __attribute__((aligned(16))) Staged;
 
-// Stages a splat. Returns those of the blocks `among` that it reaches.
+// Copies a splat to local memory. Returns the blocks of `among` that it reaches.
 static inline uint stage(__local Staged *place, uint gaussian, uint slot, uint among, __global const float *splats,
                          int tile_x, int tile_y) {
   __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian;
@@ -151,18 +151,18 @@ static inline uint blocks_above(int floor, __local const int *numbers) {
   return blocks;
 }
 
-// A warp can walk a list of only the pairs of a batch that reach one of its blocks. First each pair is marked for each
-// warp, then the marked pairs are listed in order.
-#define LIST (BATCH + 1) // room of a warp's list; the last place is read ahead, and not used
+// A warp's list has those pairs of a batch that reach one of its blocks. First each pair is marked for each warp, then
+// the marked pairs are listed in order.
+#define LIST (BATCH + 1) // length of a list; the last element is loaded ahead, but not used
 
-// Marks the j-th pair of a batch for the warps of the blocks: a byte for each pair, 1 or 0.
+// Marks the j-th pair of a batch for the warps that own one of `blocks`. A mark is a byte, 1 or 0.
 static inline void mark(__local uint *marks, int j, uint blocks) {
   _Pragma("unroll") for (int warp = 0; warp < WARPS; ++warp)((__local uchar *)marks)[warp * BATCH + j] =
       (blocks >> warp & OF_FIRST_WARP) != 0;
 }
 
-// An entry of a list: the pair's number in its batch, and DENSE if it reaches more than SPARSE of the warp's blocks. It
-// is then quicker to take all of the item's cells without a branch.
+// An element of a list: the pair's number in its batch, and DENSE if it reaches more than SPARSE of the warp's blocks.
+// It is then faster to process all of the item's cells without a branch.
 #define DENSE 0x80000000u
 #define PAIR_OF(entry) ((int)((entry) & ~DENSE))
 #if ALL_REACHED
@@ -177,10 +177,10 @@ static inline int list_marked(__local const uint *marks, __local const Staged *s
   const int lane = ITEM % BLOCK_ITEMS;
   int count = 0;
   _Pragma("unroll") for (int first = 0; first < BATCH; first += BLOCK_ITEMS) {
-    uint marked = 0; // a bit for each of BLOCK_ITEMS pairs; a product's upper byte has the bits of four bytes
+    uint marked = 0; // a bit for each of BLOCK_ITEMS pairs; the product's upper byte joins the bits of four bytes
     _Pragma("unroll") for (int four = 0; four < BLOCK_ITEMS; four += 4) marked |=
         marks[(WARP * BATCH + first + four) / 4] * 0x01020408u >> 24 << four;
-    const uint until = marked << (31 - lane); // those up to the item's pair
+    const uint until = marked << (31 - lane); // marks up to the item's pair
     if (until >> 31) {
       const int j = first + lane;
       const int reached = popcount(FROM_OWN(staged[j].blocks) & OF_FIRST_WARP);

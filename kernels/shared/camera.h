@@ -1,9 +1,9 @@
-// The camera model of this build: the one place that chooses a header of shared/camera/. All camera models have the
-// same functions and macros, which docs/cameras.md (Adding a camera model) lists. Needs math.h and lanes.h.
+// The camera model of this build, a header of shared/camera/. All camera models have the same functions and macros,
+// which docs/cameras.md (Adding a camera model) lists. Needs math.h and lanes.h.
 //
 // Before the first include, a kernel defines the macros of the parts that it needs:
-//   NEEDS_PROJECTION   a Gaussian's place on the image plane; gaussian.h and ewa.h define this macro
-//   NEEDS_GRADIENT     the gradient with respect to the mean, through that place
+//   NEEDS_PROJECTION   a Gaussian's position on the image plane; gaussian.h and ewa.h define this macro
+//   NEEDS_GRADIENT     the gradient with respect to the mean, through this position
 //   NEEDS_TANGENTS     with RAYS, a pixel on the plane that touches the sphere of directions; one lane
 //   NEEDS_BOXES        with RAYS, the box of pixels around a direction; one lane
 //   NEEDS_MOTION       the motion of a mean, in pixels; one lane
@@ -48,9 +48,9 @@ typedef struct {
 #include "shared/camera/plane.h"
 #endif
 
-// A component of the view direction at a Gaussian, in world axes, and of the gradient through that direction.
-// `offset`: this component of the vector from the camera's centre; `length`: length of that vector; `axis`: this
-// component of the camera's axis.
+// A component of the view direction at a Gaussian, in world axes, and of the gradient through this direction. offset:
+// component of the vector from the camera's centre to the mean; length: length of this vector; axis: component of the
+// camera's axis.
 #ifdef PARALLEL_RAYS // one direction for all Gaussians
 #define SEEN_ALONG(offset, length, axis) (axis)
 #define BY_DIRECTION(gradient, length) (0.0f)

@@ -1,7 +1,7 @@
 // The pixels of a tile as cells, and the cells that a Gaussian reaches. Where several work-items share a tile, blocks.h
-// is used. Otherwise one work-item walks the tile, and a cell is a block of CELL_W x CELL_H pixels in a vector, row by
-// row: an ellipse's edge cuts fewer blocks than rows of as many pixels. Cell c is at column c % COLUMNS and row c /
-// COLUMNS.
+// is used. Otherwise a work-item has the tile, and a cell is a block of CELL_W x CELL_H pixels in a vector, row by row.
+// An ellipse reaches fewer such blocks than rows of the same number of pixels. Cell c is at column c % COLUMNS and row
+// c / COLUMNS.
 #if ITEMS > 1
 #include "shared/blocks.h"
 #else
@@ -15,13 +15,13 @@
 #define CELL_X(cell) ((cell) % COLUMNS * CELL_W)
 #define CELL_Y(cell) ((cell) / COLUMNS * CELL_H)
 
-// The place of a cell's first pixel in a plane.
+// The index of a cell's first pixel in a plane.
 #define CELL_IN_PLANE(cell) (stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell))
 
-// A lane's pixel, relative to its cell's first pixel.
+// The index of a lane's pixel, relative to its cell's first pixel.
 #define LANE_IN_PLANE(lane) (stride * ((lane) / CELL_W) + (lane) % CELL_W)
 
-// The coordinates of a cell's pixels in the tile, and access to the cell in a plane whose rows are `stride` apart.
+// The coordinates of a cell's pixels in the tile, and access to the cell in a plane of rows of `stride` values.
 #define PIXELS_X(cell) ((floatL)(CELL_X(cell)) + LANE_X)
 #define PIXELS_Y(cell) ((floatL)(CELL_Y(cell)) + LANE_Y)
 #if LANES == 1
@@ -56,8 +56,8 @@ typedef int4 int4U __attribute__((aligned(4)));
 #endif
 #endif
 
-// The cells that a Gaussian reaches. In a tile of at most 32 cells, this is a bit for each cell with a pixel in the
-// ellipse. In larger tiles it is the range of cells that the ellipse's box reaches.
+// The cells that a Gaussian reaches. If a tile has at most 32 cells, this is a bit for each cell that has a pixel in
+// the ellipse, otherwise the range of cells that the ellipse's box reaches.
 #if LANES >= 8
 #ifndef RAYS // with RAYS every cell of a tile is visited
 #define CELLS_BY_ELLIPSE
@@ -72,16 +72,16 @@ typedef uint Reach;
 #define LOWEST(bits) (31 - clz((bits) & -(bits)))
 #endif
 
-// sqrt(x), up to 0.2 % too large: one Newton step from an estimate of 1 / sqrt(x) by its bits. A vector's sqrt is a
-// call in PoCL.
+// sqrt(x), up to 0.2 % too large: one step of Newton's method from an estimate of 1 / sqrt(x) by its bits. In PoCL the
+// sqrt of a vector is a function call.
 static inline float8 over_sqrt(float8 x) {
   const float8 y = as_float8((int8)(0x5f375a86) - (as_int8(x) >> 1));
   const float8 root = x * y;
   return root * (1.502f - 0.5f * (root * y));
 }
 
-// The ellipse's chord in eight rows of pixels, from *low to *end, in pixels and not clamped: |l11 (mx - x) + l12 (my -
-// y)| <= sqrt(rest), rest = budget - (l22 (my - y))^2. The chord is a single point where rest < 0.
+// The chords of the ellipse in eight rows of pixels, from *low to *end, in pixels and not clamped: |l11 (mx - x) + l12
+// (my - y)| <= sqrt(rest), rest = budget - (l22 (my - y))^2. A chord is a point where rest < 0.
 static inline float8 chord(float8 dy, float mx, float l12, float l22, float inverse_l11, float budget, float8 *low,
                            float8 *end) {
   const float8 v = l22 * dy, shift = l12 * dy;
@@ -140,9 +140,8 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
 #endif
 }
 
-// Tables of the pixels' coordinates: in some compilers, integer conversions in the inner loop became one long
-// dependency chain. A cell has the same index in every table and array, because address arithmetic is much of a loop's
-// instructions.
+// Tables of the pixels' coordinates, because some compilers make integer conversions in the inner loop a long chain of
+// dependent instructions. A cell has the same index in all tables and arrays, which saves address arithmetic.
 #define PIXEL_TABLES                                                                                                   \
   floatL table_x[CELLS], table_y[CELLS];                                                                               \
   ALL_CELLS(cell) {                                                                                                    \
@@ -152,7 +151,7 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
 #define AT_X(cell) table_x[cell]
 #define AT_Y(cell) table_y[cell]
 
-// Cells that have an open pixel.
+// A set of cells that have open pixels, as bits.
 typedef uint Open;
 #define OPEN_CELL(open, cell) ((open) |= 1u << (cell))
 #define CLOSE_CELL(open, cell) ((open) &= ~(1u << (cell)))
@@ -164,9 +163,9 @@ typedef uint Open;
 
 #define FOR_CELLS(cell, reach) for (uint left = (reach), cell = 0; left && ((cell = LOWEST(left)), 1); left &= left - 1)
 
-// A record has one bit for each vector of the shape's own width, of which a cell has VECTORS. RECORDED(mask) <<
-// FIRST_RECORDED(cell): the bits of a cell's vectors with a lane set in `mask`. CELLS_OF(recorded): the cells that
-// contain recorded vectors. PLACE_OF(each): a recorded vector's index in an array of cells, read as an array of floatS.
+// A record has a bit for each vector of the shape's width; a cell has VECTORS of these. RECORDED(mask) <<
+// FIRST_RECORDED(cell): the bits of a cell's vectors that have a lane set in `mask`. CELLS_OF(recorded): the cells of
+// the recorded vectors. PLACE_OF(each): index of a recorded vector in an array of cells, as an array of floatS.
 #if VECTORS == 1
 #define FIRST_RECORDED(cell) (cell)
 #define RECORDED(mask) ((uint)(ANYL(mask) != 0))

@@ -31,7 +31,7 @@ static inline floatL log2L(floatL x) {
 
 static inline floatL sigmoidL(floatL x) { return 1.0f / (1.0f + expL(-x)); }
 
-// floor and fabs are calls in some drivers. Floats of at least 2^23 are integers already.
+// In some drivers floor and fabs are function calls. Floats from 2^23 on are integers.
 static inline floatL floorL(floatL x) {
   const floatL cut = TO_FLOATL(TO_INTL(x));
   const floatL whole = cut > x ? cut - 1.0f : cut;
@@ -39,7 +39,7 @@ static inline floatL floorL(floatL x) {
   return x > -8388608.0f ? below : x;
 }
 
-// A number as the unevaluated sum of two floats (Dekker 1971).
+// A number as the sum of two floats, with twice the precision of one (Dekker 1971).
 typedef struct {
   floatL high, low;
 } Double;
@@ -92,8 +92,8 @@ static inline Double scaled2(float a, float a_low, Double b) {
   return multiply2(factor, b);
 }
 
-// s1 - s2, where `x` is the difference of their logarithms. Close scales use the series of exp(x) - 1: rounding in the
-// difference of two equal scales would rotate every spherical Gaussian.
+// s1 - s2, where x is the difference of their logarithms. For close scales this is a series of exp(x) - 1: otherwise
+// rounding in the difference of equal scales would rotate every spherical Gaussian.
 static inline floatL scale_difference(floatL x, floatL s1, floatL s2) {
   floatL series = fmaL(x, (floatL)(1.0f / 720.0f), (floatL)(1.0f / 120.0f));
   series = fmaL(x, series, (floatL)(1.0f / 24.0f));

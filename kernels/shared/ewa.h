@@ -1,19 +1,18 @@
 // From LANES Gaussians to their ellipses on the image, with gsplat's conventions; shared by ewa.cl and its gradient.
-// Equation numbers refer to docs/gradients.md. The view matrix may be any matrix, and has a gradient with respect to
-// each of its twelve numbers: (154) uses cofactors of its rows instead of the rows. With ORTHOGRAPHIC the image is
-// linear in x and y, with FISHEYE in the angle from the axis. With COVARIANCES, covariances replace quaternions and
-// scales.
+// Equation numbers refer to docs/gradients.md. The view matrix need not be a rotation, and all its twelve numbers have
+// gradients: (154) uses cofactors instead of rows. With ORTHOGRAPHIC the image is linear in x and y, with FISHEYE in
+// the angle from the axis. With COVARIANCES, covariances replace quaternions and scales.
 #include "shared/place.h"
 #define NEEDS_PROJECTION
 #include "shared/camera.h"
 
-// A compensation has a gradient only if the determinant without the low-pass is at least this.
+// A compensation has a gradient only if the determinant without the low-pass is this or more.
 #define LEAST_DETERMINANT 1e-30f
 
 typedef struct {
-  intL valid;        // not culled for its depth, its size or a value that is not finite
-  floatL x, y, z;    // mean in the camera's frame
-  floatL lx, ly, lz; // the mean's rounding remainders
+  intL valid;        // not culled, for its depth, its size or a value that is not finite
+  floatL x, y, z;    // mean in the camera's axes
+  floatL lx, ly, lz; // rounding errors of the mean
 #ifdef FISHEYE
   floatL away;         // theta / r: distance on the image over distance from the axis
   floatL bend, bend2;  // (1/r d/dr) of `away`, once and twice
@@ -55,12 +54,12 @@ typedef struct {
 
 static inline floatL dotL(const floatL *a, const floatL *b) { return fmaL(a[0], b[0], fmaL(a[1], b[1], a[2] * b[2])); }
 
-// The dot product of a with a row of three camera numbers.
+// The dot product of a and a row of three numbers of the camera.
 static inline floatL dot_row(const floatL *a, __constant float *row) {
   return fmaL(a[0], (floatL)(row[0]), fmaL(a[1], (floatL)(row[1]), a[2] * row[2]));
 }
 
-// a b - c d, accurate to its own last digits.
+// a b - c d, accurate to the last digits of the result.
 static inline floatL product_difference(floatL a, floatL b, floatL c, floatL d) {
   const floatL cd = c * d;
   return fmaL(a, b, -cd) + fmaL(-c, d, cd);
@@ -89,7 +88,7 @@ static inline floatL atan_of_ratio(floatL x) {
   return fmaL(t * p, x, x);
 }
 
-// (157), (158): near the axis by series, because the closed forms are differences of nearly equal terms there.
+// (157), (158): near the axis by series, because terms of the closed forms nearly cancel there.
 static inline void fisheye_of(Ellipse2 *p) {
   const floatL q = fmaL(p->x, p->x, p->y * p->y), d = fmaL(p->z, p->z, q);
   const floatL up = 1.0f / p->z, up2 = up * up, t = q * up2;
@@ -170,7 +169,7 @@ static inline void covariance2(float eps, Ellipse2 *p) {
 #define EWA_NUMBER2(name, index)                                                                                       \
   {(floatL)(camera[EWA_##name##0 + (index)]), (floatL)(camera[EWA_##name##0_LOW + (index)])}
 
-// (57): recomputes b1, b2 and c in the lanes of `which`, in two floats until the last cancellation is done.
+// (57): recomputes b1, b2 and c in the lanes of `which`, in two floats up to the last step where terms cancel.
 static inline void refine2(const uint *row, __global const float *quaternions, __constant float *camera, intL which,
                            Ellipse2 *p) {
   Double r[9];
@@ -275,7 +274,7 @@ static inline int project_ellipses(const uint *row, __global const float *means,
     p->c[k] = fmaL(p->n[0], p->r[k], fmaL(p->n[1], p->r[3 + k], p->n[2] * p->r[6 + k]));
   }
   covariance2(camera[EWA_EPS], p);
-#ifndef FISHEYE // as in gaussian.h: rounding must move a long axis little compared with the short axis
+#ifndef FISHEYE // as in gaussian.h: rounding must move the end of a long axis by little, compared to the short axis
   floatL longest2 = p->s[0] * p->s[0];
   longest2 = p->s[1] * p->s[1] > longest2 ? p->s[1] * p->s[1] : longest2;
   longest2 = p->s[2] * p->s[2] > longest2 ? p->s[2] * p->s[2] : longest2;

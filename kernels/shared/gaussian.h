@@ -1,10 +1,10 @@
-// From LANES Gaussians' parameters to their ellipses on the image, shared by projection and its gradient. Equation
-// numbers refer to docs/gradients.md. With RAYS, tangent.h has its own projection, which uses only the code outside of
-// #ifndef RAYS here.
+// From the parameters of LANES Gaussians to their ellipses on the image, shared by projection and its gradient.
+// Equation numbers refer to docs/gradients.md. With RAYS, tangent.h has the projection; it uses the code that is not
+// inside #ifndef RAYS here.
 
 #include "shared/place.h"
 
-// Variance added to the projected covariance, in px^2, and with ANTIALIASED the smallest factor of opacity in (83).
+// Variance added to the projected covariance, in px^2; with ANTIALIASED also the minimum factor of the opacity in (83).
 #ifdef ANTIALIASED
 #define LOW_PASS 0.1f
 #define LEAST_COMPENSATION 0.005f
@@ -14,13 +14,13 @@
 
 typedef struct {
   intL valid;           // not culled
-  floatL x, y, z;       // mean in the camera's frame
-  floatL lx, ly, lz;    // the mean's rounding remainders
+  floatL x, y, z;       // mean in the camera's axes
+  floatL lx, ly, lz;    // rounding errors of the mean
   floatL rx, ry;        // x/z and y/z as in the Jacobian, clamped; orthographic: 0
   floatL jx, jy;        // the Jacobian's rows are jx (1, 0, -rx) and jy (0, 1, -ry)
   floatL q[4];          // unit quaternion w x y z
   floatL length;        // length of the raw quaternion
-  floatL a2[3];         // last row of A, camera from Gaussian: the axes' depths
+  floatL a2[3];         // last row of A, camera from Gaussian: depths of the axes
   floatL b1[3], b2[3];  // the two rows of J A
   floatL c[3];          // minors: b1[k] b2[l] - b1[l] b2[k] is c[m], for cyclic k, l, m
   floatL s[3];          // scales
@@ -34,7 +34,7 @@ typedef struct {
 #define NEEDS_PROJECTION
 #include "shared/camera.h"
 
-// From the camera's centre to the mean, along a world axis.
+// Component along a world axis of the vector from the camera's centre to the mean.
 #define FROM_CAMERA(means, axis, index)                                                                                \
   ((GATHER(means, 3, index) - camera[CAMERA_P##axis]) - camera[CAMERA_P##axis##_LOW])
 
@@ -64,8 +64,8 @@ static inline void covariance(Projection *p) {
 #endif
 
 #ifdef ANTIALIASED
-// (83): the factor by which opacity compensates for the low-pass. det0, det: the covariance's determinant without and
-// with it.
+// (83): the factor of the opacity that compensates for the low-pass. det0, det: determinants of the covariance without
+// and with the low-pass.
 static inline floatL compensation(floatL det0, floatL det) {
   const floatL part = det0 / det;
   return part > LEAST_COMPENSATION * LEAST_COMPENSATION ? sqrt(part) : (floatL)(LEAST_COMPENSATION);
@@ -73,7 +73,7 @@ static inline floatL compensation(floatL det0, floatL det) {
 #endif
 
 #ifndef RAYS
-// (57): recomputes J A and its minors in the lanes of `which`, in two floats until the last cancellation is done.
+// (57): recomputes J A and its minors in the lanes of `which`, in two floats up to the last step where terms cancel.
 static inline void refine(const uint *row, __global const float *quaternions, __constant float *camera, intL which,
                           Projection *p) {
   Double r[9];
@@ -145,9 +145,9 @@ static inline int project_gaussians(const uint *row, __global const float *means
   }
   covariance(p);
 
-  // Rounding the rotation moves the end of a long axis by 1e-7 of its length. That has to be small against the
-  // ellipse's short axis, which is between 1 and 1.42 times sqrt(det / (sxx + syy)). The gradient also needs an axis
-  // that points at the camera accurately.
+  // Rounding of the rotation moves the end of a long axis by 1e-7 of its length. This error must be small compared to
+  // the short axis of the ellipse, which is between 1 and 1.42 times sqrt(det / (sxx + syy)). For the gradient, an axis
+  // that points to the camera must also be accurate.
   floatL longest = p->s[0] > p->s[1] ? p->s[0] : p->s[1];
   longest = longest > p->s[2] ? longest : p->s[2];
   const floatL across2 = fmaL(p->jx, p->jx, p->jy * p->jy);

@@ -1,4 +1,4 @@
-// Operations of a whole work-group. With ITEMS == 1 a group is one sequential work-item, and they compile to nothing.
+// Operations of a whole work-group. With ITEMS == 1 a group is one work-item, and the operations compile to nothing.
 #ifndef ITEMS
 #error "ITEMS must be defined: work-items per group, 1 on CPUs"
 #endif
@@ -11,8 +11,8 @@
 #endif
 #define GROUP __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 
-// Raises every item's int `value` to the group's maximum. Use it once, in the outermost scope of a kernel, because it
-// declares local memory.
+// Sets the int `value` of every item to the group's maximum. Use this once, in the outermost scope of a kernel, because
+// it declares local memory.
 #if ITEMS == 1
 #define RAISE_TO_GROUP_MAX(value)
 #else
@@ -25,20 +25,19 @@
   value = group_max;
 #endif
 
-// A 64-bit sum in 32 bits; 0xffffffff if it does not fit. A saturated sum of many values is the same in every order
-// of addition.
+// A 64-bit sum in 32 bits; 0xffffffff if it does not fit. A saturated sum does not depend on the order of addition.
 #define CAPPED(sum) ((sum) > 0xffffffff ? 0xffffffff : (uint)(sum))
 
-// Intel's CPU runtime unrolls five rounds. In kernels with barriers and some 50 basic blocks, one of its compiler's
-// passes (sycl-kernel-reduce-cross-barrier-values) then reads freed memory.
+// Intel's CPU runtime unrolls five rounds. A pass of its compiler (sycl-kernel-reduce-cross-barrier-values) then reads
+// freed memory in kernels with barriers and about 50 basic blocks.
 #if ITEMS < 64
 #define ROUNDS _Pragma("unroll 1")
 #else
 #define ROUNDS
 #endif
 
-// The sum of the values of all lower-numbered items; *total gets the sum over all items. Sums saturate at 0xffffffff.
-// scratch holds ITEMS elements.
+// The exclusive prefix sum: the sum of the values of all items before this item. *total: the sum over all items. Sums
+// saturate at 0xffffffff. scratch has ITEMS elements.
 static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint *total) {
 #if ITEMS == 1
   *total = value;
@@ -60,8 +59,8 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
 #endif
 }
 
-// Defines a group's tile from the kernel's first_tile, tiles_x, height and ranges: its first pixel, its list of pairs
-// [begin, end), and the strides in floats between rows and between planes.
+// Defines the group's tile from the kernel's first_tile, tiles_x, height and ranges: its first pixel, its pairs [begin,
+// end), and the strides between rows and between planes, in floats.
 #define TILE_OF_GROUP                                                                                                  \
   const int tile = first_tile + get_group_id(0);                                                                       \
   const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;                                        \
@@ -69,7 +68,7 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
   const size_t stride = (size_t)tiles_x * TILE;                                                                        \
   const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
 
-// The sum of values (count), for every item; it saturates at 0xffffffff. scratch holds ITEMS elements.
+// The sum of values (count), returned to every item; it saturates at 0xffffffff. scratch has ITEMS elements.
 static inline uint group_sum(__global const uint *values, uint count, __local uint *scratch) {
   ulong sum = 0;
   uint total;

@@ -1,11 +1,10 @@
-// A holdout: in each pixel, the surfaces of other elements, each of which lets a fraction of the light behind it
-// through.
+// A holdout: in each pixel, surfaces of other elements. Each transmits a fraction of the light from behind it.
 //
-// held_starts (pixels of a plane + 1): the first surface of each pixel, then the end. held_surfaces (surfaces,
-// HELD_SIZE): the depths of front and back, the transmitted fraction, and its binary logarithm over the thickness. Each
-// pixel's surfaces are sorted by the depth of their fronts. Equations: docs/pictures.md, (75).
+// held_starts (pixels of a plane + 1): the first surface of each pixel, then the number of surfaces. held_surfaces
+// (surfaces, HELD_SIZE): the depths of front and back, the transmitted fraction, and its binary logarithm divided by
+// the thickness. Each pixel's surfaces are sorted by the depth of their fronts. Equations: docs/pictures.md, (75).
 #ifdef HOLDOUT
-// A cell's state: the light that the surfaces already passed let through, and the front of the next surface.
+// State of a cell: the transmittance of the surfaces so far, and the depth of the next surface's front.
 typedef struct {
   Lanes through, next;
   uint at[LANES], end[LANES];
@@ -23,10 +22,10 @@ static inline Held held_of(__global const uint *starts, __global const float *su
   return held;
 }
 
-// The fraction of the light that comes through to `depth`. Depths must not decrease from call to call.
+// The transmittance of the surfaces up to `depth`. From call to call, depths must not decrease.
 static inline floatL let_through(float depth, Held *held, __global const float *surfaces) {
   if (!ANYL(MASKL(held->next.all <= (floatL)(depth)))) return held->through.all;
-  Lanes within; // log2 of the light that the surfaces around this depth let through
+  Lanes within; // log2 of the transmittance of surfaces that contain this depth
   Lanes through;
   for (int lane = 0; lane < LANES; ++lane) {
     uint k = held->at[lane];

@@ -1,8 +1,8 @@
-// Sums over a group's items: first neighbours, then pairs, fours and so on. The order and the bits are the same whether
-// items leave their addends in local memory or exchange them in sub-groups of SUBGROUP items.
+// Sums over a group's items: of neighbours, then of pairs, of fours and so on. The order and the bits are the same if
+// items store their addends in local memory, and if they exchange them in sub-groups of SUBGROUP items.
 #define PARTS (ITEMS / SUBGROUP) // number of addends of a row in local memory
 
-// A row is padded so that rows begin in different banks.
+// Rows are padded so that they begin in different banks of local memory.
 #define ROW (PARTS < 4 ? PARTS : PARTS + 4)
 
 static inline float sum_of_1(__local const float *row) { return row[0]; }
@@ -40,7 +40,7 @@ static inline float row_sum(__local const float *row) {
                         : sum_of_256(row);
 }
 
-// The sum of a row that only the warps of these blocks have left, with the bits that zeros of the others would give.
+// The sum of a row in which only the warps of these blocks have stored addends. The others count as zeros.
 static inline float row_sum_of(__local const float *row, uint blocks) {
 #if SUBGROUP > 1
   return row_sum(row);
@@ -55,9 +55,9 @@ static inline float row_sum_of(__local const float *row, uint blocks) {
 }
 
 #if SUBGROUP > 1
-// Adds up a pair's fields over a sub-group. In each step an item gives half of its fields to a neighbour and adds the
-// neighbour's part of the other half, until it holds one field, or a few. These go to the sub-group's places in the
-// fields' rows, which start at `rows`.
+// Adds up a pair's fields over a sub-group. In each step an item gives half of its fields to another item, and adds
+// that item's values to the other half, until it has one field, or a few. The sums are stored in the rows of the
+// fields, which start at `rows`, in the sub-group's element.
 static inline void leave_sums(const float *sums, __local float *rows) {
   const int item = get_local_id(0);
   float held[SLOT_STRIDE];

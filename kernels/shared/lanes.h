@@ -3,7 +3,7 @@
 #ifndef LANES
 #error "LANES must be defined: pixels per vector, 1, 4, 8 or 16"
 #endif
-#ifndef VECTORS // number of the shape's own vectors in one floatL: widened.h
+#ifndef VECTORS // number of vectors of the shape in a floatL: widened.h
 #define VECTORS 1
 #endif
 #define CAT_(a, b) a##b
@@ -28,7 +28,7 @@ typedef CAT(int, LANES) intL;
 #define MASKL(condition) (condition)
 #define TO_INTL(x) CAT(convert_int, LANES)(x)
 #define TO_FLOATL(x) CAT(convert_float, LANES)(x)
-typedef floatL floatU __attribute__((aligned(4))); // vload and vstore are slow calls in PoCL 3.0
+typedef floatL floatU __attribute__((aligned(4))); // vload and vstore are slow function calls in PoCL 3.0
 #define LOADL(p) (*(__global const floatU *)(p))
 #define STOREL(x, p) (*(__global floatU *)(p) = (x))
 #define ANYL(m) any_lane(m)
@@ -42,7 +42,7 @@ typedef floatL floatU __attribute__((aligned(4))); // vload and vstore are slow 
 #endif
 
 #if LANES > 1
-// any() is a call that some drivers do not inline.
+// Some drivers do not inline any().
 static inline int any_lane(intL m) {
 #if LANES == 16
   const int8 a = m.lo | m.hi;
@@ -152,13 +152,14 @@ static inline float8 sums8(floatS x0, floatS x1, floatS x2, floatS x3, floatS x4
 }
 #endif
 
-// 2^x for x in [-126, 1], relative error under 2.1e-7. x is rounded to the nearest integer with the magic number 1.5 *
-// 2^23. The polynomial is minimax of degree 5 on [-1/2, 1/2] and is 1 at 0. The exponent is set by an integer addition.
-// A lane under -126 gets an arbitrary number. The polynomial is in Estrin's order, because blending's speed depends on
-// its longest dependency chain.
+// 2^x for x in [-126, 1], relative error under 2.1e-7; arbitrary for x below -126. x is rounded to the nearest integer
+// by addition of 1.5 * 2^23. The polynomial is minimax of degree 5 on [-1/2, 1/2] and is 1 at 0. An integer addition
+// sets the exponent. The polynomial is in Estrin's order, because the speed of blending depends on the longest chain of
+// dependent instructions.
 //
-// An instruction of a GPU has room for one constant. NVIDIA's compiler moves a second one into a register before each
-// use, unless it depends on a variable: `zero` is one that is always 0, and 0 itself where that does not matter.
+// An instruction of a GPU can contain one constant. NVIDIA's compiler loads a second constant into a register before
+// each use, unless it depends on a variable. `zero` is such a variable, always 0; it is 0 itself where speed does not
+// matter.
 #define IN_REGISTER(constant) ((floatL)(as_float(as_int(constant) + zero)))
 static inline floatL exp2_by(floatL x, int zero) {
   const floatL t = x + 12582912.0f;
@@ -172,7 +173,7 @@ static inline floatL exp2_by(floatL x, int zero) {
 }
 static inline floatL exp2L(floatL x) { return exp2_by(x, 0); }
 
-// One element of `width`-wide rows for each of LANES items: row[0] to row[LANES - 1].
+// Element `field` of a row of `width` elements, for the rows row[0] to row[LANES - 1].
 #define ROW_(array, width, field, lane) (array)[(size_t)(width) * row[lane] + (field)]
 #define ROW4_(a, w, f, i) ROW_(a, w, f, i), ROW_(a, w, f, i + 1), ROW_(a, w, f, i + 2), ROW_(a, w, f, i + 3)
 #if LANES == 1
@@ -187,7 +188,7 @@ static inline floatL exp2L(floatL x) { return exp2_by(x, 0); }
             ROW4_(array, width, field, 12)))
 #endif
 
-// Unrolls a short loop if LANES is 1: on a GPU an array with a variable index is in memory, not in registers.
+// Unrolls a short loop if LANES is 1, because a GPU keeps an array with variable indices in memory, not in registers.
 #if LANES == 1
 #define UNROLL _Pragma("unroll")
 #else
@@ -195,7 +196,7 @@ static inline floatL exp2L(floatL x) { return exp2_by(x, 0); }
 #endif
 #define FOR_AXES(k) UNROLL for (int k = 0; k < 3; ++k)
 
-// The rows of a work-item that owns LANES of n; the last row repeats past the end.
+// The rows of a work-item that owns LANES of n rows. Past the end, the last row is repeated.
 #define ROWS_OF_ITEM(n)                                                                                                \
   const uint first_row = get_global_id(0) * LANES;                                                                     \
   if (first_row >= (n)) return;                                                                                        \

@@ -1,11 +1,11 @@
-// Scalar arithmetic with the same bits on every driver: contraction only where fma1 asks for it, and none of the
-// driver's elementary functions. Every kernel includes this file first.
+// Scalar arithmetic with the same bits on every driver: multiply-adds fuse only in fma1, and the driver's elementary
+// functions are not used. Every kernel includes this file first.
 #pragma OPENCL FP_CONTRACT OFF
 #include "shared/layouts.h"
 
 #define LOG2E 1.44269504088896341f
 #define LN2 0.693147180559945f
-#ifndef ALPHA_MAX // clsplat can set another cap for a build
+#ifndef ALPHA_MAX // a build may have another cap of alpha
 #define ALPHA_MAX 0.99f
 #endif
 #ifndef ALPHA_MIN // RasterizerConfig can set ALPHA_MIN, LOG2_ALPHA_MIN and, below, TRANSMITTANCE_MIN
@@ -16,8 +16,8 @@
 #define TRANSMITTANCE_MIN 1e-4f
 #endif
 
-// a*b + c with one rounding. FMA_BY_CONTRACTION is set if a probe found that the driver's compiler fuses this
-// expression. Its fma() is then a slower way to the same bits, and aborts some drivers at 16 lanes.
+// a*b + c with one rounding. FMA_BY_CONTRACTION is set if a test has shown that the driver's compiler fuses this
+// expression. fma() then gives the same bits more slowly, and crashes some drivers with 16 lanes.
 static inline float fma1(float a, float b, float c) {
 #ifdef FMA_BY_CONTRACTION
 #pragma OPENCL FP_CONTRACT ON
@@ -27,6 +27,6 @@ static inline float fma1(float a, float b, float c) {
 #endif
 }
 
-// sum + x, for a loop over neighbouring floats. With AVX-512, Intel's CPU runtime would recognise a sum and reorder its
-// additions.
+// sum + x, for a loop over adjacent floats. With AVX-512, Intel's CPU runtime would otherwise recognise the sum and
+// reorder its additions.
 static inline float added(float sum, float x) { return fma(x, 1.0f, sum); }

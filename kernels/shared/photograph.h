@@ -1,4 +1,4 @@
-// A photograph as it is loaded, interleaved: bytes with BYTES, otherwise floats. SAMPLE makes a colour of a sample.
+// A photograph, interleaved: bytes with BYTES, otherwise floats. SAMPLE converts a sample to a colour.
 #ifdef BYTES
 typedef uchar source_t;
 #define SAMPLE(x) ((float)(x) * (1.0f / 255.0f)) // the same bits as OpenImageIO

@@ -1,10 +1,10 @@
 // The positions of LANES points and rotated axes in a camera, in two-float arithmetic, for several kernels. Equation
 // numbers refer to docs/gradients.md.
 
-// Limit of distances in world units and of axes in pixels, so that no sum of their products overflows.
+// Limit of distances in world units, and of axes in pixels, with which no sum of products overflows.
 #define FARTHEST 1e18f
-// Thresholds for calling `refine`: longest axis over the ellipse's short axis, and an axis over its projected length.
-// Up to them float32 is accurate to 3e-5.
+// `refine` is called above these ratios: longest axis to the ellipse's short axis, and an axis to its projected length.
+// Below them float32 is accurate to 3e-5.
 #define REFINE_FROM 64.0f
 #define FORESHORTENED 256.0f
 
@@ -22,9 +22,9 @@ static inline void rotation_of(const floatL *q, floatL *r) {
   r[8] = 1.0f - 2.0f * (x * x + y * y);
 }
 
-// (57): the rotation matrix in two floats, times the square of the returned length. `length`: of the raw quaternion.
+// (57): the rotation matrix in two floats, times the square of the returned length. length: of the raw quaternion.
 static inline floatL rotation2_of(const uint *row, __global const float *quaternions, floatL length, Double *r) {
-  // Scales by a power of two, which is exact, to keep the low parts of products out of the denormals.
+  // Scaled by a power of two, which is exact, so that the low parts of products are not denormal.
   const floatL size = AS_FLOATL(AS_INTL(length) & 0x7f800000);
   const floatL w = GATHER(quaternions, 4, 0) / size, x = GATHER(quaternions, 4, 1) / size;
   const floatL y = GATHER(quaternions, 4, 2) / size, z = GATHER(quaternions, 4, 3) / size;
@@ -53,8 +53,8 @@ static inline Double camera_row(__constant float *r, __constant float *r_low, fl
   return multiply_add2(r[2], r_low[2], z, sum);
 }
 
-// A row of cam_from_world times the mean (x, y, z), in two floats. Float32 alone would cost 1e-4 pixels, enough to flip
-// a pixel at the edge of an ellipse.
+// A row of cam_from_world times the mean (x, y, z), in two floats. In one float, the error would be 1e-4 pixels, which
+// may change a pixel at the edge of an ellipse.
 #define CAMERA_ROW(index)                                                                                              \
   camera_row(camera + CAMERA_R##index##0, camera + CAMERA_R##index##0_LOW, camera[CAMERA_T##index],                    \
              camera[CAMERA_T##index##_LOW], x, y, z)

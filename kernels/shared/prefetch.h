@@ -1,5 +1,5 @@
-// Prefetches the data of Gaussians that a loop will need a few iterations later. They may lie anywhere in memory, and a
-// loop's body is too long for the processor to look that far ahead. It is only a hint; GPUs hide latency with other
+// Prefetches data of Gaussians that a loop needs a few iterations later. The data may be anywhere in memory, and the
+// loop's body is too long for the processor to look so far ahead. GPUs do not need this: they hide latency with other
 // work-items. NVIDIA's compiler has the built-in function too, but accepts no pointer type of OpenCL C 1.2.
 #define AHEAD 16
 #if ITEMS == 1 && defined(__has_builtin) && !defined(__NV_CL_C_VERSION)

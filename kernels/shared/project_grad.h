@@ -1,16 +1,16 @@
-// The chain rule from the sums of LANES Gaussians' slots back to their parameters, and to the camera's lens. Equation
-// numbers refer to docs/gradients.md, with RAYS to docs/cameras.md. Needs splat.h, gaussian.h and sh.h, with RAYS
-// tangent.h; the defines are those of project_grad.cl.
+// The chain rule from the sums of slots of LANES Gaussians to the gradients of their parameters, and of the camera's
+// lens. Equation numbers refer to docs/gradients.md, with RAYS to docs/cameras.md. Needs splat.h, gaussian.h and sh.h,
+// with RAYS tangent.h; the defines are those of project_grad.cl.
 
-// Address space of the gradients of the higher SH bands: global for an array of all Gaussians, private for a
-// work-item's, local for a group's.
+// Address space of the gradients of the higher SH bands: global if the array is of all Gaussians, private if of a
+// work-item, local if of a group.
 #if !defined(ADAM)
 #define SH_GRADIENT __global float
 #elif LANES > 1
 #define SH_GRADIENT float
 #else
 #define SH_GRADIENT __local float
-#define SH_IN_PLACE // these rows hold the coefficients before
+#define SH_IN_PLACE // before, these rows have the coefficients
 #endif
 
 // Loops over the SH coefficients after the first, up to `used`.
@@ -21,7 +21,7 @@
 #define FOR_HIGHER(k, used) for (int k = 1; k < (used); ++k)
 #endif
 
-// Weights of the penalties as parameters and as arguments, each after a comma. `Exploration.weights` has their order.
+// Weights of the penalties, as parameters and as arguments, each after a comma, in the order of `Exploration.weights`.
 #ifdef PENALTIES
 #define PENALTY_PARAMETERS , const float opacity_weight, const float scale_weight
 #define PENALTY_WEIGHTS , opacity_weight, scale_weight
@@ -30,15 +30,15 @@
 #define PENALTY_WEIGHTS
 #endif
 
-// Gradients with respect to the parameters of LANES Gaussians, but for the higher SH bands. `colour` is red, green and
-// blue, each zero where clamped.
+// Gradients with respect to the parameters of LANES Gaussians, except for the higher SH bands. colour: red, green and
+// blue, zero where clamped.
 typedef struct {
   Lanes mean[3], quaternion[4], scale[3], opacity, colour[3];
 } Gradients;
 
 // Gradients of the visible rows among LANES rows from first_row on. Returns 0 if none is visible. Sets `shown` (LANES)
-// to 1 for visible rows, and fills screen, contributions and by_lens. d_sh_rest begins at row first_row; only visible
-// rows of it are written.
+// to 1 for visible rows, and fills screen, contributions and by_lens. Row 0 of d_sh_rest is first_row; only visible
+// rows are written.
 static inline int gradients_of(const uint n, const uint first_row, const int coefficients, __constant float *camera,
                                __global const uint *tile_counts, __global const uint *first_slots,
                                __global const float *slots, __global const float *splats, __global const float *means,
@@ -58,7 +58,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   Lanes m[SLOT_STRIDE];
   int any = 0;
   for (int field = 0; field < SLOT_STRIDE; ++field) m[field].all = (floatL)(0.0f);
-  Lanes whitening[3]; // stays zero for invisible Gaussians, whose splats are never written
+  Lanes whitening[3]; // zero for Gaussians that are not visible, whose splats are uninitialised
   for (int k = 0; k < 3; ++k) whitening[k].all = (floatL)(0.0f);
   for (uint lane = 0; lane < LANES; ++lane) {
     const uint count = lane < lanes_used ? tile_counts[first_row + lane] : 0;
@@ -133,7 +133,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   // numbers are subtracted.
   const float unwhiten = INVERSE_WHITEN2 * INVERSE_WHITEN2;
 #ifdef ANTIALIASED
-  // (84): the compensated opacity falls with the filtered covariance's determinant and rises with the unfiltered one's.
+  // (84): the compensated opacity falls with the determinant with the low-pass, and rises with that without it.
   const intL compensated = p.det0 / p.det > LEAST_COMPENSATION * LEAST_COMPENSATION;
   const floatL thinner = compensated ? m_g : (floatL)(0.0f), by_det0 = compensated ? m_g / p.det0 : (floatL)(0.0f);
   const floatL uu = fmaL((floatL)(unwhiten), m[SLOT_GUU].all, -INVERSE_WHITEN2 * thinner),
@@ -146,7 +146,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   floatL wu[3], wv[3];
   const floatL lean = l11 / p.syy;
   FOR_AXES(k) {
-#ifdef RAYS // as above, with minors of the directions' plane and of the low-pass columns
+#ifdef RAYS // as above, with the minors of the tangent plane, low-pass columns included
     const float inverse = 1.0f / p.distance, b1 = inverse * p.c1[k], b2 = inverse * p.c2[k];
     float minors = 0.0f;
     for (int j = 3; j < 5; ++j) minors = fma1(p.m2[j], fma1(p.m2[j], b1, -(p.m1[j] * b2)), minors);
@@ -163,14 +163,14 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
   }
 
-  // (122): the gradient through nearness, 1 / depth. Along the axis it points towards the camera.
+  // (122): the gradient through nearness, 1 / depth, along the camera's axis.
 #ifndef NEARNESS
 #define LESS_NEAR(z)
 #else
 #define LESS_NEAR(z) -m[SLOT_NEAR].all / ((z) * (z))
 #endif
 
-  // (59) to (61): the gradients with respect to the log scales and to the rotation in the Gaussian's frame, and the
+  // (59) to (61): the gradients with respect to the log scales and to a rotation about the Gaussian's axes, and the
   // gradient through the Jacobian.
   floatL d_size = (floatL)(0.0f), along_u = d_size, along_v = d_size, turned[3];
 #ifdef LENS
@@ -273,7 +273,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
 
   // Colour, (38) to (40): a clamped channel has no gradient. The basis depends on the mean through the view direction;
-  // that part is left out if very large SH coefficients make it overflow.
+  // this part is omitted if it overflows for very large SH coefficients.
   floatL vx = FROM_CAMERA(means, X, 0), vy = FROM_CAMERA(means, Y, 1), vz = FROM_CAMERA(means, Z, 2);
   const floatL length = sqrt(fmaL(vx, vx, fmaL(vy, vy, vz * vz)));
   vx = (floatL)(SEEN_ALONG(vx, length, camera[CAMERA_R20]));

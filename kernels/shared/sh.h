@@ -1,7 +1,7 @@
 // Real spherical harmonics to degree 3, signs and order of Kerbl et al. 2023; basis[k] at the unit direction (x, y, z).
 
 #define SH_CONSTANT 0.28209479177387814f
-// Limit of a channel. Below it the squares that SSIM multiplies stay finite, and no picture has a brighter colour.
+// Limit of a colour channel. Below it the squares in SSIM are finite, and no picture is so bright.
 #define COLOUR_LIMIT 1e9f
 
 // The number of stored coefficients that are used (RasterizerConfig.sh_degree_limit).
@@ -61,7 +61,7 @@ static inline void sh_direction_gradient(int coefficients, floatL x, floatL y, f
           8.0f * c11 * x * z * weight[13] + c14 * (xx - yy) * weight[14];
 }
 
-// Exact floats from the bits of finite halves, also of denormal ones; vload_half is slower.
+// Exact floats from the bits of finite halves, including denormal ones; faster than vload_half.
 static inline float4 float_from_half(int4 bits) {
   const int4 magnitude = bits & 0x7fff;
   const float4 normal = as_float4((magnitude << 13) + (112 << 23));
@@ -70,12 +70,12 @@ static inline float4 float_from_half(int4 bits) {
   return as_float4(as_int4(positive) | (bits & 0x8000) << 16);
 }
 
-// The three channels of a coefficient; a load of four floats would read past the row's end at its last coefficient.
+// The three channels of a coefficient; for the last coefficient, a load of four floats would read past the row's end.
 // shT: storage type of the bands above 0 (RasterizerConfig.sh_storage).
 #ifdef SH_HALF
 typedef ushort shT;
 static inline float4 sh_channels(__global const shT *f, int last) {
-  return float_from_half((int4)(f[0], f[1], f[2], 0)); // a ushort4 takes PoCL 3.0 longer to convert
+  return float_from_half((int4)(f[0], f[1], f[2], 0)); // in PoCL 3.0 a ushort4 takes longer to convert
 }
 #else
 typedef float shT;
@@ -94,15 +94,15 @@ static inline float4 sh_fma(float a, float4 b, float4 c) {
 #endif
 }
 
-// The number of coefficients of Gaussian i's colour; with SH_DEGREES, of its own bands.
+// The number of coefficients in the colour of Gaussian i; with SH_DEGREES each Gaussian has its own degree.
 #ifdef SH_DEGREES
 #define SH_OF_GAUSSIAN(i, coefficients) min(SH_USED(coefficients), (sh_degrees[i] + 1) * (sh_degrees[i] + 1))
 #else
 #define SH_OF_GAUSSIAN(i, coefficients) SH_USED(coefficients)
 #endif
 
-// A Gaussian's colour before clamping at 0, (12) of docs/gradients.md, from one lane of the basis. `dc` (3) and `rest`
-// (coefficients - 1, 3) are its SH coefficients; the first `used` count, including dc.
+// A Gaussian's colour before it is clamped at 0, (12) of docs/gradients.md, from one lane of the basis. dc (3) and rest
+// (coefficients - 1, 3): its SH coefficients, of which the first `used` are evaluated, dc included.
 static inline float4 sh_colour(const Lanes *basis, uint lane, int used, int coefficients, __global const float *dc,
                                __global const shT *rest) {
   float4 colour = sh_fma(SH_CONSTANT, (float4)(dc[0], dc[1], dc[2], 0.0f), (float4)(0.5f));
@@ -111,7 +111,7 @@ static inline float4 sh_colour(const Lanes *basis, uint lane, int used, int coef
   return colour;
 }
 
-// A colour that is not finite, or at least COLOUR_LIMIT, is not drawn: one such pixel would dominate the loss.
+// False for a colour that is not finite or at least COLOUR_LIMIT: a single such pixel would dominate the loss.
 static inline int colour_is_drawn(float4 colour) {
   return colour.x < COLOUR_LIMIT && colour.y < COLOUR_LIMIT && colour.z < COLOUR_LIMIT;
 }

@@ -1,5 +1,4 @@
-// Conventions that the writers and readers of a splat or slot share, in addition to the layouts at the top of every
-// source.
+// Conventions of splats and slots, in addition to layouts.h.
 
 // A splat's L11, L12 and L22 are the whitening W times WHITEN = sqrt(log2(e) / 2). Moments in slots use WHITEN W too.
 #define WHITEN 0.84932180028801904f
@@ -14,8 +13,8 @@ static inline float larger_eigenvalue(float l11, float l12, float l22) {
   return middle + sqrt(fma1(half_difference, half_difference, sxy * sxy));
 }
 
-// Floats between slots. The optional contribution follows the gradients, and the optional gradient by nearness (1 /
-// depth) follows that.
+// Floats per slot. After the gradients come, both optional, the contribution and the gradient with respect to nearness,
+// 1 / depth.
 #ifdef ABSOLUTE_GRADIENTS
 #define SLOT_GRADIENTS SLOT_SIZE
 #else
@@ -34,7 +33,7 @@ static inline float larger_eigenvalue(float l11, float l12, float l22) {
 #define SLOT_STRIDE SLOT_KEPT
 #endif
 
-// From the first pixel's centre to the mean. Whole pixels and remainder are subtracted separately, because a float32 of
-// their sum would lose digits.
+// The mean relative to the centre of the first pixel. Whole pixels and fraction are subtracted separately, because
+// their sum in float32 would lose digits.
 #define FROM_TILE(splat, axis, origin)                                                                                 \
   ((splat[SPLAT_PIXEL_##axis] - (float)(origin)) + (splat[SPLAT_SUB_##axis] - 0.5f))

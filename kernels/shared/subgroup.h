@@ -1,15 +1,15 @@
-// Sub-groups of SUBGROUP items that exchange values; 1 for kernels without exchange. An item's place in its sub-group
-// is in the lowest bits of its local number (device/context.py probes this).
+// Sub-groups of SUBGROUP items that exchange values; 1 for kernels without exchange. The lowest bits of an item's local
+// number are its number in the sub-group (device/context.py tests this).
 #ifndef SUBGROUP
 #define SUBGROUP 1
 #endif
-#ifdef SUBGROUP_IS_ASKED // for drivers with sub-groups of several sizes
+#ifdef SUBGROUP_IS_ASKED // for drivers in which a kernel requests the size
 #define SUBGROUPED __attribute__((intel_reqd_sub_group_size(SUBGROUP)))
 #else
 #define SUBGROUPED
 #endif
 
-// EXCHANGED: x of the item whose number differs from this item's in the bit `step`. Every item must reach it.
+// EXCHANGED: x of the item whose number differs from this item's in the bit `step`. Every item must execute it.
 #if defined(SHUFFLE_KHR)
 #pragma OPENCL EXTENSION cl_khr_subgroup_shuffle : enable
 #define EXCHANGED(x, step) sub_group_shuffle_xor(x, (uint)(step))

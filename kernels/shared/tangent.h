@@ -1,15 +1,15 @@
-// A Gaussian's ellipse on the tangent plane of the direction sphere at its mean, shared by projection and its gradient.
-// All values are scalars: built with one lane. Equation numbers refer to docs/cameras.md. Needs gaussian.h, and
-// NEEDS_TANGENTS of camera.h.
+// A Gaussian's ellipse on the plane that touches the sphere of directions at its mean, shared by projection and its
+// gradient. Built with one lane. Equation numbers refer to docs/cameras.md. Needs gaussian.h, and NEEDS_TANGENTS of
+// camera.h.
 
 typedef struct {
   float f[3], distance; // direction and distance of the mean, in the camera
   Tangent t;
-  float q[4], length;       // unit quaternion, and the length of the raw one
-  float a[9];               // the Gaussian's axes in the camera, in columns
+  float q[4], length;       // unit quaternion, and length of the raw quaternion
+  float a[9];               // the Gaussian's axes in the camera, as columns
   float s[3];               // scales
   float c1[3], c2[3];       // the axes along e1 and e2
-  float m1[5], m2[5];       // M, and the low-pass as two more columns
+  float m1[5], m2[5];       // M, with two more columns for the low-pass
   float sxx, sxy, syy, det; // covariance with the low-pass
 #ifdef ANTIALIASED
   float det0; // determinant without the low-pass
@@ -30,7 +30,7 @@ static inline int project_ray(size_t i, __global const float *means, __global co
   if (!is_shown(p->f, camera)) return 0;
   tangent_of(p->f, camera, &p->t);
 
-  // (11), (12): M = e A S / distance, and the low-pass as two more columns; the determinant from the minors.
+  // (11), (12): M = e A S / distance, with two more columns for the low-pass; the determinant is from the minors.
   const Tangent t = p->t;
   __global const float *raw = quaternions + 4 * i;
   float norm2 = 0.0f, r[9];

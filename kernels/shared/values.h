@@ -12,10 +12,10 @@
 #define LANE_PIXEL_Y(lane) 0
 #endif
 
-// A short loop over the pass's values, unrolled if LANES is 1 (lanes.h).
+// A loop over the values of a pass, unrolled if LANES is 1 (lanes.h).
 #define FOR_VALUES(k) UNROLL for (int k = 0; k < VALUES; ++k)
 
-// The cells with a pixel that takes the i-th pair, or may take it.
+// The cells that have a pixel to which the i-th pair is added, or may be added.
 #ifdef RECORD_CELLS // blend has recorded them
 #define CELLS_OF_PAIR(i, splat) cells_from_sorted[i]
 #else

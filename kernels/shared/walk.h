@@ -1,9 +1,9 @@
-// The gradient of blending with one Gaussian per item, BY_GAUSSIAN. A group's items walk the pixels of a tile one
-// behind another. Each item has a Gaussian and its sums in registers, and passes the pixels' state on in local memory.
+// The gradient of blending with one Gaussian per item, BY_GAUSSIAN. The items of a group process the pixels of a tile
+// one behind the other. Each item has a Gaussian and its sums in registers; the state of the pixels is in local memory.
 //
-// The pixels are in ITEMS chunks, each a piece of a row. In round r of a turn item j is at chunk (r - j) % ITEMS. So a
-// chunk meets the Gaussians in their order, an item starts its next Gaussian right after its last chunk, and one
-// barrier serves all pixels of a chunk. Values common to a chunk's row are computed once.
+// The pixels are in ITEMS chunks, each a part of a row. In round r item j is at chunk (r - j) % ITEMS. So each chunk
+// gets the Gaussians in order, an item begins its next Gaussian right after its last chunk, and there is one barrier
+// per chunk. Values that are constant in a row are computed once per chunk.
 #if ITEMS < 16 || ITEMS > 128
 #error "a chunk is a row of a tile, or a part of one of two pixels or more"
 #endif
@@ -11,15 +11,15 @@
 #define ROW_CHUNKS (TILE / CHUNK)
 #define CHUNK_BLOCK(chunk) ((chunk) / ROW_CHUNKS / BLOCK_H * BLOCK_COLUMNS + (chunk) % ROW_CHUNKS * CHUNK / BLOCK_W)
 
-// A pixel's place: items at neighbouring chunks read neighbouring places.
+// Index of a pixel: items at adjacent chunks read adjacent elements.
 #define PLACE(x, y) ((x) % CHUNK * ITEMS + (y) * ROW_CHUNKS + (x) / CHUNK)
 
-// Pixels in local memory. Passing: transmittance and `behind`, which change. Fixed: the image's gradient and, as bits,
-// the stop.
+// Pixels in local memory. Passing: transmittance and `behind`, which change. Fixed: the image's gradient, and the bits
+// of the stop.
 typedef float2 Passing;
 typedef float4 Fixed;
 
-// A Gaussian in progress. i: the index of its pair, less than `begin` if there is none.
+// The Gaussian of an item. i: the index of its pair, less than `begin` if there is none.
 typedef struct {
   float mx, my, l11, l12, l22, log2o, red, green, blue;
   int i;
@@ -40,14 +40,14 @@ typedef struct {
 #define NEAR_PIXELS_PARAMETER
 #endif
 
-// Removes the walker's pair from a chunk's pixels, and adds their gradients to its sums (SLOT_STRIDE). Pixels that do
-// not take it are processed with alpha 0: among 32 items some nearly always have a pixel that does, and branches would
-// serialise a chunk's pixels.
+// Removes the walker's pair from the pixels of a chunk, and adds their gradients to its sums (SLOT_STRIDE). Pixels to
+// which the pair was not added are processed with alpha 0, without a branch: of 32 items, one nearly always has a pixel
+// to which its pair was added, and branches would serialise the pixels of a chunk.
 static inline void take_chunk(const Walker *w, int chunk, __local Passing *passing, __local const Fixed *fixed,
                               float *sums NEAR_PIXELS_PARAMETER) {
   const float dy = w->my - (float)(chunk / ROW_CHUNKS), v = w->l22 * dy;
   const float left = (float)(chunk % ROW_CHUNKS * CHUNK);
-  float g_row = 0.0f, gu_row = 0.0f; // sums of g and g u; v is the same in the whole row
+  float g_row = 0.0f, gu_row = 0.0f; // sums of g and g u; v is constant in a row
   _Pragma("unroll") for (int k = 0; k < CHUNK; ++k) {
     const int place = k * ITEMS + chunk;
     const Fixed pixel = fixed[place];

@@ -74,7 +74,7 @@ def test_a_processor_that_llvm_does_not_know(mended: bool, tmp_path: Path) -> No
     assert (child.returncode == 0) == mended, child.stderr
     if not mended:
         assert KernelBuildError.__name__ in child.stderr
-        assert "this driver is older than the processor: take another one" in child.stderr
+        assert "this driver is older than the processor: use another driver" in child.stderr
 
 
 def test_other_drivers_are_left_alone() -> None:

@@ -72,7 +72,7 @@ def test_advice_by_system() -> None:
     assert gpu_advice("NVIDIA", ["debian"]).startswith("apt install nvidia-opencl-icd")
     assert gpu_advice("AMD", ["cachyos", "arch"]) == "pacman -S rocm-opencl-runtime"
     assert gpu_advice("AMD", ["void"]) == "install AMD's OpenCL driver"
-    assert gpu_advice("AMD", []) == "install AMD's own graphics driver, which has OpenCL in it"
+    assert gpu_advice("AMD", []) == "install AMD's own graphics driver, which includes OpenCL"
 
 
 def test_drivers_that_cannot_be_loaded_are_named(tmp_path: Path) -> None:

@@ -167,7 +167,7 @@ def test_no_gaussians_and_no_cameras(default_device: Device) -> None:
         ({"covars": np.zeros((400, 6))}, "covars: expected either covars, or quaternions and scales"),
         ({"viewmats": np.eye(4)}, r"intrinsics: got shape \(3, 3, 3\), expected \(1, 3, 3\) or \(3, 3\)"),
         ({"intrinsics": np.zeros((2, 3, 3))}, r"intrinsics: got shape \(2, 3, 3\), expected \(3, 3, 3\) or \(3, 3\)"),
-        ({"intrinsics": np.eye(3)}, "intrinsics has 1 matrices, expected 3, one for each of viewmats"),
+        ({"intrinsics": np.eye(3)}, "intrinsics has 1 matrices, expected 3, one for each matrix of viewmats"),
         ({"intrinsics": np.zeros((3, 3, 3))}, "intrinsics: a focal length is 0"),
         ({"width": 0}, "width is 0, expected a positive whole number"),
         ({"eps2d": -1.0}, r"eps2d is -1.0, expected a number from 0 to 3.4\d*e\+38"),

@@ -333,7 +333,7 @@ def test_absolute_gradients(default_device: Device) -> None:
         ({"viewmats": np.zeros((2, 3, 4))}, "viewmats: got shape (2, 3, 4), expected (C, 4, 4) or (4, 4)"),
         ({"intrinsics": np.zeros((2, 3, 3))}, "intrinsics: a focal length is 0, expected numbers other than 0"),
         ({"near_plane": 2, "far_plane": 1}, "near_plane is 2 and far_plane is 1, expected near_plane < far_plane"),
-        ({"intrinsics": np.eye(3)}, "intrinsics has 1 matrices, expected 2, one for each of viewmats"),
+        ({"intrinsics": np.eye(3)}, "intrinsics has 1 matrices, expected 2, one for each matrix of viewmats"),
         ({"width": 0}, "width is 0, expected a positive whole number, or one for each of 2 cameras"),
         ({"width": 40.5}, "width is 40.5, expected a positive whole number, or one for each of 2 cameras"),
         ({"width": np.inf}, "width is inf, expected a positive whole number, or one for each of 2 cameras"),
@@ -348,7 +348,7 @@ def test_absolute_gradients(default_device: Device) -> None:
         ({"eps2d": -1}, "eps2d is -1, expected a number from 0 to 3.40282e+38"),
         (
             {"viewmats": np.zeros((2, 4, 4)), "sh_degree": 0, "colors": np.zeros((12, 1, 3))},
-            "viewmats: a matrix has no inverse",
+            "viewmats: a matrix is singular",
         ),
     ],
     ids=str,

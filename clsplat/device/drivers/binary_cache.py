@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cache of built programs, for a driver that has no cache of its own and builds everything again in each process.
+"""Cache of built programs, for a driver without its own cache, which would build everything again in each process.
 
 A file begins with a digest of its contents, as a driver may crash on a truncated binary. Its name is a digest of
 everything the binary depends on: the text, the options, the driver and its settings, and the processor.
@@ -24,8 +24,8 @@ from clsplat.device.drivers.quirks import TARGET_VARIABLE_PREFIX, wants_cache
 from clsplat.files.atomic import atomic_write
 
 MAX_BINARY_CACHE_BYTES = 256 << 20
-"""Most bytes of all files together; beyond it the oldest are removed. A binary takes 30 to 500 KB, all tests together
-take 90 MB."""
+"""Maximum bytes of all files; beyond it the least recently used are removed. A binary takes 30 to 500 KB, and those of
+all tests take 90 MB."""
 
 BINARIES_VARIABLE = "CLSPLAT_BINARIES"
 """Environment variable that names another folder for the cache."""
@@ -48,7 +48,7 @@ def _path(device: cl.Device, digest: str) -> Path:
 
 
 def load(context: cl.Context, device: cl.Device, digest: str, options: Sequence[str]) -> cl.Program | None:
-    """The saved program for a variant's digest; None if there is none, or it cannot be used."""
+    """The saved program for a variant's digest; None if there is none or it cannot be used."""
     if not wants_cache(device):
         return None
     path = _path(device, digest)
@@ -71,7 +71,7 @@ def load(context: cl.Context, device: cl.Device, digest: str, options: Sequence[
 
 
 def save(device: cl.Device, digest: str, program: cl.Program) -> None:
-    """Save a program that has kernels. An unwritable folder is no error: the next process builds again."""
+    """Save a program that has kernels. If the folder is not writable, nothing is saved, and no error is raised."""
     if not wants_cache(device):
         return
     try:

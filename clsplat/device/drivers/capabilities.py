@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Capabilities of a device that select an algorithm, and CLSPLAT_PRETEND, which overrides them.
+"""Capabilities of a device by which algorithms are chosen, and CLSPLAT_PRETEND, which overrides them.
 
-With CLSPLAT_PRETEND a machine without a GPU, a small device or a plain compiler can test the code paths for these.
+With CLSPLAT_PRETEND any machine can test the code paths for GPUs, for small devices and for simple compilers.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ class Capabilities:
     """The kind, limits and arithmetic of a device.
 
     kind: cpu, gpu or other.
-    group: the most work-items of a group.
-    local_memory: the most bytes of a group's local memory.
-    allocation: the most bytes of a buffer.
+    group: maximum work-items in a group.
+    local_memory: maximum bytes of a group's local memory.
+    allocation: maximum bytes of a buffer.
     exact_division: True if the device supports correctly rounded division and square roots.
-    contraction: True if the device may be probed for fused multiply-adds.
+    contraction: True if the compiler may be tested for fusing a*b + c (`Device._probe_fma`).
     """
 
     kind: str
@@ -45,9 +45,9 @@ _CAPABILITIES_BY_WORD: dict[str, dict[str, Any]] = {
     "no-exact-division": {"exact_division": False},
     "no-contraction": {"contraction": False},
 }
-"""Capabilities by the word that pretends them."""
+"""Changes of the capabilities by the word in CLSPLAT_PRETEND."""
 _LIMIT_FIELDS = {"group": "group", "local-memory": "local_memory", "allocation": "allocation"}
-"""Limits by the name that pretends a lower one."""
+"""Limits that CLSPLAT_PRETEND can lower: the fields of `Capabilities`, by their names in the variable."""
 
 
 def pretended() -> str:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A processor name that PoCL 3.0's compiler knows.
+"""A processor name that PoCL 3.0's compiler accepts.
 
-The PoCL that pip installs has LLVM 14, which knows AMD processors by their family. For Zen 5 and later LLVM 14 reports
-"generic", which its own front end refuses, so nothing can be built. It takes Zen 4 for Zen 3, which has no AVX-512, but
-PoCL links built-ins that use AVX-512: kernels with vectors of 16 then end the process. Later versions of PoCL name the
+The PoCL that pip installs has LLVM 14, which identifies AMD processors by their family. For Zen 5 and later it reports
+"generic", a name that its own front end refuses, so nothing can be built. Zen 4 is identified as Zen 3, which has no
+AVX-512. But PoCL links built-ins that use AVX-512, so kernels with vectors of 16 crash. Later versions of PoCL name the
 processor by its features, as this module does. See docs/decisions/0020-processors-are-named-by-features.md.
 """
 
@@ -26,11 +26,11 @@ CPU_NAMES_BY_FEATURES = (
     ("sandybridge", {"avx", "popcnt", "aes", "pclmulqdq"}),
     ("x86-64", set[str]()),
 )
-"""LLVM's processor names, the most capable first, with the features that each needs, named as in Linux."""
+"""Processor names of LLVM, the most capable first, and the features that each requires, named as in Linux."""
 DEVICE_RECORD_BYTES = 2048
-"""Bytes of PoCL's device record that are searched for the name; PoCL 3.0 has it at byte 640."""
+"""Number of bytes of PoCL's device record to search for the name; in PoCL 3.0 it is at byte 640."""
 _kept: dict[int, ctypes.Array[ctypes.c_char]] = {}
-"""Strings that the device records point to, by the address of the pointer."""
+"""Processor names that device records now point to, by the address of the pointer. They must stay in memory."""
 
 
 @cache
@@ -45,7 +45,7 @@ def features(path: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
 
 
 def better_name(name: str, present: frozenset[str]) -> str:
-    """LLVM's name that suits a processor with these features; `name`, the name from LLVM 14, if that suits already."""
+    """The best processor name for these features. If `name`, which LLVM 14 reports, is as good, it is returned."""
     if not present or not (name == "generic" or name.startswith("znver")):
         return name
     by_features = next(better for better, needed in CPU_NAMES_BY_FEATURES if needed <= present)
@@ -53,9 +53,9 @@ def better_name(name: str, present: frozenset[str]) -> str:
 
 
 def name_processor(device: cl.Device) -> str:
-    """Give PoCL 3.0 for x86-64 a processor name that its compiler knows.
+    """Set a processor name that the compiler of PoCL 3.0 accepts, on x86-64.
 
-    Returns the name then in use; empty for another driver, or if the name is not found.
+    Returns the name in use; empty for other drivers, or if the name is not found in the device record.
     """
     if not misnames_processors(device):
         return ""
@@ -72,8 +72,8 @@ def name_processor(device: cl.Device) -> str:
 
 
 def _place(record: int) -> int | None:
-    """The address of the pointer to the name, which follows the pointer to the target triple; None if they are not
-    found."""
+    """The address of the pointer to the processor name, which follows the pointer to the target triple; None if it is
+    not found."""
     for address in range(record, record + DEVICE_RECORD_BYTES, 8):
         triple = _text(_word(address))
         if triple is not None and triple.startswith("x86_64-") and "linux" in triple:
@@ -87,13 +87,13 @@ def _word(address: int) -> int:
 
 
 def _text(address: int) -> str | None:
-    """A short printable text in memory, or None."""
+    """The printable text at an address, or None if there is none."""
     text, end, _ = _memory(address, 64).partition(b"\0")
     return text.decode("ascii") if end and text.isascii() and text.decode("ascii").isprintable() else None
 
 
 def _memory(address: int, size: int) -> bytes:
-    """Bytes in this process's memory; empty at an address that is not mapped, so that any address may be asked for."""
+    """Bytes in this process's memory; empty if the address is not mapped."""
     with suppress(OSError, OverflowError), open("/proc/self/mem", "rb", buffering=0) as memory:
         return os.pread(memory.fileno(), size, address)
     return b""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Findings about an installation: the machine's GPUs, driver files and devices, and advice if one is missing.
+"""Diagnosis of an installation: GPUs of the machine, driver files and devices, with advice on missing parts.
 
-Each check runs in its own process, as loading a driver may crash it.
+Each check runs in a process of its own, because loading a driver may crash the process.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from clsplat.device.drivers.quirks import GPU_MAKERS_BY_PCI_VENDOR, driver_advic
 from clsplat.device.drivers.worker_process import driver_timeout, python_module
 
 _PCI_DISPLAY_CLASS = "0x03"
-"""Beginning of a display controller's class code on the PCI bus."""
+"""First digits of the PCI class code of display controllers."""
 _LOAD_LIBRARY_CODE = "import ctypes, sys; ctypes.CDLL(sys.argv[1])"
 
 
 def _outcome(*command: str) -> subprocess.CompletedProcess[str] | None:
-    """The outcome of a process; None if it did not come back in time."""
+    """The exit status and output of a command; None if it did not finish in time."""
     try:
         return subprocess.run(command, capture_output=True, text=True, timeout=driver_timeout(), check=False)
     except subprocess.TimeoutExpired:
@@ -40,7 +40,7 @@ def _last_line(result: subprocess.CompletedProcess[str]) -> str:
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """A line about a part of the installation.
+    """A finding about a part of the installation, printed as a line.
 
     state: ok, note (no action needed) or missing.
     advice: an action to take, or empty.
@@ -53,7 +53,7 @@ class Diagnostic:
 
 
 def families() -> list[str]:
-    """This Linux distribution and the ones it is like, as named in os-release; empty on other systems."""
+    """Names of this Linux distribution and of those it is based on, from os-release; empty on other systems."""
     if platform.system() != "Linux":
         return []
     try:
@@ -64,7 +64,7 @@ def families() -> list[str]:
 
 
 def gpus(bus: Path = Path("/sys/bus/pci/devices")) -> list[str]:
-    """The makers of this machine's GPUs, each once; empty if the system does not list its PCI bus as Linux does."""
+    """The makers of this machine's GPUs, each once; empty on systems other than Linux."""
     makers = []
     for folder in sorted(bus.glob("*")):
         try:
@@ -77,7 +77,7 @@ def gpus(bus: Path = Path("/sys/bus/pci/devices")) -> list[str]:
 
 
 def driver_findings(files: Iterable[Path]) -> list[Diagnostic]:
-    """A line for each .icd file: whether its library can be loaded."""
+    """A finding for each .icd file: whether its library can be loaded."""
     return [_driver(path) for path in files]
 
 
@@ -97,7 +97,7 @@ def _driver(path: Path) -> Diagnostic:
 
 
 def listed_devices() -> tuple[list[dict[str, Any]], str]:
-    """The devices that `clsplat devices --json` lists, and the reason if it failed, or an empty string."""
+    """The devices that `clsplat devices --json` lists; and the reason if it failed, otherwise an empty string."""
     result = _outcome(*python_module("clsplat", "devices", "--json"))
     if result is None:
         return [], f"a driver does not come back within {driver_timeout():g} s"
@@ -109,7 +109,7 @@ def listed_devices() -> tuple[list[dict[str, Any]], str]:
 
 
 def device_findings(devices: Sequence[dict[str, Any]], trouble: str) -> list[Diagnostic]:
-    """A line for each device, or one line if there is none."""
+    """A finding for each device, or a single finding if there is no device."""
     if trouble or not devices:
         return [Diagnostic("device", "missing", trouble or "no OpenCL device found", driver_advice())]
     return [
@@ -119,7 +119,7 @@ def device_findings(devices: Sequence[dict[str, Any]], trouble: str) -> list[Dia
 
 
 def gpu_findings(makers: Sequence[str], devices: Sequence[dict[str, Any]]) -> list[Diagnostic]:
-    """A line for each GPU maker in this machine: whether OpenCL shows a GPU of that maker."""
+    """A finding for each maker of GPUs in this machine: whether OpenCL shows a GPU of this maker."""
     findings = []
     for maker in makers:
         shown = any(info["kind"] == "gpu" and of_maker(info["platform"], info["name"], maker) for info in devices)
@@ -130,7 +130,7 @@ def gpu_findings(makers: Sequence[str], devices: Sequence[dict[str, Any]]) -> li
 
 
 def access_findings(nodes: Sequence[Path] | None = None) -> list[Diagnostic]:
-    """On Linux, a line for each GPU device node that this user may not open."""
+    """On Linux, a finding for each GPU device node that this user may not open."""
     if nodes is None:
         nodes = [*Path("/dev/dri").glob("renderD*"), *(path for path in (Path("/dev/kfd"),) if path.exists())]
     closed = [node for node in nodes if not os.access(node, os.R_OK | os.W_OK)]
@@ -139,7 +139,7 @@ def access_findings(nodes: Sequence[Path] | None = None) -> list[Diagnostic]:
 
 
 def loader_finding() -> Diagnostic:
-    """A line about pyopencl, which includes the driver loader: whether it can be imported."""
+    """A finding about pyopencl, which contains the driver loader: whether it can be imported."""
     result = _outcome(sys.executable, "-c", "import pyopencl; print(pyopencl.VERSION_TEXT)")
     if result is None:
         text = f"pyopencl does not come back from its import within {driver_timeout():g} s"

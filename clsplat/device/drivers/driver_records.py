@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Driver records in the user's cache: per driver and kernel shape, the tests and kernels that passed or failed.
+"""Driver records in the user's cache: the tests and kernels that passed or failed, per driver and kernel shape.
 
-A record applies to one device, driver and set of kernels, so a new version of any of them is tested again.
+A record is keyed by device, driver version and kernel sources. So a new version of any of these is tested again.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from clsplat.files.locks import briefly_locked
 from clsplat.version import package_version
 
 BREAK_KERNEL_VARIABLE = "CLSPLAT_BREAK_KERNEL"
-"""Environment variable for the tests of `clsplat selftest` only. STEM: WORDS => WORDS replaces words in one kernel's
-text, to simulate a driver that miscompiles an operation."""
+"""Environment variable only for tests of `clsplat selftest`. STEM: OLD => NEW replaces words in a kernel's text, to
+simulate a driver that miscompiles an operation."""
 MAX_DRIVER_RECORDS = 16
-"""The number of latest drivers and versions that are kept; each takes a few KiB."""
+"""Maximum number of drivers and versions in the file. The latest are kept; each takes a few KiB."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """The record of one driver in one shape.
+    """The record of a driver in one kernel shape.
 
     stages: self-test stages that passed.
-    kernels: builds and launches that succeeded, named as in `sandbox`, each with the salt that the kernel text needs.
-    failed: description of the driver's failure, or empty. In an addition to the record, None keeps the recorded
+    kernels: names (`sandbox`) of builds and launches that succeeded, with the salt (`Variant.anew`) that each needed.
+    failed: description of the driver's failure, or empty. When an entry is added to a record, None keeps the recorded
     failure.
     trial: if a single kernel failed, its name and the input of `sandbox.again`.
     """
@@ -52,8 +52,7 @@ class Entry:
 
 
 def cache_folder() -> Path:
-    """The folder of clsplat in the user's cache. It is an unwritable path if the user has no home, as in some
-    containers."""
+    """The folder of clsplat in the user's cache. If the user has no home, as in some containers, it is not writable."""
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clsplat"
     except RuntimeError:
@@ -78,13 +77,13 @@ def device_key(device: cl.Device) -> str:
 
 
 def driver_key(device: cl.Device) -> str:
-    """Key of a record, except for the shape."""
+    """Key of a driver's records for all shapes: device, driver, version of clsplat and kernel sources."""
     kernels = _kernels_digest(os.environ.get(BREAK_KERNEL_VARIABLE, ""))
     return f"{device_key(device)} | clsplat {package_version()} {kernels}"
 
 
 def _entry(value: object) -> Entry:
-    """Parse an entry of the file. A value that clsplat cannot have written gives an empty entry."""
+    """Parse an entry of the file. A value that clsplat never writes gives an empty entry."""
     given = value if isinstance(value, dict) else {}
     stages, kernels, failed = given.get("stages", []), given.get("kernels", {}), given.get("failed", "")
     trial = given.get("trial", {})
@@ -96,13 +95,13 @@ def _entry(value: object) -> Entry:
 
 
 _RECORDS_LOCK = threading.Lock()
-"""Lock of the additions below, as several devices may work in threads."""
+"""Lock of `_unwritten`, as several devices may work in threads."""
 _unwritten: dict[Path, list[tuple[str, str, Entry]]] = {}
-"""Additions that could not be written yet, by file: driver, shape and addition to the entry."""
+"""Entries that could not be written yet, by file: driver, shape, and the entry to add."""
 
 
 def _read() -> dict[str, Any]:
-    """The contents of the file, with the additions that are not written yet."""
+    """The contents of the file, with the entries that are not written yet."""
     try:
         saved = parse_json(memory_path().read_bytes())
     except (OSError, ValueError):
@@ -153,7 +152,7 @@ def remember(
     failed: None keeps the recorded failure.
     trial: the failed trial, as in `Entry`.
 
-    If the folder is not writable, it warns; each process then tests everything again.
+    If the folder is not writable, this warns, and each process tests everything again.
     """
     path = memory_path()
     addition = Entry(frozenset(stages), kernels or {}, failed, trial or {})
@@ -167,7 +166,7 @@ def remember(
 
 
 def rewrite(path: Path, changed: Callable[[], Mapping[str, Any]]) -> None:
-    """Write what `changed` makes of a JSON file, while no other process or thread rewrites it. Raises OSError."""
+    """Write the result of `changed` to a JSON file, with other processes and threads locked out. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with briefly_locked(path):
         atomic_write(path, (json.dumps(changed(), indent=1) + "\n").encode())

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Differences between drivers. Only this module knows drivers by their names.
+"""Differences between drivers. Only this module recognises drivers by their names.
 
-It is imported before pyopencl, because drivers read the environment variables that `offer_packaged`,
-`make_cache_folder` and `pin_threads` set when they are loaded.
+It is imported before pyopencl: `offer_packaged`, `make_cache_folder` and `pin_threads` set environment variables that
+drivers read when they are loaded.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ _INTEL_DRIVER_PATH = Path("Library", "bin", "intelocl64.dll")
 _POCL_CACHE = "POCL_CACHE_DIR"
 _POCL_AFFINITY = "POCL_AFFINITY"
 _POCL_COUNTS = ("POCL_CPU_MAX_CU_COUNT", "POCL_MAX_PTHREAD_COUNT", "POCL_MAX_COMPUTE_UNITS")
-"""Variables, by PoCL version, that limit the number of processors used."""
+"""Environment variables that limit the number of processors used, in different versions of PoCL."""
 _ICD_VENDORS = "OCL_ICD_VENDORS"
-"""Variable that replaces the system's folder of drivers."""
+"""Environment variable that names another folder of .icd files than the system's."""
 DRIVER_VARIABLES = (
     *(_ICD_VENDORS, _ICD_FILENAMES, _POCL_CACHE, _POCL_AFFINITY, *_POCL_COUNTS),
     *("POCL_DEVICES", "RUSTICL_ENABLE", "CUDA_VISIBLE_DEVICES"),
 )
-"""Variables of loaders and drivers that change the list of devices, or how they work."""
+"""Environment variables of loaders and drivers that change the list of devices, or how the devices work."""
 GPU_MAKERS_BY_PCI_VENDOR = {0x10DE: "NVIDIA", 0x1002: "AMD", 0x8086: "Intel"}
 """GPU makers by their PCI vendor number."""
 _SUBGROUP_SIZES = (16, 32, 8)
-"""Sub-group sizes to request if the kernel may choose, in the order to try."""
+"""Sub-group sizes to request, in the order to try, where a kernel may choose the size."""
 _GPU_PACKAGES = {
     "NVIDIA": {
         "debian": "apt install nvidia-opencl-icd, beside the driver; in a container the host's libraries, with "
@@ -75,7 +75,7 @@ def kind_of(device: cl.Device) -> str:
 
 
 def title(device: cl.Device) -> str:
-    """The device and its driver in one line of text, without the build options that PoCL appends after two spaces."""
+    """The device and its driver in a line of text. PoCL's build options, which follow two spaces, are left out."""
     return f"{device.name.strip()}, {device.platform.version.split('  ')[0].strip()}"
 
 
@@ -92,8 +92,8 @@ def _is_rusticl(device: cl.Device) -> bool:
 
 
 def most_lanes(device: cl.Device) -> int:
-    """The most pixels per vector that the driver's compiler can take on a CPU."""
-    if _is_rusticl(device):  # with vectors, llvmpipe hangs in the larger kernels
+    """Maximum pixels per vector that the driver's compiler handles on a CPU."""
+    if _is_rusticl(device):  # llvmpipe hangs in larger kernels with vectors
         return 1
     return 8 if _pocl_version(device) == (3, 0) else 16  # PoCL 3.0 aborts on some float16 built-ins
 
@@ -101,13 +101,13 @@ def most_lanes(device: cl.Device) -> int:
 def subgroup_ways(device: cl.Device) -> list[dict[str, object]]:
     """Defines for kernels with sub-groups, in the order to try.
 
-    Empty if the device offers no sub-groups whose size is known when a kernel is built. The exchange is probed before
-    it is used (`Device.kernels`).
+    Empty if the device offers no sub-groups whose size is known when a kernel is built. `Device.kernels` tests that
+    items exchange the right values before it uses the defines.
     """
     extensions = device.extensions.split()
-    if "cl_nv_device_attribute_query" in extensions:  # by inline PTX, as NVIDIA's OpenCL has no such functions
+    if "cl_nv_device_attribute_query" in extensions:  # by inline PTX, as NVIDIA's OpenCL has no functions for it
         return [{"SUBGROUP": 32, "SHUFFLE_PTX": True}]
-    if "cl_amd_device_attribute_query" in extensions:  # by the compiler's own functions
+    if "cl_amd_device_attribute_query" in extensions:  # by built-in functions of the compiler
         return [{"SUBGROUP": 32, "SHUFFLE_AMD": True}]
     functions = {"cl_khr_subgroup_shuffle": "SHUFFLE_KHR", "cl_intel_subgroups": "SHUFFLE_INTEL"}
     offered = [define for extension, define in functions.items() if extension in extensions]
@@ -119,13 +119,13 @@ def subgroup_ways(device: cl.Device) -> list[dict[str, object]]:
 
 
 def register_limit(device: cl.Device, registers: int) -> str:
-    """Build option for at most this many registers per work-item; empty for a driver without one."""
+    """Build option that limits the registers per work-item; empty for a driver without such an option."""
     offered = "cl_nv_compiler_options" in device.extensions.split()
     return f"-cl-nv-maxrregcount={registers}" if offered else ""
 
 
 def misnames_processors(device: cl.Device) -> bool:
-    """True for PoCL 3.0, whose compiler may refuse the processor name that it has found itself."""
+    """True for PoCL 3.0, whose compiler may refuse the processor name that it has detected itself."""
     return str(device.platform.version).startswith("OpenCL 3.0 PoCL 3.0")
 
 
@@ -148,24 +148,24 @@ def compiles_by_size(device: cl.Device) -> bool:
 
 
 def wants_cache(device: cl.Device) -> bool:
-    """True for a driver that needs our cache: it builds everything again in each process, and can load saved binaries.
+    """True for Intel's CPU runtime, which needs `binary_cache`: it builds everything again in each process.
 
-    That is Intel's runtime for CPUs. Other drivers have their own cache, or have not been tried.
+    Other drivers have their own cache, or have not been tried.
     """
     return kind_of(device) == "cpu" and str(device.platform.name).strip() == "Intel(R) OpenCL"
 
 
 def build_advice(log: str) -> str:
-    """Advice on a failed build, from its log."""
+    """Advice for a failed build, according to its log."""
     if "unknown target CPU" in log:
-        return "this driver is older than the processor: take another one, such as your distribution's PoCL"
+        return "this driver is older than the processor: use another driver, such as your distribution's PoCL"
     return "CLSPLAT_DEBUG=1 shows the log and the source"
 
 
 def driver_advice(system: str | None = None, machine: str | None = None) -> str:
-    """Advice on the driver to install, in a line without a full stop.
+    """Advice on the driver to install: a line without a full stop.
 
-    system, machine: like `platform.system` and `platform.machine`; this computer's unless given.
+    system, machine: as `platform.system` and `platform.machine` return; None means this computer.
     """
     system, machine = system or platform.system(), (machine or platform.machine()).lower()
     pc = machine in ("x86_64", "amd64")
@@ -185,24 +185,24 @@ def driver_advice(system: str | None = None, machine: str | None = None) -> str:
 def gpu_advice(maker: str, families: Sequence[str]) -> str:
     """Advice on the OpenCL driver for a maker's GPU.
 
-    families: this Linux distribution and the ones it is like; empty on other systems.
+    families: this Linux distribution and those it is based on; empty on other systems.
     """
     if not families:
-        return f"install {maker}'s own graphics driver, which has OpenCL in it"
+        return f"install {maker}'s own graphics driver, which includes OpenCL"
     packages = _GPU_PACKAGES.get(maker, {})
     return next((packages[name] for name in families if name in packages), f"install {maker}'s OpenCL driver")
 
 
 def of_maker(platform_name: str, device_name: str, maker: str) -> bool:
-    """True if the driver's name or the device's name shows that an OpenCL GPU is from this maker."""
+    """True if the platform's or the device's name shows that an OpenCL GPU is from this maker."""
     names = f"{platform_name} {device_name}".lower()
     return any(word in names for word in {"AMD": ("amd", "radeon", "gfx")}.get(maker, (maker.lower(),)))
 
 
 def driver_files(environment: Mapping[str, str] = os.environ) -> list[Path]:
-    """The .icd files; each names a driver's library in one line.
+    """The .icd files; each contains the name of a driver's library.
 
-    They are in the system's folder, or in the folder that an environment variable names instead, and in Python
+    They are in the system's folder, or instead in the folder that an environment variable names, and in Python
     packages.
     """
     folders = [Path(environment.get(_ICD_VENDORS) or "/etc/OpenCL/vendors")]
@@ -212,7 +212,7 @@ def driver_files(environment: Mapping[str, str] = os.environ) -> list[Path]:
 
 
 def no_device() -> DeviceError:
-    """The error that no device was found."""
+    """The error to raise if no device is found."""
     return DeviceError(f"no OpenCL device found: {driver_advice()}")
 
 
@@ -222,11 +222,11 @@ def offer_packaged(
     prefix: str = sys.prefix,
     environment: MutableMapping[str, str] = os.environ,
 ) -> None:
-    """Make OpenCL's loader, in this process and its children, find Intel's CPU driver installed by pip.
+    """Make OpenCL's loader find Intel's CPU driver that pip installed, in this process and its children, on Windows.
 
-    On Windows the loader reads the registry, which pip does not write, and OCL_ICD_FILENAMES, which it ignores in a
-    process with administrator rights. A variable that is already set is kept. On Linux the loader finds PyPI's PoCL by
-    itself; macOS has no loader.
+    Windows' loader reads the registry, which pip does not write, and OCL_ICD_FILENAMES, except in a process with
+    administrator rights. A variable that is already set is kept. On Linux the loader finds PyPI's PoCL by itself;
+    macOS has no loader.
     """
     driver = Path(prefix) / _INTEL_DRIVER_PATH
     if windows and _ICD_FILENAMES not in environment and driver.is_file():
@@ -234,10 +234,10 @@ def offer_packaged(
 
 
 def make_cache_folder(environment: MutableMapping[str, str] = os.environ) -> Path | None:
-    """Give PoCL a cache folder for this process and its children if it could not make its own below the home.
+    """Make a cache folder for PoCL, in this process and its children, if PoCL cannot make one in the home folder.
 
     Without a cache folder PoCL shows no device, as if it were not installed. Returns the folder, which is removed when
-    this process ends; None if no folder was needed, or none could be made.
+    this process ends; None if no folder is needed or none can be made.
     """
     if os.name == "nt" or environment.get(_POCL_CACHE):
         return None
@@ -261,11 +261,11 @@ def make_cache_folder(environment: MutableMapping[str, str] = os.environ) -> Pat
 
 
 def pin_threads(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Pin each PoCL thread to the processor of its number, in this process and its children.
+    """Pin PoCL's thread number n to processor number n, in this process and its children.
 
-    Otherwise two threads that wake up together share a processor for whole kernels while another processor idles.
-    Threads are not pinned if the process may use only some processors, or PoCL is set to use fewer. Two processes
-    of one thread each would then share the first processor. A variable that is already set is kept.
+    Otherwise two threads that wake up together may share a processor for whole kernels, while another is idle. Nothing
+    is pinned if the process may use only some processors, or PoCL is set to use fewer: two processes of one thread
+    each would then share the first processor. A variable that is already set is kept.
     """
     if sys.platform != "linux" or any(name in environment for name in (_POCL_AFFINITY, *_POCL_COUNTS)):
         return
@@ -274,7 +274,7 @@ def pin_threads(environment: MutableMapping[str, str] = os.environ) -> None:
 
 
 def _can_be_made(folder: Path) -> bool:
-    """True if the folder can be made, if necessary, and written to."""
+    """True if the folder exists or can be made, and is writable."""
     for place in (folder, *folder.parents):
         if os.path.lexists(place):
             return place.is_dir() and os.access(place, os.W_OK | os.X_OK)

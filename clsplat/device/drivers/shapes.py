@@ -22,9 +22,9 @@ from clsplat.files.documents import parse_json
 VECTOR_LANES = (1, 4, 8, 16)
 """Allowed numbers of pixels per vector."""
 BY_GAUSSIAN_SHAPES = ((1, 32), (1, 64))
-"""Lanes and items of the shapes that also exist by Gaussian."""
+"""Lanes and items of the shapes that exist with the suffix `g` too (`Shape.by_gaussian`)."""
 SUBGROUP_SHAPES = (*BY_GAUSSIAN_SHAPES, (1, 128), (1, 256))
-"""Lanes and items of the shapes that also exist with sub-groups."""
+"""Lanes and items of the shapes that exist with the suffix `s` too (`Shape.subgroups`)."""
 _SHAPES_BY_SUFFIX = {"g": BY_GAUSSIAN_SHAPES, "s": SUBGROUP_SHAPES}
 
 
@@ -33,13 +33,13 @@ class Shape:
     """The shape of the kernels for a device.
 
     lanes: pixels per vector in the blend kernels (1 on GPUs).
-    items: work-items per work-group in kernels whose items co-operate (1 on CPUs, where a group is one sequential
+    items: work-items per work-group in kernels whose items co-operate (1 on CPUs, which run a group as a sequential
     loop).
-    chunks: pieces that a scan or sort is divided into if `items` is 1.
-    by_gaussian: in the gradient of blending, a work-item takes one Gaussian and loops over the pixels, instead of the
-    reverse (docs/decisions/0023-a-group-shares-a-tile.md). It needs 1 lane and items as in BY_GAUSSIAN_SHAPES.
-    subgroups: in the gradient of blending, work-items sum by exchange within sub-groups, with the same bits. It needs
-    items as in SUBGROUP_SHAPES.
+    chunks: number of chunks in a scan or sort if `items` is 1.
+    by_gaussian: in the gradient of blending, a work-item has a Gaussian and loops over pixels, instead of the reverse
+    (docs/decisions/0023-a-group-shares-a-tile.md). Only for lanes and items in BY_GAUSSIAN_SHAPES.
+    subgroups: in the gradient of blending, the work-items of a sub-group add by exchange of values, with the same
+    bits. Only for lanes and items in SUBGROUP_SHAPES.
     """
 
     lanes: int
@@ -50,7 +50,7 @@ class Shape:
 
     @property
     def label(self) -> str:
-        """LANESxITEMS, the form that CLSPLAT_SHAPE takes; with suffix `g` by Gaussian, `s` with sub-groups."""
+        """The value of CLSPLAT_SHAPE for this shape: LANESxITEMS, with suffix `g` by Gaussian, `s` with sub-groups."""
         return f"{self.lanes}x{self.items}{'g' if self.by_gaussian else 's' if self.subgroups else ''}"
 
     @property
@@ -60,7 +60,7 @@ class Shape:
         return f"{self.lanes} lanes x {self.items} items{form}"
 
     def relabelled(self, label: str) -> Shape:
-        """A shape like this with another label. Raises ValueError if the label is invalid."""
+        """A copy of this shape that has the lanes, items and suffix of `label`. Raises ValueError if it is invalid."""
         match = re.fullmatch(r"(\d+)x(\d+)([gs]?)", label.strip())
         lanes, items, form = (int(match[1]), int(match[2]), match[3]) if match else (0, 0, "")
         if (
@@ -69,7 +69,7 @@ class Shape:
             or items & (items - 1)
             or (form and (lanes, items) not in _SHAPES_BY_SUFFIX[form])
         ):
-            raise ValueError(f"{label}: no shape")
+            raise ValueError(f"{label}: not a shape")
         return replace(self, lanes=lanes, items=items, by_gaussian=form == "g", subgroups=form == "s")
 
     @property
@@ -79,15 +79,15 @@ class Shape:
 
     @property
     def sort_items(self) -> int:
-        """Work-items of the radix sort's groups: with up to 256 of them its local sort fits in 32 KiB."""
+        """Work-items in a group of the radix sort: at most 256, so that its local memory fits in 32 KiB."""
         return min(self.items, 256)
 
     @property
     def local_bytes(self) -> int:
-        """The most local memory that a group needs.
+        """Maximum bytes of local memory that a group needs, which is in the sort.
 
-        With one item the local memory holds the sort's counters of wide digits. Otherwise it holds a tile of 16 keys
-        per item, 16 counters of 16 bits and a sum per item, padding between these, and a counter per digit.
+        With one item, it holds the counters of wide digits. Otherwise it holds 16 keys per item, 16 counters of 16 bits
+        per item, a sum per item, padding, and a counter per digit.
         """
         if self.items == 1:
             return 32 << 10
@@ -96,7 +96,7 @@ class Shape:
 
 
 def default_shape(device: cl.Device) -> Shape:
-    """The shape by device type and vector width; docs/decisions/0003-one-source-many-shapes.md explains the shapes."""
+    """The shape for the device's type and vector width (docs/decisions/0003-one-source-many-shapes.md)."""
     if capabilities_of(device).kind != "cpu":
         items = next((n for n in (64, 32, 16) if n <= most_items(device)), 1)
         return Shape(lanes=1, items=items, chunks=4 * device.max_compute_units)
@@ -105,7 +105,7 @@ def default_shape(device: cl.Device) -> Shape:
 
 
 def most_items(device: cl.Device) -> int:
-    """The most work-items in a group of clsplat's kernels, by the device's limit and its local memory."""
+    """Maximum work-items per group for clsplat's kernels, by the device's limit and its local memory."""
     capabilities = capabilities_of(device)
     most = capabilities.group
     while most > 1 and Shape(1, most, 1).local_bytes > capabilities.local_memory:
@@ -135,10 +135,10 @@ def asked_shape() -> str:
     text = os.environ.get("CLSPLAT_SHAPE", "")
     if text and _parsed(text, Shape(1, 1, 1)) is None:
         raise DeviceError(
-            f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; lanes are 1, 4, 8 or 16; a g behind "
-            f"{' and '.join(f'{lanes}x{items}' for lanes, items in BY_GAUSSIAN_SHAPES)} is for a gradient by "
-            "Gaussian, an s behind "
-            f"{', '.join(f'{lanes}x{items}' for lanes, items in SUBGROUP_SHAPES)} for sub-groups"
+            f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; lanes are 1, 4, 8 or 16; with "
+            f"{' or '.join(f'{lanes}x{items}' for lanes, items in BY_GAUSSIAN_SHAPES)}, suffix g selects a gradient by "
+            "Gaussian; with "
+            f"{', '.join(f'{lanes}x{items}' for lanes, items in SUBGROUP_SHAPES)}, suffix s selects sub-groups"
         )
     return text
 
@@ -170,17 +170,17 @@ def wanted_shape(device: cl.Device) -> Shape:
 
 
 def failures(device: cl.Device) -> dict[str, str]:
-    """Recorded failures of the driver by shape, LANESxITEMS. Empty with CLSPLAT_TRUST_DRIVER=1."""
+    """Recorded failures of the driver by shape label. Empty with CLSPLAT_TRUST_DRIVER=1."""
     if regardless():
         return {}
     return {label: entry.failed for label, entry in driver_records.entries(device).items() if entry.failed}
 
 
 def shape_of(device: cl.Device) -> tuple[Shape, str]:
-    """The shape of a device that is opened without an explicit one, and a warning or an empty string.
+    """The shape for a device that is opened without an explicit shape, and a warning or an empty string.
 
-    It is `wanted_shape`; if the driver has failed in that before, the first other shape without a recorded failure,
-    with a warning. Raises DeviceError like `wanted_shape`.
+    It is `wanted_shape`. If the driver has a recorded failure in that shape, it is the first shape without a failure,
+    and there is a warning. Raises DeviceError like `wanted_shape`.
     """
     wanted, failed = wanted_shape(device), failures(device)
     shape = shapes_to_try(device, wanted, failed)[0]
@@ -188,7 +188,7 @@ def shape_of(device: cl.Device) -> tuple[Shape, str]:
 
 
 def shape_text(device: cl.Device) -> str:
-    """The shape in the list of devices, or a note that the device cannot take CLSPLAT_SHAPE."""
+    """The shape for the list of devices, or a note that the device cannot run CLSPLAT_SHAPE."""
     try:
         shape, _ = shape_of(device)
     except DeviceError:
@@ -197,7 +197,7 @@ def shape_text(device: cl.Device) -> str:
 
 
 def shapes_in_turn(device: cl.Device) -> list[Shape]:
-    """The shapes to try, the default first: the candidates, then simpler ones that demand less of a compiler."""
+    """All shapes in the order to try: the default, the other candidates, then shapes that demand less of a compiler."""
     first = candidates(device)
     default = first[0]
     smaller = [replace(default, lanes=lanes, items=1) for lanes in (4, 1)] if default.items == 1 else []
@@ -206,16 +206,16 @@ def shapes_in_turn(device: cl.Device) -> list[Shape]:
 
 
 def shapes_to_try(device: cl.Device, first: Shape, failed: Mapping[str, str]) -> list[Shape]:
-    """The shapes in which the driver has not failed: `first`, then `shapes_in_turn`.
+    """`first` and then `shapes_in_turn`, without the shapes in which the driver has failed.
 
-    `first` alone if it has failed in all, as the reason may be gone.
+    If it has failed in every shape, `first` is tried again, because the cause may be gone.
     """
     shapes = dict.fromkeys((first, *shapes_in_turn(device)))
     return [shape for shape in shapes if shape.label not in failed] or [first]
 
 
 def instead(device: cl.Device, wanted: Shape, other: Shape, failure: str) -> str:
-    """The warning that another shape is used."""
+    """The warning that `other` is used instead of the wanted shape."""
     return (
         f"{title(device)}: kernels in the shape {wanted.label} failed: {failure}; {other.label} is "
         f"taken (clsplat selftest tries {wanted.label} anew)"
@@ -239,7 +239,7 @@ def saved_shapes() -> dict[str, str]:
     path = saved_path()
     try:
         saved = parse_json(path.read_bytes())
-    except (FileNotFoundError, NotADirectoryError):  # the home may be a file, or missing
+    except (FileNotFoundError, NotADirectoryError):  # the home folder may be missing, or be a file
         return {}
     except OSError as error:
         warnings.warn(f"{path}: cannot be read ({reason_of(error)}), so that no tuned shape is used", stacklevel=2)

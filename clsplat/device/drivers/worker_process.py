@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Python worker processes of this package, which a driver may abort or hang, and the reasons why they ended."""
+"""Worker processes in Python, in which a driver may crash or hang without harm, and the reasons why they ended."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from clsplat.errors import DriverError, InputError, switched_on
 from clsplat.process import MAX_SIGNAL_WAIT_SECONDS, Interrupted, apart, endings
 
 CHILD_MESSAGE_PREFIX = "clsplat-child "
-"""Prefix of a line that is a message to the parent. Lines that drivers print do not have it."""
+"""Prefix of lines that are messages to the parent, unlike lines that a driver prints."""
 DRIVER_TIMEOUT_SECONDS = 120.0
-"""Seconds without a message after which a driver counts as hung. The slowest working driver takes 60 to build a
-kernel."""
+"""Seconds without a message after which a driver counts as hung. The slowest driver that works takes 60 seconds to
+build a kernel."""
 DRIVER_TIMEOUT_VARIABLE = "CLSPLAT_DRIVER_TIMEOUT"
 TRUST_DRIVER_VARIABLE = "CLSPLAT_TRUST_DRIVER"
 _SIGKILL, _SIGTERM = -9, -15
@@ -34,27 +34,27 @@ _SIGKILL, _SIGTERM = -9, -15
 
 
 class TrialInterrupted(Interrupted):
-    """This process was asked to end while it waited for a driver's trial."""
+    """Raised if this process is asked to end while it waits for a driver's trial."""
 
 
 class WorkerEndedError(Exception):
-    """A worker process has ended before it answered. The text is the end of a sentence about it.
+    """Raised if a worker process ends before it answers. The text completes a sentence about the process.
 
-    hung: True if it was ended because it did not answer in time.
-    status: its exit status; negative for a signal.
+    hung: True if the process was ended because it did not answer in time.
+    status: exit status of the process; negative for a signal.
     """
 
     def __init__(self, text: str, status: int = 0, *, hung: bool = False) -> None:
         super().__init__(text)
         self.hung = hung
-        # which only a driver can cause; a Python error has status 1 or 2
+        # True if a driver has ended the process; a Python error has status 1 or 2
         self.crashed = hung or status not in (0, 1, 2, _SIGTERM, _SIGKILL)
         self.killed = status == _SIGKILL
 
 
 def driver_timeout() -> float:
-    """Seconds after which a driver counts as hung: CLSPLAT_DRIVER_TIMEOUT, else DRIVER_TIMEOUT_SECONDS. Raises
-    InputError."""
+    """Seconds after which a driver counts as hung: CLSPLAT_DRIVER_TIMEOUT, or DRIVER_TIMEOUT_SECONDS. Raises InputError
+    if the variable is invalid."""
     text = os.environ.get(DRIVER_TIMEOUT_VARIABLE, "")
     if not text:
         return DRIVER_TIMEOUT_SECONDS
@@ -73,12 +73,12 @@ def regardless() -> bool:
 
 
 def tell(**values: object) -> None:
-    """Send a message from this process to its parent, on a line of its own even if a driver has printed something."""
+    """Send a message from this process to its parent. It begins a new line, as a driver may have printed text."""
     print(f"\n{CHILD_MESSAGE_PREFIX}{json.dumps(values)}", flush=True)
 
 
 def end_with_parent() -> None:
-    """End this process when the parent ends, even if a driver hangs. It is for a process that reads no messages."""
+    """End this process when its parent ends, even if a driver hangs. For a process that reads no messages."""
 
     def wait() -> None:
         while os.read(0, 1 << 10):
@@ -90,10 +90,10 @@ def end_with_parent() -> None:
 
 @contextmanager
 def ending_at_once() -> Iterator[None]:
-    """Raise TrialInterrupted in the block on a signal that asks this process to end.
+    """Inside the block, signals that ask this process to end raise TrialInterrupted.
 
-    The signal's own handler, which may only record the signal, runs first. Outside the main thread the block has no
-    effect, as other threads get no signals.
+    The previous handler of the signal runs first; it may just record the signal. Outside the main thread the block has
+    no effect, as other threads get no signals.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -112,7 +112,7 @@ def ending_at_once() -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            if signal.getsignal(number) is interrupt:  # a handler may have installed another one
+            if signal.getsignal(number) is interrupt:  # the previous handler may have installed another
                 signal.signal(number, handler)
 
 
@@ -127,7 +127,7 @@ def abandon() -> None:
 
 
 class WorkerProcess:
-    """A process that answers in lines of JSON. Ctrl-C does not reach it: it ends with its parent, or by `close`.
+    """A process that answers in lines of JSON. Ctrl-C does not reach it. It ends with its parent, or by `close`.
 
     Raises DriverError if it cannot be started.
     """
@@ -174,10 +174,10 @@ class WorkerProcess:
             self._process.stdin.flush()
 
     def receive(self, seconds: float, doing: str = "") -> dict[str, Any]:
-        """The next message.
+        """The next message of the process.
 
-        doing: work of the process, for the text of the error.
-        Raises TrialInterrupted, and WorkerEndedError. After `seconds` without a message it ends the process.
+        doing: the current work of the process, for the text of an error.
+        Raises TrialInterrupted or WorkerEndedError. After `seconds` without a message the process is ended.
         """
         until = time.monotonic() + seconds
         while True:
@@ -200,7 +200,7 @@ class WorkerProcess:
         return message
 
     def _last_words(self) -> str:
-        """The line of its standard error that tells most, in brackets, or an empty string."""
+        """The most informative line of its standard error, in brackets, or an empty string."""
         self._readers[1].join(timeout=5)
         words = [line for line in self._errors if line]
         said = next((line for line in words if "ERROR" in line or "Assertion" in line), words[-1] if words else "")
@@ -216,7 +216,7 @@ class WorkerProcess:
         for reader in self._readers:
             reader.join(timeout=5)
         assert self._process.stdin is not None
-        with suppress(OSError, ValueError):  # it writes text that the process never read; two threads may close it
+        with suppress(OSError, ValueError):  # the process may have ended; two threads may close the pipe
             self._process.stdin.close()
 
 
@@ -229,8 +229,8 @@ _NO_PYTHON_ADVICE = (
 def python_module(module: str, *words: str) -> list[str]:
     """The command that runs a module of this package.
 
-    It imports nothing from the current folder, unlike `python -m`. Raises DriverError if Python does not know its own
-    executable.
+    Unlike `python -m`, it imports nothing from the current folder. Raises DriverError if Python does not know the path
+    of its executable.
     """
     if not sys.executable:  # another program may embed Python
         raise DriverError(f"sys.executable is empty, {_NO_PYTHON_ADVICE}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gains of photographs, their gradient and Adam's step."""
+"""Case of appearance: gains of photographs, their gradient and their update by Adam."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ GAINS_PHOTOGRAPH = 1
 
 
 def random_gradient(rng: Generator, image: Float32) -> Float32:
-    """A gradient of any size by an image."""
+    """A random gradient with respect to an image; its order of magnitude is random too."""
     return (rng.standard_normal(image.shape) * 10 ** rng.uniform(-9, 4)).astype(np.float32)
 
 
 def random_moments(rng: Generator, shape: tuple[int, ...], size: float) -> Float32:
-    """Adam's moments (2, ...) of gradients of a size; zero in one of three."""
+    """First and second moments of Adam, (2, *shape), for gradients near `size`; in a third of the cases zero."""
     moments = np.stack([rng.standard_normal(shape) * size, rng.uniform(0.1, 1, shape) * size**2])
     return (moments * (rng.random() > 1 / 3)).astype(np.float32)
 
 
 def frozen_pictures(bench: CaseBench, photograph_seed: int, gradient_seed: int) -> Inputs:
-    """The scene's blended image as the render, a photograph, and the loss's gradient by the render."""
+    """The scene's blended image as the render, a photograph, and the loss's gradient with respect to the render."""
     image = bench.blended.image.get()
     photograph = evenly(photograph_seed, image.shape, 0.0, 1.0).astype(np.float32)
     by_image = evenly(gradient_seed, image.shape, -0.25, 1.0).astype(np.float32)
@@ -43,7 +43,7 @@ def frozen_pictures(bench: CaseBench, photograph_seed: int, gradient_seed: int) 
 
 
 def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
-    """Gains of 1/256 to 256, and gradients of any size."""
+    """Gains of 1/256 to 256, and gradients of any magnitude."""
     image, photograph = random_pictures(rng, size)
     by_image = random_gradient(rng, image)
     pull = rng.choice([0.0, 1e-3, 1.0]) * rng.uniform(0, 0.5, (3, 3)) * np.abs(by_image).sum()
@@ -61,16 +61,16 @@ def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
 
 
 def _frozen(bench: CaseBench) -> list[Inputs]:
-    """One of three photographs."""
+    """Inputs with gains for three photographs, one of which is used."""
     ends = {41: (-1.0, 1.0), 43: (-1.0, 1.0), 44: (0.0, 0.5)}
     logs, start, pull = (evenly(seed, (3, 3), *ends[seed]).astype(np.float32) for seed in ends)
-    pull[2] = pull[:, 2] = 0  # a photograph without pull
+    pull[2] = pull[:, 2] = 0  # this photograph is not pulled
     learnt = Inputs(logs=logs, start=start, pull=pull, moments=np.zeros((2, 3, 3), np.float32), number=5, rate=0.03125)
     return [Inputs(**vars(frozen_pictures(bench, 45, 42)), **vars(learnt))]
 
 
 def uploaded(device: Device, given: Inputs) -> list[DeviceArray]:
-    """The photograph with a plane of alpha, the render, and the gradient by it, unwritten below like the loss's."""
+    """Planes of the photograph with alpha, the render, and the gradient; its padding rows, never written, are NaN."""
     planes, below = planes_of(given.photograph), planes_of(given.by_image)
     below[:, given.size[1] :] = np.nan
     return [upload(device, each) for each in (np.concatenate([planes, planes[:1]]), planes_of(given.image), below)]
@@ -88,7 +88,7 @@ def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
 
 
 def pictures_read(given: Inputs, target: DeviceArray, gradient: DeviceArray) -> Arrays:
-    """The changed photograph, and the planes that do not change."""
+    """The photograph after the launch, and the planes that must not change: its alpha, and the gradient."""
     planes = target.get()
     return {
         "target": cropped(planes[:3], given.size),
@@ -98,17 +98,17 @@ def pictures_read(given: Inputs, target: DeviceArray, gradient: DeviceArray) -> 
 
 
 def unchanged(given: Inputs) -> dict[str, Wanted]:
-    """The planes that do not change."""
+    """The planes that must not change."""
     return {"alpha": exactly(planes_of(given.photograph)[0]), "gradient": exactly(given.by_image)}
 
 
 def moment(values: Float64) -> Wanted:
-    """A moment of Adam: beta2 in float32 is 1e-8 off in 1 - beta2 = 1e-3."""
+    """A moment of Adam. The bound: beta2 in float32 is off by 1e-8, which is 1e-5 of 1 - beta2 = 1e-3."""
     return Wanted(values, 3e-5, np.abs(values).max())
 
 
 def stepped(values: Float64, rate: float | Float64) -> Wanted:
-    """Values after a step of Adam: beta2 is 1e-5 of one, and a sum of 16 floats nearly cancels."""
+    """Values after a step of Adam. The bound: beta2 is 1e-5 of a step, and a sum of 16 floats may nearly cancel."""
     return Wanted(values, 1e-4, rate + 1e-2 * np.abs(values))
 
 
@@ -117,13 +117,13 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
         *("image", "by_image", "photograph", "logs", "start", "pull", "moments")
     )
     got["by gains"] = np.log(2) * got["columns"].sum(axis=1, dtype=np.float64)
-    gradients = np.zeros_like(logs)  # of the device's sums, so that no error counts twice
+    gradients = np.zeros_like(logs)  # from the device's sums: their error does not count again
     gradients[GAINS_PHOTOGRAPH] = got["by gains"] + reference.pull(logs, start, pull)[GAINS_PHOTOGRAPH]
     after, first, second = reference.step(logs, moments[0], moments[1], gradients, given.number, given.rate)
     removed = reference.removed(photograph, logs[GAINS_PHOTOGRAPH])
     terms = np.log(2) * np.abs(image * by_image).sum(axis=(0, 1))
     return {
-        "target": Wanted(removed, 3e-7, removed),  # two roundings, of 2^log and of the quotient
+        "target": Wanted(removed, 3e-7, removed),  # two roundings: 2^log and a quotient
         "by gains": Wanted(reference.gradient(image, by_image), 1e-6, terms),  # a few roundings of partial sums
         "logs": stepped(after, given.rate),
         "gains": Wanted(np.exp2(after), 1e-5, np.exp2(after)),

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The core stages of the self-test, each compared with the float64 reference on one frozen scene.
+"""The core stages of the self-test, each compared with the float64 reference on a frozen scene.
 
-A stage's input is the device's own output of the stage before, so that errors do not add up.
+The reference of a stage gets the device's output of the previous stage, so that errors do not add up.
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ def _project(bench: CaseBench) -> StageOutcome:
 
 
 def _box_tiles(projected: reference_project.ProjectedTwin, tiles: tuple[int, int]) -> NDArray[np.int64]:
-    """Number of tiles in each Gaussian's bounding box plus half a pixel, an upper bound of its tiles; 0 if not
-    visible."""
+    """Upper bound of each Gaussian's number of tiles: those in its bounding box, enlarged by half a pixel. 0 if it is
+    not visible."""
     low = np.floor((projected.means2d - projected.half_extents - 0.5) / TILE)
     high = np.floor((projected.means2d + projected.half_extents + 0.5) / TILE) + 1
     spans = np.clip(high, 0, tiles) - np.clip(low, 0, tiles)
@@ -124,7 +124,7 @@ def _duplicate(bench: CaseBench) -> StageOutcome:
     if len(ids) != len(owners):
         return replace(outcome, trouble=f"{len(ids)} pairs instead of {len(owners)}")
     wrong += int((ids[:, 1] != owners).sum()) + int((ids[:, 0] != scanned[owners] + place).sum())
-    # each Gaussian's tiles ascend, and include every tile that it reaches
+    # each Gaussian's tiles must be in ascending order, and include every tile that it reaches
     wrong += int((np.diff(tile_keys.astype(np.int64))[place[1:] > 0] <= 0).sum()) + int(
         (tile_keys >= bench.band.end).sum()
     )
@@ -206,8 +206,7 @@ def _moments(splats: reference_project.ProjectedTwin, wanted: reference_blend.Bl
 
 
 def _project_grad(bench: CaseBench) -> StageOutcome:
-    """Test the gradient of projection with synthetic slots, so that an error in blending's gradient is not counted
-    here."""
+    """Test the gradient of projection with synthetic slots, so that errors in the gradient of blending do not count."""
     device, n = bench.device, bench.model.count
     coefficients = bench.model.coefficients
     made, visible = MadeUpSlots.of(bench), bench.visible
@@ -235,7 +234,7 @@ def _project_grad(bench: CaseBench) -> StageOutcome:
 
 
 def _adam(bench: CaseBench) -> StageOutcome:
-    """Test Adam by itself, and as a part of projection's gradient."""
+    """Test Adam in its own kernel, and in the gradient of projection (`project_step`)."""
     outcome = ADAM_CASE.outcome(bench)
     assert ADAM_CASE.frozen is not None
     wrong = sum(_steps_off(bench, given) for given in ADAM_CASE.frozen(bench))
@@ -243,8 +242,7 @@ def _adam(bench: CaseBench) -> StageOutcome:
 
 
 def _steps_off(bench: CaseBench, given: Inputs) -> int:
-    """Count the elements that `project_step` moves differently from float64 Adam with the gradients of
-    `project_grad`."""
+    """Count the elements in which `project_step` differs from float64 Adam with the gradients of `project_grad`."""
     device, (n, coefficients) = bench.device, (bench.model.count, bench.model.coefficients)
     view = (bench.camera_array, bench.projected, MadeUpSlots.of(bench).slots)
     gradients, screen = (
@@ -264,7 +262,7 @@ def _steps_off(bench: CaseBench, given: Inputs) -> int:
         exact = reference_adam.adam(p, g, m, v, given.step, rate)
         for kind, model, wanted in zip(before, (parameters, first, second), exact, strict=True):
             got = model[group].get()
-            # beta2 in float32 is 1e-8 off in 1 - beta2 = 1e-3: 1e-5 of a step or of a new moment.
+            # beta2 in float32 is off by 1e-8, which is 1e-5 of 1 - beta2 and so of a step or a new moment.
             off = np.abs(got - wanted) > 1e-5 * np.abs(wanted) + 1e-4 * (rate if kind == "parameters" else g**2 + 1e-6)
             wrong += int(off[rows].sum()) + int((got[~rows] != before[kind][group][~rows]).sum())
     return wrong

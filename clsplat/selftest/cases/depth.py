@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-test of the depth stage: nearness, its loss, and the gradient of both."""
+"""Self-test of the depth stage: nearness, the loss on it, and the gradients of both."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from clsplat.stages.loss_terms import DepthTerm
 NEARNESS_SLOTS = SlotFields(nearness=True)
 DEPTH_LOSS_FACTOR = 0.125
 MIN_NEARNESS_DIFFERENCE = 1e-5
-"""Difference of nearness below which rounding decides the gradient's sign."""
+"""Difference of nearness below which the sign of the gradient depends on rounding."""
 
 
 def of_depth(bench: CaseBench) -> StageOutcome:
-    """Test the scene's nearness against synthetic depths, a quarter of them unknown.
+    """Test the scene's nearness with synthetic known depths, a quarter of which are missing.
 
-    The gradient of pairs has no digest: the order of its sums depends on the kernel shape.
+    The gradients of pairs are not in the digest, because the order of their sums depends on the kernel shape.
     """
     device, camera = bench.device, bench.camera
     height, width = camera.height, camera.width

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bilateral grids: a photograph's colours, their gradient and Adam's step."""
+"""Case of bilateral grids: the colours of a photograph, the gradient, and the update by Adam."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from clsplat.stages.grid import GRID_SHAPE, Grids, apply_grid, centre_grids, gri
 
 GRID_PHOTOGRAPH = 1
 MIN_LEVEL_DISTANCE = 1e-4
-"""Distance from a luminance level below which rounding decides the slope."""
+"""Distance from a luminance level below which rounding decides which two levels are interpolated."""
 
 
 def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
-    """Grids from next to none to wild ones; colours under 0 and over 1 among those between."""
+    """Grids from near the identity to far from it, and colours that include some below 0 and above 1."""
     image, _ = random_pictures(rng, size)
     image = (image * rng.uniform(1.0, 1.5) - rng.choice([0.0, 0.2])).astype(np.float32)
     noise = rng.standard_normal((2, *GRID_SHAPE)) * 10 ** rng.uniform(-4, 0.5)
@@ -41,7 +41,7 @@ def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
 
 
 def _frozen(bench: CaseBench) -> list[Inputs]:
-    """One of two photographs, with the scene's blended image as the render."""
+    """Inputs with grids for two photographs, one of which is used. The render is the scene's blended image."""
     grids = (reference.identity(GRID_SHAPE[:3]) + evenly(43, (2, *GRID_SHAPE), -0.25, 0.25)).astype(np.float32)
     by_seen = evenly(44, tuple(bench.blended.image.shape), -0.25, 1.0).astype(np.float32)
     image, by_seen = (cropped(each, bench.camera) for each in (bench.blended.image.get(), by_seen))
@@ -74,14 +74,14 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
         got["by grid"].astype(np.float64),
         given.visit,
         given.rate,
-    )  # the kernel's gradient, whose error is checked too
+    )  # the device's gradient: its error does not count again
     got |= {f"{name} of another": got[name][0] for name in ("first", "second")}
     held[at], first[at], second[at] = reference.step(own, first[at], second[at], *step)
     level = image @ reference.LUMINANCE_WEIGHTS * (GRID_SHAPE[0] - 1)
     centred = reference.centre(held)
     return {
-        "seen": Wanted(seen, 1.2e-6, max(1.0, terms.max())),  # a dozen roundings
-        # a hundred terms of either sign
+        "seen": Wanted(seen, 1.2e-6, max(1.0, terms.max())),  # about twelve roundings
+        # sums of a hundred terms of both signs
         "gradient": Wanted(by_image, 1e-5, sure=np.abs(level - np.rint(level)) > MIN_LEVEL_DISTANCE),
         "by grid": Wanted(by_grid, 1e-5),
         "first": moment(first),

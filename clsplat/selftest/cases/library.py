@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-test of the library's calls, each with its gradient.
+"""Self-test of the library's calls and their gradients.
 
-They are projection with any view matrix, colours, splats given as arrays, and the blending of any number of values.
+They are projection with any view matrix, SH colours, splats from arrays, and blending of any number of values.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ from clsplat.stages.splats import ScreenGaussians, ScreenGradients, splats
 from clsplat.stages.values import ValuePass, values, values_grad
 
 VALUES_PER_GAUSSIAN = 5
-"""Values per Gaussian: more than blend.cl supports."""
+"""Number of values per Gaussian in the test, more than blend.cl supports."""
 WRITTEN_SPLAT_COLUMNS = {name: k for k, name in enumerate(SPLAT) if name != "UNUSED"}
 
 
 def of_ewa(bench: CaseBench) -> StageOutcome:
-    """Test EWA projection with a view matrix that is not a rotation, with compensations and synthetic gradients."""
+    """Test EWA projection and its gradient, with compensations and a view matrix that is not a rotation."""
     device, camera, model = bench.device, bench.camera, bench.frozen.gaussians
     n = len(model.means)
     pose, lens = np.eye(4), np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
@@ -96,7 +96,7 @@ def of_ewa(bench: CaseBench) -> StageOutcome:
     wanted = reference_ewa.project(exact["means"], covariances, view, exact["opacities"] * alone.compensations)
     off = np.abs(got["radii"] - wanted.radii)
     both = wanted.visible & (got["radii"][:, 0] > 0)
-    wrong = int((off[both] > 1).sum()) + max(int((off > 0).sum()) - 2, 0)  # for sides near a whole pixel
+    wrong = int((off[both] > 1).sum()) + max(int((off > 0).sum()) - 2, 0)  # two may be rounded otherwise
     wanted = replace(wanted, radii=got["radii"])
     back = reference_ewa.project_grad(
         exact["means"], covariances, view, wanted, {name: array.astype(np.float64) for name, array in by.items()}
@@ -110,7 +110,7 @@ def of_ewa(bench: CaseBench) -> StageOutcome:
 
 
 def conics_of(sides: Float64, angles: Float64) -> Float32:
-    """Conics (n, 3) of ellipses with these standard deviations (n, 2) in pixels, turned by the angles (n,)."""
+    """Conics (n, 3) of ellipses with these standard deviations (n, 2) in pixels, rotated by the angles (n,)."""
     axes = np.stack([np.cos(angles), -np.sin(angles), np.sin(angles), np.cos(angles)], axis=1).reshape(-1, 2, 2)
     inverse = (axes / sides[:, None, :] ** 2) @ axes.transpose(0, 2, 1)
     return np.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], axis=1).astype(np.float32)
@@ -119,9 +119,10 @@ def conics_of(sides: Float64, angles: Float64) -> Float32:
 def random_splats(
     rng: Generator, count: int, *, width: int = 70, height: int = 50, depth: int = 3, opaque: float = 0.1
 ) -> Inputs:
-    """Gaussians of a few pixels all over an image and a little beyond, a tenth culled by a radius.
+    """Gaussians of a few pixels, spread over an image and slightly past its edges. A radius of 0 culls a tenth.
 
-    A part is as opaque as the cap, and two each have the same depth. They have `depth` values each.
+    opaque: fraction of Gaussians of opacity 1, where alpha reaches its cap. Pairs of Gaussians have equal depths.
+    depth: number of values per Gaussian.
     """
     sides = np.exp(rng.normal(0.9, 0.5, (count, 2)))
     opacities = np.where(rng.random(count) < opaque, 1.0, rng.uniform(0.02, 0.95, count))
@@ -136,7 +137,7 @@ def random_splats(
 
 
 def _frozen_splats(bench: CaseBench) -> list[Inputs]:
-    """The scene's projected Gaussians, given as arrays."""
+    """The scene's projected Gaussians as arrays."""
     camera, seen, rows = bench.camera, bench.visible, bench.splats()
     arrays = {
         "means2d": rows.means2d,
@@ -176,12 +177,12 @@ def _twin_of_splats(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     size = np.abs(wanted.whitenings).max(axis=1, keepdims=True, initial=0)
     logs = np.log2(opacities)
     return {
-        # three roundings of a root and two quotients; l12 may be near 0 beside the others
+        # three roundings, of a root and two quotients; relative to the largest entry, as l12 may be near 0
         "whitening": Wanted(wanted.whitenings, 5e-7, size, seen),
-        # the budget is a difference of logarithms; the tile test has 0.01 px more
+        # the extent depends on a difference of logarithms; the tile test has 0.01 px of slack
         "half extents": Wanted(wanted.half_extents, 1e-4, 1 + wanted.half_extents, seen),
-        "LOG2O": Wanted(logs, 1.4e-6, 1.0, seen),  # an ulp of the logarithm is 1e-6 of the opacity
-        "means": Wanted(given.means2d[seen], 6e-8, 1.0),  # the place in a pixel is a float32 under 1
+        "LOG2O": Wanted(logs, 1.4e-6, 1.0, seen),  # an ulp of the logarithm changes the opacity by 1e-6
+        "means": Wanted(given.means2d[seen], 6e-8, 1.0),  # the fraction of a pixel is a float32 below 1
         "values": exactly(given.values[seen]),
         "shown": exactly(np.zeros_like(got["shown"])),
     }
@@ -198,8 +199,8 @@ SPLATS_CASE = Case(
 
 
 def of_values(bench: CaseBench) -> StageOutcome:
-    """Test the blending of VALUES_PER_GAUSSIAN values per Gaussian with the weights of the scene's image, and synthetic
-    gradients."""
+    """Test the blending of VALUES_PER_GAUSSIAN values per Gaussian with the weights of the scene's image, and its
+    gradient."""
     device, camera, n = bench.device, bench.camera, bench.model.count
     size = (camera.height, camera.width)
     given, behind = evenly(91, (n, VALUES_PER_GAUSSIAN), -1.0, 1.0), evenly(92, (VALUES_PER_GAUSSIAN,), 0.0, 1.0)
@@ -213,7 +214,7 @@ def of_values(bench: CaseBench) -> StageOutcome:
 
     def launch() -> tuple[DeviceArray, ScreenGradients]:
         pixels = bench.work.array("value_pixels", (*size, VALUES_PER_GAUSSIAN))
-        pixels.fill(0.0)  # blend.cl makes the first three
+        pixels.fill(0.0)  # blend.cl computes the first three
         values(device, of, pixels, first=0)
         into = ScreenGradients(
             *(bench.work.array(f"by_{name}", (n, width) if width else (n,)) for name, width in widths.items())
@@ -240,11 +241,11 @@ def of_values(bench: CaseBench) -> StageOutcome:
 
 
 SH_CENTRE = np.array([0.1, 0.2, 3.3])
-"""Of a camera; not one of float32's numbers."""
+"""A camera's centre; its coordinates are not exact in float32."""
 
 
 def random_harmonics(rng: Generator, count: int, degree: int | None = None, *, camera: bool | None = None) -> Inputs:
-    """Colours of a degree, seen from a camera or not, each random unless it is given."""
+    """Random SH coefficients and directions. camera: means and a camera's centre instead; None chooses at random."""
     degree = int(rng.integers(MAX_SH_BASIS_DEGREE + 1)) if degree is None else degree
     shapes = ((count, 3), (count, 25 if degree == MAX_SH_BASIS_DEGREE else 16, 3), (count, 3))
     directions, sh, by = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
@@ -254,7 +255,7 @@ def random_harmonics(rng: Generator, count: int, degree: int | None = None, *, c
 
 
 def _frozen_harmonics(bench: CaseBench) -> list[Inputs]:
-    """Colours of the highest degree in synthetic directions."""
+    """SH coefficients of the highest degree, and synthetic directions."""
     n = bench.model.count
     shapes = ((n, 3), (n, (MAX_SH_BASIS_DEGREE + 1) ** 2, 3), (n, 3))
     away, sh, by = (evenly(71 + index, shape, -1.0, 1.0).astype(np.float32) for index, shape in enumerate(shapes))
@@ -263,7 +264,7 @@ def _frozen_harmonics(bench: CaseBench) -> list[Inputs]:
 
 
 def harmonics_inputs(device: Device, given: Inputs) -> Harmonics:
-    """The inputs on the device."""
+    """The inputs, uploaded to the device."""
     mask, centre = None, None
     if given.centre is not None:
         mask, centre = upload(device, given.mask), centre_array(device, given.centre)
@@ -271,7 +272,7 @@ def harmonics_inputs(device: Device, given: Inputs) -> Harmonics:
 
 
 def launch_harmonics(device: Device, work: Workspace, given: Inputs, *, add: bool = False, start: float = -7.0) -> Read:
-    """Launch both kernels, with gradients in arrays that are full of `start`."""
+    """Launch both kernels. start: value with which colours and gradients are filled before."""
     inputs = harmonics_inputs(device, given)
     shapes = ((inputs.count, 3), given.sh.shape, (inputs.count, 3))
     colours, d_sh, d_directions = (allocate(device, shape, np.float32) for shape in shapes)
@@ -301,7 +302,7 @@ def _twin_of_harmonics(given: Inputs, _: Arrays) -> dict[str, Wanted]:
     d_sh[:, :used] = basis[:, :, None] * d_colours[:, None]
     by_unit = np.einsum("nkd,nkc,nc->nd", slopes, sh, d_colours)
     d_directions = (by_unit - unit * (unit * by_unit).sum(axis=1, keepdims=True)) / length
-    # sums of up to 25 products of size 1, each off by 1e-7
+    # sums of up to 25 products near 1, each off by 1e-7
     wanted = {"colours": Wanted(colours, 4e-6, 1.0), "sh": Wanted(d_sh, 2e-6)}
     wanted["directions"] = Wanted(d_directions, 2e-6) if given.degree else exactly(np.zeros_like(d_directions))
     if given.centre is not None:

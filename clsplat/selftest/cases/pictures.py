@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-test of the stages that only rendered pictures need.
+"""Self-test of the stages that rendering needs and training does not.
 
-They are channels other than colour, slices by depth, holdouts, and cameras without an image plane.
+They are channels other than colour, deep pictures, holdouts, and cameras without an image plane.
 """
 
 from __future__ import annotations
@@ -44,26 +44,26 @@ from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.holdout import holdout, upload_held
 
 TESTED_FEATURES = Features.of(name for name in FEATURE_WIDTHS if name != "backward")
-"""All features but backward motion, which is motion to another camera, by the same function."""
+"""All features except backward motion, which uses the same function as motion."""
 MIN_NORMAL_COSINE = 1e-4
-"""Cosine between a normal and the direction to the camera below which rounding decides which side is seen."""
+"""Cosine of a normal and the direction to the camera, below which the visible side depends on rounding."""
 MIN_TRANSMITTANCE_MARGIN = 1e-5
-"""Margin like `harness.MARGIN`, as differences: of the transmittance to one half, of a slice's cut, and between the two
-largest weights."""
+"""Margin like `harness.MIN_DECISION_MARGIN`, but absolute: distance of the transmittance to one half and to the cuts of
+slices, and difference between the two largest weights."""
 MIN_MERGED_MARGIN = 1e-6
-"""Margin of merged slices: light is a sum of up to 16 products."""
+"""Margin of merged slices, where transmittance is a sum of up to 16 products."""
 DEEP_CASE_SLICES = 4
 """Slices per pixel."""
 DEEP_SLICE_PARTS = {"colour": slice(0, 3), "alpha": slice(3, 4), "depth": slice(4, 5)}
 """Fields of a slice that are compared."""
 
 MAX_GAUSSIANS_FOR_REFERENCE = 500
-"""The most Gaussians of a scene whose surround picture is compared. The reference evaluates each at every pixel, which
-takes a second for this number."""
+"""Maximum number of Gaussians in a scene whose picture along rays is compared. The reference evaluates each Gaussian at
+every pixel, which takes a second for this number."""
 
 
 def _after(camera: Camera) -> Camera:
-    """The camera that motion leads to: a step aside, up and back, with a longer lens."""
+    """The camera at the end of the motion: moved in x, y and z, with a longer focal length."""
     return replace(camera, translation=camera.translation + np.array([-0.0625, 0.03125, 0.125]), fx=camera.fx + 2.0)
 
 
@@ -98,7 +98,7 @@ def _channels(bench: CaseBench) -> StageOutcome:
     wanted = reference_channels.channels(splats, bench.frozen.gaussians, camera, _after(camera))
     means, whole = (cropped(planes, camera) for planes in outcome.arrays)
     sure = clear & (wanted.doubt > MIN_TRANSMITTANCE_MARGIN)
-    # at low opacity normals may cancel in the sum, and no digit of it is accurate
+    # at low alpha, normals may cancel in the sum so that no digit of it is accurate
     solid = sure & (frame.transmittance < 0.5)
     parts = {
         name: (means[solid, at : at + FEATURE_WIDTHS[name]], getattr(wanted, name).reshape(*solid.shape, -1)[solid])
@@ -128,12 +128,12 @@ def _deep(bench: CaseBench) -> StageOutcome:
 def random_deep_pictures(
     rng: Generator, size: tuple[int, int], count: int | None = None, bins: int | None = None
 ) -> Inputs:
-    """Pictures (P, bins, H, W, 5) whose pixels have 0 to `bins` slices, and weights (P, H, W) of the sum 1."""
+    """Pictures (P, bins, H, W, 5) with 0 to `bins` slices per pixel, and weights (P, H, W) whose sum is 1."""
     count, bins = count or int(rng.choice([1, 2, 3, DEEP_PICTURES])), bins or int(rng.choice([1, 4, 7, 40]))
     shape = (count, bins, size[1], size[0])
-    alpha = (rng.uniform(0.02, 0.95, shape) * min(1, 8 / bins)).astype(np.float32)  # so that light is left
+    alpha = (rng.uniform(0.02, 0.95, shape) * min(1, 8 / bins)).astype(np.float32)  # so that some light passes
     depth = np.cumsum(rng.uniform(0.01, 1, shape), axis=1).astype(np.float32)
-    depth[:, :, ::3] = np.round(depth[:, :, ::3]) + np.arange(bins, dtype=np.float32)[:, None, None]  # equal ones too
+    depth[:, :, ::3] = np.round(depth[:, :, ::3]) + np.arange(bins, dtype=np.float32)[:, None, None]  # equal depths too
     colours = rng.uniform(-0.2, 1.5, (*shape, 3)).astype(np.float32) * alpha[..., None]
     pictures = np.concatenate([colours, alpha[..., None], depth[..., None]], axis=4)
     slices = rng.integers(0, bins + 1, (count, *shape[2:]))
@@ -143,7 +143,7 @@ def random_deep_pictures(
 
 
 def _frozen_deep_pictures(bench: CaseBench) -> list[Inputs]:
-    """The sliced picture with itself, shifted and upside down: depths are equal, and there are too many slices."""
+    """The scene's deep picture twice, shifted, and upside down, with equal depths and too many slices."""
     planes = bench.slices.get()
     pictures = np.stack([planes, np.roll(planes, 3, axis=3), planes[:, :, ::-1], planes]).transpose(0, 1, 3, 4, 2)
     return [Inputs(pictures=pictures, weights=np.full((4, *planes.shape[2:]), 0.25, np.float32))]
@@ -168,7 +168,7 @@ def _twin_of_deep_merge(given: Inputs, _: Arrays) -> dict[str, Wanted]:
     pictures, weights = given.wide("pictures", "weights")
     twin = reference_deep_merge.deep_merge(pictures, weights)
     sure = np.broadcast_to(twin.margin > MIN_MERGED_MARGIN, twin.slices.shape[:3])
-    # a slice's colour is a sum of up to 16 x bins products, over light that has lost as many; its depth is one of them
+    # a slice's colour is a sum of up to 16 x bins products, times a transmittance of as many factors; depth is copied
     bounds = {"colour": 1e-5, "alpha": 1e-5, "depth": 0.0}
     return {name: Wanted(twin.slices[..., at], bounds[name], 1.0, sure) for name, at in DEEP_SLICE_PARTS.items()}
 
@@ -185,7 +185,7 @@ DEEP_MERGE_CASE = Case(
 
 
 def _holdout(bench: CaseBench) -> StageOutcome:
-    """Test a half-transparent surface and an absorbing volume in front of a wall, each in some of the pixels."""
+    """Test a half-transparent surface and an absorbing volume, each before a wall and in some of the pixels."""
     device, camera = bench.device, bench.camera
     shape = (camera.height, camera.width)
     at = np.arange(camera.height * camera.width).reshape(shape)
@@ -212,14 +212,14 @@ def _holdout(bench: CaseBench) -> StageOutcome:
 
 
 def _rays(bench: CaseBench) -> StageOutcome:
-    """Test projection to tangent planes, and a frame with a channel of it, for each projection that uses rays."""
+    """Test each camera model along rays: the projection to tangent planes, and a frame with the channel of depth."""
     models = [model for model in CAMERA_MODELS if model.along_rays and model.self_tested]
     return joined([_of_rays(bench, model.projection, _camera_of(bench.camera, model)) for model in models])
 
 
 def _camera_of(camera: Camera, model: CameraModel) -> Camera:
-    """The frozen scene's camera along rays, or one amid the scene, with Gaussians all around it, at the poles and on
-    the seam."""
+    """The frozen scene's camera along rays; or, for other models than a pinhole, a camera in the middle of the scene.
+    That one has Gaussians all around it, at the poles and on the seam too."""
     if model.is_pinhole:
         return camera.along_rays(by_rays=True)
     middle = np.array([0.25, -0.125, 4.0])
@@ -232,7 +232,7 @@ def _camera_of(camera: Camera, model: CameraModel) -> Camera:
 
 
 def _of_rays(bench: CaseBench, projection: str, camera: Camera) -> StageOutcome:
-    # with its own memory: later stages need the results of earlier ones
+    # a workspace of its own: later stages need the results in the bench's
     rasterizer, gaussians = Rasterizer(bench.device), bench.frozen.gaussians
 
     def launch() -> tuple[ForwardPass, Channels]:
@@ -251,7 +251,7 @@ def _of_rays(bench: CaseBench, projection: str, camera: Camera) -> StageOutcome:
     parts = _tangent_parts(tangents, shown, splats)
     if bench.model.count <= MAX_GAUSSIANS_FOR_REFERENCE:
         picture = every_pixel.render(gaussians, camera, bench.frozen.background.astype(np.float64))
-        clear = picture.margin > 3 * MIN_DECISION_MARGIN  # float32 directions are accurate to 1e-7, a pixel is 0.1
+        clear = picture.margin > 3 * MIN_DECISION_MARGIN  # float32 directions are off by 1e-7; a pixel is 0.1 wide
         solid = clear & (picture.alpha > 0.5)
         parts["image"] = (cropped(image, camera)[clear], picture.image[clear])
         parts["transmittance"] = (cropped(left, camera)[clear], 1 - picture.alpha[clear])
@@ -263,7 +263,7 @@ def _of_rays(bench: CaseBench, projection: str, camera: Camera) -> StageOutcome:
 
 
 def _tangent_parts(tangents: reference_rays.Tangents, shown: Any, splats: Array) -> dict[str, tuple[Array, Array]]:
-    """Columns of the visible Gaussians, and their values in float64."""
+    """Columns of the visible Gaussians' splats on the device, each with the reference's values."""
 
     def column(*names: str) -> Array:
         return splats[:, [RAY.index(name) for name in names]]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-test of the pose and lens stages: the gradients by a camera's pose and by its lens."""
+"""Self-test of the pose and lens stages: the gradients with respect to a camera's pose and lens."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SYNTHETIC_GRADIENT_GROUPS = ("means", "quaternions", "sh_dc")
 
 
 def _random(rng: Generator, count: int) -> Inputs:
-    """Gradients of any size of Gaussians, of which some are not seen: their gradients are no numbers."""
+    """Gradients of any magnitude. Those of Gaussians that are not visible are NaN."""
     scene, seen = random_scene(rng, count), np.arange(count) % 3 != 1
     size, by = 10 ** rng.uniform(-6, 3), {}
     for group in SYNTHETIC_GRADIENT_GROUPS:
@@ -64,7 +64,7 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     degree = given.gaussians.sh_degree
     wanted = reference(means, quaternions, sh, given.camera, degree, by)
     got |= {"turn": got["sums"][:3], "shift": got["sums"][3:]}
-    # terms of either sign: the sum of 4000 is 60 times a term, and off by roundings of partial sums
+    # terms of both signs: a sum of 4000 is about 60 times a term, and off by roundings of partial sums
     return {"turn": Wanted(wanted[:3], 2e-6), "shift": Wanted(wanted[3:], 2e-6)}
 
 
@@ -79,7 +79,7 @@ POSE_CASE = Case(
 
 
 def of_lens(bench: CaseBench) -> StageOutcome:
-    """Test the lens gradient from synthetic slots."""
+    """Test the gradient with respect to the lens, from synthetic slots."""
     device, model, made = bench.device, bench.model, MadeUpSlots.of(bench)
 
     def launch() -> DeviceArray:

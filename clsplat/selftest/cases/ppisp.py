@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs by several cameras: gains, mixes and vignettes, their gradient and Adam's step."""
+"""Case of photographs by several cameras: gains, mixes and vignettes, their gradient and their update by Adam."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ from clsplat.stages.ppisp import (
 
 PPISP_MIX_RATE_FACTOR = 0.125
 MAX_FALLOFF_OCTAVES, MAX_MIX = 16.0, 0.2
-"""Octaves at which the kernel holds a vignette, and the largest mix."""
+"""Limits in the kernel: octaves of a vignette, and absolute value of a mix."""
 IS_GAIN = np.arange(COLOUR_ENTRIES) < 3
 PPISP_PARTS = {"by gains": slice(3), "by mixes": slice(3, COLOUR_ENTRIES), "by lens": slice(COLOUR_ENTRIES, None)}
-"""Parts of the gradient by a photograph's entries and a lens's vignette."""
+"""Parts of the gradient: with respect to a photograph's gains, its mixes, and a lens's vignette."""
 
 
 def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
-    """Gains of 1/256 to 256, any mixes, vignettes to where they are held, principal points beside the picture."""
+    """Gains of 1/256 to 256, mixes and vignettes up to their limits, and principal points outside the picture too."""
     image, photograph = random_pictures(rng, size)
     by_image = random_gradient(rng, image)
     entries = np.concatenate([rng.uniform(-8, 8, (3, 3)), rng.uniform(-MAX_MIX, MAX_MIX, (3, 6))], axis=1)
@@ -65,7 +65,7 @@ def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
 
 
 def _frozen(bench: CaseBench) -> list[Inputs]:
-    """The frozen inputs: photograph 1 of three, taken with lens 1 of two."""
+    """Inputs with three photographs and two lenses; photograph 1 is used, taken with lens 1."""
     learnt = Inputs(
         taken=PhotoLens(photograph=1, lens=1, centre=(0.4375, 0.5625)),
         entries=evenly(46, (3, COLOUR_ENTRIES), -0.125, 0.125).astype(np.float32),
@@ -94,7 +94,7 @@ def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
 
 
 def _sums(columns: Float32) -> Float64:
-    """Gradient by the entries and the vignette from column sums."""
+    """The gradient with respect to a photograph's entries and a lens's vignette, from column sums."""
     factors = np.full(len(columns), np.log(2))
     factors[3:COLOUR_ENTRIES] = 1.0
     sums: Float64 = factors * columns.sum(axis=1, dtype=np.float64)
@@ -122,9 +122,9 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     after[:, 3:] = np.clip(after[:, 3:], -MAX_MIX, MAX_MIX)
     through, _, _ = appearance.step(lenses, of_lenses[0], of_lenses[1], by_lenses, *step, centred=False)
     return {
-        # some roundings for each octave of the vignette
+        # a few roundings for each octave of the vignette
         "target": Wanted(wanted, 1.2e-6, (largest * (0.4 + terms))[:, :, None], np.abs(octaves) < MAX_FALLOFF_OCTAVES),
-        # relative to the sum of the magnitudes: a few roundings of partial sums and of distances
+        # relative to the sum of magnitudes: a few roundings of partial sums and of distances
         **{name: Wanted(sums[part], 2e-6, sizes[part]) for name, part in PPISP_PARTS.items()},
         "entries": stepped(after, rates),
         "gains": Wanted(np.exp2(after), 1e-5, np.exp2(after), np.broadcast_to(IS_GAIN, after.shape)),

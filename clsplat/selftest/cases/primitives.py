@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Elementary functions of the kernels' own (shared/math.h, shared/lanes.h), both sorts, and prefix sums."""
+"""Cases of the kernels' own elementary functions (shared/math.h, shared/lanes.h), both sorts, and prefix sums."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PROBED: dict[str, tuple[float, float, Callable[[Array], Array]]] = {
     "sigmoid": (-80.0, 80.0, lambda x: 1 / (1 + np.exp(-x))),
     "exp2": (-8.5, 0.0, np.exp2),
 }
-"""Functions in the order of the probe's rows, each with the ends of its arguments."""
+"""Functions in the order of the probe's rows, each with the range of its arguments."""
 
 
 def _random_arguments(rng: Generator, count: int) -> Inputs:
@@ -41,8 +41,8 @@ def _launch_probe(device: Device, _: Workspace, given: Inputs) -> Read:
 def _twin_of_probe(given: Inputs, _: Arrays) -> dict[str, Wanted]:
     exact = {name: function(given.x[name].astype(np.float64)) for name, (_, _, function) in PROBED.items()}
     return {
-        "exp": Wanted(exact["exp"], 2.4e-7, exact["exp"]),  # 2 ulp: one of the polynomial, one of the reduction
-        "log2": Wanted(exact["log2"], 2.4e-7, np.maximum(np.abs(exact["log2"]), 1)),  # it goes through 0
+        "exp": Wanted(exact["exp"], 2.4e-7, exact["exp"]),  # 2 ulp: the polynomial and the range reduction
+        "log2": Wanted(exact["log2"], 2.4e-7, np.maximum(np.abs(exact["log2"]), 1)),  # its values pass through 0
         "sigmoid": Wanted(exact["sigmoid"], 3.6e-7, exact["sigmoid"]),  # 3 ulp
         "exp2": Wanted(exact["exp2"], 2.1e-7, exact["exp2"]),  # 0.8e-7 from the polynomial, the rest from rounding
     }
@@ -63,7 +63,7 @@ SCAN_SIZES = (
 
 
 def _random_keys(rng: Generator, count: int) -> Inputs:
-    """Keys of few bits, or of many, which begin at a base."""
+    """Keys of few bits or of many, and a base that is not larger than any of them."""
     bits = int(rng.choice([1, 4, 5, 11, 12, 13, 22, 23, 24, 26, 27, 31, 32, 32]))
     base = int(rng.choice([0, 0, 2**32 - 2**bits, rng.integers(2**32 - 2**bits + 1)]))
     values = (base + rng.integers(0, 2**bits, count)).astype(np.uint32)
@@ -71,7 +71,7 @@ def _random_keys(rng: Generator, count: int) -> Inputs:
 
 
 def _frozen_keys(bench: CaseBench) -> list[Inputs]:
-    """Keys for both sorts, as another scene may use the sort that this one does not."""
+    """Keys for both sorts, because a scene of another size may use the other sort."""
     sizes = ((400, 12), (3000, 20), (30_000 if bench.frozen.name == "crowd" else 5000, 32))
     found = [Inputs(keys=keys(51 + index, n, bits), bits=bits, base=0) for index, (n, bits) in enumerate(sizes)]
     found[0].base = None

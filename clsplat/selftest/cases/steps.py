@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of a training step: Adam, the noise of MCMC on means, and penalties on opacity and scale."""
+"""Cases of parts of a training step: Adam, the noise of MCMC on means, and penalties on opacity and scale."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from clsplat.stages.noise import highest_logit, noise
 from clsplat.stages.project import Screen, Slots, project, project_grad
 
 ADAM_ENDS = {"parameters": (-1.0, 1.0), "gradients": (-0.5, 0.5), "first": (-0.25, 0.25), "second": (0.0625, 0.5)}
-"""Arrays of a step, and where their values in the self-test end."""
+"""Arrays of a step, and the range of their values in the self-test."""
 ADAM_RATES = {name: 2.0**-power for power, name in enumerate(PARAMETER_GROUPS, 3)}
 
 
 def _random_step(rng: Generator, count: int) -> Inputs:
-    """Gradients of 1e-15 to 1e6, from moments of any size or none, all in view or some."""
+    """Gradients of 1e-15 to 1e6, with moments of any magnitude or zero. Adam updates all Gaussians or the visible."""
     step = int(rng.choice([1, 2, 10, 1000, 30_000, 10_000_000]))
     later, sparse = step > 1, bool(rng.random() < 0.5)
-    visible = (rng.random(count) < 0.5) | (np.arange(count) >= 2 * count // 3)  # whole vectors among them
+    visible = (rng.random(count) < 0.5) | (np.arange(count) >= 2 * count // 3)  # some vectors are visible as a whole
     visible[: count // 3] = False
     made: dict[str, Arrays] = {name: {} for name in ADAM_ENDS}
     for group, shape in group_shapes(count, int(rng.choice([4, 16]))).items():
@@ -73,7 +73,7 @@ def _frozen_steps(bench: CaseBench) -> list[Inputs]:
 
 
 def uploaded_groups(device: Device, arrays: Mapping[str, Arrays]) -> list[DeviceGaussians]:
-    """Arrays by group as on the device."""
+    """Arrays by group, uploaded to the device."""
     found = []
     for groups in arrays.values():
         count, rest, _ = groups["sh_rest"].shape
@@ -107,7 +107,7 @@ def _twin_of_adam(given: Inputs, got: Arrays) -> dict[str, Wanted]:
             found.append(values.ravel())
     parameters, first, second, steps, terms, rows = (np.concatenate(found) for found in made.values())
     wanted = {
-        # of a step: beta2 in float32 is 1e-8 off in 1 - beta2 = 1e-3, 1e-5 of a step
+        # beta2 in float32 is off by 1e-8, which is 1e-5 of 1 - beta2 = 1e-3 and so of a step
         "parameters": Wanted(parameters, 1e-4, steps + 1e-2 * np.abs(parameters), rows),
         "first": Wanted(first, 1e-6, terms, rows),  # a few roundings
         "second": Wanted(second, 3e-5, second, rows),
@@ -133,10 +133,10 @@ GEOMETRY_ARRAYS = ("quaternions", "log_scales", "opacity_logits")
 
 
 def _random_noise(rng: Generator, count: int) -> Inputs:
-    """Gaussians of nearly any opacity, needles and discs among them."""
+    """Gaussians of nearly any opacity and shape, including needles and discs."""
     explore = Exploration(amount=10 ** rng.uniform(-3, 3), key=step_key(0, int(rng.integers(1 << 30))))
     logits = rng.uniform(-9, 0, count).astype(np.float32)
-    logits[0] = -7.0  # one moves
+    logits[0] = -7.0  # at least one Gaussian moves
     return Inputs(
         explore=explore,
         quaternions=(rng.standard_normal((count, 4)) * 10 ** rng.uniform(-3, 3, (count, 1))).astype(np.float32),
@@ -160,7 +160,7 @@ def _frozen_noise(bench: CaseBench) -> list[Inputs]:
 
 def _launch_noise(device: Device, _: Workspace, given: Inputs) -> Read:
     count = len(given.opacity_logits)
-    means, sh = np.zeros((count, 3), np.float32), np.zeros((count, 1, 3), np.float32)  # so that no digit is lost
+    means, sh = np.zeros((count, 3), np.float32), np.zeros((count, 1, 3), np.float32)  # no rounding in sums
     arrays = {name: getattr(given, name) for name in GEOMETRY_ARRAYS}
     held = upload_gaussians(device, Gaussians(means=means, sh=sh, **arrays))
     noise(device, given.explore, held, 0, fresh_readback(device))
@@ -174,7 +174,7 @@ def _twin_of_noise(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     got |= {"moves": got["means"][~stays], "means of the opaque": got["means"][stays]}
     size = np.abs(wanted) + 0.1 * np.abs(wanted).max(initial=0)
     return {
-        "means": Wanted(wanted, 5e-6),  # of 100 (o - dead), up to 16, a digit of o is 1e-6 of the weight
+        "means": Wanted(wanted, 5e-6),  # an ulp of o changes 100 (o - dead), up to 16, by 1e-6
         "moves": Wanted(wanted[~stays], 1e-4, size[~stays]),
         "means of the opaque": exactly(np.zeros_like(got["means of the opaque"])),
         **{name: exactly(getattr(given, name)) for name in GEOMETRY_ARRAYS},
@@ -192,7 +192,7 @@ NOISE_CASE = Case(
 
 
 def random_scene(rng: Generator, count: int) -> Inputs:
-    """Gaussians with SH of degree 1 before a camera, and some behind it."""
+    """Gaussians with SH of degree 1, in front of a camera and some behind it."""
     rotation = Rotation.random(random_state=rng).as_matrix()
     camera = Camera(70, 50, 60.0, 65.0, 30.0, 27.0, rotation, rng.normal(size=3))
     depths = rng.uniform(1.0, 6.0, count) * np.where(np.arange(count) % 5 == 3, -1, 1)
@@ -207,7 +207,7 @@ def random_scene(rng: Generator, count: int) -> Inputs:
 
 
 def _launch_penalties(device: Device, work: Workspace, given: Inputs) -> Read:
-    """The gradient of a loss that is 0."""
+    """Compute the gradient of the penalties alone: that of the loss is zero."""
     model, camera_array = upload_gaussians(device, given.gaussians), upload(device, pack_camera(given.camera))
     projected = project(device, work, model, given.camera, camera_array)
     gradients = allocate_gaussians(device, model.count, model.coefficients, zero=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every case by name, and every stage of the self-test."""
+"""All cases by name, and all stages of the self-test."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ CASES: dict[str, Case] = {
     "statistics": STATISTICS_CASE,
     "marks": MARKS_CASE,
 }
-"""Cases that stand by themselves. One with inputs from a frozen scene is the self-test's stage of that name."""
+"""Cases that do not need results of other stages. Those with inputs from a frozen scene are self-test stages."""
 
 OUTCOMES_BY_STAGE: dict[str, Callable[[CaseBench], StageOutcome]] = {
     **{name: case.outcome for name, case in CASES.items() if case.frozen is not None},

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""gsplat's names for programs that import it: names that clsplat replaces, and names that it refuses."""
+"""gsplat's names, for programs that import gsplat: functions that clsplat replaces, and functions that it refuses."""

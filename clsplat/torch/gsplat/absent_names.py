@@ -37,9 +37,9 @@ CUDA_ONLY_NAMES = (
     "spherical_harmonics_l1_plus",
     "world_to_cam",
 )
-"""Functions that gsplat implements only in CUDA and that clsplat lacks."""
+"""Functions that gsplat implements only in CUDA and that clsplat does not have."""
 CUDA_ONLY_MODULES = ("gsplat.cuda._wrapper", "gsplat.rendering", "gsplat.losses_fused")
-"""gsplat's modules that define these functions."""
+"""Modules of gsplat in which these functions are defined."""
 PURE_PYTHON_NAMES = (
     "PngCompression",
     "Strategy",
@@ -51,7 +51,7 @@ PURE_PYTHON_NAMES = (
     "rasterization_2dgs_inria_wrapper",
     "rasterization_inria_wrapper",
 )
-"""Names of gsplat's Python code that needs no CUDA. They are not replaced if gsplat is installed."""
+"""Names in gsplat's Python code that need no CUDA. They are not replaced if gsplat is installed."""
 
 
 def what_is_absent(name: str) -> str:

@@ -41,7 +41,7 @@ REPLACEMENTS_BY_MODULE: dict[str, tuple[Any, ...]] = {
     "gsplat.relocation": (compute_relocation,),
     "gsplat.rendering": (rasterization,),
 }
-"""clsplat's functions and classes, keyed by the gsplat module that defines the originals."""
+"""clsplat's functions and classes, by the gsplat module that defines the originals."""
 GSPLAT_PACKAGES = ("gsplat", "gsplat.cuda", "gsplat.optimizers")
 TWO_RADII_SINCE_VERSION = (1, 5)
 """The first version of gsplat in which a splat has two radii."""
@@ -52,13 +52,12 @@ FUNCTIONS_CHANGED_IN_1_5 = (fully_fused_projection, isect_tiles)
 def install_as_gsplat() -> list[str]:
     """Let a program that imports gsplat run on clsplat.
 
-    If gsplat is installed, its functions are replaced in all imported modules, gsplat's and the program's. Functions
-    that gsplat has only in CUDA, and clsplat does not have, then raise an InputError when they are called. gsplat's own
-    Python code stays. For versions before 1.5, `meta["radii"]` of `rasterization` has one radius a splat, as their
-    strategies expect.
+    If gsplat is installed, its functions are replaced in all imported modules, gsplat's and the program's. CUDA
+    functions that clsplat does not have raise InputError when they are called. gsplat's Python code is not replaced.
+    For versions before 1.5, `meta["radii"]` of `rasterization` has one radius per splat, as their strategies expect.
 
-    If gsplat is not installed, a module `gsplat` with clsplat's names is created. It
-    has no strategies, and gsplat's other names in it raise an error. A second call does nothing.
+    If gsplat is not installed, a module `gsplat` with clsplat's names is created. It has no strategies, and gsplat's
+    other names in it raise an error. A second call does nothing.
 
     Returns
     -------
@@ -116,7 +115,8 @@ def strategy(name: str) -> Any:
 
 
 def _of_gsplat(place: str, name: str) -> Any:
-    """Handle a name that the replacement module `place` lacks: a refusing function, a gsplat strategy, or an error."""
+    """The attribute `name`, which the replacement module `place` lacks: a function that raises InputError, or a gsplat
+    strategy. Raises AttributeError for other names, and ImportError if gsplat is needed and not installed."""
     if name in absent_names.CUDA_ONLY_NAMES:
         return absent_names.refuses(name)
     if place == "gsplat" and name in {"DefaultStrategy", "MCMCStrategy"}:

@@ -29,7 +29,7 @@ static inline float bend_of(float t, CAMERA_SPACE float *camera) {
 // The derivative of p = 1 / slope.
 #define SLOPE_OF_INVERSE(theta, p, camera) (-bend_of(theta, camera) * (p) * (p))
 
-// The angle whose image radius is `radius`, by Newton's method; the host makes sure that it converges.
+// The angle whose image radius is `radius`, by Newton's method. The host has checked that this converges.
 static inline floatL angle_of(floatL radius, CAMERA_SPACE float *camera) {
   const floatL fold = (floatL)(FARTHEST_ANGLE(camera));
   floatL t = radius < fold ? radius : fold;

@@ -1,7 +1,7 @@
 // Functions that all camera models with RAYS share, included before their headers. Equation numbers refer to
 // docs/cameras.md.
 
-// sin(x) for |x| up to slightly over a quarter turn, relative error 2e-8: minimax in x^2.
+// sin(x) for |x| up to slightly over 90 degrees, relative error 2e-8: minimax in x^2.
 static inline floatL sinL(floatL x) {
   const floatL t = x * x;
   floatL p = fmaL(t, (floatL)(2.601887672e-06f), (floatL)(-1.980741217e-04f));
@@ -13,9 +13,9 @@ static inline floatL sinL(floatL x) {
 static inline floatL absL(floatL x) { return x < 0.0f ? -x : x; }
 
 #ifdef NEEDS_TANGENTS
-// (9), (10), (19), (30) of an image whose radius depends on the angle from the axis alone. f: the direction; across:
-// its distance from the axis; along / slope: radians that fx pixels cover away from the axis; around: radians that fx
-// pixels cover around it.
+// (9), (10), (19), (30) for images whose radius depends only on the angle from the axis. f: the direction; across: its
+// distance from the axis; along / slope: radians that fx pixels cover away from the axis; around: radians that they
+// cover around it.
 static inline void tangent_around_axis(const float *f, float across, float along, float slope, float around,
                                        __constant float *camera, Tangent *t) {
   const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];
@@ -32,8 +32,8 @@ static inline void tangent_around_axis(const float *f, float across, float along
   t->k[3] = c * around / fy;
 }
 
-// (27), (28) of such an image (its radius depends on the angle alone). r: the direction's distance from the axis; p, q:
-// as along / slope and around above; dp, dq: their derivatives with respect to the angle.
+// (27), (28) for such an image. r: the direction's distance from the axis; p, q: along / slope and around, as above;
+// dp, dq: their derivatives with respect to the angle.
 static inline void low_pass_around_axis(const float *f, float r, float p, float q, float dp, float dq,
                                         __constant float *camera, const float *g, float *by) {
   const float wide = 1.0f / (camera[CAMERA_FX] * camera[CAMERA_FX]), z = f[2];
@@ -60,7 +60,7 @@ static inline InCamera in_camera(__constant float *camera, float x, float y, flo
   return p;
 }
 
-// A mean in the camera's axes before its motion and after, and the difference.
+// A mean in the camera's axes before and after the motion, and the difference.
 typedef struct {
   float p[3], q[3], d[3];
 } Moved;

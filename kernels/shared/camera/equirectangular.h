@@ -1,10 +1,10 @@
 // Equirectangular: a panorama of longitude and latitude. Equation numbers refer to docs/cameras.md.
 #define WRAPS
 
-// (5): the unit direction (x, y, z) of pixels (px, py); all 0 where a pixel has none.
+// (5): the unit direction (x, y, z) of pixels (px, py); 0 if there is none.
 static inline void ray_of(floatL px, floatL py, CAMERA_SPACE float *camera, floatL *x, floatL *y, floatL *z) {
   const floatL a = (px - camera[CAMERA_CX]) / camera[CAMERA_FX], b = (py - camera[CAMERA_CY]) / camera[CAMERA_FY];
-  // longitude within half a turn of the axis
+  // longitude within 180 degrees of the axis
   const floatL turns = floorL(fmaL(a, (floatL)(0.5f / HALF_TURN), (floatL)(0.5f)));
   const floatL longitude = fmaL(turns, (floatL)(-2.0f * HALF_TURN), a);
   const floatL away = absL(longitude), from_side = QUARTER_TURN - away;
@@ -31,14 +31,14 @@ static inline void tangent_of(const float *f, __constant float *camera, Tangent 
   t->e2[0] = -f[1] * s;
   t->e2[1] = level;
   t->e2[2] = -f[1] * c;
-  const float least = 0.5f / fy; // half a row from a pole: at the pole itself a pixel is a point
+  const float least = 0.5f / fy; // at least half a row from a pole, where a pixel is a point
   t->k[0] = (level > least ? level : least) / fx;
   t->k[1] = t->k[2] = 0.0f;
   t->k[3] = 1.0f / fy;
 }
 
-// (26): the gradient, through the low-pass part of the covariance, with respect to a step of the mean's direction along
-// e1 and e2. g: the gradient with respect to the covariance's xx, xy (counted once) and yy.
+// (26): the gradient through the low-pass part of the covariance, with respect to a move of the mean's direction along
+// e1 and e2. g: the gradient with respect to the covariance's xx, xy (as one variable) and yy.
 static inline void low_pass_gradient(const float *f, __constant float *camera, const float *g, float *by) {
   const float wide = 1.0f / (camera[CAMERA_FX] * camera[CAMERA_FX]);
   const float level = sqrt(fma1(f[0], f[0], f[2] * f[2])), least = 0.5f / camera[CAMERA_FY];
@@ -75,8 +75,8 @@ static inline void box_of(const float *f, float reach, __constant float *camera,
 #endif
 
 #ifdef NEEDS_MOTION
-// Computes the change of the angles from the change of the coordinates, (74) of docs/channels.md, because the
-// difference of two angles would round small motions away.
+// (74) of docs/channels.md: the change of the angles, computed from the change of the coordinates. A difference of two
+// angles would lose small motions by rounding.
 static inline void motion_of(__constant float *camera, __constant float *after, float x, float y, float z,
                              __global const float *to, __global const float *splat, __global float *motion) {
   Moved m;
@@ -88,7 +88,7 @@ static inline void motion_of(__constant float *camera, __constant float *after, 
   const float grown = sum > 0.0f ? fma1(d[0], p[0] + q[0], d[2] * (p[2] + q[2])) / sum : 0.0f;
   const float turned = signed_atan(fma1(d[0], p[2], -(d[2] * p[0])), fma1(p[0], q[0], p[2] * q[2]));
   const float risen = signed_atan(fma1(d[1], level, -(grown * p[1])), fma1(p[1], q[1], level * level_there));
-  // the longitude nearest to the frame's centre, where the mean is shown, (6)
+  // (6): the longitude nearest to the middle of the frame, at which the mean is drawn
   const float middle = 0.5f * (camera[CAMERA_XMIN] + camera[CAMERA_XMAX]), longitude = signed_atan(p[0], p[2]);
   const float turns = floorL(fma1(longitude - middle, 0.5f / HALF_TURN, 0.5f));
   const float a = fma1(turns, -2.0f * HALF_TURN, longitude), b = signed_atan(p[1], level);
@@ -98,7 +98,7 @@ static inline void motion_of(__constant float *camera, __constant float *after, 
 #endif
 
 #ifdef NEEDS_PIXEL_WIDTH
-// A pixel's width at a point of the camera's frame, in world units; 1e30 if the camera does not see it.
+// The width of a pixel at a point in the camera's axes, in world units; 1e30 if the camera does not see the point.
 static inline float pixel_width(float x, float y, float z, CAMERA_SPACE float *camera) {
   const float distance = sqrt(fma1(x, x, fma1(y, y, z * z)));
   return distance > camera[CAMERA_NEAR] ? distance / fmax(camera[CAMERA_FX], camera[CAMERA_FY]) : 1e30f;

@@ -13,7 +13,7 @@
 #define is_shown(f, camera) 1
 #endif
 
-// (4): the unit direction (x, y, z) of pixels (px, py); all 0 where a pixel has none.
+// (4): the unit direction (x, y, z) of pixels (px, py); 0 if there is none.
 static inline void ray_of(floatL px, floatL py, CAMERA_SPACE float *camera, floatL *x, floatL *y, floatL *z) {
   const floatL a = (px - camera[CAMERA_CX]) / camera[CAMERA_FX], b = (py - camera[CAMERA_CY]) / camera[CAMERA_FY];
   const floatL radius = sqrt(fmaL(a, a, b * b));
@@ -39,15 +39,15 @@ static inline void tangent_of(const float *f, __constant float *camera, Tangent 
   tangent_around_axis(f, across, 1.0f, slope_of(theta, camera), around, camera, t);
 }
 
-// (27), (28): the gradient, through the low-pass part of the covariance, with respect to a step of the mean's direction
-// along e1 and e2. g: the gradient with respect to the covariance's xx, xy (counted once) and yy.
+// (27), (28): the gradient through the low-pass part of the covariance, with respect to a move of the mean's direction
+// along e1 and e2. g: the gradient with respect to the covariance's xx, xy (as one variable) and yy.
 static inline void low_pass_gradient(const float *f, __constant float *camera, const float *g, float *by) {
   const float r = sqrt(fma1(f[0], f[0], f[1] * f[1])), z = f[2], theta = half_atan(r, z);
   const float radius = radius_of(theta, camera), slope = slope_of(theta, camera);
   const float p = 1.0f / slope, dp = SLOPE_OF_INVERSE(theta, p, camera);
   const float ratio = theta > 1e-6f ? r / radius : 1.0f, least = 0.5f / (HALF_TURN * camera[CAMERA_FX]);
   const float q = ratio > least ? ratio : least;
-  // near the axis, the series of the difference: sin(t) / D(t) is 1 - (1/6 + k1) t^2
+  // near the axis by a series: sin(t) / D(t) is 1 - (1/6 + k1) t^2
   const float near_axis = theta * (-1.0f / 3.0f - SERIES(camera));
   const float off_axis = fma1(-q, slope, z) / radius;
   const float dq = ratio > least ? (theta > 0.02f ? off_axis : near_axis) : 0.0f;
@@ -69,7 +69,7 @@ static inline void box_of(const float *f, float reach, __constant float *camera,
   const float outer = radius_of(far, camera);
   float middle_x = 0.0f, middle_y = 0.0f, half_x = outer, half_y = outer;
   if (sine < 0.999f * across && theta > cap && theta + cap < FARTHEST_ANGLE(camera)) {
-    // part of a ring around the axis, in a rectangle along the mean's direction
+    // a part of a ring around the axis, bounded by a rectangle along the mean's direction
     const float ratio = sine / across, cosine = sqrt(1.0f - ratio * ratio);
     const float c = f[0] / across, s = f[1] / across;
     const float near = radius_of(theta - cap, camera) * cosine;
@@ -87,8 +87,8 @@ static inline void box_of(const float *f, float reach, __constant float *camera,
 #endif
 
 #ifdef NEEDS_MOTION
-// Computes the change of the angles from the change of the coordinates, (75) of docs/channels.md, because the
-// difference of two angles would round small motions away.
+// (75) of docs/channels.md: the change of the angles, computed from the change of the coordinates. A difference of two
+// angles would lose small motions by rounding.
 static inline void motion_of(__constant float *camera, __constant float *after, float x, float y, float z,
                              __global const float *to, __global const float *splat, __global float *motion) {
   Moved m;
@@ -111,8 +111,8 @@ static inline void motion_of(__constant float *camera, __constant float *after, 
 #endif
 
 #ifdef NEEDS_PIXEL_WIDTH
-// A pixel's width at a point of the camera's frame, in world units: the smaller of the widths along the radius and
-// around the axis. 1e30 if the camera does not see it.
+// The width of a pixel at a point in the camera's axes, in world units: along the radius or around the axis, whichever
+// is smaller. 1e30 if the camera does not see the point.
 static inline float pixel_width(float x, float y, float z, CAMERA_SPACE float *camera) {
   const float distance = sqrt(fma1(x, x, fma1(y, y, z * z)));
   const float width = distance / fmax(camera[CAMERA_FX], camera[CAMERA_FY]);

@@ -2,7 +2,7 @@
 #define ON_PLANE
 #define PARALLEL_RAYS
 
-// The quantity in which the image position is linear, and its low part.
+// RATIO: the image position is a linear function of this. ratio_rest: its low part.
 #define RATIO(x, z) (x)
 #define ratio_rest(ratio, x, x_low, z, z_low) (x_low)
 

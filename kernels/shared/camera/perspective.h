@@ -2,12 +2,12 @@
 // docs/gradients.md.
 #define ON_PLANE
 
-// The quantity in which the image position is linear, and its low part.
+// RATIO: the image position is a linear function of this. ratio_rest: its low part.
 #define RATIO(x, z) ((x) / (z))
 #define ratio_rest slope_rest
 
 #ifdef NEEDS_PROJECTION
-// The low part of the x/z that the Jacobian uses; where x/z is clamped, the low part of the limit.
+// The low part of x/z as in the Jacobian: where x/z is clamped, the low part of the limit.
 static inline floatL clamped_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low, float low,
                                   float low_rest, float high, float high_rest) {
   const floatL rest = ratio_rest(ratio, x, x_low, z, z_low);
@@ -23,11 +23,11 @@ static inline void jacobian_row(floatL x, floatL z, float focal, float low, floa
 #endif
 
 #ifdef NEEDS_GRADIENT
-// (52): the gradient with respect to the mean in the camera's frame, through the image position and through J. Where
-// the ratio is clamped, J depends on z alone. at: the mean; limited: rx, ry; jx, jy: as in (4); d_mx, d_my: the
-// gradient with respect to the image position; by_j02, by_j12: with respect to the Jacobian's last column, divided by
-// -jx and -jy; d_size: with respect to the log of the size. Fills d[3], and beyond[2] of (145), where a clamped ratio
-// is a fixed image position.
+// (52): the gradient with respect to the mean in the camera's axes, through the image position and through J. Where
+// the ratio is clamped, J depends only on z. at: the mean; limited: rx, ry; jx, jy: as in (4); d_mx, d_my: the gradient
+// with respect to the image position; by_j02, by_j12: with respect to the Jacobian's last column, divided by -jx and
+// -jy; d_size: with respect to the log of the size. Fills d[3]; and beyond[2] of (145), for a clamped ratio, which is a
+// fixed image position.
 static inline void mean_gradient(const floatL *at, const floatL *limited, floatL jx, floatL jy, floatL d_mx,
                                  floatL d_my, floatL by_j02, floatL by_j12, floatL d_size, floatL *d, floatL *beyond) {
   const floatL z = at[2], rx = at[0] / z, ry = at[1] / z;

@@ -1,8 +1,8 @@
-// Perspective along rays: a pinhole camera that projects each Gaussian onto its tangent plane, as a fisheye does.
+// Perspective along rays: a pinhole camera for which each Gaussian is projected to its tangent plane, as for a fisheye.
 // Equation numbers refer to docs/cameras.md.
 #define ON_PLANE
 
-// The quantity in which the image position is linear, and its low part.
+// RATIO: the image position is a linear function of this. ratio_rest: its low part.
 #define RATIO(x, z) ((x) / (z))
 #define ratio_rest slope_rest
 
@@ -25,8 +25,8 @@ static inline void tangent_of(const float *f, __constant float *camera, Tangent 
   tangent_around_axis(f, across, f[2] * f[2], 1.0f, f[2], camera, t);
 }
 
-// (31): the gradient, through the low-pass part of the covariance, with respect to a step of the mean's direction along
-// e1 and e2. g: the gradient with respect to the covariance's xx, xy (counted once) and yy.
+// (31): the gradient through the low-pass part of the covariance, with respect to a move of the mean's direction along
+// e1 and e2. g: the gradient with respect to the covariance's xx, xy (as one variable) and yy.
 static inline void low_pass_gradient(const float *f, __constant float *camera, const float *g, float *by) {
   const float r = sqrt(fma1(f[0], f[0], f[1] * f[1])), z = f[2];
   low_pass_around_axis(f, r, z * z, z, -2.0f * (z * r), -r, camera, g, by);
@@ -35,11 +35,10 @@ static inline void low_pass_gradient(const float *f, __constant float *camera, c
 
 #ifdef NEEDS_BOXES
 #define NO_END 1e15f
-#define LEAST_AHEAD 1e-4f // least z of a unit direction; with less it is outside every picture
+#define LEAST_AHEAD 1e-4f // minimum z of a unit direction; with less it is outside every picture
 
-// (32), for one axis: the range on the image, in focal lengths, of the directions within an angle of a given direction.
-// `sine`: the sine of that angle; along, z: the given direction's coordinates. An end that crosses the camera's plane
-// is unbounded.
+// (32), for one axis: the range on the image, in focal lengths, of all directions within an angle of a given direction.
+// sine: the sine of the angle; along, z: coordinates of the given direction. An end beyond the plane z = 0 is infinite.
 static inline void side_of(float along, float z, float sine, float *low, float *high) {
   const float level = sqrt(fma1(along, along, z * z));
   *low = -NO_END;
