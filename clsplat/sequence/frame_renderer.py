@@ -13,13 +13,16 @@ from clsplat.config.channels import light_and_rest
 from clsplat.config.pictures import DEEP_STRIP_FLOATS
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import open_device
-from clsplat.errors import DriverError
+from clsplat.errors import DriverError, warn
 from clsplat.frame.deep_exr import write_deep
 from clsplat.frame.draw import Planes
+from clsplat.frame.holdout import Cut
+from clsplat.frame.lens import INTERPOLATION_MARGIN_PX
 from clsplat.frame.mattes import Matte
 from clsplat.frame.pipeline import FramePipeline, FrameRequest
 from clsplat.frame.strips import check_parts, in_strips, strip_rows, write_in_strips
 from clsplat.gaussians import Gaussians
+from clsplat.images.holdouts import read_holdout
 from clsplat.layouts.columns import TILE
 from clsplat.models.edit import exposed
 from clsplat.models.instances import Ensemble, kind_of
@@ -27,7 +30,6 @@ from clsplat.models.series import ModelSeries
 from clsplat.rendering.renderer import Renderer
 from clsplat.selftest.driver_check import require
 from clsplat.selftest.result import CHANNEL_STAGES, DEEP_STAGES, FORWARD_STAGES, HOLDOUT_STAGES, RAY_STAGES
-from clsplat.sequence.holdout_files import cut_of
 from clsplat.sequence.task import (
     NOT_MEASURED,
     Measured,
@@ -39,6 +41,8 @@ from clsplat.sequence.task import (
     lens_of,
     picture_camera,
     sampling_of,
+    straight_camera,
+    warp_of,
 )
 from clsplat.stages.holdout import HELD_PIXEL_BYTES, held_bytes
 
@@ -207,6 +211,35 @@ class FrameRenderer:
         floats = self._objects * camera.width * framing.supersample**2  # for the planes of all objects
         most = DEEP_STRIP_FLOATS // max(floats, 1)
         return rows if most >= camera.height else min(rows, max(most // TILE, 1) * TILE)
+
+
+def cut_of(task: Task, options: RenderOptions) -> Cut | None:
+    """The surfaces of a frame's holdout, None if it has none. Raises InputError.
+
+    Warns about surfaces that end at the frame's edge if the picture extends beyond it.
+    """
+    if task.holdout is None or options.holdout is None:
+        return None
+    how, pictures, size = options.holdout, options.pictures, (task.camera.width, task.camera.height)
+    holdout = read_holdout(task.holdout, size, how.channel, inverse=how.depths == "inverse")
+    if how.depths == "ray":
+        height, width = holdout.surfaces.counts.shape
+        cosines = task.camera.cropped(holdout.x, holdout.y, width, height).cosines()
+        holdout = replace(holdout, surfaces=holdout.surfaces if cosines is None else holdout.surfaces.scaled(cosines))
+    cut, bent = Cut(holdout), warp_of(task, pictures) is not None
+    if _reaches_out(straight_camera(task, pictures), INTERPOLATION_MARGIN_PX + 1 if bent else 0) and cut.goes_on:
+        where = "where the warped picture extends beyond it" if bent else "in the overscan"
+        warn(f"{task.holdout}: ends with the frame, and nothing is held out {where}; render the CG with overscan")
+    return cut
+
+
+def _reaches_out(camera: Camera, margin: int) -> bool:
+    """True if the picture has pixels more than `margin` pixels outside its frame."""
+    window = camera.window
+    if window is None:
+        return False
+    ends = (window.x + camera.width - window.width, window.y + camera.height - window.height)
+    return max(-window.x, -window.y, *ends) > margin
 
 
 def open_frame_renderer(

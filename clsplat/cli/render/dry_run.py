@@ -13,11 +13,9 @@ from clsplat.config.channels import light_and_rest
 from clsplat.config.pictures import DEFAULT_VIDEO_FPS
 from clsplat.device.context import open_device
 from clsplat.errors import amount, examples
-from clsplat.frame.deep import deep_rows
 from clsplat.frame.draw import feature_floats, on_tiles
 from clsplat.frame.samples import finer
-from clsplat.frame.strips import strip_rows
-from clsplat.frame.window import crop
+from clsplat.frame.strips import deep_rows, strip_rows
 from clsplat.images.video import rate_of
 from clsplat.rendering.memory_needs import plan_frame
 from clsplat.rendering.memory_plan import Plan
@@ -138,7 +136,7 @@ def _device_plan(job: Job, selector: str | None) -> DevicePlan:
         else:
             planes = HELD_PIXEL_BYTES if options.holdout is not None else 0
             rows = strip_rows(device, camera, options.channels, framing, planes)
-        strip = crop(camera, 0, 0, camera.width, rows) if rows < camera.height else camera
+        strip = camera.cropped(0, 0, camera.width, rows) if rows < camera.height else camera
         drawn = [(strip, features)]
         if framing.supersample > 1 and light_and_rest(names)[0]:
             drawn.append((finer(strip, framing), feature_floats(light_and_rest(names)[0])))
