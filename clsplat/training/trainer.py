@@ -111,7 +111,7 @@ class Trainer:
         self.sizes = by_doubling(config.warmup)
         self.background: NDArray[np.float32] = np.zeros(3, np.float32)
         self.given = initial
-        self.monitor = NonFiniteMonitor(self.rasterizer.readback, [view.name for view in self.views])
+        self.monitor = NonFiniteMonitor(self.rasterizer.readback)
         self.pending = SpeculativeSteps(device, self.monitor, self._begin_again)
         self.pending.on &= self.batch is None and not config.refines  # a batch reads losses, and refinement gradients
         self._start()
@@ -337,6 +337,7 @@ class Trainer:
             self.photographs.kept(view, factor),
             area=full.width * full.height / (width * height),
             place=place,
+            name=self.views[view].name,
         )
 
     def _view_gradients(self, inputs: ViewInputs) -> DeviceGaussians | None:
