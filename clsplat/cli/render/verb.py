@@ -21,10 +21,6 @@ def run(verb: RenderVerb, services: Services) -> int:
 
     request = checked(verb)
     job = job_of(request)
-    if verb.dry_run:
-        from clsplat.cli.render.dry_run import dry_run
-
-        return dry_run(job)
     renderers = [
         services.open_frame_renderer(
             job.cast.drawn,
@@ -34,9 +30,14 @@ def run(verb: RenderVerb, services: Services) -> int:
             memory_limit=request.memory_limit,
             profile=verb.profile,
             mattes=job.mattes,
+            tested=not verb.dry_run,
         )
         for selector in (() if verb.on_farm else request.devices)
     ]
+    if verb.dry_run:
+        from clsplat.cli.render.dry_run import dry_run
+
+        return dry_run(job, [renderer.memory_plan(job.tasks) for renderer in renderers])
     for renderer in renderers:
         renderer.check(job.tasks)
     with terminable():  # installed again: pycolmap and kernel compilers have installed handlers of their own
