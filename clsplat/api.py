@@ -19,7 +19,7 @@ from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
 from clsplat.training.host_memory import HostMemory
 from clsplat.training.loop import Between, StepReport, TrainingSession
-from clsplat.training.preparation import begin, checked
+from clsplat.training.preparation import begin, check_scene, settings_of
 from clsplat.training.trainer import Trainer
 
 
@@ -99,7 +99,8 @@ def train(
     -----
     Kerbl et al. 2023; docs/gradients.md has the equations, docs/decisions/ the changes to the method.
     """
-    config = checked(scene, config, run, resume=resume)
+    check_scene(scene)
+    config = settings_of(config, run, resume=resume)
     with nullcontext() if run is None else locked(run.path, "train"):
         first, *further = _opened(device, parse_bytes(max_device_mem))
         config = config.on_devices(1 + len(further), explicit=resume)

@@ -340,6 +340,21 @@ class Camera:
         fx, fy, cy = self.fx * scale, self.fy * scale, self.cy * scale
         return replace(self, width=width, height=height, fx=fx, fy=fy, cx=middle, cy=cy)
 
+    def cropped(self, x: int, y: int, width: int, height: int) -> Camera:
+        """The part of the picture that begins at its pixel (x, y). It may extend beyond the picture.
+
+        The part is a window of the frame, and its pixels are bit-identical to the frame's there (docs/pictures.md).
+        """
+        window = self.window or Window(0, 0, self.width, self.height)
+        return replace(self, width=width, height=height, window=replace(window, x=window.x + x, y=window.y + y))
+
+    def reframed(self, like: Camera) -> Camera:
+        """This camera of a whole frame, with the size and window of another, whose frame may be larger or smaller."""
+        frame = like.window or like
+        sized = self if (self.width, self.height) == (frame.width, frame.height) else None
+        sized = sized or self.resized(frame.width, frame.height)
+        return replace(sized, width=like.width, height=like.height, window=like.window)
+
     def resized(self, width: int, height: int) -> Camera:
         """The same view on another pixel grid. Since pixel centres are at +0.5, this is a pure scaling.
 

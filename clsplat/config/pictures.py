@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from functools import cache
 from math import inf
 from typing import Literal
 
@@ -191,6 +192,17 @@ class SamplingConfig:
         return self.shutter[1] > self.shutter[0]
 
     @property
+    def sample_times(self) -> list[float]:
+        """The time of each sample, in frames from the frame: spread over the open shutter, or its middle without motion
+        blur."""
+        if not self.on or self.samples == 1:
+            return [self.middle]
+        if not self.moves:
+            return [self.middle] * self.samples
+        begin, end = self.shutter
+        return [begin + (end - begin) * time for time in stratified_times(self.samples)]
+
+    @property
     def has_lens(self) -> bool:
         """True if the lens has a size, so that there is depth of field."""
         return bool(self.aperture) or self.f_stop is not None
@@ -204,6 +216,19 @@ class SamplingConfig:
     def pictures(self) -> int:
         """Number of pictures that are averaged for a frame."""
         return self.samples if self.on else 1
+
+
+@cache
+def stratified_times(count: int) -> tuple[float, ...]:
+    """`count` times in (0, 1), one per interval of equal length.
+
+    Their order, the ranks of van der Corput's sequence, is uncorrelated with the lens samples.
+    """
+    times = [0.0] * count
+    by_mirrored_digits = sorted(range(count), key=lambda index: f"{index:b}"[::-1])
+    for rank, index in enumerate(by_mirrored_digits):
+        times[index] = (rank + 0.5) / count
+    return tuple(times)
 
 
 @dataclass(frozen=True)

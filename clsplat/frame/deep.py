@@ -15,16 +15,14 @@ import numpy as np
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
-from clsplat.config.pictures import DEEP_MERGE_FLOATS, DEEP_STRIP_FLOATS
+from clsplat.config.pictures import DEEP_MERGE_FLOATS
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.frame.draw import on_tiles
 from clsplat.frame.lens import Warp
 from clsplat.frame.strips import strips
-from clsplat.frame.window import reframed
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import DEEP_PICTURES, TILE
-from clsplat.rendering.memory_needs import frame_pixels
 from clsplat.rendering.renderer import Renderer
 from clsplat.stages.deep import DEEP_FLOATS
 from clsplat.stages.deep_merge import deep_merge, merge_bytes
@@ -53,17 +51,6 @@ def drawn_in_slices(renderer: Renderer, gaussians: Callable[[], Gaussians], bins
     gaussians: function that returns the model; it is called only when the picture is drawn.
     """
     return lambda camera: render_deep(renderer, gaussians(), camera, bins).transpose(0, 3, 1, 2)
-
-
-def deep_rows(device: Device, camera: Camera, bins: int, pictures: int = 1) -> int:
-    """Number of rows in the strips of a deep picture of `bins` slices, a multiple of the tile size.
-
-    pictures: number of pictures that are averaged.
-    """
-    floats = DEEP_FLOATS * bins
-    most = DEEP_STRIP_FLOATS if pictures == 1 else DEEP_MERGE_FLOATS // min(pictures, DEEP_PICTURES)
-    pixels = min(most // floats, frame_pixels(device, planes=4 * floats))
-    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # padding of the first and last tile included
 
 
 def deep_in_strips(draw: DrawDeep, rows: Callable[[Camera], int]) -> DrawDeep:
@@ -134,7 +121,7 @@ def deep_sampled(draws: Sequence[DrawDeep], cameras: Sequence[Camera], merge: Me
 
     def blurred(camera: Camera) -> Float32:
         weight = np.full((camera.height, camera.width), 1 / len(cameras), np.float32)
-        drawn = (draw(reframed(sample, camera)) for draw, sample in zip(draws, cameras, strict=True))
+        drawn = (draw(sample.reframed(camera)) for draw, sample in zip(draws, cameras, strict=True))
         return merge((planes, weight) for planes in drawn)
 
     return blurred

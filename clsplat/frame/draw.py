@@ -13,7 +13,6 @@ from clsplat.camera import Camera
 from clsplat.config.channels import CRYPTOMATTE_CHANNELS, FRAME_CHANNELS, feature_names, light_and_rest
 from clsplat.frame.holdout import Cut
 from clsplat.frame.mattes import Matte
-from clsplat.frame.window import crop, reframed
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import TILE
 from clsplat.rendering.renderer import OBJECTS_PER_COVERAGE_PASS, Renderer
@@ -60,8 +59,8 @@ def drawn_by(
                 gaussians,
                 camera,
                 feature_names(rest),
-                after=after and reframed(after, camera),
-                before=before and reframed(before, camera),
+                after=after and after.reframed(camera),
+                before=before and before.reframed(camera),
                 moved=moved,
                 earlier=earlier,
                 background=background,
@@ -103,5 +102,5 @@ def on_tiles(camera: Camera) -> tuple[Camera, slice, slice]:
     if camera.window is None:
         return camera, slice(None), slice(None)
     left, top = camera.window.x % TILE, camera.window.y % TILE
-    larger = crop(camera, -left, -top, camera.width + left, camera.height + top)
+    larger = camera.cropped(-left, -top, camera.width + left, camera.height + top)
     return larger, slice(top, None), slice(left, None)

@@ -14,7 +14,6 @@ import numpy as np
 
 from clsplat.arrays import Float64
 from clsplat.camera import JACOBIAN_CLAMP_HALF_FRAMES, Camera, Window
-from clsplat.frame.window import crop
 from clsplat.images.stmap import StMap
 from clsplat.scenes.dataset import Lens
 
@@ -161,7 +160,7 @@ class Warp:
         last = np.ceil(np.nanmax(places, axis=(0, 1))).astype(int) + INTERPOLATION_MARGIN_PX
         (left, top), (width, height) = first.tolist(), (last - first).tolist()
         whole = replace(self.frame, window=Window(0, 0, self.frame.width, self.frame.height, self.clamp))
-        return places, crop(whole, left, top, width, height)
+        return places, whole.cropped(left, top, width, height)
 
 
 def distorted_places(lens: Lens, straight: Camera) -> Float64:

@@ -22,7 +22,6 @@ from clsplat.frame.deep import (
     Merge,
     deep_converted,
     deep_in_strips,
-    deep_rows,
     deep_sampled,
     deep_warped,
     drawn_in_slices,
@@ -32,13 +31,12 @@ from clsplat.frame.holdout import Cut
 from clsplat.frame.lens import Places, Warp
 from clsplat.frame.mattes import Matte
 from clsplat.frame.samples import sample_cameras, sampled, supersampled
-from clsplat.frame.strips import in_strips, strip_rows
+from clsplat.frame.strips import deep_rows, in_strips, strip_rows
 from clsplat.frame.warp import warped
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import SRGB, Colours
 from clsplat.images.cryptomatte import ranked
 from clsplat.rendering.renderer import Renderer
-from clsplat.shots.shutter_times import sample_moments
 from clsplat.stages.holdout import held_bytes
 
 BLANK_COLOUR_TOLERANCE = 1e-6
@@ -82,7 +80,7 @@ def at_each_time(apply: Callable[[Draw], Draw]) -> Pass:
 
 def _at_its_samples(at: Callable[[float], Camera], sampling: SamplingConfig, draw: DrawAt) -> DrawAt:
     """A pass that averages the samples of shutter and lens."""
-    (middle, cameras), times = sample_cameras(at, sampling), sample_moments(sampling)
+    (middle, cameras), times = sample_cameras(at, sampling), sampling.sample_times
     return lambda time: sampled(draw(time), middle, cameras, lambda index: draw(times[index]))
 
 
@@ -190,7 +188,7 @@ class FramePipeline:
 
         draw = draw_at(sampling.middle)
         if len(cameras) > 1:
-            draw = deep_sampled([draw_at(time) for time in sample_moments(sampling)], cameras, Merge(device, bins))
+            draw = deep_sampled([draw_at(time) for time in sampling.sample_times], cameras, Merge(device, bins))
         if frame.lens is not None:
             draw = deep_warped(deep_in_strips(draw, rows), Warp(frame.lens, middle), Merge(device, bins))
         return draw, between(space, colours.output), rows

@@ -20,8 +20,6 @@ from clsplat.camera import Camera
 from clsplat.config.pictures import SENSOR_WIDTH_MM, Filter, FramingConfig, SamplingConfig
 from clsplat.errors import InputError
 from clsplat.frame.draw import Draw, Planes, in_two
-from clsplat.frame.window import crop, reframed
-from clsplat.shots.shutter_times import sample_moments
 
 _FILTER_RADII_PX: dict[Filter, float] = {"box": 0.5, "blackman-harris": 1.5}
 """Radius of each pixel filter, in pixels."""
@@ -57,7 +55,7 @@ def finer(camera: Camera, config: FramingConfig) -> Camera:
         return camera.resized(camera.width * samples, camera.height * samples)
     if camera.model.wraps:
         raise InputError(f"--filter {config.filter}: needs pixels beyond a panorama's edges; use --filter box")
-    padded = crop(camera, -margin, -margin, camera.width + 2 * margin, camera.height + 2 * margin)
+    padded = camera.cropped(-margin, -margin, camera.width + 2 * margin, camera.height + 2 * margin)
     return padded.resized(padded.width * samples, padded.height * samples)
 
 
@@ -124,7 +122,7 @@ def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tup
     middle = at(config.middle)
     if not config.on or config.samples == 1:
         return middle, [middle]
-    cameras = [at(time) for time in sample_moments(config)] if config.moves else [middle] * config.samples
+    cameras = [at(time) for time in config.sample_times] if config.moves else [middle] * config.samples
     if config.has_lens:
         focus = config.focus or 0.0
         cameras = [
@@ -147,11 +145,11 @@ def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera], light: Callab
         sums: dict[str, Float64] = {}
         for index, sample in enumerate(cameras):
             drawn = draw if light is None else light(index)
-            for name, plane in drawn(reframed(sample, camera), names).items():
+            for name, plane in drawn(sample.reframed(camera), names).items():
                 if name in sums:
                     sums[name] += plane
                 else:
                     sums[name] = plane.astype(np.float64)
         return {name: (total / len(cameras)).astype(np.float32) for name, total in sums.items()}
 
-    return in_two(blurred, lambda camera, names: draw(reframed(middle, camera), names))
+    return in_two(blurred, lambda camera, names: draw(middle.reframed(camera), names))

@@ -10,15 +10,21 @@ from pathlib import Path
 import numpy as np
 
 from clsplat.camera import Camera
-from clsplat.config.pictures import STRIP_PIXELS, Encoding, FramingConfig
+from clsplat.config.pictures import (
+    DEEP_MERGE_FLOATS,
+    DEEP_STRIP_FLOATS,
+    STRIP_PIXELS,
+    Encoding,
+    FramingConfig,
+)
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.frame.draw import Draw, Planes, feature_floats
-from clsplat.frame.window import crop
 from clsplat.images.frame_files import FrameFileHeader, check_target, encoded
 from clsplat.images.writing import write_rows
-from clsplat.layouts.columns import TILE
+from clsplat.layouts.columns import DEEP_PICTURES, TILE
 from clsplat.rendering.memory_needs import frame_pixels
+from clsplat.stages.deep import DEEP_FLOATS
 
 
 def strip_rows(
@@ -45,6 +51,17 @@ def strip_rows(
     return max(rows // TILE, 1) * TILE
 
 
+def deep_rows(device: Device, camera: Camera, bins: int, pictures: int = 1) -> int:
+    """Rows of a deep picture's strips, in whole tiles, for `bins` slices.
+
+    pictures: number of pictures that each pixel is the mean of.
+    """
+    floats = DEEP_FLOATS * bins
+    most = DEEP_STRIP_FLOATS if pictures == 1 else DEEP_MERGE_FLOATS // min(pictures, DEEP_PICTURES)
+    pixels = min(most // floats, frame_pixels(device, planes=4 * floats))
+    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # with the padding of the first and last tile
+
+
 def strips(camera: Camera, rows: int) -> Iterator[Camera]:
     """Cameras of the picture's strips, of at most `rows` rows, from the top. All but the last end at tile borders."""
     if rows >= camera.height:
@@ -54,7 +71,7 @@ def strips(camera: Camera, rows: int) -> Iterator[Camera]:
     while top < camera.height:
         within = (camera.window.y + top) % TILE if camera.window and rows >= TILE else 0
         height = min(rows - within, camera.height - top)
-        yield crop(camera, 0, top, camera.width, height)
+        yield camera.cropped(0, top, camera.width, height)
         top += height
 
 

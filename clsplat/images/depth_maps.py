@@ -12,7 +12,7 @@ import OpenImageIO as oiio
 from clsplat.arrays import Float32
 from clsplat.errors import InputError
 from clsplat.files.documents import open_input
-from clsplat.images.reading import MAX_IMAGE_PIXELS, error_of, image_size, one_line, open_image
+from clsplat.images.reading import MAX_IMAGE_PIXELS, error_of, image_size, one_line, open_image, stored_range
 
 DEPTH_MAP_SUFFIXES = (".png", ".exr", ".tif", ".tiff", ".npy")
 """Lower-case extensions of the depth maps that a folder search finds."""
@@ -31,10 +31,8 @@ def map_header(path: Path) -> tuple[int, int, bool]:
     if path.suffix.lower() == ".npy":
         array = _numpy(path)
         return array.shape[1], array.shape[0], array.dtype.kind in "iu"
-    source = open_image(path)
-    kind = str(source.spec().format)
-    source.close()
-    return *image_size(path, orient=False), kind in INTEGER_MAXIMA
+    highest, _ = stored_range(path)
+    return *image_size(path, orient=False), highest in INTEGER_MAXIMA.values()
 
 
 def read_map(path: Path) -> Float32:

@@ -7,6 +7,7 @@ p_world M, in the coordinate systems of OpenEXR's standard attributes (ImfStanda
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -23,7 +24,6 @@ from clsplat.config.channels import DEEP_CHANNELS, WRITABLE_CHANNELS
 from clsplat.config.pictures import Encoding
 from clsplat.errors import InputError, examples
 from clsplat.images.alpha import unassociate
-from clsplat.images.provenance import RECORD_TAGS, attribute_of, record_text
 from clsplat.images.reading import decodes, image_size, opened
 from clsplat.images.writing import steps_of, write_spec
 
@@ -42,6 +42,14 @@ _DISK_BLOCK_BYTES = 1 << 12
 
 FRAME_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".dpx")
 VIDEO_SUFFIXES = (".mp4", ".mov")
+MODEL_DIGEST_ATTRIBUTE, SETTINGS_DIGEST_ATTRIBUTE = "clsplat:model", "clsplat:settings"
+"""Attributes that record a frame's source: SHA-256 of the model file, and a digest of all other settings."""
+RECORD_TAGS = {
+    **dict.fromkeys((".tif", ".tiff", ".jpg", ".jpeg"), "ImageDescription"),
+    ".dpx": "DocumentName",
+}
+"""Header text that holds the record. In a DPX it is the project name, which has 200 characters."""
+_RECORD_PATTERN = re.compile(r"clsplat model ([0-9a-z]+) settings ([0-9a-z]+)", re.ASCII)
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,3 +357,23 @@ def _spec(shape: tuple[int, ...], names: Sequence[str], kind: Any, header: Frame
     for name, value in header.attributes.items():
         spec.attribute(name, value)
     return spec
+
+
+def record_text(attributes: Mapping[str, Any]) -> str:
+    """Provenance record of a header's attributes, as text for headers without custom ones; '' if there is none."""
+    model, settings = attributes.get(MODEL_DIGEST_ATTRIBUTE), attributes.get(SETTINGS_DIGEST_ATTRIBUTE)
+    return f"clsplat model {model} settings {settings}" if model and settings else ""
+
+
+def parse_record(text: object) -> dict[str, str]:
+    """Attributes in a record; empty for any other text."""
+    match = _RECORD_PATTERN.search(str(text or ""))
+    return {MODEL_DIGEST_ATTRIBUTE: match[1], SETTINGS_DIGEST_ATTRIBUTE: match[2]} if match else {}
+
+
+def attribute_of(spec: Any, name: str) -> Any:
+    """Attribute in OpenImageIO's specification of a file, or in the record there; None if neither has it."""
+    value = spec.getattribute(name)
+    for place in dict.fromkeys(RECORD_TAGS.values()) if value is None else ():
+        value = parse_record(spec.getattribute(place)).get(name) if value is None else value
+    return value

@@ -21,8 +21,7 @@ from clsplat.files.documents import is_file
 from clsplat.files.names import native_name
 from clsplat.images.alpha import unassociate
 from clsplat.images.colour import REC709_LUMA_WEIGHTS
-from clsplat.images.frame_files import VIDEO_SUFFIXES
-from clsplat.images.provenance import parse_record
+from clsplat.images.frame_files import VIDEO_SUFFIXES, parse_record
 
 _BLUE_CHROMA_RANGE, _RED_CHROMA_RANGE = (np.float32(2 * (1 - REC709_LUMA_WEIGHTS[index])) for index in (2, 0))
 """Widths of the ranges of B - Y and R - Y (Rec.709), by which chroma is normalised."""
@@ -58,7 +57,7 @@ MAX_VIDEO_MEGAPIXELS = 260
 
 
 def video_record(path: Path, frames: int | None = None) -> dict[str, str]:
-    """Provenance record of a video (`provenance`); empty if the file is not a video or has no record.
+    """Provenance record of a video; empty if the file is not a video or has no record.
 
     frames: expected number of frames. The result is also empty if the video has another number or is incomplete.
     """

@@ -23,18 +23,13 @@ from clsplat.reference.render import parameters
 class ChannelsTwin:
     """Channels, eqs. (60) to (67). In pixels without Gaussians, index is -1 and the others are 0.
 
-    normal, position: (H, W, 3).
-    motion, backward: (H, W, 2).
+    features: the blended `features`, by the same names: (H, W), or (H, W, floats).
     doubt: (H, W), a margin: the distance of the transmittance to one half, or of the largest weight to the second
     largest, whichever is smaller. Where it is small, rounding may change depth_median or index.
     The other arrays are (H, W).
     """
 
-    depth: Float64
-    normal: Float64
-    position: Float64
-    motion: Float64
-    backward: Float64
+    features: dict[str, Float64]
     median: Float64
     first: Float64
     count: Int64
@@ -89,7 +84,8 @@ def channels(
 ) -> ChannelsTwin:
     """Blend the channels front to back. earlier: the camera of backward motion; None for `after`."""
     width, height = camera.width, camera.height
-    rows = np.concatenate(list(features(projected, gaussians, camera, after, earlier).values()), axis=1)
+    by_name = features(projected, gaussians, camera, after, earlier)
+    rows = np.concatenate(list(by_name.values()), axis=1)
     sums, total = np.zeros((height, width, rows.shape[1])), np.zeros((height, width))
     median, first, largest, second = (np.zeros((height, width)) for _ in range(4))
     count, index = np.zeros((height, width), np.int64), np.full((height, width), -1, np.int64)
@@ -109,15 +105,12 @@ def channels(
         index[box] = np.where(heavier, layer.gaussian, index[box])
         largest[box] = np.maximum(largest[box], weight)
     some = total > 0
-    means_of = sums / np.where(some, total, 1.0)[:, :, None]
-    length = np.linalg.norm(sums[:, :, 1:4], axis=2)
-    normal = sums[:, :, 1:4] / np.where(length > 0, length, 1.0)[:, :, None]
+    ends = np.cumsum([values.shape[1] for values in by_name.values()])[:-1]
+    blended = dict(zip(by_name, np.split(sums, ends, axis=2), strict=True))
+    scales = dict.fromkeys(by_name, total) | {"normal": np.linalg.norm(blended["normal"], axis=2)}
+    means = {name: sum_ / np.where(scales[name] > 0, scales[name], 1.0)[:, :, None] for name, sum_ in blended.items()}
     return ChannelsTwin(
-        depth=means_of[:, :, 0],
-        normal=normal,
-        position=means_of[:, :, 4:7],
-        motion=means_of[:, :, 7:9],
-        backward=means_of[:, :, 9:11],
+        features={name: mean if mean.shape[2] > 1 else mean[:, :, 0] for name, mean in means.items()},
         median=median,
         first=first,
         count=count,

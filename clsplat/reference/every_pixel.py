@@ -67,8 +67,8 @@ def render(
     blended = blend(seen, camera.width, camera.height, background)
     others = channels(seen, gaussians, camera, after or camera)
     if (of_distances := camera.depths_of_distances()) is not None:
-        depth, median, first = (each * of_distances for each in (others.depth, others.median, others.first))
-        others = replace(others, depth=depth, median=median, first=first)
+        depth, median, first = (each * of_distances for each in (others.features["depth"], others.median, others.first))
+        others = replace(others, features=others.features | {"depth": depth}, median=median, first=first)
     alpha, margin, nearness = 1 - blended.transmittance, blended.margin, blended.nearness
     return Picture(**vars(others), image=blended.image, alpha=alpha, margin=margin, nearness=nearness)
 

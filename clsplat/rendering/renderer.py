@@ -100,6 +100,7 @@ class Renderer:
     ) -> None:
         self.device = device or open_device()
         self._rasterizer = rasterizer or Rasterizer(self.device, config)
+        self.config = self._rasterizer.config
         self._rows = 0
         self._sh: tuple[Gaussians, ShStorage] | None = None
         self._held: AnyGaussians | None = None

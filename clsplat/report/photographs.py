@@ -17,8 +17,7 @@ from clsplat.report.run_numbers import number
 from clsplat.report.thumbnails import data_uri
 from clsplat.runs.run import Run
 from clsplat.scenes.analysis.mask_overlay import masked
-from clsplat.scenes.analysis.sanity_checks import spread
-from clsplat.scenes.scene import Scene, View
+from clsplat.scenes.scene import Scene, View, spread
 
 MAX_MASKED_PHOTOGRAPHS = 6
 """Maximum number of masked photographs in a report."""
@@ -48,7 +47,7 @@ def masked_photographs(scene: Scene, *, only_files: bool) -> tuple[list[MaskedPh
     views = [view for view in scene.views if view.mask is not None and (view.mask.path is not None or not only_files)]
     space = photos_space(view.path for view in scene.views)
     shown = []
-    for view in spread(views, MAX_MASKED_PHOTOGRAPHS) if views else []:
+    for view in spread(views, MAX_MASKED_PHOTOGRAPHS):
         try:
             shown.append(_shown(view, space))
         except InputError:

@@ -78,7 +78,7 @@ def known_digests(record: dict[str, Any] | None) -> set[str]:
 
 def write(run: Run, scene: Scene) -> None:
     """Write scene.json. Checkpoints of an earlier scene stay valid, because the record lists earlier scenes."""
-    record, there = record_of(scene, run.config.resolution), {scene_of(path) for _, path in run.checkpoints()}
+    record, there = record_of(scene, run.config.resolution), {scene_of(file) for _, file in run.checkpoints()}
     earlier = known_digests(read(run)) | {digest for digest in there if digest}
     record["earlier"] = sorted(earlier - {digest_of(record)})
     atomic_write(run.path / SCENE_RECORD_FILE_NAME, (json.dumps(record, allow_nan=False) + "\n").encode())
@@ -179,7 +179,7 @@ def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool =
     if earlier is None:
         return False
     known = known_digests(earlier)
-    others = [path for _, path in run.checkpoints() if (digest := scene_of(path)) and digest not in known]
+    others = [file for _, file in run.checkpoints() if (digest := scene_of(file)) and digest not in known]
     if others and not accept:
         raise InputError(
             f"{others[-1]}: is from a training on another scene than {run.path}, expected a checkpoint of this run; "

@@ -338,6 +338,12 @@ class Scene:
         return min(DEFAULT_NEAR_PLANE, self.length_unit / MIN_NEAR_PLANES_PER_EXTENT)
 
 
+def spread(items: Sequence[T], most: int) -> list[T]:
+    """At most `most` of the items, evenly spaced from the first to the last."""
+    picked = min(len(items), most)
+    return [items[index * (len(items) - 1) // max(picked - 1, 1)] for index in range(picked)]
+
+
 def _shows_much(view: View, points: Float64, views: Sequence[View]) -> bool:
     """True if a distant camera is part of the capture, for example in another room.
 

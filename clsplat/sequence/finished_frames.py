@@ -14,8 +14,13 @@ from clsplat.config.pictures import VideoConfig
 from clsplat.errors import InputError, examples, reason_of, warn
 from clsplat.files.documents import is_file
 from clsplat.files.locks import abandoned
-from clsplat.images.frame_files import attribute, is_foreign, is_whole
-from clsplat.images.provenance import MODEL_DIGEST_ATTRIBUTE, SETTINGS_DIGEST_ATTRIBUTE
+from clsplat.images.frame_files import (
+    MODEL_DIGEST_ATTRIBUTE,
+    SETTINGS_DIGEST_ATTRIBUTE,
+    attribute,
+    is_foreign,
+    is_whole,
+)
 from clsplat.images.video import video_record
 from clsplat.sequence.task import RenderOptions, Task, digest_of, picture_camera, settings_digest
 

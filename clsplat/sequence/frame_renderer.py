@@ -13,21 +13,26 @@ from clsplat.config.channels import light_and_rest
 from clsplat.config.pictures import DEEP_STRIP_FLOATS
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import open_device
-from clsplat.errors import DriverError
+from clsplat.errors import DriverError, warn
 from clsplat.frame.deep_exr import write_deep
-from clsplat.frame.draw import Planes
+from clsplat.frame.draw import Planes, feature_floats, on_tiles
+from clsplat.frame.holdout import Cut
+from clsplat.frame.lens import INTERPOLATION_MARGIN_PX
 from clsplat.frame.mattes import Matte
 from clsplat.frame.pipeline import FramePipeline, FrameRequest
-from clsplat.frame.strips import check_parts, in_strips, strip_rows, write_in_strips
+from clsplat.frame.samples import finer
+from clsplat.frame.strips import check_parts, deep_rows, in_strips, strip_rows, write_in_strips
 from clsplat.gaussians import Gaussians
+from clsplat.images.holdouts import read_holdout
 from clsplat.layouts.columns import TILE
 from clsplat.models.edit import exposed
 from clsplat.models.instances import Ensemble, kind_of
 from clsplat.models.series import ModelSeries
-from clsplat.rendering.renderer import Renderer
+from clsplat.rendering.memory_needs import plan_frame
+from clsplat.rendering.memory_plan import Plan
+from clsplat.rendering.renderer import Renderer, held_sh
 from clsplat.selftest.driver_check import require
 from clsplat.selftest.result import CHANNEL_STAGES, DEEP_STAGES, FORWARD_STAGES, HOLDOUT_STAGES, RAY_STAGES
-from clsplat.sequence.holdout_files import cut_of
 from clsplat.sequence.task import (
     NOT_MEASURED,
     Measured,
@@ -39,7 +44,10 @@ from clsplat.sequence.task import (
     lens_of,
     picture_camera,
     sampling_of,
+    straight_camera,
+    warp_of,
 )
+from clsplat.stages.deep import DEEP_FLOATS
 from clsplat.stages.holdout import HELD_PIXEL_BYTES, held_bytes
 
 TRANSFER_COMMANDS = ("read", "write", "fill")
@@ -61,6 +69,18 @@ class RenderedFrame:
     finish: Callable[[Planes], Planes] = lambda planes: planes
     measured: Measured = NOT_MEASURED
     right: Planes | None = None
+
+
+@dataclass(frozen=True)
+class DevicePlan:
+    """Memory plan of a device for the frame that needs most memory.
+
+    strips: number of strips that a frame is rendered in.
+    """
+
+    device: str
+    plan: Plan
+    strips: int
 
 
 RenderFrame = Callable[[Task], RenderedFrame]
@@ -110,6 +130,33 @@ class FrameRenderer:
             for camera in (picture_camera(view, self.options.pictures) for view in task.views):
                 if self._rows(camera, held) < camera.height:
                     check_parts(camera, self.options.encoding, views=len(task.views))
+
+    def memory_plan(self, tasks: Sequence[Task]) -> DevicePlan:
+        """Plan the device's memory for these frames. Raises CapacityError if a frame does not fit."""
+        device, options, config = self._renderer.device, self.options, self._renderer.config
+        framing, names = options.pictures.framing, set(options.channels)
+        models, _ = self._placed(tasks[0])
+        gaussians = models(sampling_of(tasks[0], options.pictures).middle)
+        floats, moved = held_sh(gaussians, config).floats, tasks[0].placed is not None and "motion" in names
+        samples = max(sampling_of(task, options.pictures).pictures for task in tasks)
+        plans = []
+        cameras = [straight_camera(task, options.pictures) for task in tasks]
+        for camera in {(camera.width, camera.height): camera for camera in cameras}.values():
+            if options.deep is not None:
+                planes = 4 * DEEP_FLOATS * options.deep.bins
+                rows = deep_rows(device, camera, options.deep.bins, samples)
+            else:
+                planes = HELD_PIXEL_BYTES if options.holdout is not None else 0
+                rows = self._rows(camera, planes)
+            strip = camera.cropped(0, 0, camera.width, rows) if rows < camera.height else camera
+            drawn = [(strip, feature_floats(names))]
+            if framing.supersample > 1 and (light := light_and_rest(names)[0]):
+                drawn.append((finer(strip, framing), feature_floats(light)))
+            for part, features in drawn:
+                sizes = (on_tiles(part)[0], config, features, planes)
+                plan = plan_frame(device, len(gaussians), floats, *sizes, moved)
+                plans.append(DevicePlan(device.name, plan, -(-camera.height // rows)))
+        return max(plans, key=lambda each: each.plan.need.total)
 
     def __call__(self, task: Task) -> RenderedFrame:
         """Render a frame. Raises ClsplatError if it cannot be rendered or, in strips, cannot be written."""
@@ -209,6 +256,35 @@ class FrameRenderer:
         return rows if most >= camera.height else min(rows, max(most // TILE, 1) * TILE)
 
 
+def cut_of(task: Task, options: RenderOptions) -> Cut | None:
+    """The surfaces of a frame's holdout, None if it has none. Raises InputError.
+
+    Warns about surfaces that end at the frame's edge if the picture extends beyond it.
+    """
+    if task.holdout is None or options.holdout is None:
+        return None
+    how, pictures, size = options.holdout, options.pictures, (task.camera.width, task.camera.height)
+    holdout = read_holdout(task.holdout, size, how.channel, inverse=how.depths == "inverse")
+    if how.depths == "ray":
+        height, width = holdout.surfaces.counts.shape
+        cosines = task.camera.cropped(holdout.x, holdout.y, width, height).cosines()
+        holdout = replace(holdout, surfaces=holdout.surfaces if cosines is None else holdout.surfaces.scaled(cosines))
+    cut, bent = Cut(holdout), warp_of(task, pictures) is not None
+    if _reaches_out(straight_camera(task, pictures), INTERPOLATION_MARGIN_PX + 1 if bent else 0) and cut.goes_on:
+        where = "where the warped picture extends beyond it" if bent else "in the overscan"
+        warn(f"{task.holdout}: ends with the frame, and nothing is held out {where}; render the CG with overscan")
+    return cut
+
+
+def _reaches_out(camera: Camera, margin: int) -> bool:
+    """True if the picture has pixels more than `margin` pixels outside its frame."""
+    window = camera.window
+    if window is None:
+        return False
+    ends = (window.x + camera.width - window.width, window.y + camera.height - window.height)
+    return max(-window.x, -window.y, *ends) > margin
+
+
 def open_frame_renderer(
     models: Gaussians | Sequence[Gaussians | ModelSeries],
     options: RenderOptions,
@@ -218,10 +294,12 @@ def open_frame_renderer(
     memory_limit: int | None = None,
     profile: bool = False,
     mattes: Mapping[str, Matte] | None = None,
+    tested: bool = True,
 ) -> FrameRenderer:
     """Open a renderer for the models on the device that `device` names. Raises DeviceError.
 
     profile: add the device's busy times to each frame's record.
+    tested: False to leave out the self-test of the driver, for a renderer that only plans.
     """
     opened = open_device(device, memory_limit, profile=profile)
     kernels = (
@@ -231,5 +309,6 @@ def open_frame_renderer(
         if light_and_rest(options.channels)[1] or mattes
         else ()
     )
-    opened = require(opened, (*FORWARD_STAGES, *kernels, *(HOLDOUT_STAGES if options.holdout is not None else ())))
+    if tested:
+        opened = require(opened, (*FORWARD_STAGES, *kernels, *(HOLDOUT_STAGES if options.holdout is not None else ())))
     return FrameRenderer(Renderer(opened, config=rasterizer), models, options, mattes)

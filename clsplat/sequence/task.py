@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from math import inf
 from pathlib import Path
@@ -13,28 +13,37 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.camera import DEFAULT_NEAR_PLANE, Camera
+from clsplat.camera import DEFAULT_NEAR_PLANE, JACOBIAN_CLAMP_HALF_FRAMES, Camera
 from clsplat.config.channels import WRITABLE_CHANNELS
 from clsplat.config.holdout import HoldoutConfig
-from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, SamplingConfig
+from clsplat.config.pictures import (
+    DeepConfig,
+    Encoding,
+    FramingConfig,
+    PictureConfig,
+    SamplingConfig,
+    parse_overscan,
+    parse_region,
+)
 from clsplat.errors import InputError
 from clsplat.files.documents import known_digest
 from clsplat.frame.lens import ByLens, ByMap, Places, Warp
-from clsplat.frame.window import framed
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import CHROMATICITIES, COLOR_INTEROP_IDS, SRGB, configuration_digest
 from clsplat.images.cryptomatte import header_of
-from clsplat.images.frame_files import VIDEO_SUFFIXES, FrameFileHeader, camera_matrices, is_whole_panorama
-from clsplat.images.provenance import SETTINGS_DIGEST_ATTRIBUTE
+from clsplat.images.frame_files import (
+    SETTINGS_DIGEST_ATTRIBUTE,
+    VIDEO_SUFFIXES,
+    FrameFileHeader,
+    camera_matrices,
+    is_whole_panorama,
+)
 from clsplat.images.stmap import read_stmap
 from clsplat.models.instances import State
 from clsplat.scenes.dataset import Lens
 from clsplat.shots import Shot
-from clsplat.shots import motion as moving
-from clsplat.shots.frame_numbers import output_paths
 from clsplat.shots.motion import Moments
-from clsplat.shots.optics import Optics, headers, settled
-from clsplat.shots.shutter_times import sample_moments
+from clsplat.shots.optics import Optics, headers
 
 LATLONG_ATTRIBUTES: dict[str, str | int] = {"textureformat": "LatLong Environment", "openexr:levelmode": 0}
 """OpenImageIO's attributes for EXR's envmap. The level mode says that no mipmap levels follow, for which OpenImageIO
@@ -180,47 +189,6 @@ class Task:
         return self.path.suffix.lower() in VIDEO_SUFFIXES
 
 
-def make_tasks(
-    chosen: Shot,
-    whole: Shot,
-    pattern: str,
-    resize: Callable[[Camera], Camera],
-    channels: Sequence[str],
-    sampling: SamplingConfig | None = None,
-) -> list[Task]:
-    """Tasks for the frames of `chosen`, which are part of the shot `whole`.
-
-    Raises InputError if two frames share a file that is not a video, and if the channels or the lens are not defined
-    for a camera.
-    """
-    sampling = sampling or SamplingConfig()
-    motion, backward = "motion" in channels, "backward" in channels
-    whole.check(channels)
-    indices = {frame.number: index for index, frame in enumerate(whole.frames)}
-    if Path(pattern).suffix.lower() in VIDEO_SUFFIXES:
-        paths = [Path(pattern)] * len(chosen.frames)
-    else:
-        paths = output_paths(pattern, [(frame.number, frame.name) for frame in chosen.frames])
-    stretch: Callable[[int], Shot | None] = lambda number: None  # noqa: E731
-    if sampling.shutter != (0.0, 0.0) and whole.moment is None:
-        stretch = moving.stretches(whole, resize, *sampling.shutter, motion=motion, backward=backward)
-    numbers = [frame.number for frame in whole.frames]
-    ends = (numbers[0], numbers[-1]) if len(numbers) > 1 else None
-    tasks = []
-    for frame, path in zip(chosen.frames, paths, strict=True):
-        camera = resize(frame.camera)
-        own = settled(sampling, frame.optics, camera)
-        own.check()
-        if own.has_lens and not camera.is_pinhole:
-            raise InputError(f"depth of field: frame {frame.number} is {camera.projection}, expected perspective")
-        looked_at = moving.moments(whole, resize, frame.number, own) or stretch(frame.number)
-        beside = moving.targets(whole, resize, indices[frame.number], own.middle, motion=motion, backward=backward)
-        after, earlier = (other and other.resized(camera.width, camera.height) for other in beside)
-        looks = (after, earlier, looked_at, None, None if frame.optics is None else own, frame.optics)
-        tasks.append(Task(frame.number, frame.name, camera, path, *looks, lens=frame.lens, ends=ends))
-    return tasks
-
-
 def sampling_of(task: Task, pictures: PictureConfig) -> SamplingConfig:
     """Shutter and lens of a frame."""
     return task.sampling or pictures.sampling
@@ -276,6 +244,30 @@ def picture_camera(task: Task, pictures: PictureConfig) -> Camera:
     return framed(shown, pictures.framing)
 
 
+def framed(camera: Camera, config: FramingConfig) -> Camera:
+    """The camera of the written picture, from a camera of the frame's size.
+
+    Its window is None if the picture is the whole frame. Raises InputError for a region outside the frame.
+    """
+    pixels, share = parse_overscan(config.overscan)
+    if config.region:
+        x, y, width, height = parse_region(config.region)
+        if x + width > camera.width or y + height > camera.height:
+            raise InputError(
+                f"--region {config.region}: ends at {x + width},{y + height}, beyond the frame's size "
+                f"{camera.width},{camera.height}"
+            )
+        return camera.cropped(x, y, width, height)
+    across = pixels or round(share * camera.width)
+    down = pixels or round(share * camera.height)
+    if across == down == 0:
+        return camera
+    larger = camera.cropped(-across, -down, camera.width + 2 * across, camera.height + 2 * down)
+    assert larger.window is not None
+    clamp = max(JACOBIAN_CLAMP_HALF_FRAMES, 2 * across / camera.width, 2 * down / camera.height)
+    return replace(larger, window=replace(larger.window, clamp=clamp))
+
+
 def lens_of(task: Task, pictures: PictureConfig) -> Places | None:
     """The lens or STMap that warps the picture, None if nothing does. Raises InputError for an unreadable map."""
     if stmap := pictures.warp.stmap:
@@ -328,7 +320,7 @@ def model_times(task: Task, pictures: PictureConfig, channels: Collection[str]) 
     """Times at which the models of a frame are evaluated, in frames from it: the shutter's middle, its samples, and one
     frame later or earlier for motion channels."""
     sampling = sampling_of(task, pictures)
-    times = [sampling.middle, *(sample_moments(sampling) if sampling.moves else ())]
+    times = [sampling.middle, *(sampling.sample_times if sampling.moves else ())]
     times += [sampling.middle + by for name, by in (("motion", 1), ("backward", -1)) if name in channels]
     return list(dict.fromkeys(times))
 

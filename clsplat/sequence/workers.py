@@ -22,7 +22,7 @@ from clsplat.config.channels import DEEP_CHANNELS, WRITABLE_CHANNELS
 from clsplat.config.pictures import DEEP_MERGE_FLOATS, DEEP_STRIP_FLOATS, STRIP_PIXELS, VideoConfig, WarpConfig
 from clsplat.device.drivers.worker_process import abandon
 from clsplat.images import frame_files
-from clsplat.images.provenance import record_text
+from clsplat.images.frame_files import record_text
 from clsplat.images.video import VideoPlanes, VideoWriter, planes_of, video_writer
 from clsplat.layouts.columns import DEEP_PICTURES
 from clsplat.sequence.finished_frames import MAX_FILE_THREADS, made_of
@@ -126,19 +126,21 @@ def run_tasks(
     options: RenderOptions,
     on_done: Callable[[Record], None],
     video: VideoWriter | None = None,
-    sharing: Sharing | None = None,
+    *,
+    shared: bool = False,
 ) -> None:
     """Render the frames, and at the same time write them or add them to the video.
 
     Each renderer has a thread, which takes the next free frame.
-    sharing: claims of frames, if other jobs may render some of them meanwhile. Their frames are awaited at the end.
+    shared: other jobs may render some of these frames meanwhile. Frames are then claimed, and the frames of other jobs
+    are awaited at the end.
     on_done: function that is called in this thread for each frame whose file is complete, in any order. For a video it
     is called in order, when the frame has been encoded. The first error of any thread is raised after all have ended.
     """
     if not tasks:
         return
     writers, held = frames_ahead(tasks, options, len(renderers))
-    room, frames = threading.Semaphore(held), FrameQueue(tasks, sharing)
+    room, frames = threading.Semaphore(held), FrameQueue(tasks, Sharing(options) if shared else None)
     finished: queue.SimpleQueue[Future[Any]] = queue.SimpleQueue()
     encoders = ThreadPoolExecutor(writers, "clsplat-write")
     devices = ThreadPoolExecutor(len(renderers), "clsplat-render")

@@ -16,7 +16,6 @@ from clsplat.camera import Camera
 from clsplat.config.pictures import SamplingConfig
 from clsplat.errors import InputError
 from clsplat.shots.shot import Frame, Shot
-from clsplat.shots.shutter_times import sample_moments
 
 NEIGHBOUR_FRAMES = 2
 """Number of frames on each side of a time that determine the camera there: a segment's end, and the neighbour that sets
@@ -75,7 +74,7 @@ def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, samplin
     """
     if shot.moment is None or sampling.shutter == (0.0, 0.0):
         return None
-    moment, times = shot.moment, sample_moments(sampling) if sampling.moves else ()
+    moment, times = shot.moment, sampling.sample_times if sampling.moves else ()
     wanted = [sampling.middle, *sampling.shutter, *times]
     begin = bisect_left(shot.authored, number + min(wanted))
     end = bisect_right(shot.authored, number + max(wanted))

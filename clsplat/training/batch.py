@@ -165,7 +165,8 @@ class Replica:
     """A further device of a training, with a copy of the parameters and a thread of its own."""
 
     def __init__(self, device: Device, config: TrainConfig, photographs: ImageCache) -> None:
-        self.device, self.config, self.photographs = device, config, photographs.for_device(device)
+        self.device, self.config = device, config
+        self.photographs = ImageCache(device, photographs.host)
         self.rasterizer = Rasterizer(device, config.rasterizer, antialiased=config.antialiased)
         self.thread = ThreadPoolExecutor(1, f"clsplat-{device.name}")
         self.plan: Plan | None = None

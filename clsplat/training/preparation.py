@@ -19,7 +19,7 @@ from clsplat.scenes.depth_sources import with_depths
 from clsplat.scenes.scene import Scene
 from clsplat.scenes.start.initialise import is_colourless, photographed
 from clsplat.scenes.start.point_cloud import with_points
-from clsplat.training.cameras.refinement import Cameras
+from clsplat.training.cameras.refinement import check_refinable
 
 
 def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None) -> Scene:
@@ -28,14 +28,12 @@ def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None) -> S
     resumed: the run that continues, which keeps its length unit.
     Raises InputError if training with its points, depths or refined cameras would fail.
     """
+    scene.require_training_views()
+    check_refinable(config, scene.train_views)
     unit = scene_record.length_unit_of(resumed, scene) if resumed else scene.unit or length_unit_of(scene)
     if unit != scene.unit:
         scene = replace(scene, unit=unit)
-    scene = with_depths(with_points(scene, config.start_points), config.depth_use)
-    scene.require_training_views()
-    if config.refines:
-        Cameras(config, scene)
-    return scene
+    return with_depths(with_points(scene, config.start_points), config.depth_use)
 
 
 def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:
@@ -70,15 +68,19 @@ def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -
     return scene
 
 
-def checked(scene: Scene, config: TrainConfig | None, run: Run | None, *, resume: bool) -> TrainConfig:
+def check_scene(scene: Scene) -> None:
+    """Raise InputError for anything but a scene with training views."""
+    if not isinstance(scene, Scene):
+        raise InputError(f"scene is {scene!r:.100}, expected clsplat.load_scene(...)")
+    scene.require_training_views()
+
+
+def settings_of(config: TrainConfig | None, run: Run | None, *, resume: bool) -> TrainConfig:
     """Settings of the training. Raises InputError for invalid arguments of `clsplat.train`."""
-    for name, value, kind, meant in (
-        ("scene", scene, Scene, "clsplat.load_scene(...)"),
-        ("config", config, TrainConfig | None, "TrainConfig(...)"),
-        ("run", run, Run | None, "Run.create(...)"),
-    ):
-        if not isinstance(value, kind):
-            raise InputError(f"{name} is {value!r:.100}, expected {meant}")
+    if not isinstance(config, TrainConfig | None):
+        raise InputError(f"config is {config!r:.100}, expected TrainConfig(...)")
+    if not isinstance(run, Run | None):
+        raise InputError(f"run is {run!r:.100}, expected Run.create(...)")
     if resume and run is None:
         raise InputError("resume=True: expected run=..., the run to continue")
     if config is None:
@@ -87,7 +89,6 @@ def checked(scene: Scene, config: TrainConfig | None, run: Run | None, *, resume
     if resume and run is not None:
         check_resumed(run, config)
         check_steps_left(run, config, "iterations")
-    scene.require_training_views()
     return config
 
 

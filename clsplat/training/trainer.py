@@ -103,7 +103,7 @@ class Trainer:
         self.views = scene.require_training_views()
         self.rasterizer = Rasterizer(device, config.rasterizer, antialiased=config.antialiased)
         self.memory, self._begins, self._tight = memory, True, False
-        self.photographs = ImageCache(self.views, device, memory.photographs(scene, config))
+        self.photographs = ImageCache(device, memory.photographs(scene, config))
         self.renderer = Renderer(device, self.rasterizer)
         self.validation_views = ValidationViews(scene, device, config)
         self.depths = DepthTargets(config, self.views, scene.length_unit, scene.near, self._pixels)
@@ -111,7 +111,7 @@ class Trainer:
         self.sizes = by_doubling(config.warmup)
         self.background: NDArray[np.float32] = np.zeros(3, np.float32)
         self.given = initial
-        self.monitor = NonFiniteMonitor(self.rasterizer.readback, [view.name for view in self.views])
+        self.monitor = NonFiniteMonitor(self.rasterizer.readback)
         self.pending = SpeculativeSteps(device, self.monitor, self._begin_again)
         self.pending.on &= self.batch is None and not config.refines  # batches read losses, refinement reads gradients
         self._start()
@@ -130,7 +130,7 @@ class Trainer:
         if initial is None:
             initial = from_scene(self.scene, self.config.random_points, self.rng)
         self.appearance = appearance_of(self.config, self.device, self.scene)
-        self.cameras = Cameras(self.config, self.scene, self.rasterizer.work, len(self.validation_views.views))
+        self.cameras = Cameras(self.config, self.scene, self.rasterizer.work)
         self.origin, self.near = initial.origin, self.scene.near
         asked = self.config.perspective
         self.by_rays = asked == "rays" or (asked == "auto" and any(view.camera.model.along_rays for view in self.views))
@@ -337,6 +337,7 @@ class Trainer:
             self.photographs.kept(view, factor),
             area=full.width * full.height / (width * height),
             place=place,
+            name=self.views[view].name,
         )
 
     def _view_gradients(self, inputs: ViewInputs) -> DeviceGaussians | None:

@@ -264,6 +264,15 @@ def test_far_more_objects_than_a_matte_has(folder: Path, tmp_path: Path, capsys:
     assert "--channels objects: has 301 objects, expected at most 256" in error_line(capsys)
 
 
+def test_a_plan_knows_the_strips_of_many_objects(
+    folder: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    objects, rows, flags = 4, 16, f"--channels objects --width {4 * WIDTH} --dry-run --json"
+    monkeypatch.setattr("clsplat.sequence.frame_renderer.DEEP_STRIP_FLOATS", objects * 4 * WIDTH * rows)
+    plan = json.loads(ran(capsys, render, folder, tmp_path, flags).out)
+    assert plan["devices"][0]["strips"] == -(-4 * HEIGHT // rows)
+
+
 def test_a_mesh_is_a_volume(folder: Path, tmp_path: Path) -> None:
     """A box as a mesh, from the shot's folder: the matte of the box."""
     low, high = np.array(BOX[:3]), np.array(BOX[3:])

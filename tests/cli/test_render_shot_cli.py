@@ -32,10 +32,10 @@ from clsplat.reference.render import forward
 from clsplat.rendering.renderer import Renderer
 from clsplat.sequence.farm import Failure, WorkerJob, render_frame
 from clsplat.sequence.job_models import load_cast
-from clsplat.sequence.task import RenderOptions, make_tasks
+from clsplat.sequence.shot_tasks import make_tasks
+from clsplat.sequence.task import RenderOptions
 from clsplat.shots import read_shot
 from clsplat.shots.shot_file import parse_transform, read_layout
-from clsplat.shots.shutter_times import sample_moments
 from clsplat.spherical_harmonics import SH_C0, sh_basis
 
 CLOSE = 1e-5
@@ -178,7 +178,7 @@ def test_a_moving_model_blurs(folder: Path, tmp_path: Path) -> None:
     flags = "--frames 2 --shutter-angle 180 --samples 8"
     assert render(folder, shot, tmp_path, flags) == 0
     renderer, means = Renderer(), []
-    for time in sample_moments(SamplingConfig(samples=8, shutter_angle=180)):
+    for time in SamplingConfig(samples=8, shutter_angle=180).sample_times:
         merged = edit.merge([A, edit.transform(B, moved_by(2 + time))])
         means.append(srgb_to_linear(renderer.render(merged, camera_at(2 + time)).image))
     wanted, got = (

@@ -25,7 +25,6 @@ from clsplat.images.colour import LINEAR, SRGB, linear_to_srgb, srgb_to_linear
 from clsplat.models import edit
 from clsplat.models.formats import colour_space, load, usd
 from clsplat.rendering.renderer import Renderer
-from clsplat.shots.shutter_times import sample_moments
 from clsplat.spherical_harmonics import SH_C0
 
 require("pxr")
@@ -117,7 +116,7 @@ def test_a_stages_model_blurs_and_moves(stage: Usd.Stage, tmp_path: Path) -> Non
     moving(stage.GetPrimAtPath("/Asset"))
     assert render(stage, tmp_path, "--frames 3 --channels rgb,alpha,motion --shutter-angle 180 --samples 6") == 0
     own = load(tmp_path / "asset" / "model.usdc")
-    times = [3 + time for time in sample_moments(SamplingConfig(samples=6, shutter_angle=180))]
+    times = [3 + time for time in SamplingConfig(samples=6, shutter_angle=180).sample_times]
     pictures = [Renderer().render(edit.transform(own, turned(time)), CAMERA) for time in times]
     alpha = np.mean([picture.alpha for picture in pictures], axis=0, dtype=np.float64)
     got = pixels_of(tmp_path / "0003.exr")

@@ -22,16 +22,16 @@ from clsplat.errors import InputError
 from clsplat.frame.draw import drawn_by
 from clsplat.frame.samples import sample_cameras, sampled, supersampled
 from clsplat.frame.strips import in_strips, strip_rows, strips, write_in_strips
-from clsplat.frame.window import crop, framed
 from clsplat.images.frame_files import FrameFileHeader, write_channels
 from clsplat.rendering.renderer import Renderer
+from clsplat.sequence.task import framed
 
 CLOUD, CAMERA = scenes.random_cloud(3000, 8, 150, 200)
 EVERYTHING = tuple(FRAME_CHANNELS)
 
 
 def test_strips_cover_the_picture_and_end_with_tiles() -> None:
-    for camera in (CAMERA, crop(CAMERA, 5, 21, 100, 150), crop(CAMERA, -7, -9, 170, 220)):
+    for camera in (CAMERA, CAMERA.cropped(5, 21, 100, 150), CAMERA.cropped(-7, -9, 170, 220)):
         top = camera.window.y if camera.window else 0
         for rows in (16, 48, 64):
             parts = list(strips(camera, rows))
@@ -69,7 +69,7 @@ def test_everything_at_once_in_strips() -> None:
 @pytest.mark.parametrize("ending", ["exr", "png", "tif", "jpg"])
 def test_files_are_those_of_the_whole(ending: str, tmp_path: Path) -> None:
     names = EVERYTHING if ending == "exr" else ("rgb",) if ending == "jpg" else ("rgb", "alpha")
-    camera = crop(CAMERA, 5, 21, 100, 150)
+    camera = CAMERA.cropped(5, 21, 100, 150)
     header = FrameFileHeader({"clsplat:frame": 7}, window=Window(5, 21, 150, 200) if ending == "exr" else None)
     draw = drawn_by(Renderer(), CLOUD)
     write_channels(tmp_path / f"whole.{ending}", draw(camera, names), Encoding(), header)

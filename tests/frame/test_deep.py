@@ -23,7 +23,6 @@ from clsplat.device.context import Device, open_device
 from clsplat.frame.deep import render_deep
 from clsplat.frame.deep_exr import write_deep
 from clsplat.frame.pipeline import FramePipeline, FrameRequest
-from clsplat.frame.window import crop
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import LINEAR
 from clsplat.images.frame_files import FrameFileHeader, camera_matrices
@@ -133,7 +132,7 @@ def test_flattened_it_is_the_picture(default_device: Device, projection: str, bi
 def test_windows_and_little_memory_change_no_bit() -> None:
     gaussians, camera = scenes.random_cloud(20_000, 4, 300, 200, degree=1)
     whole = render_deep(Renderer(), gaussians, camera, 4)
-    part = crop(camera, 37, 21, 100, 60)
+    part = camera.cropped(37, 21, 100, 60)
     assert_same_bits(render_deep(Renderer(), gaussians, part, 4), np.ascontiguousarray(whole[:, 21:81, 37:137]))
     limit = 14 << 20
     renderer = Renderer(open_device(None, limit))
@@ -165,7 +164,7 @@ def made(tmp_path: Path, camera: Camera | None = None, **options: Any) -> tuple[
 
 def test_a_file(tmp_path: Path) -> None:
     header = FrameFileHeader({"clsplat:frame": 7}, camera_matrices(scenes.tilted_camera(71, 50)))
-    empty_at_the_left = crop(scenes.tilted_camera(71, 50), -48, 0, 119, 50)
+    empty_at_the_left = scenes.tilted_camera(71, 50).cropped(-48, 0, 119, 50)
     path, gaussians, camera = made(tmp_path, empty_at_the_left, encoding=Encoding(depth="float"), header=header)
     spec, pixels = read(path)
     assert spec.deep and spec.channelnames == ("R", "G", "B", "A", "Z", "ZBack")
@@ -185,7 +184,7 @@ def test_a_file(tmp_path: Path) -> None:
 
 
 def test_halves_and_a_window(tmp_path: Path) -> None:
-    camera = crop(scenes.tilted_camera(71, 50), 5, 3, 40, 30)
+    camera = scenes.tilted_camera(71, 50).cropped(5, 3, 40, 30)
     header = FrameFileHeader(window=Window(5, 3, 71, 50))
     path, gaussians, _ = made(tmp_path, camera, encoding=Encoding("half", compression="piz"), header=header)
     spec, pixels = read(path)
@@ -199,7 +198,7 @@ def test_halves_and_a_window(tmp_path: Path) -> None:
 def test_strips_make_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, *_ = made(tmp_path)
     whole = path.read_bytes()
-    monkeypatch.setattr("clsplat.frame.deep.DEEP_STRIP_FLOATS", 71 * 5 * 6 * 16)
+    monkeypatch.setattr("clsplat.frame.strips.DEEP_STRIP_FLOATS", 71 * 5 * 6 * 16)
     made(tmp_path)
     assert path.read_bytes() == whole
 

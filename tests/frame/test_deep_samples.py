@@ -19,7 +19,6 @@ from clsplat.config.pictures import ColourConfig, PictureConfig, SamplingConfig
 from clsplat.frame.lens import ByMap, Warp
 from clsplat.frame.pipeline import FramePipeline, FrameRequest
 from clsplat.frame.samples import sample_cameras
-from clsplat.frame.window import crop
 from clsplat.gaussians import Gaussians
 from clsplat.images.stmap import StMap
 from clsplat.rendering.renderer import Renderer
@@ -107,7 +106,7 @@ def test_what_stands_still_stays_what_it_is() -> None:
 def test_windows_have_the_same_bits(kind: str) -> None:
     pipeline, camera = pipeline_of(KINDS[kind]), moving(KINDS[kind].middle)
     whole = deep(pipeline, camera)
-    assert_same_bits(deep(pipeline, crop(camera, 19, 21, 40, 30)), whole[:, 21:51, 19:59])
+    assert_same_bits(deep(pipeline, camera.cropped(19, 21, 40, 30)), whole[:, 21:51, 19:59])
 
 
 @pytest.mark.parametrize("zoom", [1.0, 1.7], ids=["one place a pixel", "four places"])
@@ -131,7 +130,7 @@ def test_bent(zoom: float) -> None:
     k = warp.samples
     wanted = wanted.reshape(camera.height, k, camera.width, k, 4).mean(axis=(1, 3))
     assert_close(flattened(slices), wanted, absolute=4e-6)  # as above
-    part = crop(camera, 5, 7, 33, 20)
+    part = camera.cropped(5, 7, 33, 20)
     assert_same_bits(deep(pipeline, part, lens=source), slices[:, 7:27, 5:38])
 
 
@@ -142,6 +141,7 @@ def test_bent_and_blurred(monkeypatch: pytest.MonkeyPatch) -> None:
     slices = deep(pipeline, camera, lens=source)
     flat = pipeline.draw(FrameRequest(moving, lens=source))[0](camera, ("rgb", "alpha"))
     assert np.abs(flattened(slices)[..., 3] - flat["alpha"]).mean() < 0.01  # that is between pixels by a cubic
-    monkeypatch.setattr("clsplat.frame.deep.DEEP_MERGE_FLOATS", 1 << 16)
+    for module in ("deep", "strips"):
+        monkeypatch.setattr(f"clsplat.frame.{module}.DEEP_MERGE_FLOATS", 1 << 16)
     monkeypatch.setattr("clsplat.frame.deep._WARP_BATCH_PIXELS", 200)
     assert_same_bits(deep(pipeline_of(KINDS["shutter"]), camera, lens=source), slices)

@@ -20,10 +20,10 @@ from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.frame.draw import Draw, Planes, drawn_by
 from clsplat.frame.samples import filter_taps, supersampled
-from clsplat.frame.window import crop, framed, reframed
 from clsplat.reference import every_pixel
 from clsplat.reference import render as reference
 from clsplat.rendering.renderer import Renderer
+from clsplat.sequence.task import framed
 
 WIDTH, HEIGHT = 150, 100
 EVERYTHING = tuple(FRAME_CHANNELS)
@@ -97,12 +97,12 @@ def test_wide_overscan_is_exact_where_it_shows() -> None:
 def test_the_twins_have_windows_too() -> None:
     gaussians, camera = scenes.overlap()
     whole, _ = reference.render(gaussians, camera)
-    part, _ = reference.render(gaussians, crop(camera, 7, 5, 20, 11))
+    part, _ = reference.render(gaussians, camera.cropped(7, 5, 20, 11))
     np.testing.assert_allclose(part, whole[5:16, 7:27], rtol=0, atol=1e-12)
     focal = camera.width / (2 * np.pi)
     panorama = replace(camera, fx=focal, fy=focal, projection="equirectangular")
     pictures = [
-        every_pixel.render(gaussians, each, (0, 0, 0)).image for each in (panorama, crop(panorama, 7, 5, 20, 11))
+        every_pixel.render(gaussians, each, (0, 0, 0)).image for each in (panorama, panorama.cropped(7, 5, 20, 11))
     ]
     np.testing.assert_allclose(pictures[1], pictures[0][5:16, 7:27], rtol=0, atol=1e-12)
 
@@ -130,7 +130,7 @@ def test_a_region_of_a_supersampled_frame(default_device: Device, kind: str) -> 
     whole = draw(camera, EVERYTHING)
     for x, y, width, height in ((37, 21, 50, 41), (0, 0, 10, HEIGHT)):
         assert_same(
-            draw(crop(camera, x, y, width, height), EVERYTHING), whole, slice(y, y + height), slice(x, x + width)
+            draw(camera.cropped(x, y, width, height), EVERYTHING), whole, slice(y, y + height), slice(x, x + width)
         )
 
 
@@ -160,12 +160,12 @@ def test_motion_is_up_in_files(default_device: Device) -> None:
 
 def test_a_camera_gets_the_window_of_another() -> None:
     camera = PERSPECTIVE[1]
-    part = crop(camera.resized(2 * WIDTH, 2 * HEIGHT), 10, 20, 30, 40)
+    part = camera.resized(2 * WIDTH, 2 * HEIGHT).cropped(10, 20, 30, 40)
     moved = replace(camera, translation=camera.translation + 1)
-    again = reframed(moved, part)
+    again = moved.reframed(part)
     assert (again.width, again.height, again.fx, again.cx) == (30, 40, part.fx, part.cx)
     assert again.window == part.window
-    assert reframed(camera, camera).window is None
+    assert camera.reframed(camera).window is None
     refuses("edges on whole pixels", part.resized, 31, 40, error=ValueError)
 
 

@@ -20,7 +20,6 @@ from clsplat.frame.draw import drawn_by
 from clsplat.frame.holdout import Cut
 from clsplat.frame.samples import supersampled
 from clsplat.frame.strips import in_strips
-from clsplat.frame.window import crop
 from clsplat.gaussians import Gaussians
 from clsplat.images.holdouts import Holdout, Surfaces, surfaces_of
 from clsplat.reference import holdout as twin
@@ -136,8 +135,8 @@ def test_windows_strips_and_little_memory_change_no_bit() -> None:
     cut = Cut(Holdout(stacked(layered(camera)), 0, 0, (300, 200)))
     draw = drawn_by(Renderer(), gaussians, cut=cut)
     whole = draw(camera, names)
-    part, striped = draw(crop(camera, 37, 21, 100, 60), names), in_strips(draw, 64)(camera, names)
-    larger = draw(crop(camera, -16, -8, 340, 216), names)
+    part, striped = draw(camera.cropped(37, 21, 100, 60), names), in_strips(draw, 64)(camera, names)
+    larger = draw(camera.cropped(-16, -8, 340, 216), names)
     limit = 14 << 20
     renderer = Renderer(open_device(None, limit))
     little = drawn_by(renderer, gaussians, cut=cut)(camera, names)

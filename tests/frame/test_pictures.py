@@ -20,10 +20,10 @@ from clsplat.errors import InputError
 from clsplat.frame.draw import Planes
 from clsplat.frame.pipeline import FramePipeline, FrameRequest
 from clsplat.frame.strips import write_in_strips
-from clsplat.frame.window import framed
 from clsplat.images.colour import LINEAR, linear_to_srgb, srgb_to_linear
 from clsplat.images.frame_files import FrameFileHeader, write_channels
 from clsplat.rendering.renderer import Renderer
+from clsplat.sequence.task import framed
 
 CLOUD, CAMERA = scenes.random_cloud(1500, 8, 100, 70)
 

@@ -12,15 +12,14 @@ from calls import refuses
 from compare import assert_close, assert_same_bits
 
 from clsplat.camera import Camera
-from clsplat.config.pictures import FramingConfig, SamplingConfig
+from clsplat.config.pictures import FramingConfig, SamplingConfig, stratified_times
 from clsplat.errors import InputError
 from clsplat.frame.draw import drawn_by
 from clsplat.frame.samples import lens_points, lens_radius, sample_cameras, sampled, through_lens
-from clsplat.frame.window import crop, framed
 from clsplat.reference import render as reference
 from clsplat.rendering.renderer import Renderer
+from clsplat.sequence.task import framed
 from clsplat.shots.shot import Shot, numbered
-from clsplat.shots.shutter_times import sample_times
 
 CLOUD, CAMERA = scenes.random_cloud(1000, 8, 100, 70)
 
@@ -46,9 +45,9 @@ def dot(depth: float, width: int = 201) -> tuple[scenes.Gaussians, Camera]:
 
 def test_times_are_one_in_each_interval() -> None:
     for count in (1, 2, 7, 16, 100):
-        times = sample_times(count)
+        times = np.array(stratified_times(count))
         assert_close(np.sort(times), (np.arange(count) + 0.5) / count)
-    times = sample_times(64)
+    times = np.array(stratified_times(64))
     assert abs(np.corrcoef(times, np.arange(64))[0, 1]) < 0.2  # the lens's radius grows with the index
     assert (np.abs(np.diff(times)) > 0.25).mean() > 0.5
 
@@ -154,7 +153,7 @@ def test_windows_have_the_bits_of_the_frame_and_twice_the_same() -> None:
     config = SamplingConfig(samples=4, shutter_angle=90.0, aperture=0.05, focus=4.0)
     draw = sampled(drawn_by(Renderer(), CLOUD), *sample_cameras(sliding, config))
     whole, again = (draw(CAMERA, ("rgb", "alpha", "depth")) for _ in range(2))
-    part = draw(crop(CAMERA, 21, 13, 40, 30), ("rgb", "alpha", "depth"))
+    part = draw(CAMERA.cropped(21, 13, 40, 30), ("rgb", "alpha", "depth"))
     for name, values in whole.items():
         assert_same_bits(values, again[name])
         assert_same_bits(part[name], np.ascontiguousarray(values[13:43, 21:61]))

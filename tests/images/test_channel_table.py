@@ -32,10 +32,10 @@ def kernel(name: str) -> str:
 
 def test_every_feature_has_its_define_in_the_kernel_and_the_other_way_round() -> None:
     text = kernel("features.cl")
-    written = {name.lower() for name in re.findall(r"row(?:\[| \+ )FEATURE_([A-Z_]+)", text)}
-    guarded = {name.lower() for name in re.findall(r"#ifdef FEATURE_([A-Z_]+)", text)}
+    written = {name.lower() for name in re.findall(r"row(?:\[| \+ )FEATURE_([A-Z0-9_]+)", text)}
+    guarded = {name.lower() for name in re.findall(r"#ifdef FEATURE_([A-Z0-9_]+)", text)}
     assert written == guarded == set(FEATURE_WIDTHS)
-    assert {name.lower() for name in re.findall(r"FEATURE_([A-Z_]+)", kernel("channels.cl"))} <= set(FEATURE_WIDTHS)
+    assert {name.lower() for name in re.findall(r"FEATURE_([A-Z0-9_]+)", kernel("channels.cl"))} <= set(FEATURE_WIDTHS)
 
 
 def test_the_planes_behind_the_features_are_those_of_the_kernel() -> None:

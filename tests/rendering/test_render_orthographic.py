@@ -106,8 +106,9 @@ def test_render(name: str, tmp_path: Path) -> None:
     found, spec = read(tmp_path / "a.01.exr")
     after = replace(CAMERA, translation=-ROTATION @ (POSITION + 0.25 * RIGHT))
     wanted = every_pixel.render(gaussians, CAMERA, after=after)
-    names = {"R": wanted.image[:, :, 0], "A": wanted.alpha, "Z": wanted.depth, "P.y": wanted.position[:, :, 1]}
-    names |= {"N.z": wanted.normal[:, :, 2], "forward.u": wanted.motion[:, :, 0]}
+    names = {"R": wanted.image[:, :, 0], "A": wanted.alpha, "Z": wanted.features["depth"]}
+    names |= {"P.y": wanted.features["position"][:, :, 1], "N.z": wanted.features["normal"][:, :, 2]}
+    names["forward.u"] = wanted.features["motion"][:, :, 0]
     solid = (wanted.alpha > 0.5) & (wanted.margin > 3e-4)
     assert solid.sum() > 50
     for channel, values in names.items():

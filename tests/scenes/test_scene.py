@@ -22,6 +22,7 @@ from clsplat.images.reading import companions, read_image
 from clsplat.images.writing import write_image
 from clsplat.scenes.folder_layouts import detect
 from clsplat.scenes.loading import camera_bounds, load_scene
+from clsplat.scenes.scene import spread
 
 RNG = np.random.default_rng(2)
 WIDTH, HEIGHT = 48, 32
@@ -457,3 +458,11 @@ def test_a_cut_jpeg_is_found_before_training(tmp_path: Path) -> None:
     cut.write_bytes(data[: len(data) // 2])
     scene = load_scene(folder)
     refuses(cut.name, scene.check_pictures)
+
+
+def test_a_selection_is_spread_evenly() -> None:
+    assert spread([], 8) == []
+    assert spread(range(1), 8) == [0]
+    assert spread(range(8), 8) == list(range(8))
+    assert spread(range(15), 8) == [0, 2, 4, 6, 8, 10, 12, 14]
+    assert spread(range(5), 2) == [0, 4]

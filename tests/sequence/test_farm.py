@@ -29,7 +29,8 @@ from clsplat.errors import InputError
 from clsplat.files.documents import digest
 from clsplat.sequence import farm
 from clsplat.sequence.finished_frames import stamp
-from clsplat.sequence.task import RenderOptions, make_tasks
+from clsplat.sequence.shot_tasks import make_tasks
+from clsplat.sequence.task import RenderOptions
 from clsplat.shots.shot import Shot, numbered
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -118,7 +118,7 @@ def test_two_jobs_render_each_frame_once(tmp_path: Path) -> None:
     def job() -> None:
         records: list[Record] = []
         begin.wait()
-        run_tasks(tasks, [slowly], OPTIONS, records.append, sharing=Sharing(OPTIONS))
+        run_tasks(tasks, [slowly], OPTIONS, records.append, shared=True)
         ends.append((records, all(is_complete(task, OPTIONS) for task in tasks)))
 
     jobs = [threading.Thread(target=job) for _ in range(2)]
@@ -151,7 +151,7 @@ def test_a_frame_of_another_job_is_waited_for(
         return rendered(task)
 
     job = threading.Thread(
-        target=run_tasks, args=(tasks, [noting, noting], OPTIONS, records.append, None, Sharing(OPTIONS))
+        target=run_tasks, args=(tasks, [noting, noting], OPTIONS, records.append), kwargs={"shared": True}
     )
     job.start()
     time.sleep(0.4)
@@ -175,7 +175,7 @@ def test_claims_are_given_back_when_a_job_breaks_off(tmp_path: Path) -> None:
         return rendered(task)
 
     with pytest.raises(OSError, match="no room"):
-        run_tasks(tasks_in(tmp_path, 9), [failing], OPTIONS, lambda record: None, sharing=Sharing(OPTIONS))
+        run_tasks(tasks_in(tmp_path, 9), [failing], OPTIONS, lambda record: None, shared=True)
     assert not [path for path in tmp_path.iterdir() if path.suffix != ".exr"]
 
 

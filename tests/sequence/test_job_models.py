@@ -24,10 +24,10 @@ from clsplat.models import edit
 from clsplat.models.formats import usd
 from clsplat.models.instances import Placement, extrapolated, rows_of
 from clsplat.sequence.job_models import load_cast
-from clsplat.sequence.task import RenderOptions, Task, camera_after, camera_before, header, make_tasks, model_times
+from clsplat.sequence.shot_tasks import make_tasks
+from clsplat.sequence.task import RenderOptions, Task, camera_after, camera_before, header, model_times
 from clsplat.shots import Shot, read_shot
 from clsplat.shots.shot_file import AnimatedProperty, KeyedTrack, Within
-from clsplat.shots.shutter_times import sample_moments
 
 KEY = {"world_from_cam": [1, 0, 0, 0], "fov_x": 60}
 LATE = SamplingConfig(shutter_open=0.0, shutter_close=0.5, samples=2)
@@ -63,7 +63,7 @@ def assert_goes_along(model: Path, shot: Shot, sampling: SamplingConfig) -> None
     wanted = None
     for task in load_cast(model).seen(tasks, options.pictures, options.channels):
         middle = sampling.middle
-        cameras = {time: task.at(time) for time in (middle, *(sample_moments(sampling) if sampling.moves else ()))}
+        cameras = {time: task.at(time) for time in (middle, *(sampling.sample_times if sampling.moves else ()))}
         around = camera_before(task, options.pictures), camera_after(task, options.pictures)
         assert around[0] and around[1] and task.placed
         for time, camera in (*cameras.items(), (middle - 1, around[0]), (middle + 1, around[1])):

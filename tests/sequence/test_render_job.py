@@ -29,7 +29,8 @@ from clsplat.sequence import finished_frames, workers
 from clsplat.sequence import task as sequence_task
 from clsplat.sequence.finished_frames import is_complete
 from clsplat.sequence.frame_renderer import FrameRenderer, RenderedFrame
-from clsplat.sequence.task import Record, RenderOptions, Task, make_tasks, settings_digest
+from clsplat.sequence.shot_tasks import make_tasks
+from clsplat.sequence.task import Record, RenderOptions, Task, settings_digest
 from clsplat.sequence.workers import encode_frame, run_tasks
 from clsplat.shots.motion import camera_after, camera_before, stretches
 from clsplat.shots.shot import Frame, Shot, numbered

@@ -15,11 +15,11 @@ from needs import require
 from clsplat.camera import Camera
 from clsplat.config.pictures import PictureConfig, SamplingConfig
 from clsplat.reference.cameras import pixel_from_world
-from clsplat.sequence.task import RenderOptions, Task, camera_after, make_tasks, picture_camera, settings_digest
+from clsplat.sequence.shot_tasks import make_tasks
+from clsplat.sequence.task import RenderOptions, Task, camera_after, picture_camera, settings_digest
 from clsplat.shots import Shot, choose_shot, read_shot
 from clsplat.shots.optics import Optics, settled, time_code
 from clsplat.shots.readers.usd_settings import CONFORM_POLICIES
-from clsplat.shots.shutter_times import sample_moments
 
 LENS = "float fStop = 2\nfloat focusDistance = 5\n"
 SHUTTER = "double shutter:open = -0.25\ndouble shutter:close = 0.25\n"
@@ -199,7 +199,7 @@ def test_tasks_hold_the_moments_of_the_shutter(tmp_path: Path) -> None:
     assert task.sampling == SamplingConfig(samples=5, shutter_open=-0.25, shutter_close=0.25)
     sent = pickle.loads(pickle.dumps(task))  # as Dask does
     assert shot.moment is not None
-    for time in (*sample_moments(task.sampling), -0.25, 0.25, 1.8 - 2, 2.15 - 2):
+    for time in (*task.sampling.sample_times, -0.25, 0.25, 1.8 - 2, 2.15 - 2):
         for one in (task, sent):
             np.testing.assert_array_equal(one.at(time).position, shot.moment(2 + time).position)
             assert one.at(time).fx == shot.moment(2 + time).fx

@@ -81,7 +81,7 @@ def test_against_the_twin(shaped_device: Device, name: str) -> None:
     assert solid.any()
     # The bound, relative to what a value is made of: a coordinate or a motion near zero is a sum that cancels.
     for field in ("depth", "normal", "position", "motion", "backward"):
-        of = getattr(wanted, field).reshape(*solid.shape, -1)[solid]
+        of = wanted.features[field].reshape(*solid.shape, -1)[solid]
         size = np.abs(of).max(axis=1, keepdims=True)
         assert_close(got[field][solid] / size, of / size, absolute=1e-4, name=field)
 

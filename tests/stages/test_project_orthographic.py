@@ -17,7 +17,6 @@ from clsplat.config.rasterizer import BenchSwitches
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
 from clsplat.frame.draw import on_tiles
-from clsplat.frame.window import crop
 from clsplat.reference import every_pixel
 from clsplat.reference import render as reference
 from clsplat.reference.cameras import pixel_from_world
@@ -141,7 +140,7 @@ def test_windows_and_little_memory_change_no_bit() -> None:
         return {"image": image.image, "alpha": image.alpha, **found}
 
     whole = drawn(open_device(), camera, moved(camera))
-    part, rows, columns = on_tiles(crop(camera, 37, 21, 100, 60))
+    part, rows, columns = on_tiles(camera.cropped(37, 21, 100, 60))
     after = replace(moved(camera), width=part.width, height=part.height, window=part.window)
     got = {
         name: np.ascontiguousarray(plane[rows, columns]) for name, plane in drawn(open_device(), part, after).items()

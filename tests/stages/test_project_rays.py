@@ -119,7 +119,7 @@ def assert_as_the_twin(device: Device, scene: scenes.Scene, after: Camera, wante
     fields = {name: plane for name, plane in found.items() if name not in ("median", "first", "count", "index")}
     assert set(fields) == {"depth", *FEATURES}
     for name, plane in fields.items():
-        of, got = (values.reshape(*solid.shape, -1)[solid] for values in (getattr(wanted, name), plane))
+        of, got = (values.reshape(*solid.shape, -1)[solid] for values in (wanted.features[name], plane))
         # The bound, relative to what a value is made of.
         size = np.abs(of).max(axis=1, keepdims=True)
         assert_close(got / size, of / size, absolute=1e-4, name=name)

@@ -23,6 +23,8 @@ from clsplat.rendering.memory_plan import Need, plan
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.training.supervision import image_cache
+from clsplat.training.supervision.decoding import Decoder
+from clsplat.training.supervision.host_photographs import HostPhotographs
 from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.trainer import Trainer
 
@@ -49,7 +51,7 @@ def bytes_of(scene: Scene) -> int:
 
 def test_they_go_up_once_and_stay(scene: Scene, device: Device) -> None:
     apart = with_memory_of_its_own(device)
-    store = ImageCache(scene.require_training_views(), apart)
+    store = ImageCache(apart, HostPhotographs(Decoder(scene.require_training_views())))
     store.follow(bytes_of(scene))
     for _ in range(2):
         for index in range(len(scene.require_training_views())):
@@ -66,7 +68,7 @@ def test_they_go_up_once_and_stay(scene: Scene, device: Device) -> None:
 def test_those_that_do_not_fit_stay_on_the_host(scene: Scene, default_device: Device) -> None:
     views = scene.require_training_views()
     device, some = with_memory_of_its_own(default_device), bytes_of(scene) // 2
-    store = ImageCache(views, device)
+    store = ImageCache(device, HostPhotographs(Decoder(views)))
     store.follow(some)
     kinds = [isinstance(store.bring(index, 1.0), DeviceArray) for index in range(len(views))]
     assert kinds == [index < len(views) // 2 for index in range(len(views))]
@@ -80,7 +82,7 @@ def test_those_that_do_not_fit_stay_on_the_host(scene: Scene, default_device: De
 def test_a_device_that_has_less_than_it_says(
     scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store = ImageCache(scene.require_training_views(), with_memory_of_its_own(default_device))
+    store = ImageCache(with_memory_of_its_own(default_device), HostPhotographs(Decoder(scene.require_training_views())))
     store.follow(2**30)
     monkeypatch.setattr(image_cache, "allocate", raising(CapacityError("no memory left")))
     assert not isinstance(store.bring(0, 1.0), DeviceArray)
@@ -90,7 +92,7 @@ def test_a_device_that_has_less_than_it_says(
 
 def test_memory_that_is_the_host_s_takes_none(scene: Scene, device: Device) -> None:
     assert device.shares_memory == (device.kind == "cpu")
-    store, used = ImageCache(scene.require_training_views(), device), device.memory.used
+    store, used = ImageCache(device, HostPhotographs(Decoder(scene.require_training_views()))), device.memory.used
     image = store.bring(0, 1.0)
     if device.shares_memory:
         assert isinstance(image, DeviceArray)
@@ -145,7 +147,7 @@ def test_those_that_do_not_fit_are_sent_ahead(scene: Scene, default_device: Devi
     """From room that the last ones give up; never more than allowed."""
     views = scene.require_training_views()
     device, some = with_memory_of_its_own(default_device), bytes_of(scene) // len(views) * (UPLOAD_RING_SLOTS + 1)
-    store = ImageCache(views, device)
+    store = ImageCache(device, HostPhotographs(Decoder(views)))
     store.follow(some)
     for index in range(len(views)):
         store.bring(index, 1.0)
@@ -157,7 +159,7 @@ def test_those_that_do_not_fit_are_sent_ahead(scene: Scene, default_device: Devi
         assert device.memory.used <= some
     store.ahead(0, 2.0)
     assert device.memory.used <= some, "at another size it begins anew"
-    tight = ImageCache(views, with_memory_of_its_own(default_device))
+    tight = ImageCache(with_memory_of_its_own(default_device), HostPhotographs(Decoder(views)))
     tight.follow(some // 2)
     for index in range(len(views) // 2):
         tight.bring(index, 1.0)

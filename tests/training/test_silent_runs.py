@@ -31,8 +31,10 @@ from clsplat.training.loop import OVERFITTING_DB, doubt_length
 from clsplat.training.preparation import late_settings
 
 
-def test_the_module_of_the_command_line_is_one() -> None:
-    assert python("-m", "clsplat.cli", "--version").stdout == f"clsplat {clsplat.__version__}\n"
+def test_a_module_that_is_no_entry_point_is_not_silent() -> None:
+    done = python("-m", "clsplat.cli", "--version")
+    assert done.returncode == 1
+    assert "cannot be directly executed" in done.stderr
 
 
 @pytest.mark.parametrize("value", ['""', "5", "[]"])

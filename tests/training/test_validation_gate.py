@@ -16,7 +16,7 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.config.presets import scheduled
 from clsplat.config.training import DensityConfig, TrainConfig
-from clsplat.training.cameras.validation_gate import CameraGate, Drift, drift, spread, steps_of
+from clsplat.training.cameras.validation_gate import CameraGate, Drift, drift, steps_of
 
 CONFIG = TrainConfig(iterations=1000, refine_poses=True, refine_gate=0.5, density=DensityConfig(every=0))
 EXTENT = 3.0
@@ -55,14 +55,6 @@ def some_drift() -> Drift:
 def test_measurements_come_before_what_disturbs_them(config: TrainConfig, expected: tuple[int, ...]) -> None:
     """Not shortly after a split or an opacity reset, but before it."""
     assert steps_of(config) == expected
-
-
-def test_views_are_spread_evenly() -> None:
-    assert spread(0) == []
-    assert spread(1) == [0]
-    assert spread(8) == list(range(8))
-    assert spread(15) == [0, 2, 4, 6, 8, 10, 12, 14]
-    assert spread(5, 2) == [0, 4]
 
 
 def test_a_camera_taken_along_sees_the_same() -> None:

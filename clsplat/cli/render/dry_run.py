@@ -5,46 +5,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from clsplat.cli.render.job import Job
-from clsplat.config.channels import light_and_rest
 from clsplat.config.pictures import DEFAULT_VIDEO_FPS
-from clsplat.device.context import open_device
 from clsplat.errors import amount, examples
-from clsplat.frame.deep import deep_rows
-from clsplat.frame.draw import feature_floats, on_tiles
-from clsplat.frame.samples import finer
-from clsplat.frame.strips import strip_rows
-from clsplat.frame.window import crop
 from clsplat.images.video import rate_of
-from clsplat.rendering.memory_needs import plan_frame
-from clsplat.rendering.memory_plan import Plan
-from clsplat.rendering.renderer import held_sh
 from clsplat.sequence import workers
 from clsplat.sequence.finished_frames import frames_there
-from clsplat.sequence.task import picture_camera, sampling_of, straight_camera
+from clsplat.sequence.frame_renderer import DevicePlan
+from clsplat.sequence.task import picture_camera, sampling_of
 from clsplat.shots.frame_numbers import ranges
-from clsplat.stages.deep import DEEP_FLOATS
-from clsplat.stages.holdout import HELD_PIXEL_BYTES
 
 
-@dataclass(frozen=True)
-class DevicePlan:
-    """Memory plan of a device for the frame that needs most memory.
-
-    strips: number of strips that a frame is rendered in.
-    """
-
-    device: str
-    plan: Plan
-    strips: int
-
-
-def dry_run(job: Job) -> int:
-    """Print the plan. Raises DeviceError, and CapacityError if a frame does not fit."""
-    plans = [] if job.request.flags.on_farm else [_device_plan(job, selector) for selector in job.request.devices]
+def dry_run(job: Job, plans: Sequence[DevicePlan]) -> int:
+    """Print the job, and the memory plan of each device that renders it."""
     document = _document(job, plans)
     print(json.dumps(document, indent=2) if job.request.flags.json else "\n".join(_lines(job, document, plans)))
     return 0
@@ -120,33 +95,6 @@ def _lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> I
     if job.request.flags.skip_existing:
         skipped = [frame["frame"] for frame in frames if frame["skipped"]]
         yield f"skipped   {len(skipped)}" + (f": {ranges(sorted(set(skipped)))}" if skipped else "")
-
-
-def _device_plan(job: Job, selector: str | None) -> DevicePlan:
-    """The plan for the device that `selector` names. Raises DeviceError and CapacityError."""
-    device, options, config = open_device(selector, job.request.memory_limit), job.options, job.request.flags.rasterizer
-    framing, names = options.pictures.framing, set(options.channels)
-    gaussians = job.cast.at(job.tasks[0].number)
-    floats, moved = held_sh(gaussians, config).floats, job.cast.tracks is not None and "motion" in names
-    features, samples = feature_floats(names), max(sampling_of(task, options.pictures).pictures for task in job.tasks)
-    plans = []
-    cameras = [straight_camera(task, options.pictures) for task in job.tasks]
-    for camera in {(camera.width, camera.height): camera for camera in cameras}.values():
-        if options.deep:
-            bins, planes = options.deep.bins, 4 * DEEP_FLOATS * options.deep.bins
-            rows = deep_rows(device, camera, bins, samples)
-        else:
-            planes = HELD_PIXEL_BYTES if options.holdout is not None else 0
-            rows = strip_rows(device, camera, options.channels, framing, planes)
-        strip = crop(camera, 0, 0, camera.width, rows) if rows < camera.height else camera
-        drawn = [(strip, features)]
-        if framing.supersample > 1 and light_and_rest(names)[0]:
-            drawn.append((finer(strip, framing), feature_floats(light_and_rest(names)[0])))
-        for part, floats_beside in drawn:
-            sizes = (on_tiles(part)[0], config, floats_beside, planes)
-            plan = plan_frame(device, len(gaussians), floats, *sizes, moved)
-            plans.append(DevicePlan(device.name, plan, -(-camera.height // rows)))
-    return max(plans, key=lambda device: device.plan.need.total)
 
 
 def _sizes(frames: Sequence[dict[str, Any]]) -> list[str]:

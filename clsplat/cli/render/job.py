@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Job of `clsplat render`: tasks, models and options of a request, and the checks that need them."""
+"""Job of `clsplat render`: tasks, models and options of a request, the checks that need them, and the writing of its
+frames."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+import json
+import sys
+import time
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from clsplat.camera import Camera, Window
 from clsplat.cli.render.flags import RenderVerb
 from clsplat.cli.render.request import Request
-from clsplat.cli.render.shots import shots_asked
-from clsplat.cli.render.usd_stage import with_stage
+from clsplat.cli.render.shots import shots_asked, with_stage
 from clsplat.config.pictures import PictureConfig, VideoConfig
 from clsplat.errors import InputError, examples, warn
 from clsplat.files.atomic import check_new
@@ -23,14 +27,14 @@ from clsplat.frame.mattes import Matte
 from clsplat.frame.samples import finer
 from clsplat.images.colour import Colours
 from clsplat.images.video import check_size, video_record
+from clsplat.progress import FrameProgress
 from clsplat.runs.appearance import gains_of
-from clsplat.sequence.finished_frames import check_folders
-from clsplat.sequence.holdout_files import held_out
+from clsplat.sequence import finished_frames, workers
 from clsplat.sequence.job_models import JobModels, load_cast
 from clsplat.sequence.mattes import mattes_of, names_of
 from clsplat.sequence.numbered import is_sequence
-from clsplat.sequence.stereo_tasks import make_views
-from clsplat.sequence.task import RenderOptions, Task, digest_of, picture_camera, warp_of
+from clsplat.sequence.shot_tasks import held_out, make_views
+from clsplat.sequence.task import Record, RenderOptions, Task, digest_of, picture_camera, warp_of
 from clsplat.shots.shot_file import is_layout, parse_transform
 from clsplat.version import package_version
 
@@ -64,11 +68,11 @@ def job_of(request: Request) -> Job:
     tasks, chosen = make_views(shots, flags.frames, flags.output, request.resize, channels, sampling=sampling)
     pictures, unapplied = with_stage(request.pictures, flags.cameras, chosen, tasks)
     sizes = _picture_sizes(tasks, pictures, deep=flags.deep)
-    check_folders(tasks)
+    finished_frames.check_folders(tasks)
     if flags.holdout is not None:
         tasks = held_out(tasks, flags.holdout, flags.holding)
     video = _video(flags, chosen.fps, tasks[0].path, sizes)
-    for text in (*request.unused(), *chosen.told(flags.cameras, *unapplied)):
+    for text in chosen.told(flags.cameras, *unapplied):
         warn(text)
     cast = models()
     gains = gains_of(flags.model, flags.appearance) if flags.appearance is not None else ()
@@ -142,7 +146,6 @@ def _picture_sizes(tasks: Sequence[Task], pictures: PictureConfig, *, deep: bool
     if deep and tasks[0].right is not None:
         raise InputError(f"--deep: {tasks[0].path} would hold both eyes, expected a file for each: {{eye}} in -o")
     sizes = set()
-    check_warps(tasks, pictures)
     for task in tasks:
         cameras = [picture_camera(view, pictures) for view in task.views]
         for camera in cameras:
@@ -151,6 +154,7 @@ def _picture_sizes(tasks: Sequence[Task], pictures: PictureConfig, *, deep: bool
             sizes.add((camera.width, camera.height))
         if len(cameras) > 1:
             _check_pair(task, *cameras)
+    check_warps(tasks, pictures)
     return sizes
 
 
@@ -197,3 +201,68 @@ def check_warps(tasks: Sequence[Task], pictures: PictureConfig) -> None:
             f"{flag}: {100 * part:.0f} % of frame {number} stays black and transparent: its pixels lie more than a "
             f"frame's size beyond the straight picture, or have no place in it{advice}"
         )
+
+
+def write_frames(job: Job, renderers: Sequence[Any]) -> int:
+    """Render and write the frames that are not there, with a renderer for each device or on a farm.
+
+    Raises ClsplatError, and KeyboardInterrupt with the number of frames done.
+    """
+    tasks, options = job.tasks, job.options
+    flags = job.request.flags
+    there = finished_frames.frames_there(tasks, options, job.video) if flags.skip_existing else set()
+    if not (flags.overwrite or flags.is_video):
+        finished_frames.check_foreign([task for task in tasks if task.key not in there])
+    finished_frames.make_folders(tasks)
+    finished_frames.remove_temporaries(tasks)
+    left = [task for task in tasks if task.key not in there]
+    records: dict[str, Record] = {}
+    lines = sys.stdout if not flags.json else sys.stderr if flags.progress in ("json", "openjd") else None
+    start = time.monotonic()
+    try:
+        with (
+            FrameProgress(len(tasks), flags.progress, lines=lines) as progress,
+            workers.open_video(left, job.video, options) as video,
+        ):
+
+            def done(record: Record) -> None:
+                records[record.key] = record
+                progress(record)
+
+            for task in tasks:
+                if task.key in there:
+                    done(workers.record_of(task, options, skipped=True))
+            if flags.on_farm:
+                from clsplat.sequence.farm import WorkerJob, render_on_farm
+
+                cast, settings = job.cast, (flags.rasterizer, job.request.devices[0], job.request.memory_limit)
+                model, placed = str(cast.path.absolute()), cast.tracks is not None
+                worker_job = WorkerJob(model, cast.digest, options, *settings, placed)
+                render_on_farm(left, worker_job, done, scheduler=flags.scheduler, workers=flags.workers, video=video)
+            else:
+                shared = flags.skip_existing and not flags.is_video
+                workers.run_tasks(left, renderers, options, done, video, shared=shared)
+    except KeyboardInterrupt as error:
+        count = f"{len(records)} of {len(tasks)} frames"
+        advice = "nothing is left of the video" if flags.is_video else "go on with --skip-existing"
+        error.args = (f"after {count}; {advice}",)
+        raise
+    if blank := [task.key for task in tasks if records[task.key].blank]:
+        warn(
+            f"{len(blank)} of {len(tasks)} frames show nothing of the model: {examples(blank)}; are the cameras in the "
+            "model's world?"
+        )
+    if flags.profile:
+        _print_profile(records.values(), time.monotonic() - start, len(renderers))
+    if flags.json:
+        print(json.dumps([records[task.key].document() for task in tasks], indent=2))
+    return 0
+
+
+def _print_profile(records: Iterable[Record], wall: float, devices: int) -> None:
+    """Print the fraction of the wall time in which the devices worked."""
+    kernels, transfers = (
+        sum(getattr(record, name) or 0.0 for record in records) / (10 * max(wall, 1e-9) * max(devices, 1))
+        for name in ("kernel_ms", "transfer_ms")
+    )
+    print(f"in {wall:.2f} s the device ran kernels {kernels:.1f} % and transfers {transfers:.1f} %", file=sys.stderr)

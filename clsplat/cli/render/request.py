@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from clsplat.config.checks import parse_bytes
 from clsplat.config.holdout import HoldoutConfig
 from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding, PictureConfig, VideoConfig, WarpConfig
 from clsplat.device.context import find_device, list_devices
-from clsplat.errors import InputError
+from clsplat.errors import InputError, warn
 from clsplat.images.alpha import background_colour
 from clsplat.images.frame_files import check_format, parse_channels
 from clsplat.images.video import check_codec, video_missing
@@ -49,30 +49,23 @@ class Request:
     memory_limit: int | None
     resize: Callable[[Camera], Camera]
 
-    def unused(self) -> Iterator[str]:
-        """A warning of flags that have no effect on these files, if there are any."""
-        flags, defaults = self.flags, {field.name: field.default for field in fields(RenderVerb)}
-        names = [
-            name
-            for name, extensions in _EXTENSIONS_BY_FLAG.items()
-            if flags.extension not in extensions
-            and getattr(flags, name) != defaults[name]
-            and not (name == "exr" and flags.deep)
-        ]
-        what = flags.extension
-        if "rgb" not in self.channels and flags.background is not None:
-            names.append("background")
-            what += " of these channels"
-        if names:
-            yield f"not used for {what}: {', '.join(f'--{name}' for name in names)}"
-
 
 def checked(flags: RenderVerb) -> Request:
-    """The request of these flags. Raises InputError, and DeviceError for a device that is not there."""
+    """The request of these flags. Warns of flags without effect.
+
+    Raises InputError, and DeviceError for a device that is not there.
+    """
     if flags.cameras is None:
         check_around(flags.path, among_own=True)  # the cameras of a run's photographs are read later
     channels = parse_channels(f"{flags.channels},alpha" if flags.alpha or flags.deep else flags.channels)
     check_format(flags.output, channels, video=True)
+    flags.video.check()
+    if flags.is_video:
+        check_codec(flags.output, flags.video, channels)
+        if reason := video_missing():
+            raise InputError(f"{flags.output}: {reason}")
+    elif flags.video != VideoConfig():
+        raise InputError(f"-o {flags.output}: --video flags are for videos, expected the name of an .mp4 or .mov file")
     pictures = PictureConfig(_colour(flags.colour), flags.framing, flags.sampling, _warp(flags.warp))
     pictures.check(whole=False)
     if not 1 <= flags.quality <= 100:
@@ -90,13 +83,7 @@ def checked(flags: RenderVerb) -> Request:
     colour, holdout = _background(flags.background or "black"), _holdout(flags)
     flags.rasterizer.check()
     resize = resizer(flags.width, flags.height, flags.scale)
-    flags.video.check()
-    if flags.is_video:
-        check_codec(flags.output, flags.video, channels)
-        if reason := video_missing():
-            raise InputError(f"{flags.output}: {reason}")
-    elif flags.video != VideoConfig():
-        raise InputError(f"-o {flags.output}: --video flags are for videos, expected the name of an .mp4 or .mov file")
+    _warn_of_unused(flags, channels)
     devices, limit = _devices(flags), parse_bytes(flags.max_device_mem)
     return Request(flags, channels, colour, encoding, pictures, holdout, devices, limit, resize)
 
@@ -215,3 +202,23 @@ def _devices(flags: RenderVerb) -> tuple[str | None, ...]:
     if len(words) > 1 and len({find_device(word).index for word in words}) < len(words):
         raise InputError(f"--device {flags.device}: names a device twice, expected each once")
     return tuple(words)
+
+
+def _warn_of_unused(flags: RenderVerb, channels: Collection[str]) -> None:
+    """Warn of flags that have no effect on these files, or on a farm."""
+    if flags.profile and flags.on_farm:
+        warn("--profile is not used: it is for devices of this process")
+    defaults = {field.name: field.default for field in fields(RenderVerb)}
+    names = [
+        name
+        for name, extensions in _EXTENSIONS_BY_FLAG.items()
+        if flags.extension not in extensions
+        and getattr(flags, name) != defaults[name]
+        and not (name == "exr" and flags.deep)
+    ]
+    what = flags.extension
+    if "rgb" not in channels and flags.background is not None:
+        names.append("background")
+        what += " of these channels"
+    if names:
+        warn(f"not used for {what}: {', '.join(f'--{name}' for name in names)}")

@@ -2,7 +2,7 @@
 """`clsplat render`, from the call to the exit status.
 
 `clsplat.cli.render.request` checks the flags. `clsplat.cli.render.job` reads cameras and models, and makes the tasks.
-`clsplat.cli.render.dry_run` prints them for --dry-run, else `clsplat.cli.render.writing` has them rendered and written.
+`clsplat.cli.render.dry_run` prints them for --dry-run, else the job has them rendered and written.
 """
 
 from __future__ import annotations
@@ -16,17 +16,11 @@ __all__ = ["RenderVerb", "run"]
 
 def run(verb: RenderVerb, services: Services) -> int:
     """Render a model from cameras to images."""
-    from clsplat.cli.render.job import job_of
+    from clsplat.cli.render.job import job_of, write_frames
     from clsplat.cli.render.request import checked
 
     request = checked(verb)
     job = job_of(request)
-    if verb.dry_run:
-        from clsplat.cli.render.dry_run import dry_run
-
-        return dry_run(job)
-    from clsplat.cli.render.writing import write_frames
-
     renderers = [
         services.open_frame_renderer(
             job.cast.drawn,
@@ -36,9 +30,14 @@ def run(verb: RenderVerb, services: Services) -> int:
             memory_limit=request.memory_limit,
             profile=verb.profile,
             mattes=job.mattes,
+            tested=not verb.dry_run,
         )
         for selector in (() if verb.on_farm else request.devices)
     ]
+    if verb.dry_run:
+        from clsplat.cli.render.dry_run import dry_run
+
+        return dry_run(job, [renderer.memory_plan(job.tasks) for renderer in renderers])
     for renderer in renderers:
         renderer.check(job.tasks)
     with terminable():  # installed again: pycolmap and kernel compilers have installed handlers of their own

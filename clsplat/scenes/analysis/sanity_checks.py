@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,7 @@ from clsplat.errors import InputError, examples
 from clsplat.images.alpha import background_colour, composite
 from clsplat.scenes.camera_checks import absurd
 from clsplat.scenes.point_files import count_points
-
-if TYPE_CHECKING:
-    from clsplat.scenes.scene import Scene, View
+from clsplat.scenes.scene import Scene, View, spread
 
 FIRST_RENDER_CHECK_STEP = 100
 """Training step after which rendered pictures are checked for the first time."""
@@ -85,11 +83,6 @@ def of_pictures(
             "photographs do not: check that cameras and points belong together, and settings other than the defaults"
         )
     return ""
-
-
-def spread(views: Sequence[View], count: int) -> list[View]:
-    """At most `count` of the views, evenly spaced."""
-    return [views[index] for index in np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).astype(int))]
 
 
 def _small(camera: Camera) -> Camera:

@@ -45,6 +45,13 @@ from clsplat.stages.holdout import holdout, upload_held
 
 TESTED_FEATURES = Features.of(name for name in FEATURE_WIDTHS if name != "backward")
 """All features except backward motion, which uses the same function as motion."""
+DIGESTED_FEATURE_PLACES = [
+    at + field
+    for name, at in TESTED_FEATURES.offsets.items()
+    if name in ("depth", "normal", "position", "motion")
+    for field in range(FEATURE_WIDTHS[name])
+]
+"""Places of the features in the self-test's digests. Other features are compared with the twin alone."""
 MIN_NORMAL_COSINE = 1e-4
 """Cosine of a normal and the direction to the camera, below which the visible side depends on rounding."""
 MIN_TRANSMITTANCE_MARGIN = 1e-5
@@ -73,9 +80,9 @@ def _features(bench: CaseBench) -> StageOutcome:
     view = (bench.model, bench.camera_array, bench.projected, motion)
     bench.features, outcome = bench.twice(
         lambda: features(device, bench.work, TESTED_FEATURES, *view),
-        lambda rows: [rows.get()[visible]],
+        lambda rows: [rows.get()[visible][:, DIGESTED_FEATURE_PLACES]],
     )
-    (got,) = outcome.arrays
+    got = bench.features.get()[visible]
     every = reference_channels.features(bench.splats(), bench.frozen.gaussians, camera, _after(camera))
     wanted = {name: values[visible] for name, values in every.items()}
     away = wanted["position"] - camera.position
@@ -90,18 +97,18 @@ def _features(bench: CaseBench) -> StageOutcome:
 def _channels(bench: CaseBench) -> StageOutcome:
     device, camera = bench.device, bench.camera
     arguments = (bench.features, bench.lists, bench.inputs, bench.blended)
-    _, outcome = bench.twice(
+    planes, outcome = bench.twice(
         lambda: channels(device, bench.work, TESTED_FEATURES, *arguments),
-        lambda planes: [planes.means.get(), planes.whole.get()],
+        lambda planes: [planes.means.get()[[*DIGESTED_FEATURE_PLACES, -2, -1]], planes.whole.get()],
     )
     splats, (frame, clear) = bench.splats(), bench.blend_reference()
     wanted = reference_channels.channels(splats, bench.frozen.gaussians, camera, _after(camera))
-    means, whole = (cropped(planes, camera) for planes in outcome.arrays)
+    means, whole = (cropped(array.get(), camera) for array in (planes.means, planes.whole))
     sure = clear & (wanted.doubt > MIN_TRANSMITTANCE_MARGIN)
     # at low alpha, normals may cancel in the sum so that no digit of it is accurate
     solid = sure & (frame.transmittance < 0.5)
     parts = {
-        name: (means[solid, at : at + FEATURE_WIDTHS[name]], getattr(wanted, name).reshape(*solid.shape, -1)[solid])
+        name: (means[solid, at : at + FEATURE_WIDTHS[name]], wanted.features[name].reshape(*solid.shape, -1)[solid])
         for name, at in TESTED_FEATURES.offsets.items()
     }
     parts["median"] = (means[sure, -2], wanted.median[sure])
@@ -256,7 +263,8 @@ def _of_rays(bench: CaseBench, projection: str, camera: Camera) -> StageOutcome:
         parts["image"] = (cropped(image, camera)[clear], picture.image[clear])
         parts["transmittance"] = (cropped(left, camera)[clear], 1 - picture.alpha[clear])
         of_distances = camera.depths_of_distances()
-        depth = picture.depth if of_distances is None else picture.depth / of_distances
+        depth = picture.features["depth"]
+        depth = depth if of_distances is None else depth / of_distances
         parts["mean depth"] = (cropped(means, camera)[solid, 0], depth[solid])
     hidden = int((shown & ~tangents.visible).sum())
     return outcome.compared({f"{name}, {projection}": part for name, part in parts.items()}, hidden_Gaussians=hidden)

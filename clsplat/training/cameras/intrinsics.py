@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
-from clsplat.errors import InputError
 from clsplat.scenes.dataset import Lens
 from clsplat.scenes.scene import View
 from clsplat.training.cameras.poses import checked_arrays, descend, fallen, first_step
@@ -23,22 +22,13 @@ LENS_PARAMETERS = 3
 
 
 class RefinedLenses:
-    """Lenses of the training views, which change if they are refined. Views of one lens share its change.
-
-    Raises InputError for photographs with distortion, and for fisheyes and panoramas.
-    """
+    """Lenses of the training views, which change if they are refined. Views of one lens share its change."""
 
     def __init__(self, config: TrainConfig, views: Sequence[View]) -> None:
         self.on, self._config = config.refine_lenses, config
         self._rows: dict[Lens, int] = {}
         if not self.on:
             return
-        for view in views:
-            if not view.lens.is_pinhole or not view.camera.model.flat:
-                raise InputError(
-                    f"--refine-lenses: the lens of {view.name} is {view.lens.model}, with distortion; expected "
-                    "photographs without distortion, as `clsplat sfm` and COLMAP's image_undistorter write them"
-                )
         self._rows = {lens: row for row, lens in enumerate(dict.fromkeys(view.lens for view in views))}
         self._of_view = [self._rows[view.lens] for view in views]
         self._start, count = first_step(config), len(self._rows)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float64
 from clsplat.camera import ROTATION_TOLERANCE
 from clsplat.config.training import TrainConfig
-from clsplat.errors import InputError
 from clsplat.scenes.outliers import stray_cameras
 from clsplat.scenes.scene import View
 
@@ -113,8 +112,6 @@ class Poses:
         self.held: tuple[int, ...] = ()
         if not self.on:
             return
-        if len(views) < 3:
-            raise InputError(f"--refine-poses: {len(views)} training views, expected 3 or more, as two are not refined")
         places = np.array([camera.position for camera in self.cameras])
         near = ~stray_cameras(self.cameras)
         first = int(near.argmax())

@@ -17,8 +17,9 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
+from clsplat.errors import InputError
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene
+from clsplat.scenes.scene import Scene, View
 from clsplat.stages.pose import LENS_NUMBERS, POSE_NUMBERS, lens_rows, pose_rows, sum_of, sums_of
 from clsplat.training.cameras.export import keep_cameras
 from clsplat.training.cameras.intrinsics import RefinedLenses
@@ -29,6 +30,18 @@ from clsplat.training.step.inputs import StepRows, ViewInputs, ViewPart
 
 REFINEMENT_ARRAYS_PER_PARAMETER = 4
 """Arrays on the device for each parameter: the parameter, two moments, and a view's gradient."""
+
+
+def check_refinable(config: TrainConfig, views: Sequence[View]) -> None:
+    """Raise InputError if the settings refine cameras of too few views, or lenses other than pinholes."""
+    if config.refine_poses and len(views) < 3:
+        raise InputError(f"--refine-poses: {len(views)} training views, expected 3 or more, as two are not refined")
+    for view in views if config.refine_lenses else ():
+        if not view.lens.is_pinhole or not view.camera.model.flat:
+            raise InputError(
+                f"--refine-lenses: the lens of {view.name} is {view.lens.model}, with distortion; expected "
+                "photographs without distortion, as `clsplat sfm` and COLMAP's image_undistorter write them"
+            )
 
 
 @dataclass(eq=False)
@@ -96,13 +109,13 @@ class Cameras(Component):
     """Cameras of the training views. Refined poses and lenses change until the validation gate ends the refinement.
 
     work: memory for sums over the model's rows.
-    held_out: number of held-out views with which the gate (`CameraGate`) validates the cameras.
     """
 
-    def __init__(self, config: TrainConfig, scene: Scene, work: Workspace | None = None, held_out: int = 0) -> None:
+    def __init__(self, config: TrainConfig, scene: Scene, work: Workspace) -> None:
         views, length_unit = scene.train_views, scene.length_unit
+        check_refinable(config, views)
         self.poses, self.lenses = Poses(config, views, length_unit), RefinedLenses(config, views)
-        self.gate = CameraGate(config, held_out)
+        self.gate = CameraGate(config, len(scene.test_views))
         self._config, self._scene, self._views, self._work = config, scene, views, work
 
     @property
@@ -126,7 +139,6 @@ class Cameras(Component):
         pose, lens = self.poses.moves(inputs.view, step), self.lenses.moves(step)
         if not (pose or lens):
             return inputs
-        assert self._work is not None, "given by a trainer"
         sums = CameraSums(self._work, count, pose, lens, partial(self._move, inputs, step))
         return replace(inputs, parts=(*inputs.parts, sums))
 

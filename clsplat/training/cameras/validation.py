@@ -16,9 +16,11 @@ from clsplat.errors import warn
 from clsplat.evaluation import metrics
 from clsplat.images.alpha import background_colour, composite
 from clsplat.runs.appearance import Look
-from clsplat.scenes.scene import Scene, View
+from clsplat.scenes.scene import Scene, spread
 from clsplat.training.cameras.refinement import Cameras
-from clsplat.training.cameras.validation_gate import spread
+from clsplat.training.cameras.validation_gate import MAX_GATE_VIEWS
+from clsplat.training.supervision.decoding import Decoder
+from clsplat.training.supervision.host_photographs import HostPhotographs
 from clsplat.training.supervision.image_cache import ImageCache
 
 Draw = Callable[[Camera], NDArray[Any]]
@@ -29,9 +31,8 @@ class ValidationViews:
     """Held-out views for the gate, at most `validation_gate.MAX_GATE_VIEWS`. Their pixels are decoded once."""
 
     def __init__(self, scene: Scene, device: Device, config: TrainConfig) -> None:
-        held_out = scene.test_views
-        self.views: list[View] = [held_out[index] for index in spread(len(held_out))]
-        self._photographs = ImageCache(self.views, device)
+        self.views = spread(scene.test_views, MAX_GATE_VIEWS)
+        self._photographs = ImageCache(device, HostPhotographs(Decoder(self.views)))
         self._background = background_colour(config.background)
         self._measure = metrics.psnr if config.appearance == "none" else metrics.psnr_corrected
 

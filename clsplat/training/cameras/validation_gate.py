@@ -50,12 +50,6 @@ def steps_of(config: TrainConfig) -> tuple[int, ...]:
     return tuple(sorted({settled(step) for step in wanted if step >= first}))
 
 
-def spread(count: int, most: int = MAX_GATE_VIEWS) -> list[int]:
-    """At most `most` of `count` indices, evenly spaced from the first to the last."""
-    picked = min(count, most)
-    return [index * (count - 1) // max(picked - 1, 1) for index in range(picked)]
-
-
 @dataclass(frozen=True, eq=False)
 class Drift:
     """Similarity transform of the world: x becomes scale * rotation @ x + shift. rotation (3, 3), shift (3,)."""

@@ -21,12 +21,14 @@ from clsplat.training.stability.health import Incident, RetryBudget
 class LastStep:
     """A step that is kept, to inspect it if non-finite values are found after it.
 
+    view, name: index and name of its view.
     sums: function that returns the sums of its loss, valid until the next step has a loss.
     others: further views of the same step.
     """
 
     step: int
     view: int
+    name: str
     background: NDArray[np.float32]
     sums: Callable[[], NDArray[np.float32]]
     others: tuple[LastStep, ...] = ()
@@ -52,14 +54,13 @@ class NonFiniteMonitor:
     """State of the monitor.
 
     readback: the values that a pass reads back; the last four are `adam`'s counts (`Rasterizer.readback`).
-    names: names of the views.
     last: the current step, once it has its loss.
     incidents: incidents not reported yet.
     retries: counts of troubled steps and of returns to a checkpoint.
     """
 
-    def __init__(self, readback: DeviceArray, names: Sequence[str]) -> None:
-        self.readback, self.names = readback, names
+    def __init__(self, readback: DeviceArray) -> None:
+        self.readback = readback
         self.retries = RetryBudget()
         self.incidents: list[Incident] = []
         self.latest: Incident | None = None
@@ -130,7 +131,7 @@ class NonFiniteMonitor:
         self.latest = Incident(
             step=last.step,
             view=last.view,
-            name=self.names[last.view],
+            name=last.name,
             stage=stage,
             count=len(concerned) or elements,
             done=_done(stage, int(lost.sum()), len(lost), hopeless=hopeless),

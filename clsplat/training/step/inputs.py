@@ -30,6 +30,7 @@ class ViewInputs:
     area: number of full-resolution pixels per pixel.
     place: the view's number in the step.
     parts: the components' parts in it.
+    name: the view's name, for messages.
     """
 
     view: int
@@ -42,6 +43,7 @@ class ViewInputs:
     area: float = 1.0
     place: int = 0
     parts: tuple[ViewPart, ...] = ()
+    name: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,7 +45,8 @@ class StepMonitor(StepProbe):
     def loss(self, result: Loss) -> None:
         """Remember the step, to inspect it if non-finite values are found after it."""
         sums = result.copy or result.sums.get
-        self.monitor.begin(LastStep(self.number, self.inputs.view, self.inputs.background, sums))
+        inputs = self.inputs
+        self.monitor.begin(LastStep(self.number, inputs.view, inputs.name, inputs.background, sums))
 
     def before_rows(self, rows: StepRows) -> None:
         """Try in the sandbox every kernel that changes the state, before the first row changes: a driver may fail in

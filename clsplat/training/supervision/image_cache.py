@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +12,8 @@ from clsplat.device.buffers import DeviceArray, allocate, shared
 from clsplat.device.context import Device
 from clsplat.device.upload_ring import UPLOAD_RING_SLOTS, UploadRing
 from clsplat.errors import CapacityError
-from clsplat.training.supervision.decoding import Decoder, PhotographError
+from clsplat.training.supervision.decoding import PhotographError
 from clsplat.training.supervision.host_photographs import HostPhotographs
-
-if TYPE_CHECKING:
-    from clsplat.scenes.scene import View
 
 
 def kept_pixels(image: NDArray[Any]) -> int | None:
@@ -29,22 +26,17 @@ class ImageCache:
 
     Only device memory is bounded here; `host` bounds the host's.
 
-    host: the photographs on the host. By default all that a step has used stay there, without rounding to 8 bits.
+    host: the photographs on the host, which the caches of several devices share.
     allowed: maximum number of bytes on the device.
     """
 
-    def __init__(self, views: list[View], device: Device, host: HostPhotographs | None = None) -> None:
-        self._views, self._device = views, device
-        self.host = host or HostPhotographs(Decoder(views))
+    def __init__(self, device: Device, host: HostPhotographs) -> None:
+        self._device, self.host = device, host
         self._factor = 0.0
         self._on_device: dict[int, DeviceArray] = {}
         self._kept: dict[tuple[int, float], int | None] = {}
         self._taken = self.allowed = 0
         self._uploads: UploadRing | None = None
-
-    def for_device(self, device: Device) -> ImageCache:
-        """The same photographs for another device, sharing the host's pixels."""
-        return ImageCache(self._views, device, self.host)
 
     def follow(self, allowed: int) -> None:
         """Set the maximum number of bytes on the device."""

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tasks of a shot: one for each frame and eye, with its files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from clsplat.camera import Camera
+from clsplat.config.holdout import HoldoutConfig
+from clsplat.config.pictures import SamplingConfig
+from clsplat.errors import InputError, examples, warn
+from clsplat.images.frame_files import VIDEO_SUFFIXES
+from clsplat.images.holdouts import check_holdout
+from clsplat.sequence.task import Task
+from clsplat.shots import Shot
+from clsplat.shots import motion as moving
+from clsplat.shots.frame_numbers import check_pattern, output_paths, path_of
+from clsplat.shots.optics import settled
+from clsplat.shots.stereo import EYE_FIELD_PATTERN, for_eye
+
+
+def make_views(
+    shots: Mapping[str, Shot],
+    frames: str | None,
+    pattern: str,
+    resize: Callable[[Camera], Camera],
+    channels: Sequence[str],
+    sampling: SamplingConfig | None = None,
+) -> tuple[list[Task], Shot]:
+    """Tasks from `make_tasks` for each eye, and the chosen frames of the first shot.
+
+    shots: shots by eye; a shot without a pair is under "".
+    The two eyes' frames alternate. If the pattern has no field for the eye, they become views of one file. Raises
+    InputError in the cases of `make_tasks` and `Shot.only`.
+    """
+    chosen = {eye: shot if frames is None else shot.only(frames) for eye, shot in shots.items()}
+    first = next(iter(chosen.values()))
+    if not any(shots) and EYE_FIELD_PATTERN.search(pattern.replace("%v", "")):
+        raise InputError(f"{pattern}: has an eye's name in it, expected --stereo DISTANCE with it")
+    if len(shots) == 2 and Path(pattern).suffix.lower() in VIDEO_SUFFIXES:
+        raise InputError(f"{pattern}: a video holds one eye, expected --eye left or right with it")
+    one_file = len(shots) == 2 and not EYE_FIELD_PATTERN.search(pattern)
+    if one_file and Path(pattern).suffix.lower() != ".exr":
+        raise InputError(
+            f"{pattern}: has no {{eye}} in it, expected one to tell left from right, the name of an .exr, which holds "
+            "both, or --eye left or right"
+        )
+    made = [
+        [
+            replace(task, eye=eye)
+            for task in make_tasks(some, shots[eye], for_eye(pattern, eye), resize, channels, sampling)
+        ]
+        for eye, some in chosen.items()
+    ]
+    pairs = list(zip(*made, strict=True))
+    if one_file:
+        return [replace(left, right=right) for left, right in pairs], first
+    return [task for pair in pairs for task in pair], first
+
+
+def make_tasks(
+    chosen: Shot,
+    whole: Shot,
+    pattern: str,
+    resize: Callable[[Camera], Camera],
+    channels: Sequence[str],
+    sampling: SamplingConfig | None = None,
+) -> list[Task]:
+    """Tasks for the frames of `chosen`, which are part of the shot `whole`.
+
+    Raises InputError if two frames share a file that is not a video, and if the channels or the lens are not defined
+    for a camera.
+    """
+    sampling = sampling or SamplingConfig()
+    motion, backward = "motion" in channels, "backward" in channels
+    whole.check(channels)
+    indices = {frame.number: index for index, frame in enumerate(whole.frames)}
+    if Path(pattern).suffix.lower() in VIDEO_SUFFIXES:
+        paths = [Path(pattern)] * len(chosen.frames)
+    else:
+        paths = output_paths(pattern, [(frame.number, frame.name) for frame in chosen.frames])
+    stretch: Callable[[int], Shot | None] = lambda number: None  # noqa: E731
+    if sampling.shutter != (0.0, 0.0) and whole.moment is None:
+        stretch = moving.stretches(whole, resize, *sampling.shutter, motion=motion, backward=backward)
+    numbers = [frame.number for frame in whole.frames]
+    ends = (numbers[0], numbers[-1]) if len(numbers) > 1 else None
+    tasks = []
+    for frame, path in zip(chosen.frames, paths, strict=True):
+        camera = resize(frame.camera)
+        own = settled(sampling, frame.optics, camera)
+        own.check()
+        if own.has_lens and not camera.is_pinhole:
+            raise InputError(f"depth of field: frame {frame.number} is {camera.projection}, expected perspective")
+        looked_at = moving.moments(whole, resize, frame.number, own) or stretch(frame.number)
+        beside = moving.targets(whole, resize, indices[frame.number], own.middle, motion=motion, backward=backward)
+        after, earlier = (other and other.resized(camera.width, camera.height) for other in beside)
+        looks = (after, earlier, looked_at, None, None if frame.optics is None else own, frame.optics)
+        tasks.append(Task(frame.number, frame.name, camera, path, *looks, lens=frame.lens, ends=ends))
+    return tasks
+
+
+def held_out(tasks: Sequence[Task], pattern: str, config: HoldoutConfig) -> list[Task]:
+    """The tasks with their holdouts.
+
+    A pattern without a field for the number serves all frames, and one without a field for the eye both eyes. Warns
+    about depths in half floats. Raises InputError for a missing file, and for one whose header is not a holdout's.
+    """
+    check_pattern(for_eye(pattern, tasks[0].eye))
+    coarse: dict[Path, bool] = {}
+
+    def held(task: Task) -> Task:
+        path = path_of(for_eye(pattern, task.eye), task.number, task.name).absolute()
+        if check_holdout(path, (task.camera.width, task.camera.height), config.channel):
+            coarse[path] = True
+        return replace(task, holdout=path, right=task.right and held(task.right))
+
+    made = [held(task) for task in tasks]
+    if coarse:
+        warn(
+            f"{examples(coarse)}: has depths of half floats, with errors of up to 1/2000, so that Gaussians near a "
+            "surface may fall on its wrong side; write the depths as floats"
+        )
+    return made
