@@ -65,7 +65,7 @@ class BatchResults:
         """Indices of the splats in view; None unless packed."""
         if not self.packed:
             return None
-        radii = self.stacked("radii")  # compared one by one: np.all over an axis of length 2 takes ten times as long
+        radii = self.stacked("radii")  # the columns are compared separately: np.all over them takes ten times as long
         return np.flatnonzero((radii[..., 0] > 0) & (radii[..., 1] > 0))
 
     def splats(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
