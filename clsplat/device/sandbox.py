@@ -37,8 +37,8 @@ MAX_TRIAL_BYTES = 2 << 30
 """Maximum bytes of the arrays of a launch that is tried. With more the kernel is only built, as memory may not suffice
 for the arrays in both processes."""
 MAX_TRIAL_ITEMS = 1 << 17
-"""Maximum work-items along each axis of a launch that is tried. They take almost no time. PoCL compiles the same code
-for more work-items, and other code for less than 65,536."""
+"""Maximum work-items along each axis of a launch that is tried, which takes almost no time. For larger launches PoCL
+compiles the same code; for fewer than 65,536 items it compiles other code."""
 
 
 class _Process:

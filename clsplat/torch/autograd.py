@@ -105,7 +105,7 @@ class BatchResults:
         return as_tensor(self.by_camera("images"), like), as_tensor(self.by_camera("alphas"), like)
 
     def of_rows(self, gradient: Tensor) -> Tensor:
-        """A gradient (N, ...) as a COO tensor with the rows in view, each row once."""
+        """A gradient (N, ...) as a COO tensor of the rows in view, without duplicate rows."""
         assert self.in_view is not None
         rows = torch.from_numpy(np.unique(self.in_view % self.sizes[2])).to(gradient.device)
         return torch.sparse_coo_tensor(
