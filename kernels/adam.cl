@@ -1,5 +1,5 @@
 // Adam on one parameter group, from gradients in memory. Usually Adam is fused into project_grad.cl. These kernels are
-// for steps that need the gradients in memory, such as batches, whose views they add up.
+// for steps that need the gradients in memory, for example to add up the views of a batch.
 //
 // Adam sets the gradients to zero, because project_grad writes only the rows of visible Gaussians.
 //

@@ -38,7 +38,7 @@ static inline void store_box(const Box *t, int width, int height, int tiles_x, i
     const int last = wraps ? end_cell(high - turn, (float)TILE, tiles_x) : 0;
     x0 = first_cell(low, (float)TILE, tiles_x);
     x1 = wraps ? tiles_x : max(x0, end_cell(high, (float)TILE, tiles_x));
-    if (last >= x0) { // the two ends of the box meet
+    if (last >= x0) { // the ends of a wrapped box meet: it has all columns
       x0 = wraps ? 0 : x0;
     } else if (last > 0) {
       x0 = x0 == tiles_x ? 0 : x0;

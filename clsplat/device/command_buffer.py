@@ -123,12 +123,12 @@ class CommandBuffer:
 
     def check(self, fresh: CommandBuffer, numbers: Sequence[float]) -> None:
         """Raise AssertionError if a replay with these numbers would differ from `fresh`, which was just recorded."""
-        assert len(self._described) == len(fresh._described), "a command buffer has another number of commands than now"
+        assert len(self._described) == len(fresh._described), "a replay would have another number of commands"
         for one, other in zip(self._described, fresh._described, strict=True):
-            assert len(one) == len(other), f"{one[0]} in a command buffer has another number of arguments than now"
+            assert len(one) == len(other), f"a replay of {one[0]} would have another number of arguments"
             differing = [place for place, pair in enumerate(zip(one, other, strict=True)) if pair[0] != pair[1]]
             assert not differing, (
-                f"{one[0]} in a command buffer has other arguments than now: {[p - 4 for p in differing]}"
+                f"a replay of {one[0]} would have other arguments: numbers {[p - 4 for p in differing]}"
             )
         given, made = ([described(number) for number in each] for each in (numbers, fresh._numbers))
         assert given == made, f"numbers given to a command buffer are {list(numbers)}, launched {fresh._numbers}"

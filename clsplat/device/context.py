@@ -461,7 +461,7 @@ def open_devices(
 ) -> list[Device]:
     """Open the devices of a list of selectors (see `select`), separated by commas.
 
-    NAME/K is part K, from 0, of a device that OpenCL divides into equal parts: the largest K plus one, at least two.
+    NAME/K is part K, from 0, of a device. OpenCL divides the device into max(2, largest K + 1) equal parts.
     Without a limit, repeated calls return the same object for the same device.
 
     memory_limit: maximum bytes of all buffers of each returned device.

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 HOST_ALIGNMENT_BYTES = 4096
-"""Alignment of the memory in bytes, with which drivers use the memory in place instead of copying it."""
+"""Alignment of the memory in bytes. Drivers use memory with this alignment in place instead of copying it."""
 MIN_RECYCLED_BYTES = 1 << 18
 """Minimum bytes of memory that is kept for reuse. For less, reuse saves no time."""
 MAX_IDLE_BYTES = 1 << 28

@@ -21,7 +21,7 @@ DEFAULT_GROUP_ITEMS = 64
 the work over a CPU's processors."""
 _LOW_32_BITS = 0xFFFFFFFF
 _RECOMPILED_SIZE_ITEMS = 1 << 16
-"""Number of items along an axis from which on PoCL compiles a kernel again."""
+"""PoCL compiles a kernel again if an axis has this number of items or more."""
 
 
 @contextmanager

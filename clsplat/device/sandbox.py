@@ -37,8 +37,8 @@ MAX_TRIAL_BYTES = 2 << 30
 """Maximum bytes of the arrays of a launch that is tried. With more the kernel is only built, as memory may not suffice
 for the arrays in both processes."""
 MAX_TRIAL_ITEMS = 1 << 17
-"""Maximum work-items along each axis of a launch that is tried. They take almost no time. PoCL compiles the same code
-for more work-items, and other code for less than 65,536."""
+"""Maximum work-items along each axis of a launch that is tried, which takes almost no time. For larger launches PoCL
+compiles the same code; for fewer than 65,536 items it compiles other code."""
 
 
 class _Process:
@@ -161,8 +161,8 @@ class KernelTrials:
         answer = _process(self._index).ask({"build": asdict(text), **asked})
         if answer.get("memory"):  # not the driver's fault; the trial is not repeated
             driver_records.tell_once(
-                f"{self._device.name.strip()}: not enough memory to try every kernel in a process of its own before it "
-                "is used here"
+                f"{self._device.name.strip()}: not enough memory to try every kernel in a separate process before its "
+                "first use"
             )
         elif trouble := answer.get("trouble"):
             trial = {**asked, "name": name, "build": {"stem": variant.stem, "options": variant.options}}
@@ -187,11 +187,11 @@ class KernelTrials:
         trial: the failed trial (`driver_records.Entry`), if there was one.
         lasting: also record the failure, so that the driver is not used in this shape again.
         """
-        advice = f"CLSPLAT_DEVICE takes another device, {TRUST_DRIVER_VARIABLE}=1 goes on regardless"
+        advice = f"CLSPLAT_DEVICE selects another device, {TRUST_DRIVER_VARIABLE}=1 ignores this"
         if lasting and not regardless():
             trial = trial or {"name": f"{variant.digest} {kernel}"}
             driver_records.remember(self._device, self._shape, failed=_text(variant, kernel, trouble), trial=trial)
-            advice = f"the next process takes another shape if one works; {advice}"
+            advice = f"the next process uses another shape if one works; {advice}"
         return self.error(variant, kernel, f"{trouble}; {advice}")
 
     def error(self, variant: Variant, kernel: str, trouble: str) -> DriverError:

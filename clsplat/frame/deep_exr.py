@@ -79,7 +79,7 @@ def _samples(
     _, floats, height, width = slices.shape
     planes = np.ascontiguousarray(slices.swapaxes(0, 1)).reshape(floats, -1)
     counts = (slices[:, 3] > 0).sum(axis=0, dtype=np.int32)
-    # a pixel's slices are its first ones: sample k of pixel p is at k H W + p
+    # in each pixel, the used slices precede the empty ones: sample k of pixel p is at k H W + p
     first = np.cumsum(counts.ravel(), dtype=np.int64) - counts.ravel()
     pixels = np.repeat(np.arange(height * width), counts.ravel())
     at = (np.arange(len(pixels)) - first[pixels]) * (height * width) + pixels

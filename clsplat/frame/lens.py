@@ -64,7 +64,7 @@ class ByMap:
 class ByLens:
     """The mapping of a photograph's lens. The pixels of the warped picture are those of the photograph.
 
-    The straight frame is that of the camera of `Lens.bare`, at any size.
+    The straight frame belongs to the camera of `Lens.bare`, at any size.
     """
 
     lens: Lens

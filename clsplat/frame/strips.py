@@ -113,8 +113,8 @@ def write_in_strips(
     """Draw and write a picture strip by strip, atomically.
 
     The file has the bytes that `write_channels` writes for the whole picture, except in formats whose layout depends on
-    the number of rows that are written at a time. Raises InputError for channels that the format cannot store and like
-    `check_parts`. Raises ClsplatError if writing fails.
+    the number of rows that are written at a time. Raises InputError for channels that the format cannot store, and in
+    the cases of `check_parts`. Raises ClsplatError if writing fails.
     """
     encoding, header, extension = encoding or Encoding(), header or FrameFileHeader(), path.suffix.lower()
     check_target(path, names)

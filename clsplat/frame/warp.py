@@ -24,10 +24,10 @@ _SAMPLE_ROWS_PER_BATCH = 128
 
 
 def warped(draw: Draw, warp: Warp) -> Draw:
-    """A Draw of warped pictures. Of the camera that is passed to it, only size and window are used.
+    """A Draw of warped pictures, which uses only the size and window of its camera.
 
-    `draw` renders windows of the straight frame, with rgb in linear light. rgb and alpha are means over `Warp.samples`
-    by `Warp.samples` samples per pixel, interpolated by the Catmull-Rom cubic. Other channels come from the nearest
+    `draw` renders windows of the straight frame, with rgb in linear light. A pixel's rgb and alpha are means of
+    `Warp.samples` x `Warp.samples` samples, interpolated by the Catmull-Rom cubic. Other channels come from the nearest
     pixel. Where nothing is visible, ids are -1 and all other values 0.
     """
 

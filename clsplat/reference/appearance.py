@@ -45,7 +45,7 @@ def step(
     *,
     centred: bool = True,
 ) -> tuple[Float64, Float64, Float64]:
-    """Logs and moments (photographs, entries) after a step of Adam with the gradient by_logs.
+    """Logs and moments (photographs, entries) after a step of Adam with the gradient `by_logs`.
 
     rate: learning rate of all entries, or of each entry.
     centred: subtract each entry's mean over the photographs afterwards.

@@ -52,7 +52,7 @@ def motions(means: Float64, camera: Camera, after: Camera, moved: Float64 | None
     to = means if moved is None else moved
     (here, _), (there, depths) = pixel_from_world(camera, means), pixel_from_world(after, to)
     if camera.model.wraps:
-        # a panorama's pixels depend on the middle of the image; a window has the middle of its frame
+        # a panorama wraps around the middle of the whole frame, even if only a window of the frame is rendered
         frame = camera.window or camera
         here[:, 0] = camera.model.wrapped(replace(camera, width=frame.width), here[:, 0])
         turned = (there[:, 0] - after.cx) / after.fx - (here[:, 0] - camera.cx) / camera.fx

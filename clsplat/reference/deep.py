@@ -33,7 +33,7 @@ class Deep:
 
 
 class _Cut:
-    """The loop (73) over layers, with a slack for each pixel. It starts with the light `whole`."""
+    """State of the loop (73) over layers. slack: for each pixel. whole: the light in front of all layers."""
 
     def __init__(self, slack: Float64, whole: Float64) -> None:
         self.slack, self.count = slack, np.ones(slack.shape, np.int64)

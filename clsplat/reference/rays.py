@@ -66,7 +66,7 @@ class Tangents(Seen):
         return np.array([a, b, c])
 
     def by_mean(self, gaussian: int, splat: Footprint) -> tuple[Float64, Float64]:
-        """Eq. (21). The tangent plane rotates with the mean, so points far from the mean move more."""
+        """Derivatives as in `Seen.by_mean`: eq. (21). The tangent plane rotates with the mean."""
         by_x, by_y = super().by_mean(gaussian, splat)
         q = splat.dx * by_x + splat.dy * by_y
         return by_x + q * splat.dx, by_y + q * splat.dy

@@ -17,7 +17,7 @@ REPORT_FILE_NAME = "report.html"
 
 
 def check_page(path: Path, *, overwrite: bool) -> None:
-    """Raise InputError if a page cannot be written to `path`: for the reasons of `check_new`, or for its ending."""
+    """Raise InputError if a page cannot be written to `path`: `check_new` refuses it, or its ending is not HTML's."""
     check_new(path, overwrite=overwrite)
     if path.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: its ending is {path.suffix or 'none'}, expected .html or .htm for a web page")

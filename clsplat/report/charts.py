@@ -215,4 +215,4 @@ def _described(curve: ChartSeries) -> str:
     if curve.kind == "bars":
         top = max(curve.points, key=lambda point: point[1])
         return f"{curve.name}: the largest bin has {short(top[1])} and begins at {short(top[0])}."
-    return f"{curve.name}: {short(curve.points[0][1])} at first, {short(curve.points[-1][1])} in the end."
+    return f"{curve.name}: {short(curve.points[0][1])} at first, {short(curve.points[-1][1])} at the end."

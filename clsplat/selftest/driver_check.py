@@ -78,7 +78,7 @@ class DriverReport:
             return "can be trusted"
         otherwise = [name for result in self.results for name in result.otherwise]
         names = " and ".join(otherwise)
-        reason = f"this device treats {names} otherwise than IEEE 754" if otherwise else "the reason is not known"
+        reason = f"this device does not follow IEEE 754 in {names}" if otherwise else "the reason is not known"
         return (
             f"can be trusted, but its bits are not those of other devices in {', '.join(self.other_bits)}: {reason}; "
             "every error is within its bound"
@@ -129,7 +129,7 @@ def require(device: Device, stages: Sequence[str] = TRAINING_STAGES) -> Device:
         known = entries.get(shape.label, driver_records.Entry())
         if known.failed or not set(stages) <= known.stages:
             if shape == shapes[0]:
-                print(f"{title(cl_device)}: used for the first time, a short test of its driver", file=sys.stderr)
+                print(f"{title(cl_device)}: first use, a short test of its driver", file=sys.stderr)
             if failure := _short_test(tried, stages):
                 driver_records.remember(cl_device, shape.label, failed=failure)
                 failed[shape.label] = failure
@@ -144,9 +144,7 @@ def require(device: Device, stages: Sequence[str] = TRAINING_STAGES) -> Device:
     )
 
 
-_ADVICE = (
-    f"clsplat selftest tells more, CLSPLAT_DEVICE takes another device, {TRUST_DRIVER_VARIABLE}=1 goes on regardless"
-)
+_ADVICE = f"clsplat selftest has details, CLSPLAT_DEVICE selects another device, {TRUST_DRIVER_VARIABLE}=1 ignores this"
 
 
 def _short_test(device: Device, stages: Sequence[str]) -> str:
@@ -193,6 +191,6 @@ def _still(index: int, entry: driver_records.Entry, report: DriverReport) -> str
     if not entry.trial or name in report.kernels:  # this test has covered the failure
         return ""
     if build is None:
-        return f"{entry.failed}; this test does not come to it"
+        return f"{entry.failed}; this test does not use that kernel"
     trouble = sandbox.again(index, entry.trial)
     return f"{entry.failed}; tried once more: {trouble}" if trouble else ""

@@ -166,8 +166,8 @@ def blend_grad(
 ) -> DeviceArray:
     """Partial gradients (pairs, fields.floats): the row of each pair is its slot.
 
-    image_gradient: (3, rows, stride). A fourth plane is the gradient of the loss with respect to the transmittance.
-    If the fields include nearness, the last plane is the gradient with respect to it.
+    image_gradient: (3, rows, stride). An optional fourth plane is the gradient with respect to the transmittance.
+    If the fields include nearness, the last plane is the gradient with respect to nearness.
     """
     rows, stride = blended.transmittance.shape
     pairs = lists.gaussian_from_sorted.shape[0]

@@ -16,7 +16,7 @@ from clsplat.optimisation.step_noise import Exploration
 from clsplat.stages.device_gaussians import DeviceGaussians
 
 NOISE_OPACITY_RANGE = 0.16
-"""No noise where the opacity exceeds `dead` by more: it would be less than 1.2e-7 of the noise at opacity `dead`."""
+"""No noise is added above opacity `dead` plus this: it would be under 1.2e-7 of the noise at opacity `dead`."""
 
 
 def highest_logit(dead: float) -> float:

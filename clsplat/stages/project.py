@@ -267,7 +267,7 @@ class _Build(NamedTuple):
 
 
 def _build(device: Device) -> _Build:
-    """The build of the gradient. If Gaussians are evaluated along rays, a work-item has one, as in the projection."""
+    """The build of the gradient. If Gaussians are evaluated along rays, it has a single lane, as in the projection."""
     return _Build(1, {"LANES": 1}) if device.switched("RAYS") else _Build(device.shape.lanes, {})
 
 

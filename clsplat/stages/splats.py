@@ -103,7 +103,7 @@ def splats_grad(
     *,
     kept: int = SPLAT_VALUES,
 ) -> None:
-    """Fill every row of the gradients from the slots of the pairs, which may include absolute gradients.
+    """Fill every row of the gradients from the pairs' slots. Slots may include absolute gradients.
 
     kept: the slots hold gradients of the first `kept` values only.
     """

@@ -65,7 +65,7 @@ class BatchResults:
         """Indices of the splats in view; None unless packed."""
         if not self.packed:
             return None
-        radii = self.stacked("radii")  # compared one by one: np.all over an axis of length 2 takes ten times as long
+        radii = self.stacked("radii")  # the columns are compared separately: np.all over them takes ten times as long
         return np.flatnonzero((radii[..., 0] > 0) & (radii[..., 1] > 0))
 
     def splats(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -105,7 +105,7 @@ class BatchResults:
         return as_tensor(self.by_camera("images"), like), as_tensor(self.by_camera("alphas"), like)
 
     def of_rows(self, gradient: Tensor) -> Tensor:
-        """A gradient (N, ...) as a COO tensor with the rows in view, each row once."""
+        """A gradient (N, ...) as a COO tensor of the rows in view, without duplicate rows."""
         assert self.in_view is not None
         rows = torch.from_numpy(np.unique(self.in_view % self.sizes[2])).to(gradient.device)
         return torch.sparse_coo_tensor(

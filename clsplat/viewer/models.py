@@ -103,7 +103,7 @@ class LiveModel:
 
     @property
     def pixels(self) -> int:
-        """Maximum number of pixels of a picture, for which the training has memory."""
+        """Maximum number of pixels of a picture: the training has memory for no more."""
         return max(view.camera.width * view.camera.height for view in self.trainer.views)
 
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:  # noqa: ARG002  # always exact

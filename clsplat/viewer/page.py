@@ -232,7 +232,7 @@ class ViserPage:
         def add() -> None:
             if (pose := self.viewer.pose) is not None:
                 add_key(self.keys, pose)
-                # thin lines: the camera is still at this pose, so they are along the page's edges
+                # lines are thin, because they lie along the page's edges as long as the camera stays at this pose
                 name = f"/keys/{len(self.keys) - 1}"
                 self._add_frustum(name, pose, "key", thickness=2.0, thickness_units="screen")
 

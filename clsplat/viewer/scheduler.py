@@ -131,7 +131,7 @@ class Viewing:
         return bool(job or turn)
 
     def _turn(self, version: int, share: Share | None) -> tuple[Viewer, Level] | None:
-        """Of the viewers whose picture is due, the one that has waited longest, and the picture's level; or None."""
+        """The viewer whose picture is due and who has waited longest, and the picture's level; None if none is due."""
         now = self.clock()
         if share is not None and not (share.ready(now, moving=True) or share.ready(now, moving=False)):
             return None

@@ -3,8 +3,8 @@
 
 // Limit of distances in world units, and of axes in pixels, with which no sum of products overflows.
 #define FARTHEST 1e18f
-// `refine` is called above these ratios: longest axis to the ellipse's short axis, and an axis to its projected length.
-// Below them float32 is accurate to 3e-5.
+// Ratios above which `refine` is called: of the longest axis to the ellipse's short axis (REFINE_FROM), and of an axis
+// to its projected length (FORESHORTENED). At smaller ratios float32 is accurate to 3e-5.
 #define REFINE_FROM 64.0f
 #define FORESHORTENED 256.0f
 

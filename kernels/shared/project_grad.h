@@ -2,15 +2,15 @@
 // lens. Equation numbers refer to docs/gradients.md, with RAYS to docs/cameras.md. Needs splat.h, gaussian.h and sh.h,
 // with RAYS tangent.h; the defines are those of project_grad.cl.
 
-// Address space of the gradients of the higher SH bands: global if the array is of all Gaussians, private if of a
-// work-item, local if of a group.
+// Address space of the gradients of the higher SH bands. The array holds all Gaussians (global), those of a work-item
+// (private), or those of a group (local).
 #if !defined(ADAM)
 #define SH_GRADIENT __global float
 #elif LANES > 1
 #define SH_GRADIENT float
 #else
 #define SH_GRADIENT __local float
-#define SH_IN_PLACE // before, these rows have the coefficients
+#define SH_IN_PLACE // the gradients overwrite the SH coefficients in local memory
 #endif
 
 // Loops over the SH coefficients after the first, up to `used`.
@@ -133,7 +133,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   // numbers are subtracted.
   const float unwhiten = INVERSE_WHITEN2 * INVERSE_WHITEN2;
 #ifdef ANTIALIASED
-  // (84): the compensated opacity falls with the determinant with the low-pass, and rises with that without it.
+  // (84): the compensated opacity falls with p.det (low-pass included) and rises with p.det0 (without low-pass).
   const intL compensated = p.det0 / p.det > LEAST_COMPENSATION * LEAST_COMPENSATION;
   const floatL thinner = compensated ? m_g : (floatL)(0.0f), by_det0 = compensated ? m_g / p.det0 : (floatL)(0.0f);
   const floatL uu = fmaL((floatL)(unwhiten), m[SLOT_GUU].all, -INVERSE_WHITEN2 * thinner),

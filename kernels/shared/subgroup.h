@@ -3,7 +3,7 @@
 #ifndef SUBGROUP
 #define SUBGROUP 1
 #endif
-#ifdef SUBGROUP_IS_ASKED // for drivers in which a kernel requests the size
+#ifdef SUBGROUP_IS_ASKED // for drivers whose kernels must request the subgroup size
 #define SUBGROUPED __attribute__((intel_reqd_sub_group_size(SUBGROUP)))
 #else
 #define SUBGROUPED

@@ -26,11 +26,11 @@ def test_it_names_packages_and_devices(capsys: Capture) -> None:
 
 
 def test_what_is_missing_has_advice_and_status_1(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(diagnostics, "listed_devices", lambda: ([], "a driver took the process down (signal 6)"))
+    monkeypatch.setattr(diagnostics, "listed_devices", lambda: ([], "a driver crashed (signal 6)"))
     monkeypatch.setattr(diagnostics, "gpus", lambda: ["NVIDIA"])
     monkeypatch.setattr(diagnostics, "families", lambda: ["debian"])
     text = printed(capsys, ["doctor"], status=1).out
-    assert re.search(r"^missing +device +a driver took the process down \(signal 6\)$", text, re.MULTILINE)
+    assert re.search(r"^missing +device +a driver crashed \(signal 6\)$", text, re.MULTILINE)
     assert "-> apt install nvidia-opencl-icd" in text
     assert text.splitlines()[-1].startswith("1 missing.")
 

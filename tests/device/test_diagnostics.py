@@ -63,7 +63,7 @@ def test_a_gpu_without_a_driver_has_advice_for_this_system(
     monkeypatch.setattr(diagnostics, "families", lambda: ["ubuntu", "debian"])
     (finding,) = gpu_findings(["Intel"], [device] if device else [])
     assert finding.state == "note"
-    assert finding.text == "Intel: in this machine, and no OpenCL driver shows it"
+    assert finding.text == "Intel: in this machine, but no OpenCL driver shows it"
     assert finding.advice == "apt install intel-opencl-icd"
 
 
@@ -93,14 +93,14 @@ def test_a_loader_that_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setenv("CLSPLAT_DRIVER_TIMEOUT", "0.5")
     finding = loader_finding()
-    assert (finding.state, finding.text) == ("missing", "pyopencl does not come back from its import within 0.5 s")
+    assert (finding.state, finding.text) == ("missing", "the import of pyopencl does not finish within 0.5 s")
 
 
 def test_no_device_and_trouble_are_missing() -> None:
     (none,) = device_findings([], "")
-    (aborted,) = device_findings([], "a driver took the process down (signal 6)")
+    (aborted,) = device_findings([], "a driver crashed (signal 6)")
     assert (none.state, none.text) == ("missing", "no OpenCL device found")
-    assert (aborted.state, aborted.text) == ("missing", "a driver took the process down (signal 6)")
+    assert (aborted.state, aborted.text) == ("missing", "a driver crashed (signal 6)")
     assert none.advice
     assert aborted.advice
 

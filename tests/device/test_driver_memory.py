@@ -123,12 +123,12 @@ def test_only_what_is_used_warns_and_names_what_is_taken(
         opened = context.open_device()
     assert "warning" not in capsys.readouterr().err
     assert opened.shape == second
-    warned(f"shape {first.label} failed: it failed; {second.label} is taken", opened.kernels, "scan")
+    warned(f"shape {first.label} failed: it failed; {second.label} is used instead", opened.kernels, "scan")
     driver_records.tell_once.cache_clear()
     monkeypatch.setattr(driver_check, "_short_test", lambda tried, _: "as well" if tried.shape == second else "")
-    with pytest.warns(UserWarning, match=f"shape {first.label} failed: it failed; {third.label} is taken") as told:
+    with pytest.warns(UserWarning, match=f"shape {first.label} failed: it failed; {third.label} is used") as told:
         driver_check.require(context.open_device()).kernels("scan")
-    assert sum("is taken" in str(each.message) for each in told) == 1
+    assert sum("is used instead" in str(each.message) for each in told) == 1
 
 
 def test_a_failure_is_forgotten_when_what_failed_works(
@@ -155,7 +155,7 @@ def test_a_failure_is_forgotten_when_what_failed_works(
     [
         ({}, {}, ""),
         ({"name": "0123 scan"}, {"0123 scan": ""}, ""),
-        ({"name": "0123 scan"}, {"0123": ""}, "it failed; this test does not come to it"),
+        ({"name": "0123 scan"}, {"0123": ""}, "it failed; this test does not use that kernel"),
     ],
     ids=["a stage", "a kernel of the test", "another kernel"],
 )
@@ -175,7 +175,7 @@ def test_a_python_that_cannot_be_started(
     monkeypatch.setattr(sys, "executable", str(tmp_path / python) if python else python)
     assert main(["bench", "--gaussians", "300", "--size", "64x48", "--repeat", "1"]) == 1
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
-    assert line.endswith("CLSPLAT_TRUST_DRIVER=1 goes on without")
+    assert line.endswith("CLSPLAT_TRUST_DRIVER=1 skips the trial")
     refuses("CLSPLAT_TRUST_DRIVER=1", context.open_device().kernels, "scan", error=DriverError)
 
 

@@ -159,7 +159,7 @@ def test_the_checkpoint_of_a_late_failure(
         return (tmp_path / name / "model.ply").read_bytes()
 
     resume("run")
-    assert "is taken" in capsys.readouterr().err
+    assert "is used instead" in capsys.readouterr().err
     assert (run / "eval.json").exists()
     with monkeypatch.context() as patch:  # one scene of the three tells as much here
         patch.setattr(driver_check, "examine", partial(driver_check.examine, quick=True))
@@ -188,7 +188,7 @@ def test_a_late_failure_of_other_verbs(
     capsys.readouterr()
     status = call(verb, scene, trained, tmp_path / "new")
     if status == 0:  # the short self-test came by it, and took another shape; or it was built anew
-        assert how == "empty" or "is taken" in capsys.readouterr().err
+        assert how == "empty" or "is used instead" in capsys.readouterr().err
     else:
         assert status == 1
         line = error_of(capsys)

@@ -308,7 +308,7 @@ BEGINS = f'import os, sys, time; print({CHILD_MESSAGE_PREFIX!r} + \'{{"begins": 
     ("code", "failure"),
     [
         (f"{BEGINS}os.abort()", "the process was ended by signal 6 in blend"),
-        (f"{BEGINS}time.sleep(60)", "the driver did not come back within 2 s from blend"),
+        (f"{BEGINS}time.sleep(60)", "the driver did not answer within 2 s in blend"),
         ("import sys; print('noise'); sys.exit('no good')", "the process ended with status 1 in starting (no good)"),
     ],
     ids=["aborts", "hangs", "ends early"],
@@ -368,7 +368,7 @@ def test_a_failure_is_an_error_and_not_remembered(
     untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(BREAK_KERNEL_VARIABLE, "blend: before * alpha => before + alpha")
-    with pytest.raises(DeviceError, match=r"cannot be trusted: blend: image is off by .* clsplat selftest tells more"):
+    with pytest.raises(DeviceError, match=r"cannot be trusted: blend: image is off by .* clsplat selftest has details"):
         driver_check.require(default_device, FORWARD_STAGES)
     assert not untrusting.exists()
     monkeypatch.setenv(TRUST_DRIVER_VARIABLE, "1")

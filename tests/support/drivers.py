@@ -79,7 +79,7 @@ def why_not(index: int, lanes: int, items: int) -> str:
         patch.setenv("POCL_CACHE_DIR", tempfile.mkdtemp(dir=answer.parent))
         report = examine(index, Shape(lanes, items, default_shape(device).chunks), ("arithmetic",), quick=True)
     driver = " ".join(device.platform.version.split("  ")[0].split()[2:])
-    ends = {"signal": "aborts", "did not come back": "hangs", "DeviceError": "cannot be used"}
+    ends = {"signal": "aborts", "did not answer": "hangs", "DeviceError": "cannot be used"}
     how = next((verb for words, verb in ends.items() if words in report.end), "")
     reason = f"{driver} {how} in {lanes}x{items} on this processor" if how else ""
     atomic_write(answer, reason.encode())

@@ -63,7 +63,7 @@ def test_no_driver_of_that_name_is_an_error() -> None:
     [
         ("", ""),
         ("the process was ended by signal 6 in arithmetic", " aborts in 16x2 on this processor"),
-        ("the driver did not come back within 300 s from arithmetic", " hangs in 16x2 on this processor"),
+        ("the driver did not answer within 300 s in arithmetic", " hangs in 16x2 on this processor"),
         ("the process ended with status 1 in arithmetic (KeyError: 1)", ""),
     ],
 )

@@ -82,7 +82,7 @@ def test_a_number_that_is_not_declared_is_found(
     monkeypatch.setattr(project, "LaunchParameter", float)
     monkeypatch.setattr(project, "step_numbers", real := project.step_numbers)
     monkeypatch.setattr("clsplat.training.step.gradient_step.step_numbers", lambda *given: real(*given)[:0])
-    with pytest.raises(AssertionError, match="project_step in a command buffer has other arguments than now"):
+    with pytest.raises(AssertionError, match="a replay of project_step would have other arguments"):
         trained(default_device, load_scene(folder), PLAIN, monkeypatch, CHECK_TAPES)
 
 

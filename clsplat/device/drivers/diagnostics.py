@@ -89,7 +89,7 @@ def _driver(path: Path) -> Diagnostic:
     name = str(path.parent / library) if (path.parent / library).is_file() else library
     result = _outcome(sys.executable, "-c", _LOAD_LIBRARY_CODE, name)
     if result is None:
-        return Diagnostic("driver", "note", f"{path}: {library} does not come back from being loaded", f"remove {path}")
+        return Diagnostic("driver", "note", f"{path}: {library} hangs when it is loaded", f"remove {path}")
     if result.returncode == 0:
         return Diagnostic("driver", "ok", f"{path}: {library}")
     text = f"{path}: {library} cannot be loaded: {_last_line(result)}"
@@ -100,11 +100,11 @@ def listed_devices() -> tuple[list[dict[str, Any]], str]:
     """The devices that `clsplat devices --json` lists; and the reason if it failed, otherwise an empty string."""
     result = _outcome(*python_module("clsplat", "devices", "--json"))
     if result is None:
-        return [], f"a driver does not come back within {driver_timeout():g} s"
+        return [], f"a driver does not answer within {driver_timeout():g} s"
     if result.returncode == 0:
         return json.loads(result.stdout[result.stdout.index("[") :]), ""
     if result.returncode < 0:
-        return [], f"a driver took the process down (signal {-result.returncode})"
+        return [], f"a driver crashed (signal {-result.returncode})"
     return [], _last_line(result)
 
 
@@ -124,7 +124,7 @@ def gpu_findings(makers: Sequence[str], devices: Sequence[dict[str, Any]]) -> li
     for maker in makers:
         shown = any(info["kind"] == "gpu" and of_maker(info["platform"], info["name"], maker) for info in devices)
         advice = "" if shown else gpu_advice(maker, families())
-        text = "shown by OpenCL" if shown else "in this machine, and no OpenCL driver shows it"
+        text = "shown by OpenCL" if shown else "in this machine, but no OpenCL driver shows it"
         findings.append(Diagnostic("GPU", "ok" if shown else "note", f"{maker}: {text}", advice))
     return findings
 
@@ -142,7 +142,7 @@ def loader_finding() -> Diagnostic:
     """A finding about pyopencl, which contains the driver loader: whether it can be imported."""
     result = _outcome(sys.executable, "-c", "import pyopencl; print(pyopencl.VERSION_TEXT)")
     if result is None:
-        text = f"pyopencl does not come back from its import within {driver_timeout():g} s"
+        text = f"the import of pyopencl does not finish within {driver_timeout():g} s"
         return Diagnostic("loader", "missing", text)
     if result.returncode == 0:
         return Diagnostic("loader", "ok", f"pyopencl {result.stdout.strip()}")

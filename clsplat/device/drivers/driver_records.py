@@ -162,7 +162,7 @@ def remember(
             rewrite(path, lambda: dict([*_read().items()][-MAX_DRIVER_RECORDS:]))
             del _unwritten[path]
         except OSError as error:
-            tell_once(f"{path}: cannot be written ({reason_of(error)}), so that drivers are tested anew each time")
+            tell_once(f"{path}: cannot be written ({reason_of(error)}), so drivers are tested again in each process")
 
 
 def rewrite(path: Path, changed: Callable[[], Mapping[str, Any]]) -> None:

@@ -47,9 +47,9 @@ _SUBGROUP_SIZES = (16, 32, 8)
 """Sub-group sizes to request, in the order to try, where a kernel may choose the size."""
 _GPU_PACKAGES = {
     "NVIDIA": {
-        "debian": "apt install nvidia-opencl-icd, beside the driver; in a container the host's libraries, with "
+        "debian": "apt install nvidia-opencl-icd, in addition to the driver; in a container the host's libraries, with "
         "NVIDIA_DRIVER_CAPABILITIES=compute,utility",
-        "ubuntu": "apt install nvidia-driver-NUMBER, which brings libnvidia-compute",
+        "ubuntu": "apt install nvidia-driver-NUMBER, which includes libnvidia-compute",
         "fedora": "dnf install xorg-x11-drv-nvidia-cuda (RPM Fusion)",
         "arch": "pacman -S opencl-nvidia",
     },
@@ -105,9 +105,9 @@ def subgroup_ways(device: cl.Device) -> list[dict[str, object]]:
     items exchange the right values before it uses the defines.
     """
     extensions = device.extensions.split()
-    if "cl_nv_device_attribute_query" in extensions:  # by inline PTX, as NVIDIA's OpenCL has no functions for it
+    if "cl_nv_device_attribute_query" in extensions:  # exchange by inline PTX: NVIDIA's OpenCL has no functions for it
         return [{"SUBGROUP": 32, "SHUFFLE_PTX": True}]
-    if "cl_amd_device_attribute_query" in extensions:  # by built-in functions of the compiler
+    if "cl_amd_device_attribute_query" in extensions:  # exchange by built-in functions of the compiler
         return [{"SUBGROUP": 32, "SHUFFLE_AMD": True}]
     functions = {"cl_khr_subgroup_shuffle": "SHUFFLE_KHR", "cl_intel_subgroups": "SHUFFLE_INTEL"}
     offered = [define for extension, define in functions.items() if extension in extensions]
@@ -170,7 +170,7 @@ def driver_advice(system: str | None = None, machine: str | None = None) -> str:
     system, machine = system or platform.system(), (machine or platform.machine()).lower()
     pc = machine in ("x86_64", "amd64")
     if system == "Darwin":
-        return "take conda-forge's packages, with a driver for the CPU: conda install pyopencl pocl (docs/drivers.md)"
+        return "use conda-forge's packages, with a driver for the CPU: conda install pyopencl pocl (docs/drivers.md)"
     if system == "Windows" and pc:
         cpu = ", or one for the CPU: pip install intel-opencl-rt (registered by an administrator: docs/drivers.md)"
     elif system == "Windows":

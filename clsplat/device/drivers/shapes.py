@@ -218,7 +218,7 @@ def instead(device: cl.Device, wanted: Shape, other: Shape, failure: str) -> str
     """The warning that `other` is used instead of the wanted shape."""
     return (
         f"{title(device)}: kernels in the shape {wanted.label} failed: {failure}; {other.label} is "
-        f"taken (clsplat selftest tries {wanted.label} anew)"
+        f"used instead (clsplat selftest tries {wanted.label} again)"
     )
 
 
@@ -242,13 +242,13 @@ def saved_shapes() -> dict[str, str]:
     except (FileNotFoundError, NotADirectoryError):  # the home folder may be missing, or be a file
         return {}
     except OSError as error:
-        warnings.warn(f"{path}: cannot be read ({reason_of(error)}), so that no tuned shape is used", stacklevel=2)
+        warnings.warn(f"{path}: cannot be read ({reason_of(error)}), so no tuned shape is used", stacklevel=2)
         return {}
     except ValueError:
         saved = None
     if not isinstance(saved, dict) or not all(isinstance(value, str) for value in saved.values()):
         warnings.warn(
-            f"{path}: is damaged, so that no tuned shape is used; clsplat tune writes the file anew", stacklevel=2
+            f"{path}: is damaged, so no tuned shape is used; clsplat tune writes the file again", stacklevel=2
         )
         return {}
     return saved

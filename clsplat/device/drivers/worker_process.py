@@ -188,7 +188,7 @@ class WorkerProcess:
                 if time.monotonic() < until:
                     continue
                 self._process.kill()
-                text = f"did not come back within {seconds:g} s" + (f" from {doing}" if doing else "")
+                text = f"did not answer within {seconds:g} s" + (f" in {doing}" if doing else "")
                 raise WorkerEndedError(text, hung=True) from None
         if self._closed:
             raise TrialInterrupted(signal.SIGINT)
@@ -221,8 +221,8 @@ class WorkerProcess:
 
 
 _NO_PYTHON_ADVICE = (
-    "expected the Python that this process runs in, for a process of its own in which a driver is tried; "
-    f"{TRUST_DRIVER_VARIABLE}=1 goes on without"
+    "expected the path of this Python, to try the driver in a separate process; "
+    f"{TRUST_DRIVER_VARIABLE}=1 skips the trial"
 )
 
 

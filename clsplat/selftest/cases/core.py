@@ -262,7 +262,7 @@ def _steps_off(bench: CaseBench, given: Inputs) -> int:
         exact = reference_adam.adam(p, g, m, v, given.step, rate)
         for kind, model, wanted in zip(before, (parameters, first, second), exact, strict=True):
             got = model[group].get()
-            # beta2 in float32 is off by 1e-8, which is 1e-5 of 1 - beta2 and so of a step or a new moment.
+            # beta2 in float32 is off by 1e-8, so that 1 - beta2, a step and a new moment are off by 1e-5 of their size.
             off = np.abs(got - wanted) > 1e-5 * np.abs(wanted) + 1e-4 * (rate if kind == "parameters" else g**2 + 1e-6)
             wrong += int(off[rows].sum()) + int((got[~rows] != before[kind][group][~rows]).sum())
     return wrong

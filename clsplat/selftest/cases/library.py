@@ -96,7 +96,7 @@ def of_ewa(bench: CaseBench) -> StageOutcome:
     wanted = reference_ewa.project(exact["means"], covariances, view, exact["opacities"] * alone.compensations)
     off = np.abs(got["radii"] - wanted.radii)
     both = wanted.visible & (got["radii"][:, 0] > 0)
-    wrong = int((off[both] > 1).sum()) + max(int((off > 0).sum()) - 2, 0)  # two may be rounded otherwise
+    wrong = int((off[both] > 1).sum()) + max(int((off > 0).sum()) - 2, 0)  # two may be rounded differently
     wanted = replace(wanted, radii=got["radii"])
     back = reference_ewa.project_grad(
         exact["means"], covariances, view, wanted, {name: array.astype(np.float64) for name, array in by.items()}
@@ -245,7 +245,7 @@ SH_CENTRE = np.array([0.1, 0.2, 3.3])
 
 
 def random_harmonics(rng: Generator, count: int, degree: int | None = None, *, camera: bool | None = None) -> Inputs:
-    """Random SH coefficients and directions. camera: means and a camera's centre instead; None chooses at random."""
+    """Random SH coefficients and directions. camera: means and a camera's centre replace directions; None: random."""
     degree = int(rng.integers(MAX_SH_BASIS_DEGREE + 1)) if degree is None else degree
     shapes = ((count, 3), (count, 25 if degree == MAX_SH_BASIS_DEGREE else 16, 3), (count, 3))
     directions, sh, by = (rng.normal(size=shape).astype(np.float32) for shape in shapes)

@@ -91,7 +91,7 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
 
 
 LOSS_CASE = Case(
-    # below and above: windows of 11, vectors of 16 columns, blocks of 32 rows, blocks of 7 x 54 with a border of 5
+    # below and above sizes of windows (11), vectors (16 columns), and blocks (32 rows, or 7 x 54 with a border of 5)
     sizes=(
         *((1, 1), (1, 40), (40, 1), (11, 11), (15, 17), (16, 5), (17, 33), (5, 16), (63, 40), (33, 65)),
         *((54, 7), (55, 8), (53, 6), (59, 12), (60, 13), (64, 2), (65, 14), (109, 9)),

@@ -124,7 +124,7 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     return {
         # a few roundings for each octave of the vignette
         "target": Wanted(wanted, 1.2e-6, (largest * (0.4 + terms))[:, :, None], np.abs(octaves) < MAX_FALLOFF_OCTAVES),
-        # relative to the sum of magnitudes: a few roundings of partial sums and of distances
+        # a few roundings of partial sums and of distances, relative to the sum of magnitudes
         **{name: Wanted(sums[part], 2e-6, sizes[part]) for name, part in PPISP_PARTS.items()},
         "entries": stepped(after, rates),
         "gains": Wanted(np.exp2(after), 1e-5, np.exp2(after), np.broadcast_to(IS_GAIN, after.shape)),

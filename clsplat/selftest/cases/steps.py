@@ -33,7 +33,7 @@ ADAM_RATES = {name: 2.0**-power for power, name in enumerate(PARAMETER_GROUPS, 3
 
 
 def _random_step(rng: Generator, count: int) -> Inputs:
-    """Gradients of 1e-15 to 1e6, with moments of any magnitude or zero. Adam updates all Gaussians or the visible."""
+    """Gradients of 1e-15 to 1e6, with moments of any magnitude or zero. Adam updates all or only visible Gaussians."""
     step = int(rng.choice([1, 2, 10, 1000, 30_000, 10_000_000]))
     later, sparse = step > 1, bool(rng.random() < 0.5)
     visible = (rng.random(count) < 0.5) | (np.arange(count) >= 2 * count // 3)  # some vectors are visible as a whole
@@ -67,7 +67,7 @@ def _frozen_steps(bench: CaseBench) -> list[Inputs]:
         }
         if sparse:
             for values in made["gradients"].values():
-                values[~bench.visible] = 0.0  # as project_grad leaves them
+                values[~bench.visible] = 0.0  # project_grad leaves zeros there
         found.append(Inputs(arrays=made, sparse=sparse, step=7, visible=bench.visible, rates=ADAM_RATES))
     return found
 
