@@ -17,7 +17,7 @@ RAY_STAGES = ("rays",)
 """The stage of a frame of an equirectangular or fisheye camera."""
 MASK_STAGES = ("masks",)
 """Stages for training photographs with masks or alpha, in addition to TRAINING_STAGES."""
-BACKWARD_STAGES = ("loss", "blend_grad", "project_grad", "penalties", "adam", "noise", "statistics")
+BACKWARD_STAGES = ("append", "loss", "blend_grad", "project_grad", "penalties", "adam", "noise", "statistics")
 """Stages that training needs in addition to a frame's."""
 APPEARANCE_STAGES = ("appearance", "ppisp", "grid")
 """Stages that training with learnt appearance needs, in addition to TRAINING_STAGES."""
@@ -34,7 +34,7 @@ SELFTEST_STAGES = (
     *(*FORWARD_STAGES, *CHANNEL_STAGES, *DEEP_STAGES, *HOLDOUT_STAGES, *RAY_STAGES, *MASK_STAGES, *BACKWARD_STAGES),
     *(*APPEARANCE_STAGES, *DEPTH_STAGES, *POSE_STAGES, *LENS_STAGES, *LIBRARY_STAGES),
 )
-INDEX_STAGES = ("project", "duplicate", "sort", "ranges")
+INDEX_STAGES = ("project", "duplicate", "sort", "ranges", "append")
 """Stages whose counts and lists index the arrays of later stages."""
 
 STAGE_BOUNDS_ULP: dict[str, tuple[float, str]] = {
@@ -43,6 +43,7 @@ STAGE_BOUNDS_ULP: dict[str, tuple[float, str]] = {
     "duplicate": (0, "whole numbers"),
     "sort": (0, "whole numbers"),
     "ranges": (0, "whole numbers"),
+    "append": (0, "whole numbers"),
     "blend": (256, "11 found; 256 are 1.5e-5 of a colour of 0.5, under the 2e-5 that a frame may be off"),
     "features": (64, "6 found; two divisions and a root one after the other"),
     "channels": (256, "13 found, of normals that cancel; else as blend"),

@@ -25,12 +25,14 @@ class TileLists:
     """The lists of a band's tiles.
 
     ranges: (tiles, 2), begin and end in gaussian_from_sorted and slot_from_sorted (pairs).
+    order: (tiles), the tiles in the order in which to work on them; None for the image's.
     """
 
     band: Band
     ranges: DeviceArray
     gaussian_from_sorted: DeviceArray
     slot_from_sorted: DeviceArray
+    order: DeviceArray | None = None
 
 
 @stage("ranges")

@@ -3,7 +3,7 @@
 //
 // No parameter and no moment becomes NaN or infinite here. An element stays unchanged if its new values would be NaN or
 // infinite, or if the square of its new parameter would reach `limit2`. Such refusals are counted in the last four
-// entries of `readback` (the first four belong to compact_visible). They count by cause: the old parameter, the
+// entries of `readback` (the others are the forward pass's). They count by cause: the old parameter, the
 // gradient, the moments, or only the step itself. Broken moments restart from zero. In the other cases the second
 // moment becomes infinite and the first 0: every step is then refused until the host has repaired the row
 // (docs/decisions/0016-never-a-nan.md).
