@@ -80,18 +80,6 @@ static inline void store_pairs(__global uint2 *list, uint count, __local const u
   BARRIER_LOCAL();
 }
 
-// Does `visit` for all tiles of the item's own box; `tile` is each one's index.
-#define OVER_OWN_BOX(e, visit)                                                                                         \
-  for (int ty = (e).tile_y0; ty < (e).tile_y1; ++ty)                                                                   \
-    for (int part = 0; part < SPANS; ++part) {                                                                         \
-      int x0, x1;                                                                                                      \
-      tile_span(&(e), ty, part, tiles_x, &x0, &x1);                                                                    \
-      for (int tx = x0; tx < x1; ++tx) {                                                                               \
-        const uint tile = ty * tiles_x + tx;                                                                           \
-        visit                                                                                                          \
-      }                                                                                                                \
-    }
-
 // tile_counts, shown (n) -> counts (tiles + 1), zero before: the length of each tile's list, then the number of visible
 // Gaussians; slots (n): the number of pairs of the group's earlier Gaussians; sums (groups): of all its pairs. Integer
 // sums do not depend on the order of the atomics.
@@ -112,17 +100,23 @@ GROUP __kernel void count_tiles(const uint n, const int tiles_x, const int tiles
     if (e.box > OWN_BOX) {
       wide[atomic_inc(&wides)] = i;
     } else {
-      OVER_OWN_BOX(e, atomic_inc(counts + tile);)
+      for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {
+        for (int part = 0; part < SPANS; ++part) {
+          int x0, x1;
+          tile_span(&e, ty, part, tiles_x, &x0, &x1);
+          for (int tx = x0; tx < x1; ++tx) atomic_inc(counts + ty * tiles_x + tx);
+        }
+      }
     }
   }
   BARRIER_LOCAL();
   for (uint k = 0; k < wides; ++k) {
     const Ellipse e = ellipse_of(splats + (size_t)SPLAT_SIZE * wide[k], tiles_x, tiles_y);
-    for (int ty = e.tile_y0 + (int)item / SIDE; ty < e.tile_y1; ty += ITEMS / SIDE) {
+    for (int row = e.tile_y0 + (int)item / SIDE; row < e.tile_y1; row += ITEMS / SIDE) {
       for (int part = 0; part < SPANS; ++part) {
         int x0, x1;
-        tile_span(&e, ty, part, tiles_x, &x0, &x1);
-        for (int tx = x0 + (int)item % SIDE; tx < x1; tx += SIDE) atomic_inc(counts + ty * tiles_x + tx);
+        tile_span(&e, row, part, tiles_x, &x0, &x1);
+        for (int tx = x0 + (int)item % SIDE; tx < x1; tx += SIDE) atomic_inc(counts + row * tiles_x + tx);
       }
     }
   }
@@ -169,13 +163,13 @@ GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint
     }
   }
   BARRIER_LOCAL();
-  for (uint k = begin; k < end; ++k) {
-    const uint length = values[k];
-    values[k] = before;
+  for (uint tile = begin; tile < end; ++tile) {
+    const uint length = values[tile];
+    values[tile] = before;
     if (has_tiles) {
       const int listed = length > 0 && !stopped;
-      ranges[2 * k] = listed ? before : 0;
-      ranges[2 * k + 1] = listed ? before + length : 0;
+      ranges[2 * tile] = listed ? before : 0;
+      ranges[2 * tile + 1] = listed ? before + length : 0;
       atomic_inc(places + clz(listed ? length : 0));
     }
     before += length;
@@ -225,7 +219,13 @@ GROUP __kernel void append_pairs(const uint n, const int tiles_x, const int tile
         wide_slots[place] = slot;
       } else {
         const uint depth = as_uint(splat[SPLAT_DEPTH]);
-        OVER_OWN_BOX(e, APPEND(tile, slot, i)++ slot;)
+        for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {
+          for (int part = 0; part < SPANS; ++part) {
+            int x0, x1;
+            tile_span(&e, ty, part, tiles_x, &x0, &x1);
+            for (int tx = x0; tx < x1; ++tx, ++slot) APPEND(ty * tiles_x + tx, slot, i)
+          }
+        }
       }
     }
   }
@@ -235,13 +235,13 @@ GROUP __kernel void append_pairs(const uint n, const int tiles_x, const int tile
     const Ellipse e = ellipse_of(splat, tiles_x, tiles_y);
     const uint depth = as_uint(splat[SPLAT_DEPTH]);
     uint slot = wide_slots[k];
-    for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {
+    for (int row = e.tile_y0; row < e.tile_y1; ++row) {
       for (int part = 0; part < SPANS; ++part) {
         int x0, x1;
-        tile_span(&e, ty, part, tiles_x, &x0, &x1);
-        if ((ty - e.tile_y0) % (ITEMS / SIDE) == (int)item / SIDE) {
+        tile_span(&e, row, part, tiles_x, &x0, &x1);
+        if ((row - e.tile_y0) % (ITEMS / SIDE) == (int)item / SIDE) {
           for (int tx = x0 + (int)item % SIDE; tx < x1; tx += SIDE) {
-            APPEND(ty * tiles_x + tx, slot + (tx - x0), wide[k])
+            APPEND(row * tiles_x + tx, slot + (tx - x0), wide[k])
           }
         }
         slot += x1 - x0;

@@ -204,10 +204,11 @@ def _random_boxes(rng: Generator, count: int) -> Inputs:
 
 
 def _frozen_boxes(bench: CaseBench) -> list[Inputs]:
-    rng = np.random.default_rng(61)
-    tiles = bench.tiles
+    """Depths that differ, and depths that are equal; among the boxes are wide ones."""
+    rng, tiles = np.random.default_rng(61), (13, 9)
     count = 4000 if bench.frozen.name == "crowd" else 400
-    return [_inputs_of_boxes(boxes_of(rng, count, tiles), depths_of(rng, count), tiles, 100) for _ in range(2)]
+    depths = rng.uniform(0.1, 100, count), rng.integers(1, 4, count)
+    return [_inputs_of_boxes(boxes_of(rng, count, tiles), each.astype(np.float32), tiles, 100) for each in depths]
 
 
 def _launch_append(device: Device, work: Workspace, given: Inputs) -> Read:
