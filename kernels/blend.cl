@@ -122,7 +122,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
                           ,
                           __global uint *counts // (items, 2): pairs that contribute, pairs evaluated
 #endif
-) {
+                              TILE_ORDER_PARAMETER) {
   TILE_OF_GROUP
   PIXEL_TABLES
   RAY_TABLES

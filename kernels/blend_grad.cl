@@ -221,7 +221,7 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
                                           ,
                                           __constant float *camera
 #endif
-) {
+                                              TILE_ORDER_PARAMETER) {
   TILE_OF_GROUP
   int last = begin;
 #ifdef BY_GAUSSIAN

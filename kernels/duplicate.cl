@@ -23,7 +23,7 @@ static inline void band_span(const Ellipse *e, int ty, int part, int tiles_x, in
 }
 
 // shown, tile_counts (n) -> sums (2, groups): numbers of visible Gaussians and of pairs in each chunk, at most
-// 0xffffffff; the first four entries of readback become zero. A group owns a chunk.
+// 0xffffffff; the entries of readback before READBACK_STOPPED become zero. A group owns a chunk.
 GROUP __kernel void visible_sums(const uint n, const uint chunk, __global const uint *shown,
                                  __global const uint *tile_counts, __global uint *sums, __global uint *readback) {
   __local uint scratch[ITEMS];
@@ -38,7 +38,7 @@ GROUP __kernel void visible_sums(const uint n, const uint chunk, __global const 
   sums[get_num_groups(0) + group] = pairs;
   if (group != 0) return;
   readback[READBACK_VISIBLE] = readback[READBACK_PAIRS] = 0;
-  readback[READBACK_KEY_COMPLEMENT] = readback[READBACK_LARGEST_KEY] = 0;
+  readback[READBACK_KEY_COMPLEMENT] = readback[READBACK_LARGEST_KEY] = readback[READBACK_LONGEST] = 0;
 }
 
 // shown, tile_counts (n), sums (2, groups) -> slots (n): scan of the tile counts; gaussian_from_visible, depth_keys

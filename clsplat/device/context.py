@@ -127,6 +127,7 @@ class Device:
     under_way: events and buffers that keep host arrays alive while the device may still read them.
     part: for a part of a device: the whole device and the part's number.
     index: position in the list of devices, for a part that of the whole device.
+    atomics_faults: the faults that `probe_atomics` has found, shared by all copies of the device; empty before it runs.
     """
 
     def __init__(
@@ -167,6 +168,7 @@ class Device:
         self.trials = KernelTrials(device, self.index, self.shape.label)
         self._fma: list[dict[str, object]] = [] if capabilities.contraction else [{}]
         self._subgroups: list[dict[str, object]] = []
+        self.atomics_faults: list[str] = []
 
     @property
     def queue(self) -> cl.CommandQueue:

@@ -135,14 +135,15 @@ SLOT_PLAIN = SLOT.index("ABSX")
 REFUSED = ("parameters", "gradients", "moments", "steps")
 """Reasons for which adam.cl does not update an element, and counts it."""
 
-COUNTED = ("VISIBLE", "PAIRS", "KEY_COMPLEMENT", "LARGEST_KEY")
+COUNTED = ("VISIBLE", "PAIRS", "KEY_COMPLEMENT", "LARGEST_KEY", "LONGEST")
 
 READBACK = (*COUNTED, "STOPPED", *(f"REFUSED_{reason.upper()}" for reason in REFUSED))
 """Numbers that the host reads back from a forward pass, in a single copy.
 
 VISIBLE, PAIRS: numbers of visible Gaussians and of pairs.
 KEY_COMPLEMENT, LARGEST_KEY: the complement of the smallest depth key, and the largest depth key.
-STOPPED: 1 if a pass with BY_CAPACITY has stopped (duplicate.cl).
+LONGEST: the length of the longest list, in a pass whose lists are made by append (append.cl); otherwise 0.
+STOPPED: 1 after a pass by capacity has stopped (duplicate.cl, append.cl).
 REFUSED_*: numbers of elements that `adam` did not update, by reason.
 """
 

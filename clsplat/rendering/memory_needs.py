@@ -12,7 +12,7 @@ from clsplat.device.context import Device
 from clsplat.gaussians import floats_of
 from clsplat.layouts.columns import POSE_ROWS, TILE, SlotFields
 from clsplat.rendering.memory_plan import Need, Plan, plan
-from clsplat.stages import blend, density, duplicate, loss, loss_terms, project, ranges, target
+from clsplat.stages import append, blend, density, duplicate, loss, loss_terms, project, ranges, target
 from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.duplicate import MAX_PAIRS_PER_BAND
 from clsplat.stages.sort import scratch_bytes
@@ -90,6 +90,7 @@ def plan_step(
         planes = max(planes, pixels + loss.scratch_bytes(device, camera.height, tiles_of(camera)[0] * TILE, step.turns))
     frame = _frame_need(device, gaussians, floats_of(coefficients), planes, config)
     fields = step.fields
+    appends = device.shape.items > 1 and device.memory.limit is None  # lists of both kinds, unless memory is limited
     screen = project.SCREEN_GRADIENT_BYTES + 4 * fields.contributions
     statistics = density.gaussian_bytes(contributions=fields.contributions)
     need = replace(
@@ -97,7 +98,7 @@ def plan_step(
         row=frame.row + screen + statistics + (_VISIBLE_MARK_BYTES if models > MODELS else 0) + step.row_bytes,
         banded=frame.banded + 4 * fields.floats,
         model=models * frame.model,
-        pair=frame.pair + blend.gradient_pair_bytes(fields),
+        pair=frame.pair + blend.gradient_pair_bytes(fields) + (append.APPEND_PAIR_BYTES if appends else 0),
         most_pairs=min(device.max_allocation // (4 * fields.floats), MAX_PAIRS_PER_BAND),
         photographs=0
         if device.shares_memory

@@ -19,6 +19,7 @@ from clsplat.layouts.columns import CAMERA, PLAIN_SLOTS, READBACK, WIDEST_SLOTS,
 from clsplat.optimisation.dropout import Thinning
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.memory_plan import Plan
+from clsplat.stages.append import MAX_MEAN_PAIRS, append, appends
 from clsplat.stages.blend import Blended, ImageInputs, blend, blend_grad
 from clsplat.stages.channels import Channels, Features, Floats, Motion, channels, features
 from clsplat.stages.deep import deep
@@ -29,6 +30,7 @@ from clsplat.stages.duplicate import (
     Band,
     Counted,
     Pairs,
+    Totals,
     count,
     count_band,
     count_by_capacity,
@@ -45,10 +47,13 @@ R = TypeVar("R")
 
 @dataclass(frozen=True, eq=False)
 class ListedBand:
-    """A band of tiles with the pairs and lists of its Gaussians."""
+    """A band of tiles with the pairs and lists of its Gaussians.
 
-    counted: Counted
-    pairs: Pairs
+    pairs: None if the lists were made by append.
+    """
+
+    counted: Totals
+    pairs: Pairs | None
     lists: TileLists
 
 
@@ -62,10 +67,12 @@ class PairCapacity:
 
     pairs: number of pairs that fit in its arrays.
     turn: index of the array for its counts, below MAX_COUNTED_PASSES.
+    appends: True if the lists may be made by append (`stages.append`), where the device can.
     """
 
     pairs: int
     turn: int
+    appends: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,16 +188,24 @@ class Rasterizer:
         """
         device, work = self.device_of(camera), self.work
         camera_array, background = self._send(camera, background)
+        by_append = room is not None and self._appends(device, room, tiles_of(camera))
 
         def make() -> tuple[Projected, tuple[Band, ...], ListedBand, Blended, tuple[int, ...]]:
             projected = project(device, work, gaussians, camera, camera_array, thinning)
+            inputs = ImageInputs(projected.splats, background, camera.width, camera.height, camera_array)
+            if by_append:
+                assert room is not None
+                numbers = (self.readback, room.pairs, self._host(room.turn))
+                totals, lists = append(device, work, projected, tiles_of(camera), *numbers)
+                record = backward and self._switches.record_cells
+                blended = blend(device, work, lists, inputs, record=record, nearness=nearness)
+                return projected, (lists.band,), ListedBand(totals, None, lists), blended, ()
             if room is None:
                 counted = count(device, work, projected, all_bits=self._all_bits, readback=self.readback)
             else:
                 counted = count_by_capacity(device, work, projected, self.readback, room.pairs, self._host(room.turn))
             bands = plan_bands(device, work, projected, counted, tiles_of(camera), self.capacity)
             record = backward and len(bands) == 1 and self._switches.record_cells
-            inputs = ImageInputs(projected.splats, background, camera.width, camera.height, camera_array)
             listed = None
             for band in bands:
                 del listed  # this band may need the memory for larger arrays
@@ -202,10 +217,14 @@ class Rasterizer:
         if room is None:
             return ForwardPass(camera, camera_array, background, *make())
         size, how = (camera.width, camera.height), (backward, thinning is not None, nearness)
-        key = (self.readback, device, background, *size, *how, room.pairs, room.turn)
+        key = (self.readback, device, background, *size, *how, room.pairs, room.turn, by_append)
         return ForwardPass(
             camera, camera_array, background, *work.replayed(gaussians, key, make, thinning_numbers(thinning))
         )
+
+    def _appends(self, device: Device, room: PairCapacity, tiles: tuple[int, int]) -> bool:
+        """True if the lists of a pass by capacity are made by append."""
+        return room.appends and room.pairs <= MAX_MEAN_PAIRS * tiles[0] * tiles[1] and appends(device)
 
     def _host(self, turn: int) -> NDArray[np.uint32]:
         """Host memory for a copy of the counts."""

@@ -17,7 +17,7 @@ RAY_STAGES = ("rays",)
 """Further stage for cameras that evaluate Gaussians along rays, such as equirectangular and fisheye cameras."""
 MASK_STAGES = ("masks",)
 """Further stages for training with masks or alpha."""
-BACKWARD_STAGES = ("loss", "blend_grad", "project_grad", "penalties", "adam", "noise", "statistics")
+BACKWARD_STAGES = ("append", "loss", "blend_grad", "project_grad", "penalties", "adam", "noise", "statistics")
 """Stages that training needs in addition to FORWARD_STAGES."""
 APPEARANCE_STAGES = ("appearance", "ppisp", "grid")
 """Further stages for training with an appearance model."""
@@ -34,7 +34,7 @@ SELFTEST_STAGES = (
     *(*FORWARD_STAGES, *CHANNEL_STAGES, *DEEP_STAGES, *HOLDOUT_STAGES, *RAY_STAGES, *MASK_STAGES, *BACKWARD_STAGES),
     *(*APPEARANCE_STAGES, *DEPTH_STAGES, *POSE_STAGES, *LENS_STAGES, *LIBRARY_STAGES),
 )
-INDEX_STAGES = ("project", "duplicate", "sort", "ranges")
+INDEX_STAGES = ("project", "duplicate", "sort", "ranges", "append")
 """Stages whose results are indices into the arrays of later stages."""
 
 STAGE_BOUNDS_ULP: dict[str, tuple[float, str]] = {
@@ -43,6 +43,7 @@ STAGE_BOUNDS_ULP: dict[str, tuple[float, str]] = {
     "duplicate": (0, "whole numbers"),
     "sort": (0, "whole numbers"),
     "ranges": (0, "whole numbers"),
+    "append": (0, "whole numbers"),
     "blend": (256, "11 measured; 256 ulp of a colour of 0.5 are 1.5e-5, and a frame may be off by 2e-5"),
     "features": (64, "6 measured; two divisions and a root in sequence"),
     "channels": (256, "13 measured, in normals that cancel; otherwise as blend"),

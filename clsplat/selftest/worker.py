@@ -37,6 +37,7 @@ DEFAULT_DEFINES: dict[str, dict[str, object]] = {
     "grid": {"LANES": 1},
     "noise": {"LANES": 1},
     "pose": {"LANES": 1},
+    "probe_atomics": {"PROBED": 1},
     "project_rays": {"LANES": 1, **next(model.defines for model in CAMERA_MODELS if model.along_rays)},
     "sampling": {"LANES": 1},
     "splats_grad": {"LANES": 1, "VALUES": 3},

@@ -125,8 +125,10 @@ def blend(
     if record and not rays and tile_items(device) == 1 and device.shape.lanes >= 8:
         cells = work.array("cells_from_sorted", lists.gaussian_from_sorted.shape, np.uint32)
     extra = ([near] if near else []) + ([cells] if cells else []) + ([inputs.camera_array] if rays else [])
+    extra += [lists.order] if lists.order else []
     arrays = (lists.ranges, lists.gaussian_from_sorted, inputs.splats, inputs.background, *planes, *extra)
-    defines = {name: True for name, on in (("NEARNESS", near), ("RECORD_CELLS", cells)) if on}
+    switches = (("NEARNESS", near), ("RECORD_CELLS", cells), ("TILE_ORDER", lists.order))
+    defines = {name: True for name, on in switches if on}
     launch_tiles(device, "blend", defines, lists, -(-width // TILE), width, height, *arrays)
     return Blended(*planes, cells, near)
 
@@ -180,9 +182,12 @@ def blend_grad(
         defines["BY_GAUSSIAN"] = True
     if image_gradient.shape[0] - fields.nearness == 4:
         defines["ALPHA_GRADIENT"] = True
+    if lists.order:
+        defines["TILE_ORDER"] = True
     listed = (lists.ranges, lists.gaussian_from_sorted, lists.slot_from_sorted)
     planes = (image_gradient, blended.transmittance, blended.stops)
     extra = ([cells] if cells else []) + ([inputs.camera_array] if rays else [])
+    extra += [lists.order] if lists.order else []
     arrays = (*listed, inputs.splats, inputs.background, *planes, slots, *extra)
     launch_tiles(device, "blend_grad", defines, lists, stride // TILE, rows, *arrays)
     return slots

@@ -15,7 +15,7 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups, launch_items
 from clsplat.device.profile import stage
 from clsplat.errors import CapacityError, amount
-from clsplat.layouts.columns import COUNTED, READBACK, REFUSED, TILE
+from clsplat.layouts.columns import COUNTED, READBACK, TILE
 from clsplat.stages.project import Projected
 from clsplat.stages.scan import Elements, chunking, scan
 from clsplat.stages.sort import SORT_KEY_BYTES, sort
@@ -52,14 +52,11 @@ class Band:
 
 
 @dataclass(frozen=True, eq=False)
-class Counted:
-    """The visible Gaussians and the number of their pairs.
+class Totals:
+    """The numbers of visible Gaussians and of their pairs.
 
     tile_counts, first_slots: (n), the number of tiles of each Gaussian, and its first slot, a prefix sum of these.
-    gaussian_from_visible, depth_keys: (visible), in the order of the Gaussians' rows.
     visible, pairs: the numbers of visible Gaussians and of pairs; pairs are capped at 2^32 - 1.
-    least_key: a lower bound of the depth keys.
-    key_bits: sufficient number of bits for all keys minus least_key.
     refused: the counts of `adam`.
 
     In a pass launched by capacity (`PairCapacity`), `visible` and `pairs` are upper bounds, and these fields are set:
@@ -70,12 +67,8 @@ class Counted:
 
     tile_counts: DeviceArray
     first_slots: DeviceArray
-    gaussian_from_visible: DeviceArray
-    depth_keys: DeviceArray
     visible: int
     pairs: int
-    least_key: int
-    key_bits: int
     refused: tuple[int, ...] = ()
     on_device: DeviceArray | None = None
     arriving: Callable[[], NDArray[Any]] | None = None
@@ -86,6 +79,21 @@ class Counted:
         most: the number itself, or an upper bound of it in a pass by capacity.
         """
         return Elements(most, self.on_device, READBACK.index(name))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Counted(Totals):
+    """The visible Gaussians and the number of their pairs.
+
+    gaussian_from_visible, depth_keys: (visible), in order of the Gaussians.
+    least_key: a lower bound of the depth keys.
+    key_bits: the number of low bits that can be set in a key minus least_key.
+    """
+
+    gaussian_from_visible: DeviceArray
+    depth_keys: DeviceArray
+    least_key: int
+    key_bits: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,18 +128,19 @@ def count(
     """
     readback = readback or work.array("readback", (len(COUNTED),), np.uint32)
     first_slots, gaussian_from_visible, depth_keys = _compact(device, work, projected, readback)
-    visible, pairs, complement, largest, *others = (int(value) for value in readback.get())
+    values = [int(value) for value in readback.get()]
+    visible, pairs, complement, largest = values[:4]
     least = 0 if all_bits else 2**32 - 1 - complement
     return Counted(
         projected.tile_counts,
         first_slots,
-        gaussian_from_visible.reshaped(visible),
-        depth_keys.reshaped(visible),
         visible,
         pairs,
-        least,
-        32 if all_bits else max(largest - least, 1).bit_length(),
-        tuple(others[-len(REFUSED) :]),
+        tuple(values[READBACK.index("STOPPED") + 1 :]),
+        gaussian_from_visible=gaussian_from_visible.reshaped(visible),
+        depth_keys=depth_keys.reshaped(visible),
+        least_key=least,
+        key_bits=32 if all_bits else max(largest - least, 1).bit_length(),
     )
 
 
@@ -152,8 +161,19 @@ def count_by_capacity(
     Depths are sorted by all 32 bits. On a GPU this takes no more passes than a sort by the bits that differ.
     """
     (n,) = projected.tile_counts.shape
-    arrays = (projected.tile_counts, *_compact(device, work, projected, readback, capacity))
-    return Counted(*arrays, n, capacity, 0, 32, (), readback, readback.begin_get(host))
+    first_slots, gaussian_from_visible, depth_keys = _compact(device, work, projected, readback, capacity)
+    return Counted(
+        projected.tile_counts,
+        first_slots,
+        n,
+        capacity,
+        on_device=readback,
+        arriving=readback.begin_get(host),
+        gaussian_from_visible=gaussian_from_visible,
+        depth_keys=depth_keys,
+        least_key=0,
+        key_bits=32,
+    )
 
 
 def _compact(

@@ -25,12 +25,14 @@ class TileLists:
     """The tile lists of a band.
 
     ranges: (tiles, 2), begin and end of each tile's pairs in gaussian_from_sorted and slot_from_sorted, (pairs) each.
+    order: (tiles), the tiles in the order in which groups take them; None for the order in the image.
     """
 
     band: Band
     ranges: DeviceArray
     gaussian_from_sorted: DeviceArray
     slot_from_sorted: DeviceArray
+    order: DeviceArray | None = None
 
 
 @stage("ranges")

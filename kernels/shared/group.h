@@ -59,12 +59,21 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
 #endif
 }
 
+// The place of a group's tile in the lists: the group's number, or as tile_order (tiles) says.
+#ifdef TILE_ORDER
+#define TILE_ORDER_PARAMETER , __global const uint *tile_order
+#define LISTED_TILE tile_order[get_group_id(0)]
+#else
+#define TILE_ORDER_PARAMETER
+#define LISTED_TILE get_group_id(0)
+#endif
+
 // Defines the group's tile from the kernel's first_tile, tiles_x, height and ranges: its first pixel, its pairs [begin,
 // end), and the strides between rows and between planes, in floats.
 #define TILE_OF_GROUP                                                                                                  \
-  const int tile = first_tile + get_group_id(0);                                                                       \
+  const int listed_tile = LISTED_TILE, tile = first_tile + listed_tile;                                                \
   const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;                                        \
-  const int begin = ranges[2 * get_group_id(0)], end = ranges[2 * get_group_id(0) + 1];                                \
+  const int begin = ranges[2 * listed_tile], end = ranges[2 * listed_tile + 1];                                        \
   const size_t stride = (size_t)tiles_x * TILE;                                                                        \
   const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from clsplat.device.context import Device
 from clsplat.device.drivers import diagnostics
 from clsplat.device.drivers.diagnostics import (
     access_findings,
@@ -14,6 +15,7 @@ from clsplat.device.drivers.diagnostics import (
     driver_findings,
     gpu_findings,
     gpus,
+    list_findings,
     loader_finding,
 )
 from clsplat.device.drivers.quirks import driver_files, gpu_advice
@@ -103,6 +105,23 @@ def test_no_device_and_trouble_are_missing() -> None:
     assert (aborted.state, aborted.text) == ("missing", "a driver crashed (signal 6)")
     assert none.advice
     assert aborted.advice
+
+
+def test_how_lists_are_made(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of devices with groups of items; the driver's probe is in a process of its own."""
+    listed = {"index": default_device.index, "name": "a device", "shape": "1 lanes x 64 items"}
+    monkeypatch.setenv("CLSPLAT_SHAPE", "1x64")
+    (finding,) = list_findings([{**listed, "shape": "8 lanes x 1 items"}, listed])
+    assert (finding.state, finding.text) == ("ok", f"{default_device.index}: a device, by append")
+    monkeypatch.setenv("CLSPLAT_PRETEND", "no-atomics")
+    (finding,) = list_findings([listed])
+    assert finding.state == "note"
+    assert finding.text == f"{default_device.index}: a device, by radix sort: it has no 32-bit integer atomics"
+    (finding,) = list_findings([{**listed, "index": 999}])
+    assert "by radix sort: the probe fails: " in finding.text
+    monkeypatch.setenv("CLSPLAT_DRIVER_TIMEOUT", "0.01")
+    (finding,) = list_findings([listed])
+    assert finding.text.endswith("does not come back within 0.01 s")
 
 
 def test_a_node_that_may_not_be_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -48,6 +48,8 @@ BROKEN = {
     "duplicate: ty * tiles_x + tx": ("tx * tiles_x + ty", "duplicate"),
     "sort_radix: & (digits - 1)": ("& (digits - 2)", "sort"),
     "ranges: = i + 1;": ("= i;", "ranges"),
+    "append: a.y > b.y": ("a.y < b.y", "append"),
+    "append: slot + (tx - x0)": ("slot + (x1 - tx)", "append"),
     "blend: before * alpha": ("before + alpha", "blend"),
     "blend: fmaL(-before, alpha, before)": ("fmaL(-before, before, before)", "blend"),
     "target: pixel[4] > 0": ("pixel[4] >= 0", "masks"),

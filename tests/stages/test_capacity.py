@@ -79,10 +79,12 @@ def drawn(device: Device, name: str) -> tuple[Rasterizer, DeviceGaussians, Forwa
 
 
 def by_capacity(
-    rasterizer: Rasterizer, held: DeviceGaussians, exact: ForwardPass, pairs: int
+    rasterizer: Rasterizer, held: DeviceGaussians, exact: ForwardPass, pairs: int, *, appends: bool = True
 ) -> tuple[ForwardPass, dict[str, int]]:
     """A frame with room for so many pairs, and what its copy of the counts has."""
-    frame = rasterizer.forward(held, exact.camera, exact.background, room=PairCapacity(pairs, 1))
+    frame = rasterizer.forward(held, exact.camera, exact.background, room=PairCapacity(pairs, 1, appends))
+    by_append = appends and rasterizer.device.shape.items > 1
+    assert (frame.listed.pairs is None) == by_append
     assert frame.listed.counted.arriving is not None
     arrived = frame.listed.counted.arriving()
     return frame, {name: int(arrived[READBACK.index(name)]) for name in NAMES}
@@ -91,13 +93,14 @@ def by_capacity(
 @pytest.mark.slow_in_groups
 @pytest.mark.parametrize("name", ["cloud", "few", "hidden"])
 @pytest.mark.parametrize("spare", quick([0, 1, 3000], 1))
-def test_a_pass_with_room_is_the_exact_one(shaped_device: Device, name: str, spare: int) -> None:
+@pytest.mark.parametrize("appends", quick([True, False], True))
+def test_a_pass_with_room_is_the_exact_one(shaped_device: Device, appends: bool, name: str, spare: int) -> None:
     _, _, exact = drawn(shaped_device, name)
     rasterizer, held, _ = drawn(shaped_device, "few")  # a workspace with something else in it
     held = upload_gaussians(shaped_device, scene(name)[0])
     count = exact.listed.counted.pairs
     assert (count == 0) == (name == "hidden")
-    frame, counts = by_capacity(rasterizer, held, exact, max(count + spare, 1))
+    frame, counts = by_capacity(rasterizer, held, exact, max(count + spare, 1), appends=appends)
     assert (counts["VISIBLE"], counts["PAIRS"], counts["STOPPED"]) == (exact.listed.counted.visible, count, 0)
     assert_same_bits(frame.blended.image.get(), exact.blended.image.get())
     assert_same_bits(frame.listed.lists.ranges.get(), exact.listed.lists.ranges.get())

@@ -14,10 +14,13 @@ from clsplat.bench import stages as bench_stages
 from clsplat.bench import workload as bench_subject
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.context import Device
+from clsplat.rendering import rasterizer
+from clsplat.rendering.rasterizer import ForwardPass
 from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import upload_gaussians
 from clsplat.training.density import ModelState, RowPlan
 from clsplat.training.density.adaptive import Adaptive
+from clsplat.training.step import speculative_steps
 from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE, SpeculativeSteps, by_capacity
 from clsplat.training.trainer import Trainer
 
@@ -77,8 +80,31 @@ def test_a_step_by_capacity_waits_for_no_number(
     for _ in range(4):
         calls = bench_stages.calls_of(device, trainer.train_step)
         assert (calls.blocking_reads, calls.blocking_writes, calls.reads) == (0, 0, 1)
-        assert 0 < calls.launches <= 40
+        assert 0 < calls.launches <= (12 if device.shape.items > 1 else 40)
     assert len(device.under_way) < 10, "what the device has read is let go of"
+
+
+def test_long_lists_are_sorted_by_radix(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the step after the one that found a list too long, until the model grows; at once where the mean is."""
+    monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
+    device = default_device.with_shape(lanes=1, items=64)
+    trainer = bench_stages.trainer_of(bench_subject.synthetic(200, 80, 60), device, RasterizerConfig())
+    frames: list[ForwardPass] = []
+    noted(monkeypatch, SpeculativeSteps, "seen", lambda _, frame: frames.append(frame))
+
+    def appended() -> list[bool]:
+        frames.clear()
+        run_steps(5, trainer)
+        return [frame.listed.pairs is None for frame in frames]
+
+    assert appended() == [False, True, True, True, True]
+    monkeypatch.setattr(speculative_steps, "MAX_LIST_PAIRS", 1)
+    assert appended() == [True, False, False, False, False]
+    monkeypatch.setattr(speculative_steps, "MAX_LIST_PAIRS", 10**6)
+    trainer.pending.room(trainer.rasterizer, None, 0)
+    assert appended()[1:] == [True] * 4
+    monkeypatch.setattr(rasterizer, "MAX_MEAN_PAIRS", 0)
+    assert appended() == [False] * 5
 
 
 class _Looks(Adaptive):

@@ -55,7 +55,7 @@ def measure(device: Device, count: int, width: int, height: int, repeat: int) ->
     draw = partial(rasterizer.forward, gaussians, subject.camera, background, backward=False)
     frames = [draw() for _ in range(2)]  # the first builds kernels and allocates memory
     ms = statistics.median(device.timed(draw)[1] for _ in range(repeat))
-    pairs = frames[-1].listed.pairs.tile_keys.shape[0]
+    pairs = frames[-1].listed.counted.pairs
     return {"gaussians": count, "width": width, "height": height, "pairs": pairs, "ms": ms}
 
 

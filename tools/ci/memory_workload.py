@@ -45,6 +45,7 @@ from clsplat.scenes.scene import Scene
 from clsplat.scenes.supervision.depth_samples import KnownDepth
 from clsplat.selftest.case import Case, Inputs, faults
 from clsplat.selftest.cases.table import CASES
+from clsplat.stages import append as stages_append
 from clsplat.stages import scan as stages_scan
 from clsplat.stages.adam import add_view
 from clsplat.stages.appearance import Gains, step_gains
@@ -52,6 +53,7 @@ from clsplat.stages.blend import count_pairs, tile_items
 from clsplat.stages.density import DeviceMarker, carry, gather, new_statistics
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, host_gaussians, upload_gaussians
 from clsplat.stages.peak import _splats
+from clsplat.stages.probe_atomics import atomics_fault
 from clsplat.training.trainer import Trainer
 
 STAND_INS = (
@@ -294,6 +296,16 @@ def sorts(device: Device) -> None:
     stages_scan.MAX_SINGLE_CHUNK_ELEMENTS = few
 
 
+def lists(device: Device) -> None:
+    """Lists by append that local memory does not hold, and boxes that a group shares; the probe of its atomics."""
+    fits, stages_append.LOCAL_PAIRS = stages_append.LOCAL_PAIRS, 4
+    rng = np.random.default_rng(2)
+    check("lists by append", CASES["append"], device, CASES["append"].random(rng, 70))
+    stages_append.LOCAL_PAIRS = fits
+    if found := atomics_fault(device):
+        raise SystemExit(found)
+
+
 def density(device: Device) -> None:
     """Rows that are marked, listed and gathered, of a model on the device and of one on the host, in parts."""
     count = 3 * device.row_alignment + 1
@@ -404,7 +416,7 @@ PARTS = {
     "training": (training,),
     "methods": (methods,),
     "library": (library,),
-    "cases": (cases, sorts),
+    "cases": (cases, sorts, lists),
     "passes": (limits, frames, subgroups, rendering, pictures, density),
 }
 """The workload in parts that take a child each, by name."""

@@ -36,6 +36,7 @@ from clsplat.files.atomic import atomic_write
 from clsplat.layouts.columns import SPLAT, TILE
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.device_gaussians import upload_gaussians
+from clsplat.stages.duplicate import Counted
 
 FRAMES = Path(__file__).with_name("gpu_frames.json")
 
@@ -48,6 +49,7 @@ def count(name: str, subject: Subject) -> dict[str, Any]:
     frame = rasterizer.forward(gaussians, camera, upload(device, np.zeros(3, np.float32)), backward=False)
     require(len(frame.bands) == 1, f"{name}: the frame needs more memory than there is, expected one band")
     lists, counted = frame.listed.lists, frame.listed.counted
+    assert isinstance(counted, Counted), "the frame has exact counts"
     stops = frame.blended.stops.get()
     tiles = stops.reshape(stops.shape[0] // TILE, TILE, stops.shape[1] // TILE, TILE).swapaxes(1, 2)
     splats, order = frame.projected.splats.get(), lists.gaussian_from_sorted.get()

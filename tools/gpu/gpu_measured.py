@@ -30,7 +30,7 @@ WITHIN = {"made up, 1 M": 0.25, "fox, step 7000": 0.4}
 """Most by which a prediction may differ from what was measured, by frame. Others are held out of the fit."""
 PARTS = {
     "project": ("project",),
-    "lists and sorts": ("duplicate", "ranges"),
+    "lists and sorts": ("duplicate", "ranges", "append"),
     "blend": ("blend",),
     "loss": ("target", "loss"),
     "blend_grad": ("blend_grad",),

@@ -155,7 +155,7 @@ class Rehearsed:
         """The numbers of the frame that a forward pass would read back."""
         least = 0x3F800000
         largest = least + (1 << self.frame["key_bits"]) - 1
-        return [self.frame["visible"], self.frame["listed"], 2**32 - 1 - least, largest]
+        return [self.frame["visible"], self.frame["listed"], 2**32 - 1 - least, largest, 0]
 
 
 def step(shape: Shape, frame: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -30,6 +30,7 @@ class Capabilities:
     allocation: maximum bytes of a buffer.
     exact_division: True if the device supports correctly rounded division and square roots.
     contraction: True if the compiler may be tested for fusing a*b + c (`Device._probe_fma`).
+    atomics: True if the device has 32-bit integer atomics in global and in local memory.
     """
 
     kind: str
@@ -38,14 +39,18 @@ class Capabilities:
     allocation: int
     exact_division: bool = True
     contraction: bool = True
+    atomics: bool = True
 
 
 _CAPABILITIES_BY_WORD: dict[str, dict[str, Any]] = {
     "gpu": {"kind": "gpu"},
     "no-exact-division": {"exact_division": False},
     "no-contraction": {"contraction": False},
+    "no-atomics": {"atomics": False},
 }
 """Changes of the capabilities by the word in CLSPLAT_PRETEND."""
+_ATOMICS = {"cl_khr_global_int32_base_atomics", "cl_khr_local_int32_base_atomics"}
+"""Extensions of OpenCL 1.0 that OpenCL 1.1 made part of every device."""
 _LIMIT_FIELDS = {"group": "group", "local-memory": "local_memory", "allocation": "allocation"}
 """Limits that CLSPLAT_PRETEND can lower: the fields of `Capabilities`, by their names in the variable."""
 
@@ -63,7 +68,8 @@ def capabilities_of(device: cl.Device) -> Capabilities:
     group, local, allocation = (
         int(limit) for limit in (device.max_work_group_size, device.local_mem_size, device.max_mem_alloc_size)
     )
-    capabilities = Capabilities(kind_of(device), group, local, allocation, exact_division=exact)
+    atomics = device.version.split()[1] != "1.0" or set(device.extensions.split()) >= _ATOMICS
+    capabilities = Capabilities(kind_of(device), group, local, allocation, exact_division=exact, atomics=atomics)
     for part in filter(None, pretended().split(",")):
         name, _, number = part.strip().partition("=")
         if name in _CAPABILITIES_BY_WORD and not number:

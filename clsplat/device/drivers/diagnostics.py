@@ -118,6 +118,22 @@ def device_findings(devices: Sequence[dict[str, Any]], trouble: str) -> list[Dia
     ]
 
 
+def list_findings(devices: Sequence[dict[str, Any]]) -> list[Diagnostic]:
+    """A line for each device whose kernels run in groups of several items: how training makes the lists of tiles."""
+    findings = []
+    for info in devices:
+        if " x 1 items" in info["shape"]:
+            continue
+        result, name = _outcome(*python_module("clsplat.stages.probe_atomics", str(info["index"]))), info["name"]
+        if result is None:
+            fault = f"the probe of integer atomics does not come back within {driver_timeout():g} s"
+        else:
+            fault = result.stdout if result.returncode == 0 else f"the probe fails: {_last_line(result)}"
+        text = f"{info['index']}: {name}, by radix sort: {fault}" if fault else f"{info['index']}: {name}, by append"
+        findings.append(Diagnostic("lists", "note" if fault else "ok", text))
+    return findings
+
+
 def gpu_findings(makers: Sequence[str], devices: Sequence[dict[str, Any]]) -> list[Diagnostic]:
     """A finding for each maker of GPUs in this machine: whether OpenCL shows a GPU of this maker."""
     findings = []
@@ -158,6 +174,7 @@ def findings() -> list[Diagnostic]:
         loader,
         *driver_findings(driver_files()),
         *device_findings(devices, trouble),
+        *list_findings(devices),
         *gpu_findings(gpus(), devices),
         *access_findings(),
     ]

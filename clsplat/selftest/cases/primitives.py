@@ -1,19 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cases of the kernels' own elementary functions (shared/math.h, shared/lanes.h), both sorts, and prefix sums."""
+"""Cases of the kernels' own elementary functions (shared/math.h, shared/lanes.h), both sorts, prefix sums, and lists
+by append."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.random import Generator
+from numpy.typing import NDArray
 
 from clsplat.device.buffers import Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
-from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly, read_of
+from clsplat.layouts.columns import READBACK, SPLAT, TILE
+from clsplat.reference.append import lists_of
+from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly, fresh_readback, read_of
 from clsplat.selftest.harness import Array, CaseBench
 from clsplat.selftest.scenes import keys
+from clsplat.stages.append import append
+from clsplat.stages.project import Projected
 from clsplat.stages.scan import MAX_SINGLE_CHUNK_ELEMENTS, scan
 from clsplat.stages.sort import MIN_WIDE_DIGIT_KEYS, bitonic_sort, radix_sort
 
@@ -125,4 +131,140 @@ SCAN_CASE = Case(
         "sums": exactly(np.cumsum(given.values) - given.values),
         "total": exactly(given.values.sum(keepdims=True)),
     },
+)
+
+
+_WHOLE_BOX = 16
+"""The largest box, in tiles, of which every tile is listed, whatever the ellipse is (SMALL_BOX of tile.h)."""
+_EVERYWHERE = 1e6
+"""Half an ellipse's width, in pixels, that reaches all tiles of its rows."""
+_COUNTS = ("VISIBLE", "PAIRS", "LONGEST", "STOPPED")
+
+
+def splats_of_boxes(boxes: NDArray[np.int64], depths: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Splats (n, SPLAT) that reach the tiles [x0, x1) of the rows [y0, y1).
+
+    boxes: (n, 4), x0, x1, y0, y1. A box of more than 16 tiles must be as wide as the image.
+    """
+    splats = np.zeros((len(boxes), len(SPLAT)), np.float32)
+    low, high = TILE * boxes[:, ::2] + TILE / 2, TILE * (boxes[:, 1::2] - 1) + TILE / 2  # centres of the outer tiles
+    is_wide = np.prod(boxes[:, 1::2] - boxes[:, ::2], axis=1) > _WHOLE_BOX
+    values = {
+        "PIXEL_X": (low + high)[:, 0] / 2,
+        "PIXEL_Y": (low + high)[:, 1] / 2,
+        "HALF_W": np.where(is_wide, _EVERYWHERE, (high - low)[:, 0] / 2),
+        "HALF_H": (high - low)[:, 1] / 2,
+        "L11": np.full(len(boxes), 1e-6),
+        "L22": np.full(len(boxes), 1e-6),
+        "LOG2O": np.full(len(boxes), -1.0),
+        "DEPTH": depths,
+    }
+    for name, column in values.items():
+        splats[:, SPLAT.index(name)] = column
+    return splats
+
+
+def tiles_of_boxes(boxes: NDArray[np.int64], tiles_x: int) -> list[NDArray[np.int64]]:
+    """Each box's tiles, ascending."""
+    return [
+        (np.arange(y0, y1)[:, None] * tiles_x + np.arange(x0, x1)).ravel() for x0, x1, y0, y1 in boxes.astype(np.int64)
+    ]
+
+
+def boxes_of(rng: Generator, count: int, tiles: tuple[int, int]) -> NDArray[np.int64]:
+    """Random boxes for `splats_of_boxes`: none, small ones, whole rows, and now and then all tiles."""
+    begin = rng.integers(0, tiles, (count, 2))
+    end = np.minimum(begin + rng.integers(1, 5, (count, 2)), tiles)
+    kind = rng.choice(4, count, p=(0.1, 0.7, 0.17, 0.03))
+    rows = np.where((kind == 3)[:, None], (0, tiles[1]), np.stack([begin[:, 1], end[:, 1]], axis=1))
+    columns = np.where((kind >= 2)[:, None], (0, tiles[0]), np.stack([begin[:, 0], end[:, 0]], axis=1))
+    boxes = np.concatenate([columns, rows], axis=1)
+    boxes[kind == 0, 1] = boxes[kind == 0, 0]
+    return boxes
+
+
+def depths_of(rng: Generator, count: int) -> NDArray[np.float32]:
+    """Random depths, in half of the draws with many equal ones."""
+    depths = rng.uniform(0.1, 100, count) if rng.random() < 0.5 else rng.integers(1, 4, count)
+    return depths.astype(np.float32)
+
+
+def _inputs_of_boxes(
+    boxes: NDArray[np.int64], depths: NDArray[np.float32], tiles: tuple[int, int], spare: int
+) -> Inputs:
+    counts = np.prod(boxes[:, 1::2] - boxes[:, ::2], axis=1)
+    capacity = max(int(counts.sum()) + spare, 0)
+    return Inputs(boxes=boxes, depths=depths, tiles=tiles, counts=counts.astype(np.uint32), capacity=capacity)
+
+
+def _random_boxes(rng: Generator, count: int) -> Inputs:
+    tiles = (int(rng.integers(1, 14)), int(rng.integers(1, 14)))
+    spare = int(rng.choice([-1, 0, 1, 1000], p=(0.1, 0.4, 0.3, 0.2)))
+    return _inputs_of_boxes(boxes_of(rng, count, tiles), depths_of(rng, count), tiles, spare)
+
+
+def _frozen_boxes(bench: CaseBench) -> list[Inputs]:
+    """Depths that differ, and depths that are equal; among the boxes are wide ones."""
+    rng, tiles = np.random.default_rng(61), (13, 9)
+    count = 4000 if bench.frozen.name == "crowd" else 400
+    depths = rng.uniform(0.1, 100, count), rng.integers(1, 4, count)
+    return [_inputs_of_boxes(boxes_of(rng, count, tiles), each.astype(np.float32), tiles, 100) for each in depths]
+
+
+def _launch_append(device: Device, work: Workspace, given: Inputs) -> Read:
+    splats, counts = splats_of_boxes(given.boxes, given.depths), upload(device, given.counts)
+    readback, host = fresh_readback(device), np.zeros(len(READBACK), np.uint32)
+    numbers = (given.tiles, readback, given.capacity, host)
+    totals, lists = append(device, work, Projected(upload(device, splats), counts), *numbers)
+
+    def read() -> Arrays:
+        assert totals.arriving is not None
+        assert lists.order is not None
+        arrived = totals.arriving()
+        pairs, ranges, order = arrived[READBACK.index("PAIRS")], lists.ranges.get(), lists.order.get()
+        return {
+            "counts": np.array([arrived[READBACK.index(name)] for name in _COUNTS]),
+            "tile_counts": counts.get(),
+            "first_slots": totals.first_slots.get(),
+            "ranges": ranges,
+            "gaussians": lists.gaussian_from_sorted.get()[:pairs],
+            "slots": lists.slot_from_sorted.get()[:pairs],
+            "tiles": np.sort(order),
+            "lengths": _digits(np.diff(ranges, axis=1).ravel()[order]),
+        }
+
+    return read
+
+
+def _digits(lengths: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Numbers of binary digits."""
+    return np.array([int(length).bit_length() for length in lengths], np.int64)
+
+
+def _twin_of_lists(given: Inputs, got: Arrays) -> Mapping[str, Wanted]:
+    tiles, stops = given.tiles[0] * given.tiles[1], given.counts.sum() > given.capacity
+    twin = lists_of(tiles_of_boxes(given.boxes, given.tiles[0]), given.depths, tiles)
+    ranges = 0 * twin.ranges if stops else twin.ranges
+    lengths = np.diff(ranges, axis=1).ravel()
+    none = np.zeros(0, np.int64)
+    counts = [0, 0, 0, 1] if stops else [(given.counts > 0).sum(), given.counts.sum(), lengths.max(initial=0), 0]
+    return {
+        "counts": exactly(np.array(counts)),
+        "tile_counts": exactly(0 * given.counts if stops else given.counts),
+        "first_slots": exactly(twin.first_slots) if not stops else exactly(got["first_slots"]),
+        "ranges": exactly(ranges),
+        "gaussians": exactly(none if stops else twin.gaussian_from_sorted),
+        "slots": exactly(none if stops else twin.slot_from_sorted),
+        "tiles": exactly(np.arange(tiles)),
+        "lengths": exactly(np.sort(_digits(lengths))[::-1]),
+    }
+
+
+APPEND_CASE = Case(
+    sizes=(1, 63, 65, 700, 0, 2, 64, 255, 256, 257, 1025),
+    random=_random_boxes,
+    launch=_launch_append,
+    twin=_twin_of_lists,
+    frozen=_frozen_boxes,
+    digested=("counts", "ranges", "gaussians", "slots"),
 )

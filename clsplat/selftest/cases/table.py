@@ -16,7 +16,7 @@ from clsplat.selftest.cases.loss import DEPTH_LOSS_CASE, LOSS_CASE, MASKS_CASE
 from clsplat.selftest.cases.pictures import DEEP_MERGE_CASE, PICTURE_CASES
 from clsplat.selftest.cases.poses import POSE_CASE, of_lens
 from clsplat.selftest.cases.ppisp import PPISP_CASE
-from clsplat.selftest.cases.primitives import BITONIC_CASE, ELEMENTARY_CASE, SCAN_CASE, SORT_CASE
+from clsplat.selftest.cases.primitives import APPEND_CASE, BITONIC_CASE, ELEMENTARY_CASE, SCAN_CASE, SORT_CASE
 from clsplat.selftest.cases.steps import ADAM_CASE, NOISE_CASE, PENALTIES_CASE
 from clsplat.selftest.harness import CaseBench, StageOutcome
 
@@ -25,6 +25,7 @@ CASES: dict[str, Case] = {
     "sort": SORT_CASE,
     "bitonic sort": BITONIC_CASE,
     "scan": SCAN_CASE,
+    "append": APPEND_CASE,
     "loss": LOSS_CASE,
     "masks": MASKS_CASE,
     "depth loss": DEPTH_LOSS_CASE,

@@ -18,6 +18,7 @@ from clsplat.device.context import Device
 from clsplat.errors import switched_on
 from clsplat.layouts.columns import READBACK
 from clsplat.rendering.rasterizer import MAX_COUNTED_PASSES, ForwardPass, PairCapacity, Rasterizer
+from clsplat.stages.append import MAX_LIST_PAIRS
 from clsplat.stages.loss import Loss
 from clsplat.training.stability.non_finite import LastStep, NonFiniteMonitor
 
@@ -65,6 +66,7 @@ class SpeculativeSteps:
         self._kept: list[object] = []
         self._most: int | None = None
         self._of: tuple[object, int] = (None, 0)
+        self._appends = True
         self._turn = 0
         self._frame: ForwardPass | None = None
         self.redone = 0
@@ -95,7 +97,7 @@ class SpeculativeSteps:
         0 if no number is known yet, or if it exceeds the rasterizer's capacity.
         """
         if (before := self._of) != (size, gaussians):
-            self._of = size, gaussians
+            self._of, self._appends = (size, gaussians), True
             grown = max(gaussians / max(before[1], 1), 1.0)
             self._most = round(self._most * grown) if self._most is not None and size == before[0] else None
         if self._most is None:
@@ -117,7 +119,7 @@ class SpeculativeSteps:
         turn = self._turn = (
             self._turn + 1
         ) % self.turns  # exact steps take turns too, because their loss is read a step later
-        before, result = self._monitor.last, run(turn, PairCapacity(room, turn) if room else None)
+        before, result = self._monitor.last, run(turn, PairCapacity(room, turn, self._appends) if room else None)
         if not room:
             return result
         assert self._frame is not None, "each step has a frame"
@@ -151,6 +153,7 @@ class SpeculativeSteps:
                 self._again()
                 return
             self._count(int(counts[READBACK.index("PAIRS")]))
+            self._appends &= bool(counts[READBACK.index("LONGEST")] <= MAX_LIST_PAIRS)
             self._kept = self._steps.pop(
                 0
             ).kept  # the device may still be reading memory for copies launched after the counts

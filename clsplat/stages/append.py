@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches append.cl: the lists of a pass by capacity, without a sort of all pairs, for groups of several items."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.device import cl
+from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_groups
+from clsplat.device.profile import stage
+from clsplat.stages.duplicate import Band, Totals
+from clsplat.stages.probe_atomics import atomics_fault
+from clsplat.stages.project import Projected
+from clsplat.stages.ranges import TileLists
+
+APPEND_PAIR_BYTES = 12
+"""Bytes per pair in addition to the lists: its depth and slot, and the Gaussian of the slot."""
+
+MAX_MEAN_PAIRS, MAX_LIST_PAIRS = 1500, 8192
+"""The largest mean and length of lists that are sorted by a group each. Longer lists leave too few groups for too much
+work, as all steps beyond 2,048 pairs go through global memory: the radix sort is faster."""
+
+LOCAL_PAIRS = 2048
+"""Pairs that a group sorts in local memory: 16 KiB of them, half of every device's minimum. A power of two."""
+
+_OFFSET_ITEMS = 256
+"""Work-items of each group of `list_offsets`, which has all tiles or all groups of `count_tiles`."""
+
+
+def appends(device: Device) -> bool:
+    """True if passes by capacity may make their lists by append: groups have several items, and the driver counts
+    correctly with integer atomics."""
+    return device.shape.items > 1 and not atomics_fault(device)
+
+
+@stage("append")
+def append(
+    device: Device,
+    work: Workspace,
+    projected: Projected,
+    tiles: tuple[int, int],
+    readback: DeviceArray,
+    capacity: int,
+    host: NDArray[np.uint32],
+) -> tuple[Totals, TileLists]:
+    """The lists of `duplicate` and `tile_lists` for at most `capacity` pairs, without waiting.
+
+    With more pairs the pass stops (kernels/append.cl).
+
+    readback: (READBACK_SIZE,) uint32, the array that `project_step` gets too.
+    host: host memory for its copy.
+    """
+    (n,), number, items = projected.tile_counts.shape, tiles[0] * tiles[1], device.shape.items
+    groups = -(-n // items)
+    counts = work.array("list_counts", (number + 1,), np.uint32)
+    counts.fill(0)
+    slots, sums = work.array("first_slots", (n,), np.uint32), work.array("slot_group_sums", (groups,), np.uint32)
+    kernels, splats, tile_counts = device.kernels("append"), projected.splats, projected.tile_counts
+    counted = (projected.shown or tile_counts, tile_counts, splats, counts, slots, sums)
+    launch_groups(device, kernels.count_tiles, groups, items, n, *tiles, *counted)
+    ranges, order = work.array("ranges", (number, 2), np.uint32), work.array("tile_order", (number,), np.uint32)
+    many = max(items, min(_OFFSET_ITEMS, device.max_group))
+    offsets, sizes = device.kernels("append", {"ITEMS": many}).list_offsets, (number, groups, capacity)
+    launch_groups(device, offsets, 2, many, *sizes, counts, sums, ranges, order, readback)
+    arriving = readback.begin_get(host)
+    pairs = work.array("appended_pairs", (capacity, 2), np.uint32)
+    gaussian_from_slot = work.array("gaussian_from_slot", (capacity,), np.uint32)
+    appended = (splats, sums, readback, counts, tile_counts, slots, pairs, gaussian_from_slot)
+    launch_groups(device, kernels.append_pairs, groups, items, n, *tiles, *appended)
+    gaussian_from_sorted = work.array("gaussian_from_sorted", (capacity,), np.uint32)
+    slot_from_sorted = work.array("slot_from_sorted", (capacity,), np.uint32)
+    arrays = (order, ranges, gaussian_from_slot, pairs, gaussian_from_sorted, slot_from_sorted)
+    local = cl.LocalMemory(4 * LOCAL_PAIRS)
+    launch_groups(device, kernels.sort_lists, number, items, LOCAL_PAIRS, *arrays, local, local)
+    lists = TileLists(Band(0, number), ranges, gaussian_from_sorted, slot_from_sorted, order)
+    return Totals(tile_counts, slots, n, capacity, on_device=readback, arriving=arriving), lists

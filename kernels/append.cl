@@ -1,0 +1,281 @@
+// Tile lists by append, for groups of several items. Every Gaussian is appended to the lists of its tiles, in any
+// order. A group then sorts a tile's list by (depth, slot). Slots follow the order of the Gaussians, so this total
+// order is that of duplicate.cl and ranges.cl: depth, then index.
+//
+// Owner: In count_tiles and append_pairs a work-item owns a Gaussian, and its group shares those with wide boxes. In
+//   list_offsets a group owns all tiles, and another the sums of count_tiles' groups. In sort_lists a group owns a
+//   tile.
+// Launch: One work-item for each Gaussian, in groups of ITEMS; two groups; one group for each tile.
+// Buffers: splats (n, SPLAT_SIZE) in pixels, depth in world units; tile_counts (n) -> slots (n): each Gaussian's first
+//   slot; ranges (tiles, 2): a list's begin and end; gaussian_from_sorted, slot_from_sorted (pairs): the lists. The
+//   other shapes are above each kernel.
+// Equations: docs/gradients.md, (47), through shared/tile.h; Batcher's bitonic network.
+#include "shared/math.h"
+#include "shared/group.h"
+#include "shared/tile.h"
+
+// The largest box, in tiles, that an item goes over alone.
+#define OWN_BOX 32
+// Of a wide box, so many items share a row of tiles.
+#define SIDE (ITEMS < 8 ? ITEMS : 8)
+
+// True if pair a comes after pair b: (depth, slot).
+static inline int is_after(uint2 a, uint2 b) { return a.x > b.x || (a.x == b.x && a.y > b.y); }
+
+// The place of the first pair of the k-th comparison, and of the second: `step` apart, or in a mirrored step at equal
+// distances from the ends of a block of 2 step. All comparisons leave the lesser pair first, so that places past the
+// end of a list need no pairs: none would move.
+static inline uint first_of(uint k, uint step) { return 2 * k - (k & (step - 1)); }
+static inline uint second_of(uint first, uint step, int mirrored) {
+  return mirrored ? (first | (2 * step - 1)) - (first & (step - 1)) : first + step;
+}
+
+// One step over pairs (count) in local memory.
+static inline void order_step(__local uint *depths, __local uint *slots, uint count, uint step, int mirrored) {
+  for (uint k = get_local_id(0); first_of(k, step) + 1 < count; k += ITEMS) {
+    const uint a = first_of(k, step), b = second_of(a, step, mirrored);
+    if (b < count) {
+      const uint2 one = (uint2)(depths[a], slots[a]), other = (uint2)(depths[b], slots[b]);
+      if (is_after(one, other)) {
+        depths[a] = other.x;
+        slots[a] = other.y;
+        depths[b] = one.x;
+        slots[b] = one.y;
+      }
+    }
+  }
+  BARRIER_LOCAL();
+}
+
+// The same step over pairs in global memory.
+static inline void order_step_far(__global uint2 *list, uint count, uint step, int mirrored) {
+  for (uint k = get_local_id(0); first_of(k, step) + 1 < count; k += ITEMS) {
+    const uint a = first_of(k, step), b = second_of(a, step, mirrored);
+    if (b < count) {
+      const uint2 one = list[a], other = list[b];
+      if (is_after(one, other)) {
+        list[a] = other;
+        list[b] = one;
+      }
+    }
+  }
+  BARRIER_GLOBAL();
+}
+
+// Brings pairs (count) to local memory.
+static inline void fetch_pairs(__global const uint2 *list, uint count, __local uint *depths, __local uint *slots) {
+  for (uint k = get_local_id(0); k < count; k += ITEMS) {
+    const uint2 pair = list[k];
+    depths[k] = pair.x;
+    slots[k] = pair.y;
+  }
+  BARRIER_LOCAL();
+}
+
+// Takes them back.
+static inline void store_pairs(__global uint2 *list, uint count, __local const uint *depths,
+                               __local const uint *slots) {
+  for (uint k = get_local_id(0); k < count; k += ITEMS) list[k] = (uint2)(depths[k], slots[k]);
+  BARRIER_GLOBAL();
+  BARRIER_LOCAL();
+}
+
+// tile_counts, shown (n) -> counts (tiles + 1), zero before: the length of each tile's list, then the number of visible
+// Gaussians; slots (n): the number of pairs of the group's earlier Gaussians; sums (groups): of all its pairs. Integer
+// sums do not depend on the order of the atomics.
+GROUP __kernel void count_tiles(const uint n, const int tiles_x, const int tiles_y, __global const uint *shown,
+                                __global const uint *tile_counts, __global const float *splats, __global uint *counts,
+                                __global uint *slots, __global uint *sums) {
+  __local uint scratch[ITEMS], wide[ITEMS], wides, visible;
+  const uint i = get_global_id(0), item = get_local_id(0);
+  const uint count = i < n ? tile_counts[i] : 0;
+  uint pairs;
+  if (item == 0) wides = visible = 0;
+  const uint before = group_exclusive_scan(count, scratch, &pairs);
+  BARRIER_LOCAL();
+  if (i < n) slots[i] = before;
+  if (i < n && shown[i] != 0) atomic_inc(&visible);
+  if (count > 0) {
+    const Ellipse e = ellipse_of(splats + (size_t)SPLAT_SIZE * i, tiles_x, tiles_y);
+    if (e.box > OWN_BOX) {
+      wide[atomic_inc(&wides)] = i;
+    } else {
+      for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {
+        for (int part = 0; part < SPANS; ++part) {
+          int x0, x1;
+          tile_span(&e, ty, part, tiles_x, &x0, &x1);
+          for (int tx = x0; tx < x1; ++tx) atomic_inc(counts + ty * tiles_x + tx);
+        }
+      }
+    }
+  }
+  BARRIER_LOCAL();
+  for (uint k = 0; k < wides; ++k) {
+    const Ellipse e = ellipse_of(splats + (size_t)SPLAT_SIZE * wide[k], tiles_x, tiles_y);
+    for (int row = e.tile_y0 + (int)item / SIDE; row < e.tile_y1; row += ITEMS / SIDE) {
+      for (int part = 0; part < SPANS; ++part) {
+        int x0, x1;
+        tile_span(&e, row, part, tiles_x, &x0, &x1);
+        for (int tx = x0 + (int)item % SIDE; tx < x1; tx += SIDE) atomic_inc(counts + row * tiles_x + tx);
+      }
+    }
+  }
+  if (item == 0) {
+    sums[get_group_id(0)] = pairs;
+    atomic_add(counts + tiles_x * tiles_y, visible);
+  }
+}
+
+// counts (tiles + 1), sums (groups) of count_tiles -> counts: where each list begins; sums: their exclusive scan;
+// ranges (tiles, 2); order (tiles): the tiles with the longest lists first, to a power of two, as these take longest;
+// readback: as from compact_visible in duplicate.cl, but for the keys, which are 0, and with the longest list's length.
+// A pass that stops as there, BY_CAPACITY, has empty lists.
+GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint capacity, __global uint *counts,
+                                 __global uint *sums, __global uint *ranges, __global uint *order,
+                                 __global uint *readback) {
+  __local uint scratch[ITEMS], places[33], longest;
+  __local int stopped;
+  const uint item = get_local_id(0), has_tiles = get_group_id(0) == 0, number = has_tiles ? tiles : groups;
+  const uint run = (number + ITEMS - 1) / ITEMS, begin = min(item * run, number), end = min(begin + run, number);
+  const uint end_of_tiles = has_tiles ? end : begin;
+  __global uint *values = has_tiles ? counts : sums;
+  ulong sum = 0;
+  uint all, most = 0;
+  for (uint k = begin; k < end; ++k) {
+    sum += values[k];
+    most = max(most, values[k]);
+  }
+  for (uint k = item; k < 33; k += ITEMS) places[k] = 0;
+  if (item == 0) longest = 0;
+  uint before = group_exclusive_scan(CAPPED(sum), scratch, &all);
+  BARRIER_LOCAL();
+  atomic_max(&longest, most);
+  BARRIER_LOCAL();
+  if (item == 0) {
+    stopped = all > capacity;
+    if (has_tiles) {
+      for (uint k = READBACK_STOPPED; k < READBACK_SIZE; ++k) stopped |= readback[k] != 0;
+      readback[READBACK_VISIBLE] = stopped ? 0 : counts[tiles];
+      readback[READBACK_PAIRS] = stopped ? 0 : all;
+      readback[READBACK_KEY_COMPLEMENT] = readback[READBACK_LARGEST_KEY] = 0;
+      readback[READBACK_LONGEST] = stopped ? 0 : longest;
+      readback[READBACK_STOPPED] = stopped;
+    }
+  }
+  BARRIER_LOCAL();
+  for (uint tile = begin; tile < end; ++tile) {
+    const uint length = values[tile];
+    values[tile] = before;
+    if (has_tiles) {
+      const int listed = length > 0 && !stopped;
+      ranges[2 * tile] = listed ? before : 0;
+      ranges[2 * tile + 1] = listed ? before + length : 0;
+      atomic_inc(places + clz(listed ? length : 0));
+    }
+    before += length;
+  }
+  BARRIER_LOCAL();
+  if (item == 0) {
+    uint place = 0;
+    for (uint k = 0; k < 33; ++k) {
+      const uint lists = places[k];
+      places[k] = place;
+      place += lists;
+    }
+  }
+  BARRIER_LOCAL();
+  for (uint k = begin; k < end_of_tiles; ++k) order[atomic_inc(places + clz(ranges[2 * k + 1] - ranges[2 * k]))] = k;
+}
+
+// Appends a pair to a tile's list.
+#define APPEND(tile, slot, gaussian)                                                                                   \
+  {                                                                                                                    \
+    pairs[atomic_inc(cursors + (tile))] = (uint2)(depth, slot);                                                        \
+    gaussian_from_slot[slot] = gaussian;                                                                               \
+  }
+
+// sums (groups) and cursors (tiles): `counts` of list_offsets; slots (n) of count_tiles -> slots (n): each Gaussian's
+// first slot; pairs (pairs): depth and slot, by tile in any order; gaussian_from_slot (pairs). In a pass that has
+// stopped, tile_counts (n) become zero, so that it adds nothing to statistics.
+GROUP __kernel void append_pairs(const uint n, const int tiles_x, const int tiles_y, __global const float *splats,
+                                 __global const uint *sums, __global const uint *readback, __global uint *cursors,
+                                 __global uint *tile_counts, __global uint *slots, __global uint2 *pairs,
+                                 __global uint *gaussian_from_slot) {
+  __local uint wide[ITEMS], wide_slots[ITEMS], wides;
+  const uint i = get_global_id(0), item = get_local_id(0), stopped = readback[READBACK_STOPPED];
+  if (item == 0) wides = 0;
+  BARRIER_LOCAL();
+  if (i < n) {
+    uint slot = sums[i / ITEMS] + slots[i];
+    slots[i] = slot;
+    if (stopped) {
+      tile_counts[i] = 0;
+    } else if (tile_counts[i] > 0) {
+      __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
+      const Ellipse e = ellipse_of(splat, tiles_x, tiles_y);
+      if (e.box > OWN_BOX) {
+        const uint place = atomic_inc(&wides);
+        wide[place] = i;
+        wide_slots[place] = slot;
+      } else {
+        const uint depth = as_uint(splat[SPLAT_DEPTH]);
+        for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {
+          for (int part = 0; part < SPANS; ++part) {
+            int x0, x1;
+            tile_span(&e, ty, part, tiles_x, &x0, &x1);
+            for (int tx = x0; tx < x1; ++tx, ++slot) APPEND(ty * tiles_x + tx, slot, i)
+          }
+        }
+      }
+    }
+  }
+  BARRIER_LOCAL();
+  for (uint k = 0; k < wides; ++k) {
+    __global const float *splat = splats + (size_t)SPLAT_SIZE * wide[k];
+    const Ellipse e = ellipse_of(splat, tiles_x, tiles_y);
+    const uint depth = as_uint(splat[SPLAT_DEPTH]);
+    uint slot = wide_slots[k];
+    for (int row = e.tile_y0; row < e.tile_y1; ++row) {
+      for (int part = 0; part < SPANS; ++part) {
+        int x0, x1;
+        tile_span(&e, row, part, tiles_x, &x0, &x1);
+        if ((row - e.tile_y0) % (ITEMS / SIDE) == (int)item / SIDE) {
+          for (int tx = x0 + (int)item % SIDE; tx < x1; tx += SIDE) {
+            APPEND(row * tiles_x + tx, slot + (tx - x0), wide[k])
+          }
+        }
+        slot += x1 - x0;
+      }
+    }
+  }
+}
+
+// order, ranges of list_offsets; pairs, gaussian_from_slot (pairs) of append_pairs -> gaussian_from_sorted,
+// slot_from_sorted (pairs). depths, slots (fit), in local memory: fit, a power of two, is how many pairs they hold. A
+// longer list is sorted in parts, then merged in ever larger blocks, in `pairs`.
+GROUP __kernel void sort_lists(const uint fit, __global const uint *order, __global const uint *ranges,
+                               __global const uint *gaussian_from_slot, __global uint2 *pairs,
+                               __global uint *gaussian_from_sorted, __global uint *slot_from_sorted,
+                               __local uint *depths, __local uint *slots) {
+  const uint tile = order[get_group_id(0)], begin = ranges[2 * tile], count = ranges[2 * tile + 1] - begin;
+  __global uint2 *list = pairs + begin;
+  // PoCL makes wrong code of two loops, one for the parts and one for the blocks, that both have barriers inside.
+  for (uint stage = fit / 2; stage == fit / 2 || stage < count; stage *= 2) {
+    for (uint step = stage; step >= fit; step /= 2) order_step_far(list, count, step, step == stage);
+    for (uint first = 0; first < count; first += fit) {
+      const uint here = min(fit, count - first), sorts = stage < fit;
+      fetch_pairs(list + first, here, depths, slots);
+      for (uint half_block = sorts ? 1 : fit / 2; half_block < (sorts ? here : fit); half_block *= 2) {
+        for (uint step = half_block; step > 0; step /= 2) {
+          order_step(depths, slots, here, step, sorts && step == half_block);
+        }
+      }
+      store_pairs(list + first, count > fit ? here : 0, depths, slots);
+    }
+  }
+  for (uint k = get_local_id(0); k < count; k += ITEMS) {
+    const uint slot = count > fit ? list[k].y : slots[k];
+    gaussian_from_sorted[begin + k] = gaussian_from_slot[slot];
+    slot_from_sorted[begin + k] = slot;
+  }
+}
