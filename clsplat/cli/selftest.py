@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import asdict, dataclass
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -39,8 +40,8 @@ class SelftestVerb(Verb):
     json: Flag = False
     """Print the result as JSON."""
     report: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    """Write the result to a file for a bug report, with system, packages, limits of each device, digests, and the
-    shapes and kernels with which drivers failed."""
+    """Write the result to a file for a bug report, with system, packages, limits of each device, digests, the shapes
+    and kernels with which drivers failed, and times of a frame's and a training step's stages."""
     overwrite: Flag = False
     """Replace an existing file."""
 
@@ -98,14 +99,34 @@ def record(info: DeviceInfo, report: DriverReport) -> dict[str, object]:
 
 
 def _bug_report(records: list[dict[str, object]]) -> dict[str, object]:
-    """Content of a bug report: the results and facts about the installation."""
+    """Content of a bug report: the results, times of devices that can be trusted, and facts about the installation."""
     from clsplat.cli.doctor import lines
     from clsplat.device.context import all_devices, limits
     from clsplat.device.drivers.shapes import failures
 
     for entry, device in zip(records, (all_devices()[int(str(entry["index"]))] for entry in records), strict=True):
         entry |= {"limits": limits(device), "refused": failures(device)}
-    return {"clsplat": package_version(), "installation": [asdict(line) for line in lines()], "devices": records}
+        entry["times"] = times(str(entry["index"])) if entry["trusted"] else None
+    return {
+        "clsplat": package_version(),
+        "date": datetime.now(tz=timezone.utc).date().isoformat(),
+        "installation": [asdict(line) for line in lines()],
+        "devices": records,
+    }
+
+
+def times(device: str) -> dict[str, object]:
+    """Times of a device in a view of the demo's scene: what `clsplat bench` measures, or `failed` with the reason."""
+    from clsplat.bench.stages import bench
+    from clsplat.bench.workload import Subject
+    from clsplat.demo.measured_view import measured_view
+    from clsplat.device.context import open_device
+    from clsplat.errors import ClsplatError
+
+    try:
+        return bench(Subject("demo", *measured_view()), open_device(device, profile=True))
+    except ClsplatError as error:
+        return {"failed": str(error)}
 
 
 def table(report: DriverReport) -> str:

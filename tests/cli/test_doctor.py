@@ -8,11 +8,16 @@ import re
 from pathlib import Path
 from typing import Any
 
+import device_page
 import pytest
 from calls import Capture, printed, rejected
 
+from clsplat.bench import stages
+from clsplat.cli.selftest import times
+from clsplat.demo import measured_view
 from clsplat.device.context import list_devices
 from clsplat.device.drivers import diagnostics
+from clsplat.errors import CapacityError
 
 
 @pytest.mark.smoke
@@ -51,7 +56,21 @@ def test_the_report_of_a_bug(tmp_path: Path, capsys: Capture) -> None:
     assert device["refused"] == {}
     assert len(device["digests"]) == 3 * len(device["stages"])  # three scenes
     assert any(line["part"] == "package" for line in report["installation"])
+    measured = device["times"]
+    assert (measured["gaussians"], measured["width"], measured["height"]) == (20_000, 320, 240)
+    assert measured["iteration_ms"] > 0 and measured["stages"]["project_grad"]["ms"] > 0
+    rows, left_out = device_page.rows_of(report)
+    assert ([row["device"] for row in rows], left_out) == ([device["name"]], [])
     assert "exists already" in rejected(capsys, ["selftest", "--report", file])
+
+
+def test_times_that_cannot_be_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise CapacityError("no memory left")
+
+    monkeypatch.setattr(stages, "bench", fails)
+    monkeypatch.setattr(measured_view, "measured_view", lambda: (None, None, None))
+    assert times("0") == {"failed": "no memory left"}
 
 
 def test_the_report_is_refused_before_the_test(tmp_path: Path, capsys: Capture) -> None:

@@ -7,7 +7,7 @@ import pytest
 from calls import refuses
 
 from clsplat.camera import Camera
-from clsplat.demo import ray_caster
+from clsplat.demo import measured_view, ray_caster
 from clsplat.demo import run as demo
 from clsplat.shots.viewpoints import look_at
 
@@ -96,3 +96,19 @@ def test_cameras_stand_inside_the_wall_and_look_at_the_middle():
         x, y, z = view.rotation @ ray_caster.SCENE_CENTRE + view.translation
         assert z > 0
         assert abs(view.fx * x / z) < 40 and abs(view.fy * y / z) < 40
+
+
+def test_the_view_to_time_a_step_on(surfaces, monkeypatch):
+    """The Gaussians lie on surfaces that the photograph shows: rays to those in front hit nothing before them."""
+    monkeypatch.setattr(measured_view, "still_life", lambda: surfaces)
+    monkeypatch.setattr(measured_view, "bake", lambda *_, **__: None)
+    (gaussians, camera, photograph), (again, _, same) = (measured_view.measured_view(300) for _ in range(2))
+    np.testing.assert_array_equal(gaussians.means, again.means)
+    np.testing.assert_array_equal(photograph, same)
+    assert (gaussians.sh.shape, photograph.shape) == ((300, 16, 3), (camera.height, camera.width, 3))
+    origin = camera.position.astype(np.float32)
+    rays = gaussians.means - origin
+    distances = np.linalg.norm(rays, axis=1)
+    nearest = np.min([each.distance(origin, rays / distances[:, None]) for each in surfaces], axis=0)
+    assert np.all(nearest < distances + 1e-3), "each is on a surface"  # of metres; float32 has 1e-6
+    assert 0.3 < np.mean(nearest > distances - 1e-3) < 1, "and some are hidden by others"

@@ -333,7 +333,7 @@ def test_constants_of_small_kernels_are_from_the_file() -> None:
     constants = fit_constants(calibration, [Measured(gpu, "held out", "", {"blend": 0.8}, busy)])
     assert constants.efficiency == Constants().efficiency, "of a frame that is not fitted"
     assert fit_constants(calibration, [Measured(gpu, "made up, 1 M", "", {"blend": 0.8}, busy)]).efficiency == 0.5
-    (limits,) = [row["limits"] for row in calibration if "limits" in row]
+    limits = next(row["limits"] for row in calibration if "limits" in row)
     assert constants.copy == pytest.approx(limits["copy float4 x1, 1024"] / 3350)
     assert constants.groups == pytest.approx(limits["groups G/s, 64"] / 1.98)
 

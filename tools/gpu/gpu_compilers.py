@@ -20,7 +20,7 @@ from typing import Any
 from gpu_assembly import Loop, parse_gcn, parse_sass
 
 from clsplat.device.drivers.driver_records import cache_folder
-from clsplat.device.source import kernel_source
+from clsplat.device.program import text_of
 from clsplat.errors import ClsplatError
 
 CLANG = "19"
@@ -106,7 +106,7 @@ class Source:
     def used(self) -> Source:
         """The source without defines that its text does not use. Sources for which this is equal have the same kernels,
         as most files do in shapes that differ only in the number of items."""
-        words = set(re.findall(r"\w+", kernel_source(self.stem)))
+        words = set(re.findall(r"\w+", text_of(self.stem)))
         names = {each: each.removeprefix("-D").partition("=")[0].partition("(")[0] for each in self.options}
         kept = (each for each in self.options if not each.startswith("-D") or names[each] in words)
         return Source(self.stem, tuple(kept))
@@ -114,7 +114,7 @@ class Source:
     @property
     def lines(self) -> list[str]:
         """The text's lines."""
-        return kernel_source(self.stem).splitlines()
+        return text_of(self.stem).splitlines()
 
 
 def clang() -> str:
@@ -184,24 +184,31 @@ def build_builtins(target: str, folder: Path) -> Path:
     return path
 
 
+def assembled(source: Source, target: str, builtins: Path, folder: Path) -> Path:
+    """Compile a kernel file to assembly in the folder. Raises ClsplatError if clang refuses it."""
+    what = f"{source.label} for {target}"
+    text, assembly = (folder / f"{source.stem}.{end}" for end in ("cl", "s"))
+    text.write_text(text_of(source.stem), encoding="utf-8")
+    link = ("-Xclang", "-mlink-builtin-bitcode", "-Xclang", str(builtins))
+    options = (*FLAGS, "-gline-tables-only", *target_flags(target), *source.options_for(target), *link)
+    run_checked([clang(), *options, "-S", str(text), "-o", str(assembly)], what)
+    if missing := re.search(r"\b_Z(\d+)(\w+)", assembly.read_text()):
+        name = missing[2][: int(missing[1])]
+        raise ClsplatError(f"{what}: {BUILTINS.name} has no body of the built-in function {name}")
+    return assembly
+
+
 def compile_source(source: Source, target: str, builtins: Path) -> list[Built]:
     """Compile a kernel file. Raises ClsplatError if a compiler refuses it."""
-    what = f"{source.label} for {target}"
     with tempfile.TemporaryDirectory(dir=builtins.parent) as scratch:
-        text, assembly, cubin = (Path(scratch) / f"{source.stem}.{end}" for end in ("cl", "s", "cubin"))
-        text.write_text(kernel_source(source.stem), encoding="utf-8")
-        link = ("-Xclang", "-mlink-builtin-bitcode", "-Xclang", str(builtins))
-        options = (*FLAGS, "-gline-tables-only", *target_flags(target), *source.options_for(target), *link)
-        run_checked([clang(), *options, "-S", str(text), "-o", str(assembly)], what)
-        written = assembly.read_text()
-        if missing := re.search(r"\b_Z(\d+)(\w+)", written):
-            name = missing[2][: int(missing[1])]
-            raise ClsplatError(f"{what}: {BUILTINS.name} has no body of the built-in function {name}")
+        assembly = assembled(source, target, builtins, Path(scratch))
         if not target.startswith("sm_"):
-            return read_amd(written, target)
+            return read_amd(assembly.read_text(), target)
+        cubin = Path(scratch) / f"{source.stem}.cubin"
         ptxas = (nvidia("ptxas"), "-v", "-lineinfo", f"-arch={target}", *source.register_limit)
-        told = run_checked([*ptxas, str(assembly), "-o", str(cubin)], what)
-        return read_nvidia(told, run_checked([nvidia("nvdisasm"), "-c", "-g", "-hex", str(cubin)], what), target)
+        told = run_checked([*ptxas, str(assembly), "-o", str(cubin)], f"{source.label} for {target}")
+        disassembly = run_checked([nvidia("nvdisasm"), "-c", "-g", "-hex", str(cubin)], f"{source.label} for {target}")
+        return read_nvidia(told, disassembly, target)
 
 
 _FUNCTION = re.compile(
@@ -241,7 +248,8 @@ def read_amd(assembly: str, target: str) -> list[Built]:
 
 
 def ask_package(shape: str, frames: Sequence[Mapping[str, Any]]) -> list[Any]:
-    """Launches of each frame, as recorded by `gpu_variants.py`. Raises ClsplatError."""
+    """Launches of each frame, as recorded by `gpu_variants.py`. shape: or a variant of a trial, by its place there.
+    Raises ClsplatError."""
     script = Path(__file__).with_name("gpu_variants.py")
     command = [sys.executable, str(script), shape, *(json.dumps(frame) for frame in frames)]
     root = str(script.parents[2])

@@ -67,6 +67,16 @@ GPUS = (
 )
 
 
+REPORTED = {"H100 80GB HBM3": "H100 SXM"}
+"""GPUs whose driver's name for them does not end in ours, by that ending."""
+
+
+def gpu_of(device: str) -> Gpu | None:
+    """The GPU that a driver's name of a device means; None if it is not among GPUS."""
+    ours = next((name for ending, name in REPORTED.items() if device.endswith(ending)), device)
+    return next((gpu for gpu in GPUS if ours.endswith(gpu.name)), None)
+
+
 def waves_at_a_time(built: Built, items: int, more_shared: int = 0) -> int:
     """Number of a kernel's waves that fit in a unit. more_shared: bytes that a launch adds per group."""
     unit = ARCHITECTURES[built.target]

@@ -4,11 +4,11 @@
 
     python tools/gpu/gpu_frames.py "made up, 1 M=synthetic:1000000:1600x1060" "fox, step 7000=PATH"...
 
-PATH is a run, a model or a scene, as for `clsplat bench`; its first view is rendered. Or it is the bench's synthetic
-scene. `listed` counts the (tile, Gaussian) pairs in the tiles' lists, `walked` those up to the last pair that a pixel
-of the tile needs; `walk_of`, `visits_of` and `summary` explain the rest. The rows of these names in gpu_frames.json are
-replaced. A row with `picture` is only rendered, not trained; one with `held_out` is only compared with measurements. A
-frame that was measured elsewhere gets the numbers that it had there (`as_measured`).
+PATH is a run, a model or a scene, as for `clsplat bench`; its first view is rendered. Or it is a scene of
+`gpu_scenes.py`. `listed` counts the (tile, Gaussian) pairs in the tiles' lists, `walked` those up to the last pair that
+a pixel of the tile needs; `walk_of`, `visits_of` and `summary` explain the rest. The rows of these names in
+gpu_frames.json are replaced. A row with `picture` is only rendered, not trained; one with `held_out` is only compared
+with measurements. A frame that was measured elsewhere gets the numbers that it had there (`as_measured`).
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import numpy as np
 from gpu_measured import CALIBRATION
 from gpu_rules import BLOCKS, VISITS, WARPS
+from gpu_scenes import subject_of
 from measuring import plain_parser, require, tool
 
-from clsplat.bench.workload import Subject, load_subject, synthetic
+from clsplat.bench.workload import Subject
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import open_device
@@ -159,13 +160,6 @@ def as_measured(row: Mapping[str, Any], calibration: Sequence[Mapping[str, Any]]
     lists = {name: round(row[name] * longer) for name in ("walked", "list_99", "longest", "slowest")}
     numbers = {"gaussians": scene["gaussians"], "visible": scene["visible"], "listed": scene["pairs"]["listed"]}
     return {**row, **numbers, **lists, "counted": row["gaussians"]}
-
-
-def subject_of(path: str) -> Subject:
-    """The subject at a path, or the bench's synthetic scene as `synthetic:COUNT:WIDTHxHEIGHT`."""
-    if made := re.fullmatch(r"synthetic:(\d+):(\d+)x(\d+)", path):
-        return synthetic(*map(int, made.groups()))
-    return load_subject(Path(path))
 
 
 @tool("gpu_frames")

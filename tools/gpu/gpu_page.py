@@ -215,14 +215,14 @@ def now_table(measured: Sequence[Measured], constants: Constants) -> str:
     return markdown(lines)
 
 
-def fill_in(page: str, tables: Mapping[str, str]) -> str:
+def fill_in(page: str, tables: Mapping[str, str], name_of_page: str = PAGE.name) -> str:
     """The page with its tables replaced. Each is between `<!-- NAME -->` and `<!-- end -->`. Raises ClsplatError if the
     page lacks these comments."""
     for name, text in tables.items():
         pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)
         if not pattern.search(page):
             raise ClsplatError(
-                f"{PAGE.name}: has no place for the table {name}, expected <!-- {name} --> and <!-- end -->"
+                f"{name_of_page}: has no place for the table {name}, expected <!-- {name} --> and <!-- end -->"
             )
         page = pattern.sub(_between(text), page)
     return page

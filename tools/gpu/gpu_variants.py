@@ -2,6 +2,7 @@
 """Record the kernel launches of clsplat in a child process, for `gpu_static.py`.
 
     gpu_variants.py LANESxITEMS FRAME...    a training step, or only a picture, of frames with these counts, in JSON
+    gpu_variants.py "variant N" FRAME...    the same with the Nth of trial_variants.VARIANTS
 
 The step is simulated: nothing is compiled, queued or allocated, and the numbers that it reads back are the frame's.
 Only the kernels' launches and arguments are recorded.
@@ -21,16 +22,17 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
 import pyopencl as cl
+from trial_variants import VARIANTS, Variant, VariedDevice
 
 from clsplat.bench.stages import trainer_of
 from clsplat.bench.workload import Subject
 from clsplat.camera import Camera
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.device import buffers, profile
+from clsplat.device import buffers, profile, program
 from clsplat.device.buffers import DeviceArray
 from clsplat.device.context import Device, all_devices
 from clsplat.device.drivers.shapes import Shape
-from clsplat.device.program import Variant, variant_of
+from clsplat.device.program import variant_of
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import COUNTED, READBACK
 
@@ -46,9 +48,9 @@ SUBGROUPS = {"SUBGROUP": 32, "SHUFFLE_PTX": True}
 """Defines of a shape with sub-groups. `gpu_compilers.py` adds the target's functions for exchanging values."""
 
 
-def noted(variant: Variant) -> dict[str, Any]:
+def noted(variant: program.Variant) -> dict[str, Any]:
     """A build variant for JSON: stem and options."""
-    return {"stem": variant.stem, "options": list(variant.options)}
+    return {"stem": variant.stem, "options": [each for each in variant.options if not each.startswith("-DTRIAL_")]}
 
 
 class _Buffer:
@@ -66,7 +68,7 @@ class _Buffer:
 class _Kernel:
     """Replaces a kernel: its variant and name."""
 
-    def __init__(self, variant: Variant, name: str) -> None:
+    def __init__(self, variant: program.Variant, name: str) -> None:
         self.variant, self.name = variant, name
         self.tried: set[str] = set()
         self.cl_kernel = self
@@ -82,7 +84,7 @@ class _Kernel:
 class _Kernels:
     """Replaces the kernels of a file."""
 
-    def __init__(self, variant: Variant) -> None:
+    def __init__(self, variant: program.Variant) -> None:
         self.variant = variant
         self.made: dict[str, _Kernel] = {}
 
@@ -158,12 +160,18 @@ class Rehearsed:
         return [self.frame["visible"], self.frame["listed"], 2**32 - 1 - least, largest, 0]
 
 
-def step(shape: Shape, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
+def step(variant: Variant, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The launches and copies of a training step of this frame, or of its forward pass if it has `picture`, each with
     its stage and bytes."""
     rehearsed = Rehearsed(frame)
     rehearsed.install()
-    device = Device(all_devices()[0], shape).with_memory_limit(MEMORY)
+    whole = VariedDevice(all_devices()[0], Shape(1, 1, chunks=64))
+    with whole.varied(variant):
+        return _step(rehearsed, whole, frame)
+
+
+def _step(rehearsed: Rehearsed, whole: VariedDevice, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
+    device = whole.with_memory_limit(MEMORY)
     device.kind, device.max_allocation, device.shares_memory = "gpu", MEMORY, False
     width, height, count = frame["width"], frame["height"], frame["gaussians"]
     camera = Camera(width, height, float(width), float(width), width / 2, height / 2, np.eye(3), np.zeros(3))
@@ -188,8 +196,10 @@ def step(shape: Shape, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def main(arguments: list[str]) -> int:
     """Print the launches of the frames in the arguments."""
-    shape = Shape(1, 1, chunks=64).relabelled(arguments[0])
-    print(json.dumps([step(shape, json.loads(frame)) for frame in arguments[1:]]))
+    label, *frames = arguments
+    place = label.removeprefix("variant ")
+    variant = VARIANTS[int(place)] if place != label else Variant(label, shape=label)
+    print(json.dumps([step(variant, json.loads(frame)) for frame in frames]))
     return 0
 
 

@@ -1,0 +1,364 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Measure all that the model of a GPU's step needs to know, in one call of some minutes on a machine with a GPU.
+
+    python tools/gpu/trial.py [--minutes 6] [--peers FOLDER] [--twins FOLDER] [--out trial.json]
+    python tools/gpu/trial.py --complete trial.json
+    python tools/gpu/trial.py --write-twins FOLDER [--target sm_90]
+    python tools/gpu/trial.py --dry-run
+
+On the GPU it needs no package index and no compiler but the driver's. Its parts, in order: limits of the device by
+small kernels (`trial_limits.py`); stages and steps of the synthetic scene and of one like fox, in the shapes of a GPU;
+variants of the kernels, with their bits (`trial_variants.py`); hardware counters by Nsight Compute
+(`trial_counters.py`); gsplat and Faster-GS on the same Gaussians, imported or built from FOLDER's sources
+(`trial_peers.py`). What is not there, and what no longer fits into the minutes, is listed as left out. Results are
+written after each one: trial.json, and trial.txt with the table beside it.
+
+The rest needs no GPU. --complete counts the variants' instructions with GPUs' compilers (`trial_counts.py`), adds
+predictions to the table, and a row to docs/gpus/calibration.json; in a checkout of the code that was measured.
+--write-twins writes kernels for the --twins of a later trial. --dry-run runs every part on a CPU with tiny scenes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from argparse import Namespace
+from collections.abc import Callable, Sequence
+from datetime import datetime, timezone
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bench"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+import numpy as np
+import trial_counters
+import trial_limits
+import trial_peers
+from gpu_scenes import FOX_LIKE, fox_like
+from measuring import plain_parser, require, tool
+from trial_limits import FULL, TINY, Limits
+from trial_table import table
+from trial_variants import DRY, USUAL, USUAL_SHAPE, VARIANTS, TrialScene, VariedDevice
+
+from clsplat.bench.stages import bench
+from clsplat.bench.workload import Subject, synthetic
+from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.device.context import Device, all_devices, list_devices, select
+from clsplat.device.drivers.shapes import default_shape, most_items
+from clsplat.device.drivers.worker_process import TRUST_DRIVER_VARIABLE
+from clsplat.device.source import kernel_root
+from clsplat.errors import ClsplatError
+from clsplat.files.atomic import atomic_write
+from clsplat.rendering.renderer import Renderer
+from clsplat.stages.peak import Limits as Peaks
+
+ROOT = Path(__file__).resolve().parents[2]
+SCENES: dict[str, Callable[[], Subject]] = {
+    "made up, 1 M": partial(synthetic, 1_000_000, 1600, 1060),
+    "fox-like": partial(fox_like, *FOX_LIKE),
+}
+"""Scenes by their names in gpu_frames.json."""
+TINY_SCENES: dict[str, Callable[[], Subject]] = {
+    "made up, 1 M": partial(synthetic, 300, 64, 48),
+    "fox-like": partial(fox_like, 300, 48, 64),
+}
+SHAPES = (USUAL_SHAPE, "1x32", "1x128", "1x256")
+STEPS, MORE_STEPS = 15, 5
+"""Timed steps in the usual shape, and in others; of variants, STEPS."""
+ENDS = {"limits": 0.15, "stages": 0.35, "variants": 0.75, "counters": 0.85, "peers": 1.0}
+"""Part of the minutes at whose end each part stops. A part that needs less leaves its time to the next ones."""
+NO_PEAKS = Peaks(1.0, 1.0, 1.0, 1, 1)
+"""Instead of the limits that `bench` measures; the trial's own are finer."""
+
+
+def digest_of_code() -> str:
+    """Digest of the kernels and the package, by which a trial knows the code that it measured."""
+    found = hashlib.sha256()
+    for path in sorted([*kernel_root().rglob("*.[ch]*"), *(ROOT / "clsplat").rglob("*.py")]):
+        found.update(path.read_bytes())
+    return found.hexdigest()[:16]
+
+
+def told(command: Sequence[str]) -> str:
+    """The output of a command, or nothing if it is not there or fails."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=20, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return done.stdout.strip()
+
+
+class Trial:
+    """The results so far, which are on the disk after each one, and the time that is left."""
+
+    def __init__(self, options: Namespace, device: Device, builds: Path) -> None:
+        self.options, self.device = options, device
+        self.scenes = {name: make() for name, make in (TINY_SCENES if options.dry_run else SCENES).items()}
+        self.builds = trial_peers.Builds(options.peers, builds)
+        self.begin, self.seconds = time.monotonic(), 60 * options.minutes
+        self.end = self.begin + self.seconds
+        self.record: dict[str, Any] = {
+            "device": device.name,
+            "driver": device.driver,
+            "date": datetime.now(tz=timezone.utc).date().isoformat(),
+            "commit": told(["git", "rev-parse", "--short=8", "HEAD"]),
+            "code": digest_of_code(),
+            "shape": USUAL_SHAPE,
+            "dry_run": options.dry_run,
+            "limits": {},
+            "scenes": [],
+            "variants": [],
+            "counters": [],
+            "peers": [],
+            "left_out": [],
+        }
+
+    @property
+    def left(self) -> float:
+        """Seconds until the present part has to stop."""
+        left: float = self.end - time.monotonic()
+        return left
+
+    def say(self, text: str) -> None:
+        """Print progress."""
+        print(f"{time.monotonic() - self.begin:5.0f} s  {text}", file=sys.stderr, flush=True)
+
+    def add(self, part: str, *rows: Any) -> None:
+        """Add rows to a part."""
+        self.record[part] += rows
+        self.save()
+
+    def leave_out(self, what: str, why: str) -> None:
+        """Note that something is not measured."""
+        self.say(f"left out: {what}: {why}")
+        self.add("left_out", {"what": what, "why": why})
+
+    def attempt(self, what: str, work: Callable[[], None]) -> None:
+        """Do a piece of work if there is time; note why it is left out if it fails."""
+        if self.left <= 0:
+            self.leave_out(what, "no time was left")
+            return
+        self.say(what)
+        try:
+            work()
+        except Exception as error:  # noqa: BLE001  # a driver may raise anything, and the rest is still wanted
+            self.leave_out(what, trial_peers.last_line(str(error), type(error).__name__))
+
+    def save(self) -> None:
+        """Write the results and their table."""
+        path: Path = self.options.out
+        atomic_write(path, (json.dumps(self.record, indent=1) + "\n").encode())
+        atomic_write(path.with_suffix(".txt"), ("\n".join(table(self.record)) + "\n").encode())
+
+
+def measure_limits(trial: Trial) -> None:
+    """The device's clocks and limits."""
+    query = "name,driver_version,clocks.sm,clocks.max.sm,clocks.mem,clocks.max.mem,power.limit"
+    if clocks := told(["nvidia-smi", f"--query-gpu={query}", "--format=csv"]):
+        trial.record["nvidia_smi"] = clocks.splitlines()
+    else:
+        trial.leave_out("present clocks", "nvidia-smi is not there")
+    on = Limits(trial.device, TINY if trial.options.dry_run else FULL)
+    for measured in trial_limits.MEASURED:
+        trial.attempt(f"limits: {measured.__name__}", lambda each=measured: trial.record["limits"].update(each(on)))  # type: ignore[misc]
+        on.free()
+        trial.save()
+
+
+def measure_stages(trial: Trial) -> None:
+    """Frames and steps of each scene in each shape."""
+    for name, subject in trial.scenes.items():
+        for shape in SHAPES[:1] if trial.options.dry_run else SHAPES:
+            items = trial.device.shape.relabelled(shape).items
+            if items > most_items(trial.device.cl_device):
+                trial.leave_out(f"{name}, {shape}", f"groups of {items} items do not fit")
+                continue
+            trial.attempt(f"stages: {name}, {shape}", partial(_measure_stages, trial, name, subject, shape))
+
+
+def _measure_stages(trial: Trial, name: str, subject: Subject, shape: str) -> None:
+    device = Device(trial.device.cl_device, trial.device.shape.relabelled(shape), profile=True)
+    repeat = 1 if trial.options.dry_run else STEPS if shape == USUAL_SHAPE else MORE_STEPS
+    found = bench(subject, device, repeat=repeat, limits=NO_PEAKS)
+    kernels = [(stage, kernel, ms) for stage, row in found["stages"].items() for kernel, ms in row["kernels"].items()]
+    twice = {kernel for _, kernel, _ in kernels if sum(kernel == other for _, other, _ in kernels) > 1}
+    row = {
+        "scene": f"{subject.name}, {found['gaussians']:,} Gaussians, {found['width']}x{found['height']}",
+        "frame": name,
+        "shape": shape,
+        **{key: found[key] for key in ("gaussians", "visible", "pairs")},
+        "frame_ms": round(found["frame_ms"], 4),
+        "step_ms": round(found["iteration_ms"], 4),
+        "host_ms": round(found["iteration_host_ms"], 4),
+        "kernels_ms": {
+            f"{stage}: {kernel}" if kernel in twice or kernel in ("write", "read", "fill") else kernel: round(ms, 5)
+            for stage, kernel, ms in kernels
+        },
+    }
+    trial.add("scenes", row)
+
+
+def measure_variants(trial: Trial) -> None:
+    """Variants of the kernels, scene by scene; the usual form comes first."""
+    device = VariedDevice(trial.device.cl_device, trial.device.shape.relabelled(USUAL_SHAPE))
+    for name, subject in trial.scenes.items():
+        held: list[TrialScene] = []
+        for variant in VARIANTS:
+            what = f"{name}: {variant.title}"
+            if trial.options.dry_run and variant.name not in DRY:
+                trial.leave_out(what, "a dry run")
+            elif lacking := variant.lacking(device):
+                trial.leave_out(what, lacking)
+            elif variant is not USUAL and not held:
+                trial.leave_out(what, "there is no usual form to compare with")
+            else:
+                trial.attempt(what, partial(_measure_variant, trial, name, subject, device, variant, held))
+
+
+def _measure_variant(
+    trial: Trial, name: str, subject: Subject, device: VariedDevice, variant: Any, held: list[TrialScene]
+) -> None:
+    scene = held[0] if held else TrialScene(subject, device)
+    rows = scene.measure(variant, 1 if trial.options.dry_run else STEPS)
+    held[:] = [scene]
+    trial.add("variants", *({"scene": name, **row, "ms": round(row["ms"], 5)} for row in rows))
+
+
+def count_hardware(trial: Trial) -> None:
+    """Hardware counters of kernels, where Nsight Compute and the kernels for CUDA are at hand."""
+    ncu, twins = shutil.which("ncu"), trial.options.twins
+    if why := trial_peers.no_cuda() or ("" if ncu else "ncu is not there"):
+        trial.leave_out("hardware counters", why)
+    elif twins is None:
+        trial.leave_out("hardware counters", "ncu sees no OpenCL; --twins FOLDER has the kernels for CUDA")
+    else:
+        trial.attempt("hardware counters", partial(_count_hardware, trial, twins))
+
+
+def _count_hardware(trial: Trial, twins: Path) -> None:
+    name, subject = next(iter(trial.scenes.items()))
+    device = VariedDevice(trial.device.cl_device, trial.device.shape)
+    for row in trial_counters.measure(subject, device, twins, trial.left):
+        trial.add("counters", {"scene": name, **row})
+
+
+def measure_peers(trial: Trial) -> None:
+    """Other programs on the same Gaussians."""
+    if why := trial_peers.no_cuda():
+        trial.leave_out(" and ".join(trial_peers.TIMED), why)
+        return
+    trial.builds.finish(trial.left)
+    for peer, why in trial.builds.failed.items():
+        trial.leave_out(f"{peer}, built from source", why)
+    with tempfile.TemporaryDirectory(prefix="clsplat-trial-") as folder:
+        for name, subject in trial.scenes.items():
+            path = Path(folder) / "subject.npz"
+            image = Renderer(trial.device, config=RasterizerConfig()).render(subject.gaussians, subject.camera).image
+            trial_peers.save(subject, np.clip(image[:, ::-1], 0, 1), path)
+            for peer in trial_peers.TIMED:
+                trial.attempt(f"{peer}: {name}", partial(_measure_peer, trial, name, peer, path))
+
+
+def _measure_peer(trial: Trial, name: str, peer: str, path: Path) -> None:
+    found = trial_peers.measure(peer, path, STEPS, trial.builds.into, trial.left)
+    if isinstance(found, str):
+        raise ClsplatError(found)
+    trial.add("peers", {"scene": name, "peer": peer, **found})
+
+
+PARTS = {
+    "limits": measure_limits,
+    "stages": measure_stages,
+    "variants": measure_variants,
+    "counters": count_hardware,
+    "peers": measure_peers,
+}
+
+
+def chosen_device(options: Namespace) -> tuple[Device, list[str]]:
+    """The device to measure, in the shape of a GPU, and the names of other GPUs. Raises InputError without a GPU."""
+    listed = list_devices()
+    gpus = [info for info in listed if info.kind == "gpu"]
+    names = "; ".join(info.name for info in listed) or "none"
+    require(
+        bool(gpus) or options.dry_run,
+        f"no GPU among the OpenCL devices ({names}), so all is left out; --dry-run runs every part on a CPU",
+    )
+    device = select(options.device or ("gpu" if gpus else None))
+    shape = default_shape(device).relabelled(USUAL_SHAPE)
+    others = [f"GPU {info.index}, {info.name}" for info in gpus if all_devices()[info.index] != device]
+    return Device(device, shape, profile=True), others
+
+
+@tool("trial")
+def main(arguments: Sequence[str]) -> int:
+    """Run the parts, and print the table."""
+    parser = plain_parser(__doc__, prog="trial")
+    parser.add_argument("--minutes", type=float, default=6, help="after which what remains is left out")
+    parser.add_argument("--device", help="as for `clsplat devices`; the first GPU where not given")
+    parser.add_argument("--out", type=Path, default=Path("trial.json"), metavar="FILE.json")
+    parser.add_argument("--peers", type=Path, metavar="FOLDER", help="sources of gsplat and Faster-GS")
+    parser.add_argument("--twins", type=Path, metavar="FOLDER", help="kernels for CUDA")
+    parser.add_argument("--dry-run", action="store_true", help="every part with tiny scenes, on a CPU too")
+    parser.add_argument("--complete", type=Path, metavar="FILE.json", help="add counts and predictions to a trial")
+    parser.add_argument("--write-twins", type=Path, metavar="FOLDER", help="write kernels for CUDA")
+    parser.add_argument("--target", default="sm_90", help="GPU of these kernels")
+    options = parser.parse_args(arguments)
+    if options.complete is not None:
+        return complete(options.complete)
+    if options.write_twins is not None:
+        print(f"{options.write_twins}: {', '.join(trial_counters.write_twins(options.write_twins, options.target))}")
+        return 0
+    require(options.minutes > 0, f"--minutes {options.minutes:g}: expected more than 0")
+    require(options.out.suffix == ".json", f"--out {options.out}: expected a name that ends in .json")
+    for name, folder in (("peers", options.peers), ("twins", options.twins)):
+        require(folder is None or folder.is_dir(), f"--{name} {folder}: expected a folder")
+    with patch.dict(os.environ, {TRUST_DRIVER_VARIABLE: "1"}):  # a test of the driver would take the trial's time
+        record = run(options)
+    print("\n".join(table(record)))
+    return 0
+
+
+def run(options: Namespace) -> dict[str, Any]:
+    """The results of a trial. Raises InputError without a GPU."""
+    device, others = chosen_device(options)
+    with tempfile.TemporaryDirectory(prefix="clsplat-trial-") as builds:
+        trial = Trial(options, device, Path(builds))
+        for other in others:
+            trial.leave_out(other, "a trial takes one GPU; --device chooses it")
+        for name, part in PARTS.items():
+            trial.end = trial.begin + ENDS[name] * trial.seconds
+            part(trial)
+    return trial.record
+
+
+def complete(path: Path) -> int:
+    """Add counts and predictions to a trial, and its row to the calibration."""
+    from trial_counts import add_row, count_variants
+
+    record = json.loads(path.read_text("utf-8"))
+    require(not record.get("dry_run"), f"--complete {path}: is a dry run, which measured no GPU")
+    require(
+        record.get("code") == digest_of_code(),
+        f"--complete {path}: measured other code, of commit {record.get('commit') or 'unknown'}; check that out first",
+    )
+    count_variants(record)
+    add_row(record)
+    atomic_write(path, (json.dumps(record, indent=1) + "\n").encode())
+    atomic_write(path.with_suffix(".txt"), ("\n".join(table(record)) + "\n").encode())
+    print("\n".join(table(record)))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
