@@ -12,6 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import gpu_compilers
 import gpu_measured
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ from clsplat.device.program import text_of
 from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import ClsplatError
 
-EXPECTED_REASONS = ("a dry run", "nvidia-smi is not there", "there is no CUDA", "groups of")
+EXPECTED_REASONS = ("a dry run", "nvidia-smi is not", "there is no CUDA", "ncu ", "PyTorch ", "ModuleNotFoundError")
 """Beginnings of reasons to leave something out that a machine of the tests may have."""
 
 
@@ -205,7 +206,7 @@ def test_peers_that_cannot_be_built(tmp_path: Path) -> None:
 def test_a_peer_that_cannot_be_run(tmp_path: Path) -> None:
     told = trial_peers.measure("gsplat", tmp_path / "missing.npz", 1, tmp_path, 120)
     assert isinstance(told, str)
-    assert told.startswith(("PyTorch", "ModuleNotFoundError")), told  # no CUDA device, or no PyTorch
+    assert told.startswith(("PyTorch ", "ModuleNotFoundError", "FileNotFoundError")), told  # no CUDA, no PyTorch
 
 
 @pytest.fixture
@@ -262,6 +263,44 @@ def test_what_the_peers_are_given(fakes: dict[str, list[Any]], tmp_path: Path) -
     assert settings[3:10] == (16, 48, 32, camera.fx, camera.fy, camera.cx, camera.cy)
     assert settings[-1] == 2, "Adam's second step"
     assert arrays["moments_sh_coefficients_rest"].shape == (20, 15, 3, 2)
+
+
+def test_parts_that_need_cuda(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Capture) -> None:
+    """Of two programs on two scenes one cannot be run; counters are asked for once, of the first scene."""
+    answers = {"gsplat": {"frame_ms": 1.5, "step_ms": 6.5, "loss": "L1"}, "Faster-GS": "a reason"}
+    counted = [{"kernel": "blend", "counted": {"time": "7 us"}}]
+    monkeypatch.setattr(trial, "PARTS", {"counters": trial.count_hardware, "peers": trial.measure_peers})
+    monkeypatch.setattr(trial_peers, "no_cuda", lambda: "")
+    monkeypatch.setattr(trial.shutil, "which", lambda _: "ncu")
+    monkeypatch.setattr(trial_peers, "measure", lambda peer, *_: answers[peer])
+    monkeypatch.setattr(trial_counters, "measure", lambda *_: counted)
+    out = tmp_path / "trial.json"
+    flags = ["--dry-run", "--out", out, "--twins", tmp_path, "--peers", tmp_path]
+    text = printed(capsys, flags, call=trial.main).out
+    found = json.loads(out.read_text())
+    assert found["counters"] == [{"scene": "made up, 1 M", **counted[0]}]
+    assert [(row["scene"], row["peer"]) for row in found["peers"]] == [(scene, "gsplat") for scene in trial.SCENES]
+    assert "left out, a reason: Faster-GS: made up, 1 M; Faster-GS: fox-like" in text
+    assert f"left out, no folder gsplat in {tmp_path}: gsplat, built from source" in text
+    assert printed(capsys, flags[:3], call=trial.main).out.splitlines()[-2].startswith("left out, ncu sees no OpenCL; ")
+
+
+def test_kernels_for_cuda(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Capture) -> None:
+    launches = [{"kernel": kernel, "stem": stem} for kernel, stem in (("blend", "blend"), ("project", "project"))]
+    step = [{"options": ["-DITEMS=64"], "local": [64], "shared": 0, **launch} for launch in launches]
+
+    def assembled(source: Any, target: str, builtins: Path, folder: Path) -> Path:
+        path = folder / f"{source.stem}.s"
+        path.write_text(f"{source.stem} for {target}, {builtins.name}")
+        return path
+
+    monkeypatch.setattr(gpu_compilers, "ask_package", lambda *_: [step])
+    monkeypatch.setattr(gpu_compilers, "build_builtins", lambda target, folder: folder / "built.bc")
+    monkeypatch.setattr(gpu_compilers, "assembled", assembled)
+    folder = tmp_path / "twins"
+    told = printed(capsys, ["--write-twins", folder, "--target", "sm_89"], call=trial.main).out
+    assert told == f"{folder}: blend\n"
+    assert {path.name: path.read_text() for path in folder.iterdir()} == {"blend.ptx": "blend for sm_89, built.bc"}
 
 
 def test_counters_of_ncu() -> None:

@@ -109,7 +109,7 @@ class Trial:
         self.end = self.begin + self.seconds
         self.record: dict[str, Any] = {
             "device": device.name,
-            "driver": device.driver,
+            "driver": f"{device.cl_device.driver_version.strip()}, {device.driver.split('  ')[0].strip()}",
             "date": datetime.now(tz=timezone.utc).date().isoformat(),
             "commit": told(["git", "rev-parse", "--short=8", "HEAD"]),
             "code": digest_of_code(),
@@ -257,7 +257,7 @@ def measure_peers(trial: Trial) -> None:
     if why := trial_peers.no_cuda():
         trial.leave_out(" and ".join(trial_peers.TIMED), why)
         return
-    trial.builds.finish(trial.left)
+    trial.builds.finish(trial.left / 2)
     for peer, why in trial.builds.failed.items():
         trial.leave_out(f"{peer}, built from source", why)
     with tempfile.TemporaryDirectory(prefix="clsplat-trial-") as folder:

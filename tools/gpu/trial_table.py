@@ -15,7 +15,7 @@ def table(record: Mapping[str, Any]) -> list[str]:
     """The results of a trial in lines: limits, steps, kernels by variant, counters, peers, and what was left out.
     counted: million instructions of warps, in code that clang and ptxas make. ratio: predicted to measured."""
     commit = record["commit"] or "unknown"
-    lines = [f"{record['device']}, {record['driver'].strip()}, {record['date']}, commit {commit}"]
+    lines = [f"{record['device']}, {record['driver']}, {record['date']}, commit {commit}"]
     lines += record.get("nvidia_smi", [])
     limits: list[tuple[str, ...]] = [("limit", "value")]
     limits += ((name, f"{value:.4g}") for name, value in record["limits"].items())
