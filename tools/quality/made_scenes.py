@@ -326,6 +326,17 @@ def own_blocks(town: Path) -> Scene:
     return replace(scene, points=scene.points[kept], point_colors=scene.point_colors[kept])
 
 
+def single_blocks(town: Scene) -> list[Scene]:
+    """Each block of a town from `own_blocks` as a scene of its own, sorted by name."""
+    blocks = []
+    for name in sorted({view.name.split("/")[0] for view in town.views}):
+        own = (np.floor(town.points[:, :2] / BLOCK_METRES) == [int(number) for number in name.split("_")]).all(axis=1)
+        views = [view for view in town.views if view.name.startswith(f"{name}/")]
+        points, colours = town.points[own], town.point_colors[own]
+        blocks.append(replace(town, name=f"{town.name} {name}", views=views, points=points, point_colors=colours))
+    return blocks
+
+
 def own_block_mask(config: TownConfig, shot: TownPhotograph) -> NDArray[np.bool_]:
     """The pixels (H, W) of a town's photograph that show nothing but its own block."""
     blocks = blocks_in_sight(config.seed, shot.camera)
