@@ -182,19 +182,21 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   const int zero = min(pixels[0].stop + 1, 0); // see exp2_by
   for (int block = ITEM; block < BLOCKS; block += ITEMS) open_in[block] = 0;
   BARRIER_LOCAL();
-  for (int batch = begin; batch < end; batch += BATCH) { // count open pixels, fetch, list; then loop without barriers
-    ALL_CELLS(cell) if (GOES_ON(pixels[cell].t > 0.0f)) atomic_inc(open_in + cell * WARPS + WARP);
+  for (int batch = begin; batch < end; batch += BATCH) { // count open pixels, fetch, list; then walk without barriers
+    ALL_CELLS(cell) if (GOES_ON(pixels[cell].t > 0.0f)) atomic_inc(open_in + OWN_BLOCK(cell));
     BARRIER_LOCAL();
 
     const uint live = blocks_above(0, open_in);
     if (live == 0) break;
     for (int j = ITEM; j < BATCH; j += ITEMS) {
       const uint gaussian = gaussian_from_sorted[min(batch + j, end - 1)];
-      mark(marks, j, stage(staged + j, gaussian, 0, batch + j < end ? live : 0, splats, tile_x, tile_y));
+      const uint blocks = stage(staged + j, gaussian, 0, batch + j < end ? live : 0, splats, tile_x, tile_y);
+      mark(marks, j, blocks, WARPS, OWNED);
     }
     BARRIER_LOCAL();
 
-    const int count = list_marked(marks, staged, list);
+#define ENTRY(j) ((j) | (popcount(FROM_OWN(staged[j].blocks) & OF_FIRST_WARP) > SPARSE(OWNED) ? DENSE : 0))
+    LIST_MARKED(count, marks + WARP * BATCH / 4, list, ENTRY)
     for (int block = ITEM; block < BLOCKS; block += ITEMS) open_in[block] = 0;
     BARRIER_LOCAL();
 
@@ -206,8 +208,8 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
       SPLAT_STAGED(staged[PAIR_OF(entry)])
       NEAR_HERE(s.near)
       const uint reach = FROM_OWN(s.blocks);
-      COUNT(evaluated += IS_DENSE(entry) ? OWNED : popcount(reach & OF_FIRST_WARP);)
-      if (IS_DENSE(entry)) {
+      COUNT(evaluated += IS_DENSE(entry, OWNED) ? OWNED : popcount(reach & OF_FIRST_WARP);)
+      if (IS_DENSE(entry, OWNED)) {
         ALL_CELLS(cell) { BLEND(cell, LOG2_ALPHA(splat, cell)) } // alpha is 0 in pixels that are not reached
       } else {
         FOR_CELLS(cell, reach) {

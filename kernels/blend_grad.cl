@@ -20,6 +20,9 @@
 #include "shared/group.h"
 #include "shared/subgroup.h"
 #include "shared/tile.h"
+#if ITEMS > 1 // larger batches would take more local memory
+#define BATCH 64
+#endif
 #include "shared/cells.h"
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
@@ -39,16 +42,16 @@
 #define ADD_REACHED(mask, cell) reached |= RECORDED(mask) << FIRST_RECORDED(cell);
 #endif
 
-// 1 / x for x in [0.01, 1]. Groups use Newton's method, with a relative error of 2e-7: a division takes twice as many
-// instructions, and its rounding depends on the driver.
+// 1 / x for x in [0.01, 1]. Groups use a cubic step and one of Newton's, with a relative error of 2e-7: a division
+// takes twice as many instructions, and its rounding depends on the driver.
 #if ITEMS == 1
 #define INVERSE(x) (1.0f / (x))
 #else
 #define INVERSE(x) inverse_of(x)
 static inline float inverse_of(float x) {
-  float y = as_float(0x7ef311c7 - as_int(x));
-  for (int step = 0; step < 3; ++step) y = fma1(y, fma1(-x, y, 1.0f), y);
-  return y;
+  const float y = as_float(0x7ef311c7 - as_int(x)), off = fma1(-x, y, 1.0f);
+  const float closer = fma1(y, fma1(off, off, off), y);
+  return fma1(closer, fma1(-x, closer, 1.0f), closer);
 }
 #endif
 
@@ -127,6 +130,39 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
 #endif
 }
 
+#if ITEMS > 1 && !defined(BY_GAUSSIAN)
+#include "shared/strips.h"
+
+// The same for a pixel of a group, without the fields that finish_row computes. Products are rounded before they are
+// added, as items may leave them in local memory first. `begins`: the sums are those of this pixel alone.
+static inline void add_pixel(float *sums, const Pixels *p, uint cell, float g, float weight, float u, float v,
+                             float l11, float l12, float l22, int begins) {
+  float own[SLOT_STRIDE];
+  FOR_FIELDS(field) own[field] = 0.0f;
+  own[SLOT_RED] = weight * p->red[cell];
+  own[SLOT_GREEN] = weight * p->green[cell];
+  own[SLOT_BLUE] = weight * p->blue[cell];
+#ifdef RAYS
+  add_ray_moments(g, u, v, l11, l12, l22, own);
+#else
+  own[SLOT_G] = g;
+  own[SLOT_GU] = g * u;
+  own[SLOT_GUU] = own[SLOT_GU] * u;
+#ifdef ABSOLUTE_GRADIENTS
+  own[SLOT_ABSX] = fabs(g * (l11 * u));
+  own[SLOT_ABSY] = fabs(g * fma1(l12, u, l22 * v));
+#endif
+#endif
+#ifdef CONTRIBUTIONS
+  own[SLOT_WEIGHT] = weight;
+#endif
+#ifdef NEARNESS
+  own[SLOT_NEAR] = weight * p->near[cell];
+#endif
+  FOR_FIELDS(field) if (!OF_ROW(field)) sums[field] = begins ? own[field] : sums[field] + own[field];
+}
+#endif
+
 // ALPHA_IN: alpha of the tile's i-th pair in a cell's pixels.
 #ifdef RAYS
 #define WHITENING_HERE                                                                                                 \
@@ -151,6 +187,18 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
   const floatL u = whitened_u(l11, l12, mx - AT_X(cell), dy), v = l22 * dy;                                            \
   const floatL power = log2_alpha(u, v, log2o);                                                                        \
   const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < pixels.stop[cell]);
+#endif
+
+#if ITEMS > 1
+#define TAKE_PIXEL(cell, begins, where)                                                                                \
+  {                                                                                                                    \
+    ALPHA_IN(cell)                                                                                                     \
+    if (where) {                                                                                                       \
+      const float alpha = as_float(as_int(exp2_by(power, zero)) & taken);                                              \
+      const Share share = take_out(&pixels, cell, alpha, c_red, c_green, c_blue NEAR_ARGUMENT);                        \
+      add_pixel(sums, &pixels, cell, share.g, share.weight, u, v, W11, W12, W22, begins);                              \
+    }                                                                                                                  \
+  }
 #endif
 
 // Processes a pair in the cells that it reaches. A work-item with many cells runs three short loops instead of one:
@@ -191,11 +239,6 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
 
 #ifdef BY_GAUSSIAN
 #include "shared/walk.h"
-#elif ITEMS > 1
-#include "shared/item_sums.h"
-
-// Number of pairs whose sums over the group's items are computed together: enough that most items have a row to add up.
-#define TOGETHER (SUBGROUP > 1 && ITEMS > SLOT_STRIDE ? ITEMS / SLOT_STRIDE : ITEMS < 256 ? 3 : 1)
 #endif
 
 // The gradient by a pixel's final transmittance; background: its part through the background's colour.
@@ -373,49 +416,101 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
         for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] = 0.0f;
       }
       const int chunk = (round - ITEM) & (ITEMS - 1);
-      if (walker.blocks >> CHUNK_BLOCK(chunk) & 1) take_chunk(&walker, chunk, passing, fixed, sums NEAR_PIXELS);
+      if (walker.blocks >> CHUNK_BLOCK(chunk) & FIRST_BLOCKS(CHUNK_BLOCKS))
+        take_chunk(&walker, chunk, passing, fixed, sums NEAR_PIXELS);
       BARRIER_LOCAL();
     }
   }
 #else
   const int zero = min(pixels.stop[0] + 1, 0); // see exp2_by
   __local Staged staged[BATCH];
-  __local int lasts[BLOCKS]; // the largest stop of each block
-  __local float rows[TOGETHER * SLOT_STRIDE * ROW] __attribute__((aligned(16)));
+  __local uint marks[BLOCK_ROWS * BATCH / 4] __attribute__((aligned(16)));
+  __local uchar lists[TEAMS * LIST];
+  __local int counts[BLOCK_ROWS]; // number of a strip's pairs
+  __local int lasts[BLOCKS];      // the largest stop of each block
+  __local float rows[TEAMS * TOGETHER * PAIR_ROWS * ROW] __attribute__((aligned(16)));
+  __local float totals[BLOCK_ROWS * SLOT_STRIDE * TOTALS]; // by strip, field and pair
+  __local uchar *list = lists + TEAM * LIST;
   for (int block = ITEM; block < BLOCKS; block += ITEMS) lasts[block] = begin;
   BARRIER_LOCAL();
-  ALL_CELLS(cell) atomic_max(lasts + cell * WARPS + WARP, pixels.stop[cell]);
+  ALL_CELLS(cell) atomic_max(lasts + OWN_BLOCK(cell), pixels.stop[cell]);
   BARRIER_LOCAL();
   for (int batch = last; batch > begin; batch -= BATCH) {
     const int count = min(BATCH, batch - begin); // number of pairs before `batch`, from the last one on
     for (int j = ITEM; j < BATCH; j += ITEMS) {
       const int i = max(batch - 1 - j, begin);
-      const uint live = blocks_above(i, lasts);
-      stage(staged + j, gaussian_from_sorted[i], slot_from_sorted[i], live, splats, tile_x, tile_y);
+      const uint live = j < count ? blocks_above(i, lasts) : 0;
+      const uint blocks = stage(staged + j, gaussian_from_sorted[i], slot_from_sorted[i], live, splats, tile_x, tile_y);
+      mark(marks, j, blocks, BLOCK_ROWS, BLOCK_COLUMNS);
     }
     BARRIER_LOCAL();
-    for (int first = 0; first < count; first += TOGETHER) {
-      const int together = min(TOGETHER, count - first);
-      for (int j = 0; j < together; ++j) {
-        const int i = batch - 1 - first - j;
-        const uint reach = FROM_OWN(staged[first + j].blocks) & OF_FIRST_WARP;
-        if (reach || SUBGROUP > 1) { // an exchange needs every item
-          SPLAT_STAGED(staged[first + j])
+    UNROLLED for (int k = 0; k < OWN_STRIPS; ++k) {
+      const int strip = TEAM * OWN_STRIPS + k;
+      if (TEAM_WARP == 0) {
+#define ENTRY(j) (uchar)(j)
+        LIST_MARKED(listed, marks + strip * BATCH / 4, list, ENTRY)
+        if (LANE == 0) counts[strip] = listed;
+      }
+      BARRIER_LOCAL();
+      const int own = counts[strip], most = max(counts[k], counts[(TEAMS - 1) * OWN_STRIPS + k]);
+      for (int first = 0; first < most; first += TOGETHER) { // in step with the other team
+        const int stop_at = min(first + TOGETHER, ACROSS_TEAMS ? most : own);
+        __local float *pair_rows = rows + TEAM * (TOGETHER * PAIR_ROWS * ROW);
+        for (int turn = first; turn < stop_at; ++turn, pair_rows += PAIR_ROWS * ROW) {
+          const int absent = ACROSS_TEAMS && turn >= own, j = absent ? 0 : list[turn];
+          SPLAT_STAGED(staged[j])
+          const int i = batch - 1 - j;
           NEAR_HERE(s.near)
+          const uint reach = absent ? 0 : FROM_OWN(s.blocks) >> k * BLOCK_COLUMNS;
+          WHITENING_HERE
           float sums[SLOT_STRIDE];
-          for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] = 0.0f;
-          TAKE_PAIR(reach)
-          leave_sums(sums, rows + j * (SLOT_STRIDE * ROW));
+#if TEAM_WARPS == 1
+          if (IS_WHOLE(reach)) { // alpha is 0 in pixels that do not take the pair
+            FOR_STRIP(c) TAKE_PIXEL(k * BLOCK_COLUMNS + c, c == 0, 1);
+          } else {
+            FOR_FIELDS(field) sums[field] = 0.0f;
+            FOR_STRIP(c) if (reach >> c & 1) { TAKE_PIXEL(k * BLOCK_COLUMNS + c, c == 0, taken); }
+          }
+          finish_row(l22 * (my - AT_Y(k * BLOCK_COLUMNS)), sums);
+          leave_sums(sums, pair_rows);
+#else
+          FOR_STRIP(c) if (reach >> c & 1) {
+            FOR_FIELDS(field) sums[field] = 0.0f;
+            TAKE_PIXEL(c, 1, taken);
+            leave_block(sums, pair_rows + (TEAM_WARP * STRIP_CELLS + c) * (CELL_FIELDS * ROW));
+          }
+#endif
+        }
+#if TEAM_WARPS > 1
+        BARRIER_LOCAL();
+        for (int turn = first + TEAM_WARP; turn < stop_at; turn += TEAM_WARPS) {
+          const Staged s = staged[list[turn]];
+          join_blocks(s.blocks >> strip * BLOCK_COLUMNS, s.l22 * (s.my - AT_Y(0)),
+                      rows + (TEAM * TOGETHER + turn - first) * (PAIR_ROWS * ROW));
+        }
+#endif
+        BARRIER_LOCAL();
+        for (int row = TEAM_ITEM; row < TOGETHER * SLOT_STRIDE; row += ITEMS / TEAMS) {
+          const int turn = row / SLOT_STRIDE, field = row % SLOT_STRIDE;
+          if (first + turn < own)
+            totals[(strip * SLOT_STRIDE + field) * TOTALS + list[first + turn]] =
+                row_sum(rows + ((TEAM * TOGETHER + turn) * PAIR_ROWS + field) * ROW);
+        }
+        BARRIER_LOCAL();
+      }
+    }
+    if (ITEM < ITEMS / ABREAST * ABREAST) {
+      ROLLED for (int j = ITEM / ABREAST; j < count; j += ITEMS / ABREAST) {
+        for (int field = ITEM % ABREAST; field < SLOT_STRIDE; field += ABREAST) {
+          float sum = 0.0f;
+          for (int strip = 0; strip < BLOCK_ROWS; ++strip)
+            if (staged[j].blocks >> strip * BLOCK_COLUMNS & FIRST_BLOCKS(BLOCK_COLUMNS))
+              sum += totals[(strip * SLOT_STRIDE + field) * TOTALS + j];
+          slots[SLOT_STRIDE * (size_t)staged[j].slot + field] = sum;
         }
       }
-      BARRIER_LOCAL();
-      for (int row = ITEM; row < together * SLOT_STRIDE; row += ITEMS) {
-        const int j = first + row / SLOT_STRIDE;
-        slots[(size_t)SLOT_STRIDE * staged[j].slot + row % SLOT_STRIDE] =
-            row_sum_of(rows + row * ROW, staged[j].blocks);
-      }
-      BARRIER_LOCAL();
     }
+    BARRIER_LOCAL();
   }
 #endif
 }

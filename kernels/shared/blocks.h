@@ -1,28 +1,31 @@
-// cells.h for groups of ITEMS work-items that share a tile. A cell is one pixel of a block of 8 x 4 pixels. Each block
-// has 32 items, one per pixel, so that items that run together skip a block together; groups of fewer items have blocks
-// of fewer rows. Item i owns pixel i % 32 of the blocks i / 32, i / 32 + ITEMS / 32, ...: its cells 0, 1, ... Splats
-// are fetched to local memory in batches, each with the blocks that its ellipse reaches. A warp here means the items
-// that own the same blocks, even if the device does not run 32 items together.
+// cells.h for a group of ITEMS work-items that share a tile. A cell is one pixel of a block of 4 x 8 pixels. Each block
+// has 32 items, one per pixel, so that items that run together skip a block together; groups of fewer items have lower
+// blocks. Item i owns pixel i % 32 of OWNED blocks, its cells 0, 1, ...: those of a row of blocks are side by side, so
+// that what depends on y alone is computed once for them. Splats pass through local memory in batches, each with the
+// blocks that its ellipse reaches. Items that own the same blocks are a warp here, whether or not the device runs 32
+// items together.
 #if LANES > 1
 #error "a group of work-items has one pixel a vector"
 #endif
 #define BLOCK_ITEMS (ITEMS < 32 ? ITEMS : 32)
-#define BLOCK_W 8
+#define BLOCK_W 4
 #define BLOCK_H (BLOCK_ITEMS / BLOCK_W)
 #define BLOCK_COLUMNS (TILE / BLOCK_W)
 #define BLOCK_ROWS (TILE / BLOCK_H)
 #define OWNED (TILE * TILE / ITEMS)
 #define ITEM ((int)get_local_id(0))
 #define WARPS (ITEMS / BLOCK_ITEMS)
+#if ITEMS <= 32
+#define WARP 0
+#define LANE ITEM
+#else
 #define WARP (ITEM / BLOCK_ITEMS)
-
-#if ITEMS < BLOCK_COLUMNS * 32
-#define CELL_X(cell) ((cell) % BLOCK_COLUMNS * BLOCK_W + ITEM % BLOCK_W)
-#define CELL_Y(cell) ((cell) / BLOCK_COLUMNS * BLOCK_H + ITEM / BLOCK_W)
-#else // an item's pixels are in one column
-#define CELL_X(cell) (ITEM / 32 % BLOCK_COLUMNS * BLOCK_W + ITEM % BLOCK_W)
-#define CELL_Y(cell) (((cell) * (ITEMS / 64) + ITEM / 64) * BLOCK_H + ITEM % 32 / BLOCK_W)
+#define LANE (ITEM % BLOCK_ITEMS)
 #endif
+
+#define OWN_BLOCK(cell) (WARP * OWNED + (cell))
+#define CELL_X(cell) ((WARP * OWNED % BLOCK_COLUMNS + (cell) % BLOCK_COLUMNS) * BLOCK_W + LANE % BLOCK_W)
+#define CELL_Y(cell) ((WARP * OWNED / BLOCK_COLUMNS + (cell) / BLOCK_COLUMNS) * BLOCK_H + LANE / BLOCK_W)
 #define CELL_IN_PLANE(cell) (stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell))
 #define LANE_IN_PLANE(lane) 0
 #define PIXELS_X(cell) ((float)CELL_X(cell))
@@ -48,9 +51,10 @@ typedef int Open; // number of the item's cells with an open pixel
 typedef uint Reach;
 #define BLOCKS (BLOCK_COLUMNS * BLOCK_ROWS)
 #define ALL_BLOCKS (0xffffffffu >> (32 - BLOCKS))
-#define OF_FIRST_WARP (ALL_BLOCKS / ((1u << WARPS) - 1)) // the first warp's blocks: every WARPS-th bit
-#define FROM_OWN(blocks) ((blocks) >> WARP)
-#define FOR_CELLS(cell, reach) ALL_CELLS(cell) if ((reach) >> (cell * WARPS) & 1)
+#define FIRST_BLOCKS(count) (0xffffffffu >> (32 - (count)))
+#define OF_FIRST_WARP FIRST_BLOCKS(OWNED)
+#define FROM_OWN(blocks) ((blocks) >> (WARP * OWNED))
+#define FOR_CELLS(cell, reach) ALL_CELLS(cell) if ((reach) >> cell & 1)
 
 // All blocks: in kernels that read one splat at a time, a test would cost more than the pixels.
 static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y) { return ALL_BLOCKS; }
@@ -105,9 +109,11 @@ static inline uint blocks_of(__global const float *splat, int tile_x, int tile_y
 }
 #endif
 
-// A batch: splats that the items of a group fetch together, and that all of them read. At the end of a list items fetch
-// the last splat again, instead of none: a compiler that vectorises across items may read memory for idle items too.
+// A batch: splats that the group's items fetch together and all read. Every item fetches the same number, repeating the
+// last splat at the list's end: a compiler that vectorises across items may read memory for idle items too.
+#ifndef BATCH
 #define BATCH (ITEMS < 64 ? 64 : ITEMS)
+#endif
 typedef struct {
   float mx, my, l11, l12; // mx, my: the mean, relative to the tile's first pixel
   float l22, log2o, red, green;
@@ -151,45 +157,41 @@ static inline uint blocks_above(int floor, __local const int *numbers) {
   return blocks;
 }
 
-// A warp's list has those pairs of a batch that reach one of its blocks. First each pair is marked for each warp, then
-// the marked pairs are listed in order.
-#define LIST (BATCH + 1) // length of a list; the last element is loaded ahead, but not used
+// A warp can walk a list of only the pairs of a batch that reach one of its blocks. First each pair is marked for each
+// set of blocks that has a list, then the marked pairs are listed in order.
+#define LIST (BATCH + 1) // room of a list; the last place is read ahead, and not used
 
-// Marks the j-th pair of a batch for the warps that own one of `blocks`. A mark is a byte, 1 or 0.
-static inline void mark(__local uint *marks, int j, uint blocks) {
-  _Pragma("unroll") for (int warp = 0; warp < WARPS; ++warp)((__local uchar *)marks)[warp * BATCH + j] =
-      (blocks >> warp & OF_FIRST_WARP) != 0;
+// Marks the j-th pair of a batch for `sets` sets of `own` blocks each: a byte for each pair, 1 or 0.
+static inline void mark(__local uint *marks, int j, uint blocks, int sets, int own) {
+  _Pragma("unroll") for (int set = 0; set < sets; ++set)((__local uchar *)marks)[set * BATCH + j] =
+      (blocks >> set * own & FIRST_BLOCKS(own)) != 0;
 }
 
-// An element of a list: the pair's number in its batch, and DENSE if it reaches more than SPARSE of the warp's blocks.
-// It is then faster to process all of the item's cells without a branch.
+// An entry of a list: the pair's number in its batch, and DENSE if it reaches more than half of the set's blocks. It is
+// then quicker to take all of the item's cells without a branch.
 #define DENSE 0x80000000u
 #define PAIR_OF(entry) ((int)((entry) & ~DENSE))
-#if ALL_REACHED
-#define SPARSE OWNED
-#else
-#define SPARSE (OWNED / 2)
-#endif
-#define IS_DENSE(entry) (SPARSE == 0 || (SPARSE < OWNED && ((entry) & DENSE)))
+#define SPARSE(own) (ALL_REACHED ? (own) : (own) / 2)
+#define IS_DENSE(entry, own) (SPARSE(own) == 0 || (SPARSE(own) < (own) && ((entry) & DENSE)))
 
-// Lists the marked pairs of the item's warp. Returns their number.
-static inline int list_marked(__local const uint *marks, __local const Staged *staged, __local uint *list) {
-  const int lane = ITEM % BLOCK_ITEMS;
-  int count = 0;
-  _Pragma("unroll") for (int first = 0; first < BATCH; first += BLOCK_ITEMS) {
-    uint marked = 0; // a bit for each of BLOCK_ITEMS pairs; the product's upper byte joins the bits of four bytes
-    _Pragma("unroll") for (int four = 0; four < BLOCK_ITEMS; four += 4) marked |=
-        marks[(WARP * BATCH + first + four) / 4] * 0x01020408u >> 24 << four;
-    const uint until = marked << (31 - lane); // marks up to the item's pair
-    if (until >> 31) {
-      const int j = first + lane;
-      const int reached = popcount(FROM_OWN(staged[j].blocks) & OF_FIRST_WARP);
-      list[count + popcount(until) - 1] = j | (reached > SPARSE ? DENSE : 0);
-    }
-    count += popcount(marked);
-  }
-  return count;
+// A bit for each of BLOCK_ITEMS pairs of a batch from `begin` on that are marked; a product's upper byte has the bits
+// of four bytes.
+static inline uint marked_from(__local const uint *marks, int begin) {
+  uint marked = 0;
+  _Pragma("unroll") for (int four = 0; four < BLOCK_ITEMS; four += 4) marked |=
+      marks[(begin + four) / 4] * 0x01020408u >> 24 << four;
+  return marked;
 }
+
+// Lists the pairs that are marked for a set of blocks. ENTRY: what the list has of the j-th pair. Defines the number of
+// pairs, `count`.
+#define LIST_MARKED(count, marks, list, ENTRY)                                                                         \
+  int count = 0;                                                                                                       \
+  _Pragma("unroll") for (int begin_ = 0; begin_ < BATCH; begin_ += BLOCK_ITEMS) {                                      \
+    const uint marked = marked_from(marks, begin_), until = marked << (31 - LANE); /* those up to the item's pair */   \
+    if (until >> 31) (list)[count + popcount(until) - 1] = ENTRY(begin_ + LANE);                                       \
+    count += popcount(marked);                                                                                         \
+  }
 
 // Gives a staged splat the names that LOG2_ALPHA and the kernels use for a splat in global memory.
 #define SPLAT_STAGED(place)                                                                                            \

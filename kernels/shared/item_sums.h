@@ -1,6 +1,12 @@
-// Sums over a group's items: of neighbours, then of pairs, of fours and so on. The order and the bits are the same if
-// items store their addends in local memory, and if they exchange them in sub-groups of SUBGROUP items.
-#define PARTS (ITEMS / SUBGROUP) // number of addends of a row in local memory
+// Sums over ADDENDS items, those of a group or of a warp: first neighbours, then pairs, fours and so on. The order and
+// the bits are the same whether items leave their addends in local memory or exchange them in sub-groups of SUBGROUP
+// items. ADDEND: the item's place among them.
+#ifndef ADDENDS
+#define ADDENDS ITEMS
+#define ADDEND ITEM
+#endif
+#define EXCHANGING (SUBGROUP < ADDENDS ? SUBGROUP : ADDENDS) // items that exchange their sums of a row
+#define PARTS (ADDENDS / EXCHANGING)                         // number of addends of a row in local memory
 
 // Rows are padded so that they begin in different banks of local memory.
 #define ROW (PARTS < 4 ? PARTS : PARTS + 4)
@@ -22,11 +28,6 @@ DOUBLED(32, 64)
 DOUBLED(64, 128)
 DOUBLED(128, 256)
 
-// The sum of a warp's part of a row.
-static inline float warp_sum(__local const float *part) {
-  return BLOCK_ITEMS == 8 ? sum_of_8(part) : BLOCK_ITEMS == 16 ? sum_of_16(part) : sum_of_32(part);
-}
-
 // The sum of a row.
 static inline float row_sum(__local const float *row) {
   return PARTS == 1     ? sum_of_1(row)
@@ -40,31 +41,16 @@ static inline float row_sum(__local const float *row) {
                         : sum_of_256(row);
 }
 
-// The sum of a row in which only the warps of these blocks have stored addends. The others count as zeros.
-static inline float row_sum_of(__local const float *row, uint blocks) {
-#if SUBGROUP > 1
-  return row_sum(row);
-#else
-  float sums[WARPS];
-  _Pragma("unroll") for (int warp = 0; warp < WARPS; ++warp) sums[warp] =
-      blocks >> warp & OF_FIRST_WARP ? warp_sum(row + warp * BLOCK_ITEMS) : 0.0f;
-  _Pragma("unroll") for (int step = 1; step < WARPS; step *= 2)
-      _Pragma("unroll") for (int warp = 0; warp < WARPS; warp += 2 * step) sums[warp] += sums[warp + step];
-  return sums[0];
-#endif
-}
-
 #if SUBGROUP > 1
 // Adds up a pair's fields over a sub-group. In each step an item gives half of its fields to another item, and adds
 // that item's values to the other half, until it has one field, or a few. The sums are stored in the rows of the
 // fields, which start at `rows`, in the sub-group's element.
 static inline void leave_sums(const float *sums, __local float *rows) {
-  const int item = get_local_id(0);
   float held[SLOT_STRIDE];
   int n = SLOT_STRIDE, begin = 0, end = SLOT_STRIDE; // this item has the fields [begin, end)
   _Pragma("unroll") for (int field = 0; field < SLOT_STRIDE; ++field) held[field] = sums[field];
-  _Pragma("unroll") for (int step = 1; step < SUBGROUP; step *= 2) {
-    const int upper = (item & step) != 0;
+  _Pragma("unroll") for (int step = 1; step < EXCHANGING; step *= 2) {
+    const int upper = (ADDEND & step) != 0;
     if (n > 1) {
       const int kept = (n + 1) / 2;
       _Pragma("unroll") for (int k = 0; k < kept; ++k) {
@@ -80,11 +66,11 @@ static inline void leave_sums(const float *sums, __local float *rows) {
       end = upper ? begin : end;
     }
   }
-  _Pragma("unroll") for (int k = 0; k < n; ++k) if (begin + k < end) rows[(begin + k) * ROW + item / SUBGROUP] =
+  _Pragma("unroll") for (int k = 0; k < n; ++k) if (begin + k < end) rows[(begin + k) * ROW + ADDEND / EXCHANGING] =
       held[k];
 }
 #else
 static inline void leave_sums(const float *sums, __local float *rows) {
-  for (int field = 0; field < SLOT_STRIDE; ++field) rows[field * ROW + get_local_id(0)] = sums[field];
+  for (int field = 0; field < SLOT_STRIDE; ++field) rows[field * ROW + ADDEND] = sums[field];
 }
 #endif

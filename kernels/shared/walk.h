@@ -9,6 +9,7 @@
 #endif
 #define CHUNK (TILE * TILE / ITEMS) // pixels of a chunk
 #define ROW_CHUNKS (TILE / CHUNK)
+#define CHUNK_BLOCKS (CHUNK < BLOCK_W ? 1 : CHUNK / BLOCK_W) // number of blocks that a chunk is in; the first:
 #define CHUNK_BLOCK(chunk) ((chunk) / ROW_CHUNKS / BLOCK_H * BLOCK_COLUMNS + (chunk) % ROW_CHUNKS * CHUNK / BLOCK_W)
 
 // Index of a pixel: items at adjacent chunks read adjacent elements.

@@ -125,10 +125,10 @@ def brute_force_evaluated(pipeline: Pipeline, lanes: int, reached: Callable[...,
 
 
 def brute_force_of_group(pipeline: Pipeline, items: int) -> int:
-    """Pixels of the blocks of 8x4 that each Gaussian reaches, of those that have an open pixel where its batch begins;
+    """Pixels of the blocks of 4x8 that each Gaussian reaches, of those that have an open pixel where its batch begins;
     where it reaches more than half of a warp's blocks, of all of them (kernels/shared/blocks.h)."""
     y, x = np.divmod(np.arange(TILE * TILE), TILE)
-    block, blocks = y // 4 * 2 + x // 8, TILE * TILE // 32
+    block, blocks = y // 8 * 4 + x // 4, TILE * TILE // 32
     warps, batch = items // 32, max(items, 64)
     total = 0
     for tile_x, tile_y, splats, stops, begin in walks(pipeline):
@@ -136,7 +136,7 @@ def brute_force_of_group(pipeline: Pipeline, items: int) -> int:
         np.maximum.at(last, block, stops.ravel())
         for i, splat in enumerate(splats):
             inside = np.bincount(block, weights=in_ellipse(splat, tile_x, tile_y, 1), minlength=blocks) > 0
-            of_warps = (inside & (last >= begin + i // batch * batch)).reshape(-1, warps).sum(0)
+            of_warps = (inside & (last >= begin + i // batch * batch)).reshape(warps, -1).sum(1)
             total += 32 * int(np.where(of_warps > blocks // warps // 2, blocks // warps, of_warps).sum())
     return total
 

@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 import scenes
 from compare import assert_close_gradients
-from pipeline import BACKGROUND, Pipeline
+from pipeline import BACKGROUND, Pipeline, shaped
 from quick import quick
 
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
+from clsplat.layouts.columns import PLAIN_SLOTS, SlotFields
 from clsplat.reference.blend import blend
 from clsplat.reference.project import project
 from clsplat.reference.render import forward, parameters, render_grad
+from clsplat.selftest.harness import planes_of
 
 GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 BAND = 1e-4
@@ -64,6 +66,18 @@ def test_slopes_along_random_directions(default_device: Device, name: str, group
     # a random direction sees the gradient's norm times a normal number: 1e-4 of it, as the twins' tests
     error = np.abs(np.subtract(found, wanted)).max()
     assert error <= 1e-4 * np.linalg.norm(gradient), (found, wanted)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fields", [PLAIN_SLOTS, SlotFields(absolute=True, contributions=True)])
+def test_groups_of_32_to_256_items_have_one_order_of_sums(default_device: Device, fields: SlotFields) -> None:
+    scene, d_image = subject("needles")
+    pipelines = [Pipeline.run(shaped(default_device, 1, items), scene) for items in (64, 32, 128, 256)]
+    # adding 0 removes the sign of zeros, which does not count
+    first, *others = (each.slots(planes_of(d_image), fields) + np.float32(0) for each in pipelines)
+    assert np.count_nonzero(first)
+    for each in others:
+        np.testing.assert_array_equal(each.view(np.uint32), first.view(np.uint32))
 
 
 def test_999_of_a_thousand_gaussians(default_device: Device) -> None:

@@ -24,6 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PICTURES = {"perspective": {"rgb": "c", "motion": "v"}, "fisheye": {"rgb": "d"}}
 GOOD = Row("A", "8x1", "f", "g8", "m8", True, 20.0, 100, pictures=PICTURES)
 ROWS = [GOOD, replace(GOOD, driver="B"), Row("A", "1x64", "f", "g1", "m1", True, 20.1, 101, 5e-7, pictures=PICTURES)]
+ROWS.append(replace(ROWS[2], shape="1x256s", model=None))
 
 
 def test_drivers_take_turns() -> None:
@@ -49,11 +50,12 @@ def test_no_problem() -> None:
             "A, 1x64: rgb of the fisheye camera is x, on A, 8x1 it is d",
         ),
         (1, {"pictures": {}}, "B, 8x1: rgb of the perspective camera is missing"),
-        (1, {"gradient": "x"}, "B, 8x1: the gradient is x, on A in that shape it is g8"),
+        (1, {"gradient": "x"}, "B, 8x1: the gradient is x, on A, 8x1 it is g8"),
+        (3, {"gradient": "x"}, "A, 1x256s: the gradient is x, on A, 1x64 it is g1"),
         (2, {"difference": 2e-6}, "A, 1x64: the gradient is 2.0e-06 from that of 8x1"),
         (2, {"difference": float("nan")}, "A, 1x64: the gradient is nan"),
         (0, {"repeats": False}, "A, 8x1: two trainings gave two models"),
-        (1, {"model": "x"}, "B, 8x1: the model is x, on A in that shape it is m8"),
+        (1, {"model": "x"}, "B, 8x1: the model is x, on A, 8x1 it is m8"),
         (2, {"psnr": 18.0}, "A, 1x64: the model has 18.00 dB, that of 8x1 20.00 dB"),
         (2, {"trouble": "ended with status 1"}, "A, 1x64: ended with status 1"),
     ],

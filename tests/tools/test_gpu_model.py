@@ -134,7 +134,7 @@ def test_blocks_and_pixels_that_skip_a_pair() -> None:
 
 def test_a_tile_has_the_kernels_blocks() -> None:
     text = (kernel_root() / "shared/blocks.h").read_text()
-    assert "#define BLOCK_W 8\n" in text
+    assert "#define BLOCK_W 4\n" in text
     assert "#define BLOCK_ITEMS (ITEMS < 32 ? ITEMS : 32)\n" in text
     assert TILE * TILE // 32 == BLOCKS
 
@@ -175,10 +175,11 @@ WALKS = {name: [1.0, 0.5, 3.0, 4.0] for name in VISITS} | {f"longest_{name}": [0
 
 def test_how_a_groups_warps_walk_a_pair() -> None:
     frame = {"reached": 3, "taken": 2, "longer_reached": 2, "longer_taken": 1, **WALKS}
-    shares = {"visits": 0.25, "dense": 0.25, "visits_back": 0.25}
-    assert blocks_of(frame, 64) == {"reached": 3, "taken": 2, "sparse_reached": 0.5, "sparse_taken": 0.5, **shares}
-    shares = {"visits": 0.75, "dense": 0.75, "visits_back": 0.75}
-    assert longest_of(frame, 64) == {"reached": 4, "taken": 2, "sparse_reached": 1.5, "sparse_taken": 1.5, **shares}
+    blocks = ("sparse_reached", "sparse_taken", "others_reached", "others_taken")
+    shares = dict.fromkeys(set(VISITS).difference(blocks), 0.25) | dict.fromkeys(blocks, 0.5)
+    assert blocks_of(frame, 64) == {"reached": 3, "taken": 2, **shares}
+    shares = dict.fromkeys(set(VISITS).difference(blocks), 0.75) | dict.fromkeys(blocks, 1.5)
+    assert longest_of(frame, 64) == {"reached": 4, "taken": 2, **shares}
     assert blocks_of(frame, 256)["visits"] == 4 / 8
 
 
@@ -348,14 +349,15 @@ def splat(x: float, y: float, radius: float) -> list[float]:
 def test_the_walk_of_a_tile() -> None:
     """In the tile from (16, 32) on: a small Gaussian in the upper left block, and a wide one that one pixel takes,
     in the lower right block. The pixels of the others are finished by it."""
-    splats = np.array([splat(20, 34, 1.5), splat(24, 40, 100), splat(24, 40, 100)], np.float32)
+    splats = np.array([splat(18.2, 34, 1.5), splat(24, 40, 100), splat(24, 40, 100)], np.float32)
     stops = np.ones((TILE, TILE), np.int64)
     stops[-1, -1] = 2
     walk = [2, 1 + 1, 1 + 1, 1 + 2, 1 + 1, 1 + 1]
-    visits = [1 + 1 + 1, 1 + 1, 1, 1, 2, 3, 2, 1, 1, 2]  # one warp: the third pair is not walked, but of the batch
-    visits += [1 + 2 + 2, 2 + 2, 1, 1, 2, 3, 2, 1, 1, 1]
-    visits += [1 + 4 + 4, 4 + 4, 1, 1, 2, 3, 2, 1, 1, 1]
-    visits += [1 + 8 + 8, 1 + 8 + 8, 0, 0, 2, 3, 3, 0, 0, 1]
+    # one warp: the third pair is not walked, but of the batch; the gradient visits each of two strips once
+    visits = [1 + 1 + 1, 1 + 1, 1, 1, 2, 0, 2, 2, 2, 3, 2, 1, 1, 2, 0, 2, 2, 2]
+    visits += [1 + 2 + 2, 2 + 2, 1, 1, 2, 0, 2, 2, 2, 3, 2, 1, 1, 1, 0, 1, 1, 1]
+    visits += [1 + 4 + 4, 4 + 4, 1, 1, 4, 0, 4, 4, 4, 3, 2, 1, 1, 1, 0, 1, 1, 1]
+    visits += [1 + 8 + 8, 1 + 8 + 8, 0, 0, 8, 0, 8, 8, 8, 3, 3, 0, 0, 1, 0, 1, 1, 1]
     found = walk_of(splats, stops, np.array((16, 32)))
     assert found == walk + visits
     told = summary(np.array([found, [0] * len(found)]))
@@ -371,12 +373,20 @@ def test_the_walk_of_a_tile() -> None:
         "longer_taken": 1,
         "visits": [1.5, 2.5, 4.5, 8.5],
         "dense": [1, 2, 4, 8.5],
-        "visits_back": [1] * 4,
+        "turns_back": [1, 1, 2, 4],
+        "whole_back": [0] * 4,
+        "others_reached": [1, 1, 2, 4],
+        "others_taken": [1, 1, 2, 4],
+        "rounds_back": [1, 1, 2, 4],
         "sparse_reached": [0.5, 0.5, 0.5, 0],
         "sparse_taken": [0.5, 0.5, 0.5, 0],
         "longest_visits": [1.5] * 4,
         "longest_dense": [1, 1, 1, 1.5],
-        "longest_visits_back": [1, 0.5, 0.5, 0.5],
+        "longest_turns_back": [1, 0.5, 0.5, 0.5],
+        "longest_whole_back": [0] * 4,
+        "longest_others_reached": [1, 0.5, 0.5, 0.5],
+        "longest_others_taken": [1, 0.5, 0.5, 0.5],
+        "longest_rounds_back": [1, 0.5, 0.5, 0.5],
         "longest_sparse_reached": [0.5, 0.5, 0.5, 0],
         "longest_sparse_taken": [0.5, 0.5, 0.5, 0],
     }

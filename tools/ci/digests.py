@@ -12,7 +12,7 @@ Every driver found is run in every shape, in a process of its own: PoCL also wit
 Rusticl if CLSPLAT_RUSTICL names its libRusticlOpenCL.so. The exit status is 1 if
 
 - a frame or a channel of a picture has other bits anywhere,
-- gradients differ within a shape, or between shapes by more than GRADIENT_BOUND,
+- gradients differ within a shape or between those of SAME_ORDER, or between other shapes by more than GRADIENT_BOUND,
 - two trainings on one driver differ in a bit, or those of two drivers in one shape,
 - trainings in two shapes differ by more than PSNR_BOUND,
 - a combination that is expected to fail works, or another fails.
@@ -45,6 +45,8 @@ SUBGROUPED = ("1x32s", "1x64s", "1x128s", "1x256s")
 """Shapes with sub-groups, for drivers that have them. Their gradients equal those of the shapes without sub-groups."""
 SHAPES = ("8x1", "16x1", "1x1", "1x32", "1x64", "1x128", "1x256", "1x32g", "1x64g", *SUBGROUPED)
 """Lanes x items; `g`: an item computes the gradient of a Gaussian. Other shapes are compared with the first."""
+SAME_ORDER = ("1x32", "1x64", "1x128", "1x256")
+"""Shapes with one order of sums: their gradients are the same (decision 0023)."""
 TRAINED = ("8x1", "16x1", "1x1", "1x64")
 """Shapes in which a model is trained, twice. Other work-groups differ from 1x64 only where gradients show it."""
 METHODS = {"loops": ("8x1", "1x64"), "loopvec": ("1x64",), "cbs": ("1x64",)}
@@ -290,12 +292,13 @@ def problems(rows: list[Row]) -> list[str]:
         if not row.difference <= GRADIENT_BOUND:
             off = f"{row.difference:.1e} from that of {first.shape}, over {GRADIENT_BOUND:g}"
             found.append(f"{at}: the gradient is {off}")
-        same_shape = [("gradient", by_shape.setdefault(row.shape.removesuffix("s"), row))]
+        shape = row.shape.removesuffix("s")
+        same_shape = [("gradient", by_shape.setdefault(SAME_ORDER[0] if shape in SAME_ORDER else shape, row))]
         same_shape += [("model", trained.setdefault(row.shape, row))] if row.model is not None else []
         for what, other in same_shape:
             got, wanted = getattr(row, what), getattr(other, what)
             if got != wanted:
-                found.append(f"{at}: the {what} is {got}, on {other.driver} in that shape it is {wanted}")
+                found.append(f"{at}: the {what} is {got}, on {other.driver}, {other.shape} it is {wanted}")
         if row.model is None:
             continue
         if not row.repeats:

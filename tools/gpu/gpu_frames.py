@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
 from gpu_measured import CALIBRATION
-from gpu_rules import BLOCKS, VISITS, WARPS
+from gpu_rules import BATCH_BACK, BLOCKS, VISITS, WARPS, together
 from gpu_scenes import subject_of
 from measuring import plain_parser, require, tool
 
@@ -77,9 +77,9 @@ def count(name: str, subject: Subject) -> dict[str, Any]:
 
 
 WALK = ("walked", "reached", "taken", "halves", "longer_reached", "longer_taken")
-"""Counts of a tile: walked pairs; over these, blocks of 8x4 pixels that the ellipse reaches while one of their pixels
-is not finished, and those with a pixel that takes the pair; halves of the tile (warps of 1x64, which own every other
-column of blocks) that it reaches; and the blocks of the half with more of them."""
+"""Counts of a tile: walked pairs; over these, blocks of 4x8 pixels that the ellipse reaches while one of their pixels
+is not finished, and those with a pixel that takes the pair; halves of the tile (warps of 1x64, which own a row of
+blocks) that it reaches; and the blocks of the half with more of them."""
 
 
 def walk_of(splats: np.ndarray, stops: np.ndarray, corner: np.ndarray) -> list[int]:
@@ -97,12 +97,12 @@ def walk_of(splats: np.ndarray, stops: np.ndarray, corner: np.ndarray) -> list[i
     ellipse, takes, ends = (_blocks(each) for each in (reaches, reaches & (pair < stops), reaches & (pair <= stops)))
     last = _blocks(stops[None], np.max)
     back = ellipse & (pair[:, 0] < last)
-    found = (each[:walked].reshape(-1, BLOCKS // 2, 2).sum(1) for each in (ellipse, back, takes))
+    found = (each[:walked].reshape(-1, 2, BLOCKS // 2).sum(2) for each in (ellipse, back, takes))
     halves, reached, taken = found
     more = reached.argmax(1)[:, None]
     longer = (int(np.take_along_axis(each, more, 1).sum()) for each in (reached, taken))
     walk = [walked, int(reached.sum()), int(taken.sum()), int((halves > 0).sum()), *longer]
-    return walk + [count for warps in WARPS for count in visits_of(warps, ellipse, ends, back, last)]
+    return walk + [count for warps in WARPS for count in visits_of(warps, ellipse, ends, (back, takes), last)]
 
 
 LARGEST_BATCH = 256
@@ -111,22 +111,44 @@ LARGEST_BATCH = 256
 
 def _blocks(pixels: np.ndarray, over: Callable[..., np.ndarray] = np.any) -> np.ndarray:
     """Reduce pixels (n, 16, 16) to blocks (n, BLOCKS)."""
-    return over(pixels.reshape(-1, TILE // 4, 4, TILE // 8, 8), axis=(2, 4)).reshape(-1, BLOCKS)
+    return over(pixels.reshape(-1, TILE // 8, 8, TILE // 4, 4), axis=(2, 4)).reshape(-1, BLOCKS)
 
 
-def visits_of(warps: int, ellipse: np.ndarray, ends: np.ndarray, back: np.ndarray, last: np.ndarray) -> list[int]:
+def visits_of(
+    warps: int, ellipse: np.ndarray, ends: np.ndarray, gradient: tuple[np.ndarray, np.ndarray], last: np.ndarray
+) -> list[int]:
     """VISITS of a tile, and those of its warp with most blocks. Of pairs and blocks (n, BLOCKS): those that the
-    ellipse reaches, those in which a pixel takes it or is finished by it, and those that the gradient visits. last (1,
-    BLOCKS): the largest stop."""
+    ellipse reaches, those in which a pixel takes it or is finished by it, and gradient: those that it visits, and those
+    of them with a pixel that takes it. last (1, BLOCKS): the largest stop."""
     batch, owned = max(64, 32 * warps), BLOCKS // warps
     live = last >= np.arange(len(ellipse))[:, None] // batch * batch
-    shape = (-1, owned, warps)
-    reached, taken, gradient = (each.reshape(shape).sum(1) for each in (ellipse & live, ends & live, back))
+    shape = (-1, warps, owned)
+    reached, taken = (each.reshape(shape).sum(2) for each in (ellipse & live, ends & live))
     dense = reached > (owned // 2)
+    *of_strip, rounds = back_of(*gradient, max(int(last.max()), 0), together(warps))
     of_warp = np.stack(
-        [(reached > 0).sum(0), dense.sum(0), (reached * ~dense).sum(0), (taken * ~dense).sum(0), (gradient > 0).sum(0)]
+        [
+            (reached > 0).sum(0),
+            dense.sum(0),
+            (reached * ~dense).sum(0),
+            (taken * ~dense).sum(0),
+            *(each.sum(keepdims=True) if warps == 1 else np.repeat(each, warps // 2) for each in of_strip),
+            np.full(warps, rounds.sum() if warps == 1 else rounds.max(0).sum()),
+        ]
     )
     return [*map(int, of_warp.sum(1)), *map(int, of_warp[:, reached.sum(0).argmax()])]
+
+
+def back_of(back: np.ndarray, takes: np.ndarray, walked: int, of_round: int) -> list[np.ndarray]:
+    """Of a tile's two strips (strips.h): pairs that the gradient visits there; of these the ones that reach all blocks;
+    blocks of the others that it visits, and those with a pixel that takes the pair; and (2, batches) in how many rounds
+    of so many pairs. back, takes: gradient of `visits_of`. walked: pairs of the tile."""
+    visited, taken = (each[:walked].reshape(-1, 2, BLOCKS // 2).sum(2)[::-1] for each in (back, takes))
+    whole = visited == BLOCKS // 2
+    padded = np.pad(visited > 0, ((0, -walked % BATCH_BACK), (0, 0)))
+    counts = padded.reshape(-1, BATCH_BACK, 2).sum(1).T
+    others = ((each * ~whole).sum(0) for each in (visited, taken))
+    return [counts.sum(1), whole.sum(0), *others, -(-counts // of_round)]
 
 
 def summary(walks: np.ndarray) -> dict[str, Any]:

@@ -88,7 +88,8 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
             used.update(matching)
             twins = [each for each in outer.inner if matching[0].opens(each, lines) and _same(each, loop, lines)]
             times = outer_rounds if matching[0].inner else 1
-            factor = times * matching[0].rounds(run) / _unrolled(loop, matching[0], twins)
+            unrolled = 1 if matching[0].copies else _unrolled(loop, matching[0], twins)
+            factor = times * matching[0].rounds(run) / unrolled
             blocks = shared(loop)
             for kind, count in _counts(blocks).items():
                 rounds[kind] += factor * count  # type: ignore[assignment]

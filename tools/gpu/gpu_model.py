@@ -98,7 +98,7 @@ def blocks_of(frame: Mapping[str, Any], items: int) -> dict[str, Any]:
     """The numbers of a frame that tell how a group's warps walk a pair. A group has a warp for each 32 items."""
     warps = max(items // 32, 1)
     found = {name: frame[name][WARPS.index(warps)] for name in VISITS}
-    for name in ("visits", "dense", "visits_back"):
+    for name in ("visits", "dense", "turns_back", "whole_back", "rounds_back"):
         found[name] /= warps
     return {"reached": frame["reached"], "taken": frame["taken"], **found}
 

@@ -22,16 +22,28 @@ if TYPE_CHECKING:
 PER_ITEM = 16
 """Keys per item in a tile of the radix sort: RUN in sort_radix.cl."""
 BLOCKS = 8
-"""Blocks of 8 x 4 pixels in a tile: BLOCK_COLUMNS * BLOCK_ROWS in blocks.h."""
+"""Blocks of 4 x 8 pixels in a tile: BLOCK_COLUMNS * BLOCK_ROWS in blocks.h."""
 WARPS = (1, 2, 4, 8)
 """Warps of a tile for which gpu_frames.json has counts."""
-VISITS = ("visits", "dense", "sparse_reached", "sparse_taken", "visits_back")
+BATCH_BACK = 64
+"""Pairs in a batch of blending's gradient: BATCH in blend_grad.cl."""
+VISITS = (
+    *("visits", "dense", "sparse_reached", "sparse_taken"),
+    *("turns_back", "whole_back", "others_reached", "others_taken", "rounds_back"),
+)
 """These counts, of a walked pair: over the pairs of the batches that blending fetches, warps that walk the pair, and
 those for which it is dense (blocks.h); of the others, blocks that it reaches and blocks with a pixel that takes it or
-is finished by it; and warps that the gradient's walk does not skip."""
+is finished by it. And of the gradient's walk (strips.h), over all warps: the pairs of a warp's strips, and those that
+reach all blocks of the strip; of the others, blocks that it visits and blocks with a pixel that takes it; and rounds.
+"""
 _UNEVEN = 2
 """Estimated ratio of a wave's rounds, which are those of its longest item, to the rounds of an average item, if
 neighbouring Gaussians have all sizes."""
+
+
+def together(warps: int) -> int:
+    """Pairs of a round of the gradient's walk, if this many warps share a tile: TOGETHER in strips.h."""
+    return 32 // PLAIN_SLOTS.floats if warps <= 2 else 2
 
 
 @dataclass(frozen=True)
@@ -39,8 +51,10 @@ class Run:
     """Numbers on which the rounds of a loop depend. items: per group. wave: items that run in step. subgroup: items
     that exchange values. addends: pairs per visible Gaussian. listed: pairs per tile. reached, taken: of the blocks of
     a pair's tile, those that its ellipse reaches, and those with a pixel that takes it; sparse_reached, sparse_taken:
-    only those of warps that walk it and for which it is not dense. visits, dense, visits_back: fractions of the tile's
-    warps that walk a pair, for which it is dense, and that the gradient's walk does not skip (`gpu_frames.py`).
+    only those of warps that walk it and for which it is not dense. visits, dense: fractions of the tile's warps that
+    walk a pair, and for which it is dense. turns_back, whole_back, rounds_back: a warp's pairs, those that reach a
+    whole strip, and rounds in the gradient's walk; others_reached, others_taken: blocks of the tile that it visits for
+    the other pairs (`gpu_frames.py`).
     coefficients: of SH. groups, elements: of the launch. digits: of a pass of the sort."""
 
     items: int
@@ -54,7 +68,11 @@ class Run:
     dense: float = 1
     sparse_reached: float = 0
     sparse_taken: float = 0
-    visits_back: float = 1
+    turns_back: float = 1
+    whole_back: float = 0
+    others_reached: float = 0
+    others_taken: float = 0
+    rounds_back: float = 1
     coefficients: int = 16
     groups: int = 1
     elements: int = 1
@@ -81,16 +99,19 @@ class Run:
         return self.batches * self.batch / self.items
 
     @property
-    def together(self) -> int:
-        """Pairs whose sums are computed together: TOGETHER in blend_grad.cl."""
-        if self.subgroup > 1:
-            return self.items // PLAIN_SLOTS.floats
-        return 3 if self.items < 256 else 1
+    def batches_back(self) -> float:
+        """Batches per pair in blending's gradient."""
+        return 1 / BATCH_BACK + 0.5 / self.listed
 
     @property
-    def summing(self) -> float:
-        """Fraction of the waves that add up rows of sums."""
-        return self.shared(self.together * PLAIN_SLOTS.floats)
+    def strips(self) -> int:
+        """Strips that an item walks one after the other: OWN_STRIPS in strips.h."""
+        return max(64 // self.items, 1)
+
+    @property
+    def team_waves(self) -> int:
+        """Waves that share a strip: TEAM_WARPS in strips.h."""
+        return max(self.items // 64, 1)
 
     @property
     def of_item(self) -> float:
@@ -124,8 +145,11 @@ class Rule:
     part: True for a branch that contains the line; rounds is then the fraction of its loop's rounds that take it. Of
     several such rules the first counts.
     alone: True for a branch that contains no other lines than this and `ends`.
+    holding, lacking: a part of a line that the loop contains, or does not, if a compiler jumps from one line to the
+    heads of two loops.
     mark: number of instructions of a class in a round, such as ("shared", 2). A loop with more of them is unrolled.
     inner: True if rounds are per round of the enclosing loop.
+    copies: True if a compiler makes copies of the loop that run so often each, none of which is a remainder.
     near: True if it reads what the group's items have just read.
     """
 
@@ -135,9 +159,12 @@ class Rule:
     function: str = ""
     part: bool = False
     alone: bool = False
+    holding: str = ""
+    lacking: str = ""
     mark: tuple[str, int] | None = None
     inner: bool = False
     near: bool = False
+    copies: bool = False
 
     def matches(self, number: int, lines: Sequence[str]) -> bool:
         """True if the rule matches the line with this number, counted from 1."""
@@ -151,8 +178,11 @@ class Rule:
         return (all if self.alone else any)(self.matches(number, lines) for number in sources)
 
     def opens(self, loop: Loop, lines: Sequence[str]) -> bool:
-        """True if a source line of the loop matches the rule."""
-        return any(self.matches(number, lines) for number in loop.sources)
+        """True if a source line of the loop's jumps matches the rule, and the loop holds and lacks what it is to."""
+        if not any(self.matches(number, lines) for number in loop.sources):
+            return False
+        text = "".join(lines[each.source - 1] for block in loop.blocks for each in block.body if each.source)
+        return self.holding in text and not (self.lacking and self.lacking in text)
 
 
 _HEADS = ("static ", "GROUP __kernel", "__kernel", "RARE ")
@@ -176,16 +206,16 @@ _BEFORE_PAIRS = (
 )
 
 
-def _in_block(text: str, *ends: str) -> Rule:
-    return Rule(text, lambda run: run.reached / BLOCKS, (*ends, "return fma(a, b, c);"), part=True, alone=True)
-
-
 def _of_visit(text: str, share: Rounds) -> Rule:
     return Rule(text, lambda run: share(run) / run.visits, part=True)
 
 
-def _visits_back(run: Run) -> float:
-    return run.visits_back if run.subgroup == 1 else 1  # an exchange needs every item
+def _of_others(run: Run, others: float, all_pairs: float) -> float:
+    return (others if run.team_waves == 1 else all_pairs) / BLOCKS
+
+
+def _of_turn(text: str, share: Rounds) -> Rule:
+    return Rule(text, lambda run: share(run) / run.turns_back * run.strips, part=True)
 
 
 BY_PAIR: dict[str, tuple[Rule, ...]] = {
@@ -202,18 +232,39 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
     "blend_grad": (
         *_BEFORE_PAIRS,
         Rule("atomic_max(lasts", lambda run: 0),  # once a tile: AMD's compiler loops over a wave's items
-        Rule("const floatL before = p->t[cell] * inverse;", lambda run: run.taken / BLOCKS, part=True),
-        _in_block("TAKE_PAIR(reach)"),
-        Rule("SPLAT_STAGED(staged[first + j])", _visits_back, ("sums[field] = 0.0f;", "= sums[field];"), part=True),
-        Rule("for (int batch = last", lambda run: run.batches),
-        Rule("for (int j = ITEM; j < BATCH; j += ITEMS)", lambda run: run.fetches),
-        Rule("for (int first = 0; first < count; first += TOGETHER)", lambda run: 1 / run.together),
         Rule(
-            "for (int j = 0; j < together; ++j)",
-            lambda run: 1,
-            ends=("rows[field * ROW + get_local_id(0)] = sums[field];",),
+            "for (int batch = last",
+            lambda run: run.batches_back,
+            ends=("BARRIER_LOCAL();",),
+            holding="LIST_MARKED(",
         ),
-        Rule("return (four.x + four.y)", lambda run: run.summing, ends=("DOUBLED(",), part=True),
+        Rule("for (int j = ITEM; j < BATCH; j += ITEMS)", lambda run: run.batches_back * BATCH_BACK / run.items),
+        Rule(
+            "for (int first = 0; first < most; first += TOGETHER)",
+            lambda run: run.rounds_back / run.strips,
+            ends=("for (int turn = first; turn < stop_at;",),
+            holding="BARRIER_LOCAL();",
+            copies=True,
+        ),
+        Rule(
+            "for (int turn = first; turn < stop_at;",
+            lambda run: run.turns_back / run.strips,
+            lacking="BARRIER_LOCAL();",
+            copies=True,
+        ),
+        Rule("SPLAT_STAGED(staged[j])", lambda run: 1, part=True),
+        _of_turn("c == 0, 1);", lambda run: run.whole_back / run.strips),
+        _of_turn(
+            "const floatL before = p->t[cell] * inverse;", lambda run: _of_others(run, run.others_taken, run.taken)
+        ),
+        _of_turn("l11 * dx);", lambda run: _of_others(run, run.others_reached, run.reached)),
+        _of_turn("FOR_STRIP(c) if (reach >> c & 1) {", lambda run: (run.turns_back - run.whole_back) / run.strips),
+        Rule("for (int turn = first + TEAM_WARP;", lambda run: run.turns_back / run.team_waves),
+        Rule("return (four.x + four.y)", lambda run: 1 / run.team_waves, ends=("DOUBLED(",), part=True),
+        Rule(
+            "for (int j = ITEM / ABREAST; j < count;",
+            lambda run: run.batches_back * BATCH_BACK / (run.items // PLAIN_SLOTS.floats),
+        ),
     ),
 }
 """Rules of kernels that run a group per tile: rounds per pair in each of the group's waves."""

@@ -65,7 +65,7 @@ NO_STACK = ("blend", "blend_grad", "project_grad", "sort_radix")
 """Kernel files that must use no stack memory and no spills on NVIDIA's GPUs."""
 NO_SCRATCH = ("blend", "blend_grad", "project_grad")
 """Kernel files that must use no stack memory and no spills on AMD's GPUs."""
-MOST_A_PAIR = {"blend": 140, "blend_grad": 280}
+MOST_A_PAIR = {"blend": 140, "blend_grad": 240}
 """Maximum number of a warp's instructions per pair of the largest frame, on NVIDIA's GPUs."""
 MOST_A_SAMPLE = {"sm_89": 450, "sm_90": 450, "gfx1100": 540, "gfx90a": 540}
 """Maximum number of instructions of the loss for a pixel and channel, of all items of a block. On these targets the

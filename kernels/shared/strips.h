@@ -1,0 +1,75 @@
+// Sums over a tile's pixels for blend_grad.cl, of a group of work-items. Their order is the same whatever the number of
+// items from 32 on. A strip is a row of blocks, half of the tile. Each of its 32 lanes adds its pixels from left to
+// right and applies v, which is the same for all of them; a tree adds the lanes; then come the strips from top to
+// bottom. A team of items owns a strip, or several one after the other, and walks TOGETHER of the strip's pairs at a
+// time: its items leave their sums in rows of local memory, a row a field, and add up a row each.
+#define STRIP_CELLS (OWNED < BLOCK_COLUMNS ? OWNED : BLOCK_COLUMNS) // cells of an item in a strip
+#define OWN_STRIPS (OWNED / STRIP_CELLS)
+#define TEAMS (BLOCK_ROWS / OWN_STRIPS)
+#define TEAM_WARPS (WARPS / TEAMS)
+#define TEAM_ITEM (ITEM % (ITEMS / TEAMS))
+#define TEAM (ITEM / (ITEMS / TEAMS))
+#define TEAM_WARP (WARP % TEAM_WARPS)
+
+#define ADDENDS BLOCK_ITEMS
+#define ADDEND LANE
+#if TEAM_WARPS > 1 // items of several warps exchange nothing
+#undef SUBGROUP
+#undef SUBGROUPED
+#define SUBGROUP 1
+#define SUBGROUPED
+#endif
+#include "shared/item_sums.h"
+#define ACROSS_TEAMS (SUBGROUP > BLOCK_ITEMS) // a sub-group has items of two teams, which then go on together
+#define ABREAST (ITEMS < SLOT_STRIDE ? ITEMS : SLOT_STRIDE) // items that write a slot
+
+// Whether a pair reaches all blocks of a strip. It is then quicker to take all of the item's pixels without a branch.
+#define IS_WHOLE(reach) (!ALL_REACHED && ((reach) & FIRST_BLOCKS(BLOCK_COLUMNS)) == FIRST_BLOCKS(BLOCK_COLUMNS))
+
+#define FOR_FIELDS(field) _Pragma("unroll") for (int field = 0; field < SLOT_STRIDE; ++field)
+#define ROLLED _Pragma("unroll 1")
+#define FOR_STRIP(c) _Pragma("unroll") for (int c = 0; c < STRIP_CELLS; ++c)
+
+// The fields that finish_row computes; the others have sums over pixels. Each pixel of RAYS has its own v.
+#ifdef RAYS
+#define OF_ROW(field) 0
+#define CELL_FIELDS SLOT_STRIDE
+#define PLACE_IN_CELL(field) (field)
+#else
+#define OF_ROW(field) ((field) == SLOT_GV || (field) == SLOT_GUV || (field) == SLOT_GVV)
+#define CELL_FIELDS (SLOT_STRIDE - 3)
+#define PLACE_IN_CELL(field) ((field) - ((field) > SLOT_GV) - ((field) > SLOT_GUV) - ((field) > SLOT_GVV))
+#endif
+
+// Rows of a pair: one for each field, or first one for each block and field if several warps share the strip.
+#define PAIR_ROWS (TEAM_WARPS == 1 ? SLOT_STRIDE : BLOCK_COLUMNS * CELL_FIELDS)
+#if TEAM_WARPS > 1
+#define TOGETHER (SLOT_STRIDE > 9 ? 1 : 2)
+#else
+#define TOGETHER (BLOCK_ITEMS < SLOT_STRIDE ? 1 : BLOCK_ITEMS / SLOT_STRIDE)
+#endif
+#define TOTALS (BATCH + 1) // pairs of which a strip's totals are kept, padded: a pair's totals are in different banks
+
+// Computes the fields of a lane that follow from the others.
+static inline void finish_row(float v, float *sums) {
+#ifndef RAYS
+  sums[SLOT_GV] = v * sums[SLOT_G];
+  sums[SLOT_GUV] = v * sums[SLOT_GU];
+  sums[SLOT_GVV] = v * sums[SLOT_GV];
+#endif
+}
+
+// Leaves a lane's sums over one block.
+static inline void leave_block(const float *sums, __local float *block_rows) {
+  FOR_FIELDS(field) if (!OF_ROW(field)) block_rows[PLACE_IN_CELL(field) * ROW + LANE] = sums[field];
+}
+
+// Adds up what the lane's items have left for a pair that reaches these blocks, and leaves it in the first rows.
+static inline void join_blocks(uint blocks, float v, __local float *pair_rows) {
+  float sums[SLOT_STRIDE];
+  FOR_FIELDS(field) sums[field] = 0.0f;
+  _Pragma("unroll") for (int c = 0; c < BLOCK_COLUMNS; ++c) if (blocks >> c & 1) FOR_FIELDS(field) if (!OF_ROW(field))
+      sums[field] += pair_rows[(c * CELL_FIELDS + PLACE_IN_CELL(field)) * ROW + LANE];
+  finish_row(v, sums);
+  FOR_FIELDS(field) pair_rows[field * ROW + LANE] = sums[field];
+}
