@@ -14,9 +14,9 @@
 #include "shared/group.h"
 #include "shared/tile.h"
 
-// The largest box, in tiles, that an item goes over alone.
+// Number of tiles in the largest box that an item processes alone.
 #define OWN_BOX 32
-// Of a wide box, so many items share a row of tiles.
+// Number of items that share a row of tiles of a wide box.
 #define SIDE (ITEMS < 8 ? ITEMS : 8)
 
 // True if pair a comes after pair b: (depth, slot).
@@ -62,7 +62,7 @@ static inline void order_step_far(__global uint2 *list, uint count, uint step, i
   BARRIER_GLOBAL();
 }
 
-// Brings pairs (count) to local memory.
+// Copies pairs (count) to local memory.
 static inline void fetch_pairs(__global const uint2 *list, uint count, __local uint *depths, __local uint *slots) {
   for (uint k = get_local_id(0); k < count; k += ITEMS) {
     const uint2 pair = list[k];
@@ -72,7 +72,7 @@ static inline void fetch_pairs(__global const uint2 *list, uint count, __local u
   BARRIER_LOCAL();
 }
 
-// Takes them back.
+// Writes pairs (count) back from local memory.
 static inline void store_pairs(__global uint2 *list, uint count, __local const uint *depths,
                                __local const uint *slots) {
   for (uint k = get_local_id(0); k < count; k += ITEMS) list[k] = (uint2)(depths[k], slots[k]);

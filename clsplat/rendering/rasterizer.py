@@ -67,7 +67,7 @@ class PairCapacity:
 
     pairs: number of pairs that fit in its arrays.
     turn: index of the array for its counts, below MAX_COUNTED_PASSES.
-    appends: True if the lists may be made by append (`stages.append`), where the device can.
+    appends: True if the lists may be made by append (`stages.append`), if the device supports that.
     """
 
     pairs: int

@@ -121,7 +121,7 @@ def test_how_lists_are_made(default_device: Device, monkeypatch: pytest.MonkeyPa
     assert "by radix sort: the probe fails: " in finding.text
     monkeypatch.setenv("CLSPLAT_DRIVER_TIMEOUT", "0.01")
     (finding,) = list_findings([listed])
-    assert finding.text.endswith("does not come back within 0.01 s")
+    assert finding.text.endswith("does not finish within 0.01 s")
 
 
 def test_a_node_that_may_not_be_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

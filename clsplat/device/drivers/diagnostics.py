@@ -119,14 +119,14 @@ def device_findings(devices: Sequence[dict[str, Any]], trouble: str) -> list[Dia
 
 
 def list_findings(devices: Sequence[dict[str, Any]]) -> list[Diagnostic]:
-    """A line for each device whose kernels run in groups of several items: how training makes the lists of tiles."""
+    """A finding for each device with groups of several items: how training makes the lists of tiles."""
     findings = []
     for info in devices:
         if " x 1 items" in info["shape"]:
             continue
         result, name = _outcome(*python_module("clsplat.stages.probe_atomics", str(info["index"]))), info["name"]
         if result is None:
-            fault = f"the probe of integer atomics does not come back within {driver_timeout():g} s"
+            fault = f"the probe of integer atomics does not finish within {driver_timeout():g} s"
         else:
             fault = result.stdout if result.returncode == 0 else f"the probe fails: {_last_line(result)}"
         text = f"{info['index']}: {name}, by radix sort: {fault}" if fault else f"{info['index']}: {name}, by append"
