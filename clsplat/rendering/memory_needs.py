@@ -113,7 +113,7 @@ def frame_pixels(device: Device, features: int = 0, planes: int = 0) -> int:
     All planes together may take at most a quarter of the memory, so that the rest is left for the model and its pairs.
     A plane must fit in one allocation.
     """
-    per_pixel = _pixel_bytes(features, planes) + 1  # plus the pixel's part of its tile's bytes
+    per_pixel = _pixel_bytes(features, planes) + 1  # one more for the pixel's share of the arrays by tile
     largest = max(12, 4 * (features + 2) if features else 0, planes)
     return min(device.budget // (4 * per_pixel), device.max_allocation // largest)
 

@@ -303,9 +303,9 @@ def camera_before(task: Task, pictures: PictureConfig) -> Camera | None:
 
 
 def end_before(task: Task, time: float, pictures: PictureConfig) -> float | None:
-    """Time from which the camera at `time` is extrapolated. Both times are in frames from the frame.
+    """The time from which the camera at `time` is extrapolated; both count frames from the task's frame.
 
-    None if the shot's source defines the camera at that time, and for a shot of one frame. A stage defines its camera
+    None if the shot's source defines the camera at `time`, and for a shot of one frame. A USD stage defines its camera
     while the shutter is open; motion is extrapolated from the shutter's middle.
     """
     if task.ends is None or task.ends[0] <= task.number + time <= task.ends[1]:

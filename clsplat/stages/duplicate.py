@@ -33,7 +33,7 @@ BAND_TILE_BYTES = 4
 
 
 def pair_bytes(*, sorts_pairs: bool) -> int:
-    """Bytes per pair: tile, slot and Gaussian. sorts_pairs: add the tile, Gaussian and depth of each slot, and a sort
+    """Bytes per pair: tile, slot and Gaussian. If sorts_pairs, also tile, Gaussian and depth of each slot, and a sort
     of the pairs by depth."""
     return 12 + (12 + SORT_KEY_BYTES if sorts_pairs else 0)
 

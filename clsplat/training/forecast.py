@@ -36,7 +36,7 @@ PRIOR_COSTS = np.array([8000.0, 0.6, 1.2, 80_000.0])
 PRIOR_COST_WEIGHT_SECONDS = 0.03
 """Weight of the prior costs: they count as much as this many measured seconds."""
 OUTLIER_FACTOR = 4.0
-"""Reports that took over this many times their usual time are left out of the prediction: a kernel was built."""
+"""Steps that took over this many times their usual time are left out: probably a kernel was built meanwhile."""
 PACE_WINDOW_SECONDS = 60.0
 """Seconds of recent steps that give the machine's current speed."""
 

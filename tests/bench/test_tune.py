@@ -133,7 +133,7 @@ def gpu(items: int, local_kib: int) -> Any:
     platform = SimpleNamespace(name="none", version="OpenCL 1.2 none")
     return SimpleNamespace(
         type=cl.device_type.GPU, max_work_group_size=items, local_mem_size=local_kib << 10, max_compute_units=4,
-        name="a GPU", driver_version="1", platform=platform, native_vector_width_float=1,
+        name="a GPU", driver_version="1", version="OpenCL 1.2", platform=platform, native_vector_width_float=1,
         single_fp_config=0, max_mem_alloc_size=1 << 28, extensions="",
     )  # fmt: skip
 

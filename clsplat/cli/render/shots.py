@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shots for the flags of `clsplat render`, with --stereo one for each eye, and the settings that a USD stage adds."""
+"""The shots that the flags of `clsplat render` ask for, two with --stereo, and the settings of a USD stage."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 """Reading of PLY files: the header, and the rows of the vertices.
 
 Format: http://paulbourke.net/dataformats/ply/. Comments that describe models are parsed with the header.
-ORIGIN_COMMENT, NEAR_PLANE_COMMENT and ALONG_RAYS_COMMENT are clsplat's own; many programs write comments about
+Only clsplat writes ORIGIN_COMMENT, NEAR_PLANE_COMMENT and ALONG_RAYS_COMMENT. Other programs, too, write comments about
 antialiasing.
 """
 

@@ -18,7 +18,7 @@ from clsplat.scenes.dataset import Lens
 def write_model(folder: Path, images: Sequence[tuple[str, Lens, Camera]], points: Float64, colors: Float32) -> None:
     """Create the folder and write cameras.txt, images.txt and points3D.txt into it.
 
-    images: for each image its name, the lens of its file, and a camera with its pose.
+    images: (name, lens, camera) of each image. The lens has the intrinsics, and the camera the pose.
     points: (N, 3), world coordinates.
     colors: (N, 3) in [0, 1].
     There are no observations: tracks are empty, and errors are 0.
