@@ -15,6 +15,7 @@ from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
 from clsplat.layouts.columns import READBACK
+from clsplat.reference.append import lists_of
 from clsplat.selftest.case import faults, fresh_readback
 from clsplat.selftest.cases.primitives import APPEND_CASE, boxes_of, depths_of, splats_of_boxes
 from clsplat.stages import append as stages_append
@@ -72,8 +73,9 @@ class Lists:
 
     def appended(self) -> list[NDArray[np.uint32]]:
         host = np.zeros(len(READBACK), np.uint32)
-        numbers = (self.tiles, fresh_readback(self.device), self.pairs + 3, host)
-        return self.read(append(self.device, self.work, self.projected, *numbers)[1])
+        readback = fresh_readback(self.device)  # must live until the kernels that read it have ended
+        _, lists = append(self.device, self.work, self.projected, self.tiles, readback, self.pairs + 3, host)
+        return self.read(lists)
 
     def read(self, lists: TileLists) -> list[NDArray[np.uint32]]:
         found = lists.gaussian_from_sorted.get()[: self.pairs], lists.slot_from_sorted.get()[: self.pairs]
@@ -97,8 +99,10 @@ def test_lists_are_the_radix_sort_s(device: Device) -> None:
 
 @pytest.mark.parametrize("items", quick((2, 16, 64, 256), 64))
 def test_lists_longer_than_local_memory(device: Device, items: int) -> None:
-    lists = Lists(shaped(device, 1, items), *long_lists(0, 2047, 1, 2048, 2049, 20_000, 4097))
-    wanted = lists.radix()
+    """Beside the twin: Intel's driver gives the radix sort a wrong least key in groups of 2."""
+    boxes, depths, tiles = long_lists(0, 2047, 1, 2048, 2049, 20_000, 4097)
+    lists, twin = Lists(shaped(device, 1, items), boxes, depths, tiles), lists_of(boxes[:, :1], depths, tiles[0])
+    wanted = [each.astype(np.uint32) for each in (twin.ranges, twin.gaussian_from_sorted, twin.slot_from_sorted)]
     for _ in range(RUNS):
         assert_same_lists(lists.appended(), wanted)
 
