@@ -62,7 +62,7 @@ class ByMap:
 
 @dataclass(frozen=True, eq=False)
 class ByLens:
-    """The mapping of a photograph's lens. The pixels of the warped picture are those of the photograph.
+    """The mapping of a photograph's lens. The warped picture has the photograph's pixels.
 
     The straight frame belongs to the camera of `Lens.bare`, at any size.
     """

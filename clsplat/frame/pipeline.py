@@ -113,7 +113,7 @@ class FramePipeline:
     def draw(self, frame: FrameRequest) -> tuple[Draw, Callable[[Planes], Planes]]:
         """The Draw of a frame, and a function that converts its planes to the file's colours without the device.
 
-        Of the camera that is passed to the Draw, only size and window are used: those of the picture or of a strip.
+        The Draw uses only the size and the window of its camera, which is the picture's or a strip's.
         """
         draw = self._by_kernels(frame)
         for apply in self._passes(frame):

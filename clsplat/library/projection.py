@@ -375,7 +375,7 @@ class GivenShapes:
 
 
 def full_gradient(upper: Float32) -> Float32:
-    """Gradients with respect to all nine entries of symmetric matrices, from those of their upper triangles."""
+    """Gradients with respect to all nine entries of symmetric matrices, from gradients of their upper triangles."""
     halves = upper * np.array([1, 0.5, 0.5, 1, 0.5, 1], np.float32)
     return np.asarray(halves[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3), np.float32)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Conversion between clsplat's axes and those of model formats, and transforms of scene nodes."""
+"""Conversion between clsplat's axes and the axes of model formats, and transforms of scene nodes."""
 
 from __future__ import annotations
 
