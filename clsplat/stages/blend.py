@@ -80,6 +80,27 @@ def tile_items(device: Device) -> int:
     return min(max(device.shape.items, _MIN_TILE_ITEMS), TILE * TILE)
 
 
+_BUSY_ITEMS = 4096
+"""Number of work-items per compute unit above which larger groups in `blend` only add instructions: 16 tiles of 256
+work-items or 32 of 128, as predicted for NVIDIA's GPUs (docs/gpu-static.md)."""
+
+
+def blend_items(device: Device, tiles: int) -> int:
+    """Number of work-items that share a tile in `blend`, for so many tiles. It does not change the result.
+
+    A warp walks the pairs that reach its part of the tile, one after the other. A frame with few tiles for a GPU's
+    units waits for the longest of these walks. More warps then walk shorter ones.
+    """
+    items = tile_items(device)
+    if device.kind != "gpu" or items == 1:
+        return items
+    most = min(TILE * TILE, device.max_group)
+    busy = _BUSY_ITEMS * int(device.cl_device.max_compute_units)
+    while 2 * items <= most and 2 * items * tiles <= busy:
+        items *= 2
+    return items
+
+
 def launch_tiles(
     device: Device,
     stem: str,
@@ -88,14 +109,16 @@ def launch_tiles(
     tiles_x: int,
     *arguments: Any,
     kernel: str = "",
+    items: int | None = None,
 ) -> None:
     """Launch a kernel of `stem`.cl, with one group per tile of the lists.
 
     kernel: the kernel's name, if it is not `stem`.
+    items: number of work-items that share a tile; None for `tile_items`.
 
     The kernel's arguments are the first tile, the number of tiles in a row of the image, and `arguments`.
     """
-    items = tile_items(device)
+    items = items or tile_items(device)
     built = getattr(device.kernels(stem, {"ITEMS": items, **defines}), kernel or stem)
     launch_groups(device, built, lists.band.tiles, items, lists.band.first, tiles_x, *arguments)
 
@@ -109,6 +132,7 @@ def blend(
     *,
     record: bool = True,
     nearness: bool = False,
+    items: int | None = None,
 ) -> Blended:
     """Blend the Gaussians of each tile in the lists front to back over the background.
 
@@ -116,6 +140,7 @@ def blend(
 
     record: keep the cells that the gradient has to visit, if the kernel shape supports it.
     nearness: also blend 1 / depth.
+    items: number of work-items that share a tile; None for `blend_items`.
     """
     width, height = inputs.width, inputs.height
     planes, near = _planes(work, width, height, kept=lists.band.first > 0), None
@@ -129,7 +154,8 @@ def blend(
     arrays = (lists.ranges, lists.gaussian_from_sorted, inputs.splats, inputs.background, *planes, *extra)
     switches = (("NEARNESS", near), ("RECORD_CELLS", cells), ("TILE_ORDER", lists.order))
     defines = {name: True for name, on in switches if on}
-    launch_tiles(device, "blend", defines, lists, -(-width // TILE), width, height, *arrays)
+    items = items or blend_items(device, lists.band.tiles)
+    launch_tiles(device, "blend", defines, lists, -(-width // TILE), width, height, *arrays, items=items)
     return Blended(*planes, cells, near)
 
 

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,12 +19,15 @@ from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.drivers.quirks import subgroup_ways
+from clsplat.device.drivers.shapes import Shape
+from clsplat.device.launch import launch_groups
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import SLOT_PLAIN, SlotFields
 from clsplat.models.edit import take
 from clsplat.reference import render as reference
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.stages.blend import blend_items
 from clsplat.stages.device_gaussians import upload_gaussians
 
 SIZES = ((1, 1), (15, 16), (16, 16), (17, 15), (33, 1), (1, 40), (64, 48))
@@ -75,6 +80,40 @@ def test_a_group_of_any_size_has_the_bits_of_a_lone_item(default_device: Device,
     assert_same_bits(group.image.get(), alone.image.get())
     assert_same_bits(group.transmittance.get(), alone.transmittance.get())
     assert_same_bits(group.stops.get(), alone.stops.get())
+
+
+@pytest.mark.parametrize(("kind", "group", "units", "tiles", "items"), [
+    ("gpu", 1024, 132, 2112, 256),
+    ("gpu", 1024, 132, 2113, 128),
+    ("gpu", 1024, 132, 4224, 128),
+    ("gpu", 1024, 132, 4225, 64),
+    ("gpu", 1024, 132, 100_000, 64),
+    ("gpu", 1024, 132, 1, 256),
+    ("gpu", 128, 132, 1, 128),
+    ("cpu", 1024, 132, 1, 64),
+])  # fmt: skip
+def test_few_tiles_are_shared_by_more_items(kind: str, group: int, units: int, tiles: int, items: int) -> None:
+    limits = SimpleNamespace(max_compute_units=units)
+    device = SimpleNamespace(kind=kind, max_group=group, cl_device=limits, shape=Shape(lanes=1, items=64, chunks=8))
+    assert blend_items(cast("Device", device), tiles) == items
+
+
+def test_a_gpu_blends_few_tiles_in_larger_groups(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    device, scene = shaped(default_device, 1, 64), HARD["cloud"]()
+    frame = Pipeline.run(device, scene).frame.blended
+    alone = [plane.get() for plane in (frame.image, frame.transmittance, frame.stops)]
+    groups: list[int] = []
+
+    def launch(*arguments: Any) -> None:
+        groups.append(arguments[3])
+        launch_groups(*arguments)
+
+    monkeypatch.setattr(device, "kind", "gpu")
+    monkeypatch.setattr("clsplat.stages.blend.launch_groups", launch)
+    wide = Pipeline.run(device, scene).frame.blended
+    assert groups == [256], "20 tiles for the units of a CPU"
+    for plane, wanted in zip((wide.image, wide.transmittance, wide.stops), alone, strict=True):
+        assert_same_bits(plane.get(), wanted)
 
 
 @pytest.mark.slow

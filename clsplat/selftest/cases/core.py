@@ -29,7 +29,7 @@ from clsplat.selftest.harness import WHITENING_FACTOR, Array, CaseBench, StageOu
 from clsplat.selftest.scenes import evenly, padded
 from clsplat.selftest.synthetic_slots import SLOT_COLOURS, MadeUpSlots, slot_sums
 from clsplat.stages.adam import AdamStep
-from clsplat.stages.blend import blend, blend_grad
+from clsplat.stages.blend import blend, blend_grad, tile_items
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
 from clsplat.stages.duplicate import Pairs, count, duplicate
 from clsplat.stages.project import Projected, Screen, project, project_grad, project_step
@@ -152,14 +152,19 @@ def _ranges(bench: CaseBench) -> StageOutcome:
 
 def _blend(bench: CaseBench) -> StageOutcome:
     device, camera = bench.device, bench.camera
+    items = tile_items(device)
     bench.blended, outcome = bench.twice(
-        lambda: blend(device, bench.work, bench.lists, bench.inputs),
+        lambda: blend(device, bench.work, bench.lists, bench.inputs, items=items),
         lambda blended: [blended.image.get(), blended.transmittance.get(), blended.stops.get()],
     )
     wanted, clear = bench.blend_reference()
     image, transmittance = (cropped(planes, camera)[clear] for planes in outcome.arrays[:2])
     exact = (wanted.image[clear], wanted.transmittance[clear])
-    return outcome.compared({"image": (image, exact[0]), "transmittance": (transmittance, exact[1])})
+    # A GPU shares so small a frame's tiles among more work-items, with the same bits.
+    other = blend(device, bench.work, bench.lists, bench.inputs)
+    wrong = int((other.image.get() != outcome.arrays[0]).sum())
+    parts = {"image": (image, exact[0]), "transmittance": (transmittance, exact[1])}
+    return outcome.compared(parts, values_in_larger_groups=wrong)
 
 
 def _pixels(bench: CaseBench, planes: Array) -> Float64:
