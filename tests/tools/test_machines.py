@@ -60,6 +60,23 @@ def test_each_machine_has_its_own_drivers(tmp_path: Path) -> None:
     assert environment_of(made["pypi-pocl-haswell"], tmp_path)["CLSPLAT_INTERPRETER"] == str(tmp_path / "python")
 
 
+def test_a_short_table_has_every_machine_and_few_smoke_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: list[Machine] = []
+
+    def run(rows: list[Machine], **_: object) -> int:
+        ran.extend(rows)
+        return 0
+
+    monkeypatch.setattr(machines, "look", lambda: Found(**ALL))  # type: ignore[arg-type]
+    monkeypatch.setattr(machines, "run_all", run)
+    assert machines.main(["--short"]) == 0
+    steps = {row.name: [step.name for step in row.steps] for row in ran}
+    assert steps.keys() == rows().keys()
+    assert {name for name, names in steps.items() if machines.SMOKE in names} == set(machines.SHORT_SMOKE)
+    assert steps["intel"] == ["short self-test"]
+    assert steps["ascii"] == ["short self-test", "scene", "ten steps"]
+
+
 def test_nothing_of_ours_gets_into_a_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CLSPLAT_TRUST_DRIVER", "1")
     monkeypatch.setenv("OCL_ICD_VENDORS", "/ours")

@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Table of simulated machines: each runs the short self-test of its drivers and the smoke tests.
 
-    .venv/bin/python tools/ci/machines.py [--list] [--only NAME,...] [--full NAME,...] [--jobs N] [--markdown]
+    .venv/bin/python tools/ci/machines.py [--list] [--only NAME,...] [--full NAME,...] [--short] [--jobs N]
+        [--markdown]
 
 All machines share this Python environment. They differ in drivers, environment variables, user, and the place of the
 home folder, which is new, so that every driver is used for the first time. --list prints the machines' names, --only
-selects some, --full runs all of tools/test on some, --jobs sets how many run at once, and --markdown prints the table
-for docs/machines.md.
+selects some, --full runs all of tools/test on some, --short runs the smoke tests on few of them, --jobs sets how many
+run at once, and --markdown prints the table for docs/machines.md.
 
 PyPI's PoCL and Intel's runtime are found in this environment, Debian's PoCL through CLSPLAT_DEBIAN_POCL (its
 libpocl.so) or in the system's list, Rusticl through CLSPLAT_RUSTICL (its libRusticlOpenCL.so), and Debian's QEMU
@@ -52,6 +53,11 @@ TRAIN_LIMIT = 120
 """Time limit in seconds of ten steps on a tiny scene. The self-test has already built most of the kernels."""
 EMULATED = 4
 """Factor of the time limits on an emulated processor: the short self-test takes 80 s of a core instead of 20."""
+SMOKE = "smoke tests"
+"""Name of the step of the smoke tests."""
+SHORT_SMOKE = ("pypi-pocl-1-thread", "debian-pocl-sse2", "intel-corei7", "rusticl", "not-root", "odd-paths")
+"""Machines with smoke tests in a short table: the least processor of each compiler, another user, odd paths. CI, which
+makes that table, has already run all tests on the drivers of the others."""
 TAIL = 25
 """Number of last lines of a failed step's output that are printed."""
 
@@ -247,7 +253,7 @@ def smoke(*, stages: bool = True) -> Step:
     files = sorted(path for path in (ROOT / "tests").rglob("test_*.py") if "mark.smoke" in path.read_text("utf-8"))
     names = [str(path.relative_to(ROOT)) for path in files if stages or path.parent.name != "stages"]
     command = (*pytest, "-m", "smoke", "-k", OWN_SHAPE, *names)
-    return Step("smoke tests", command, SMOKE_LIMIT, without="no tests ran")
+    return Step(SMOKE, command, SMOKE_LIMIT, without="no tests ran")
 
 
 def full() -> Step:
@@ -517,6 +523,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--list", action="store_true", help="print the names and what each is")
     parser.add_argument("--only", default="", metavar="NAME,...", help="these alone")
     parser.add_argument("--full", default="", metavar="NAME,...", help="tools/test too on these")
+    parser.add_argument("--short", action="store_true", help="smoke tests on few of them")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="so many at once")
     parser.add_argument("--markdown", action="store_true", help="print the table as Markdown")
     given = parser.parse_args(arguments)
@@ -529,11 +536,18 @@ def main(arguments: Sequence[str]) -> int:
         parser.error(f"--jobs {given.jobs}: expected at least 1")
     rows = [row for row in rows if not wanted or row.name in wanted]
     rows = [replace(row, steps=(*row.steps, full())) if row.name in whole else row for row in rows]
+    if given.short:
+        rows = [row if row.name in SHORT_SMOKE else without_smoke(row) for row in rows]
     if given.list:
         for row in rows:
             print(f"{row.name}: {row.purpose}" + (f" (not run: {row.missing})" if row.missing else ""))
         return 0
     return run_all(rows, jobs=given.jobs, markdown=given.markdown)
+
+
+def without_smoke(machine: Machine) -> Machine:
+    """A machine that does not run the smoke tests."""
+    return replace(machine, steps=tuple(step for step in machine.steps if step.name != SMOKE))
 
 
 def _named(rows: Sequence[Machine], flag: str, text: str) -> set[str]:
