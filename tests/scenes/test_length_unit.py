@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,11 +26,11 @@ STREET = 40.0
 """Length of a street of cameras, in distances of what they look at."""
 
 
-def street(folder: Path, *, factor: float = 1.0) -> Scene:
+def street(folder: Path, *, length: float = STREET, factor: float = 1.0) -> Scene:
     """Copies of the tiny scene in a row, each with its own photographs and points."""
-    one = load_scene(write_scene(folder), test_every=0)
+    one = load_scene(folder if folder.exists() else write_scene(folder), test_every=0)
     views, points = [], []
-    for index, offset in enumerate(np.linspace(0, STREET * DISTANCE, 5)):
+    for index, offset in enumerate(np.linspace(0, length * DISTANCE, 5)):
         place = np.array([offset, 0, 0])
         for view in one.views:
             camera = view.camera
@@ -53,6 +54,14 @@ def test_a_scene_that_cameras_surround_keeps_the_extent(tmp_path: Path) -> None:
     scene = load_scene(write_scene(tmp_path / "scene"))
     assert length_unit_of(scene) == scene.extent == scene.length_unit
     assert prepared(scene, short()).length_unit == scene.extent
+
+
+def test_the_unit_grows_with_the_street_up_to_the_depth(tmp_path: Path) -> None:
+    """No threshold: photographs further apart never have a much smaller unit."""
+    units = [length_unit_of(street(tmp_path / "scene", length=length)) for length in (0.4, 1.6, 2.8, 4, 8, STREET)]
+    # the nearest points of neighbours are in the photographs too, so that depths vary by the radius of 1
+    assert all(later > 0.9 * unit for unit, later in itertools.pairwise(units)), units
+    assert units[-1] == pytest.approx(units[-2], rel=0.1)
 
 
 def test_a_scene_without_points_keeps_the_extent(tmp_path: Path) -> None:

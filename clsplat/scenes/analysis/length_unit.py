@@ -12,13 +12,10 @@ from clsplat.scenes.dataset import nearest_around, occlusion_cell, pixels_of
 from clsplat.scenes.readers import colmap
 from clsplat.scenes.scene import Scene, View
 
-DEPTH_TO_UNIT = 1.1
-"""The unit, as a multiple of the median depth. The extent is the same multiple of the cameras' distance from their
-middle, so that both agree where cameras surround a small object."""
-MAX_UNIT_PER_EXTENT = 0.25
-"""The unit is used only if it is less than this fraction of the extent.
+DEPTH_TO_UNIT = 1.4
+"""The largest length unit, as a multiple of the median depth.
 
-For a scene that cameras surround, depths are about as large as the extent. Such a scene keeps the authors' unit.
+The extent of the orbited scenes that were tried is at most 1.29 times the median depth. They keep it.
 """
 NEAR_PER_EXTENT = 1e-6
 """Least depth of a point that counts, as a fraction of the extent."""
@@ -29,14 +26,14 @@ MAX_SAMPLED_POINTS = 100_000
 
 
 def length_unit_of(scene: Scene) -> float:
-    """Length unit in world units: 1.1 times the median depth if that is under a quarter of the extent, else the extent.
+    """Length unit in world units: the extent, but at most `DEPTH_TO_UNIT` times the median depth.
 
     The depth is the median over the training photographs of the median depth of the points that they show. These are
     the points of a COLMAP model's tracks. Without tracks, each cell of a picture shows its nearest point.
     """
     medians = [float(np.median(depths)) for depths in _depths(scene) if len(depths)]
     unit = DEPTH_TO_UNIT * float(np.median(medians)) if medians else np.inf
-    return unit if 0 < unit < MAX_UNIT_PER_EXTENT * scene.extent else scene.extent
+    return min(unit, scene.extent) if unit > 0 else scene.extent
 
 
 def _depths(scene: Scene) -> Iterator[Float64]:
