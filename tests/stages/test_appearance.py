@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""appearance.cl against the float64 twin, and the twin against finite differences."""
+"""The update of photographs' gains and mixes (appearance.cl), and the twins of colour models against differences."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.layouts.columns import READBACK
-from clsplat.reference import appearance as reference
+from clsplat.reference import exposure
 from clsplat.stages.appearance import Gains, step_gains
 
 
@@ -63,8 +63,8 @@ def test_the_twin_against_finite_differences() -> None:
     """The loss of the render times 2^x against the photograph, exposed as the model is, has this gradient at x = 0."""
     rng = np.random.default_rng(2)
     image, photograph, logs = rng.random((4, 5, 3)), rng.random((4, 5, 3)), rng.uniform(-1, 1, 3)
-    target = reference.removed(photograph, logs)
-    by_logs = reference.gradient(image, 2 * (image - target))
+    target = exposure.developed(photograph, logs, np.zeros(0), np.zeros((4, 5)))
+    by_logs = exposure.terms(image, 2 * (image - target), np.zeros((4, 5))).sum(axis=(0, 1))
     step = 1e-6 * np.eye(3)
     numeric = [
         (np.square(image * np.exp2(d) - target) - np.square(image * np.exp2(-d) - target)).sum() / 2e-6 for d in step
