@@ -64,7 +64,7 @@ class ColourModel:
 
     @property
     def lens_update(self) -> GainEntries:
-        """The lens's entries in column sums, which follow those of the photograph."""
+        """The update of a lens's entries. Their sums follow the photograph's; their mean over all lenses is kept."""
         return GainEntries(first_row=self.entries, centred=False)
 
 

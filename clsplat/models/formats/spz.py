@@ -235,7 +235,7 @@ def _next(stream: Stream, count: int, path: Path, what: str) -> bytes:
 
 
 def _rest(stream: Any, path: Path) -> bytes:
-    """Bytes after the Gaussians, at most MAX_EXTENSION_BYTES + 1. At its end gzip verifies its checksum."""
+    """Bytes after the Gaussians, at most MAX_EXTENSION_BYTES + 1. A read to the end also verifies gzip's checksum."""
     with _decompressing(path, "at its end"):
         return bytes(stream.read(MAX_EXTENSION_BYTES + 1))
 

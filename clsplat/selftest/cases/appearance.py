@@ -16,7 +16,7 @@ from clsplat.arrays import Float32, Float64
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.reference import appearance as reference
-from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly, fresh_readback, read_of
+from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly, fresh_readback, read_of
 from clsplat.selftest.cases.loss import random_pictures
 from clsplat.selftest.harness import CaseBench, cropped, planes_of
 from clsplat.selftest.scenes import evenly
@@ -135,32 +135,32 @@ def _pictures_read(given: Inputs, target: DeviceArray, gradient: DeviceArray) ->
     return {"target": cropped(planes[:3], given.size), "alpha": planes[3], "gradient": by_image}
 
 
-def moment(values: Float64) -> Wanted:
+def moment(values: Float64) -> Expected:
     """A moment of Adam. The bound: beta2 in float32 is off by 1e-8, which is 1e-5 of 1 - beta2 = 1e-3."""
-    return Wanted(values, 3e-5, np.abs(values).max())
+    return Expected(values, 3e-5, np.abs(values).max())
 
 
-def stepped(values: Float64, rate: float | Float64) -> Wanted:
+def stepped(values: Float64, rate: float | Float64) -> Expected:
     """Values after a step of Adam. The bound: beta2 is 1e-5 of a step, and a sum of 16 floats may nearly cancel."""
-    return Wanted(values, 1e-4, rate + 1e-2 * np.abs(values))
+    return Expected(values, 1e-4, rate + 1e-2 * np.abs(values))
 
 
-def _developed(model: ColourModel, given: Inputs, squared: Float64) -> Wanted:
+def _developed(model: ColourModel, given: Inputs, squared: Float64) -> Expected:
     """The photograph without its colours."""
     twin = import_module(f"clsplat.reference.{model.stem}")
     photograph, entries, lenses = given.wide("photograph", "entries", "lenses")
     own, lens = entries[given.taken.photograph], lenses[given.taken.lens]
     wanted = twin.developed(photograph, own, lens, squared)
     if model.sums == GAIN_ENTRIES:
-        return Wanted(wanted, 3e-7, wanted)  # two roundings: 2^log and a quotient
+        return Expected(wanted, 3e-7, wanted)  # two roundings: 2^log and a quotient
     white, none = np.ones_like(photograph), np.zeros_like(own)
     octaves, most = (np.log2(twin.developed(white, none, each, squared)) for each in (lens, -np.abs(lens)))
     largest = np.maximum(np.abs(wanted), photograph / np.exp2(own[:GAIN_ENTRIES])).max(axis=2, keepdims=True)
     # a few roundings for each octave of the lens
-    return Wanted(wanted, 1.2e-6, largest * (0.4 + most), np.abs(octaves) < MAX_FALLOFF_OCTAVES)
+    return Expected(wanted, 1.2e-6, largest * (0.4 + most), np.abs(octaves) < MAX_FALLOFF_OCTAVES)
 
 
-def _twin(model: ColourModel, given: Inputs, got: Arrays) -> dict[str, Wanted]:
+def _twin(model: ColourModel, given: Inputs, got: Arrays) -> dict[str, Expected]:
     image, by_image, entries, start, pull, lenses, of_entries, of_lenses = given.wide(
         *("image", "by_image", "entries", "start", "pull", "lenses", "of_entries", "of_lenses")
     )
@@ -186,10 +186,10 @@ def _twin(model: ColourModel, given: Inputs, got: Arrays) -> dict[str, Wanted]:
     return {
         "target": _developed(model, given, squared),
         # a few roundings of partial sums, and of distances, relative to the sum of magnitudes
-        "by gains": Wanted(sums[:GAIN_ENTRIES], 1e-6, sizes[:GAIN_ENTRIES]),
-        "by the rest": Wanted(sums[GAIN_ENTRIES:], 2e-6, sizes[GAIN_ENTRIES:]),
+        "by gains": Expected(sums[:GAIN_ENTRIES], 1e-6, sizes[:GAIN_ENTRIES]),
+        "by the rest": Expected(sums[GAIN_ENTRIES:], 2e-6, sizes[GAIN_ENTRIES:]),
         "entries": stepped(after, rates),
-        "gains": Wanted(np.exp2(after), 1e-5, np.exp2(after), np.broadcast_to(is_gain, after.shape)),
+        "gains": Expected(np.exp2(after), 1e-5, np.exp2(after), np.broadcast_to(is_gain, after.shape)),
         "first": moment(first),
         "second": moment(second),
         "start": exactly(given.start),
