@@ -58,7 +58,7 @@ COORDINATE_SYSTEM_SIGNS: tuple[Signs, ...] = (
     *(RUB_SIGNS, (-1, 1, -1), (1, 1, -1), (-1, -1, -1), RUB_SIGNS),  # unspecified, LDB, RDB, LUB, RUB
     *((-1, 1, 1), (1, 1, 1), (-1, -1, 1), (1, -1, 1)),  # LDF, RDF, LUF, RUF
 )
-"""Signs between clsplat's axes and those of each value of the coordinate system extension. Larger values have z up."""
+"""Signs between clsplat's axes and a file's, by value of its coordinate system extension. Larger values have z up."""
 MAX_EXTENSION_BYTES = 1 << 20
 MAX_ZSTD_WINDOW_BYTES = 1 << 27
 """Largest window in bytes that a Zstandard frame may require: the default limit of the Zstandard library."""

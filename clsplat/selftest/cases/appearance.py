@@ -146,7 +146,7 @@ def stepped(values: Float64, rate: float | Float64) -> Expected:
 
 
 def _developed(model: ColourModel, given: Inputs, squared: Float64) -> Expected:
-    """The photograph without its colours."""
+    """The expected photograph after gains, other entries and the lens are removed."""
     twin = import_module(f"clsplat.reference.{model.stem}")
     photograph, entries, lenses = given.wide("photograph", "entries", "lenses")
     own, lens = entries[given.taken.photograph], lenses[given.taken.lens]

@@ -207,7 +207,7 @@ def random_scene(rng: Generator, count: int) -> Inputs:
 
 
 def _launch_penalties(device: Device, work: Workspace, given: Inputs) -> Read:
-    """Compute the gradient of the penalties alone: that of the loss is zero."""
+    """Compute the gradient of the penalties alone: the loss's gradient is zero."""
     model, camera_array = upload_gaussians(device, given.gaussians), upload(device, pack_camera(given.camera))
     projected = project(device, work, model, given.camera, camera_array)
     gradients = allocate_gaussians(device, model.count, model.coefficients, zero=True)
