@@ -47,7 +47,7 @@ CLIPPED_OPACITY_SHARE = (1e-3, 0.02)
 """Values are opacities of a neural network, clipped at 1, if at least the second fraction of them is within the first
 distance of 1. Logits do not cluster there."""
 PERCENTAGE_MAXIMA = (40.0, 100.0)
-"""Range of the largest opacity in percent. If the values were levels from 0 to 255, no opacity would exceed 0.4."""
+"""Whole numbers whose largest is in this range are percentages. As levels from 0 to 255, all would be below 0.4."""
 ZERO_SCALE_LOG_LIMIT = float(np.log(values.MIN_SCALE)) + 1
 """Log scales below this stand for scales of 0, and do not show how the other scales are encoded."""
 LENGTH_SKEW_RATIO = 3.0
