@@ -1,40 +1,19 @@
-// Exposure and white balance of photographs: a gain for each channel, its gradient, and its update by Adam.
+// Appearance of photographs: the update by Adam of their gains and colour mixes, or of the vignettes of lenses, from
+// column sums of the gradient (shared/develop.h).
 //
-// Owner: A work-item owns a pixel (remove_gains), sixteen pixels of a column (gain_sums), a column of these sums
-//   (column_sums), or one entry of one photograph (move_gains, centre_gains). Sums are added in the same order on every
-//   device. Built with one lane.
-// Launch: Grids of stride x rows, stride x tiles_y and stride x sums; a work-item for each of the `count` entries.
-// Buffers: Planes (3, rows, stride) of colour, or the loss's gradient with respect to it. logs, start, first, second,
-//   moved, gains (photographs, entries): the first three entries are base-2 logs of gains, the rest are colour mixes
-//   (ppisp.cl). begins (photographs + 1), others, weights: rows of a sparse matrix. partials (sums, tiles_y, stride);
-//   columns (sums, stride), where the photograph's entries begin at row `at`. Shapes are above each kernel.
+// Owner: A work-item owns a column of the partial sums (column_sums), or one entry of one photograph or lens
+//   (move_gains, centre_gains). Sums are added in the same order on every device. Built with one lane.
+// Launch: A grid of stride x sums; a work-item for each of the `count` entries.
+// Buffers: logs, start, first, second, moved, gains (photographs, entries): the first three entries are base-2 logs of
+//   gains, the rest are colour mixes (ppisp.cl). begins (photographs + 1), others, weights: rows of a sparse matrix.
+//   partials (sums, tiles_y, stride); columns (sums, stride), where the photograph's entries begin at row `at`. Shapes
+//   are above each kernel.
 // Equations: docs/gradients.md, "Appearance".
 #include "shared/math.h"
 #include "shared/lanes.h"
 
 #define MOST_LOG 16.0f
 #define MOST_MIX 0.2f // limit of a mix: the matrix of six mixes is invertible up to it
-
-// gains, target -> target: the photograph divided by its gains, as if it had the model's exposure.
-__kernel void remove_gains(const int photograph, const int stride, const int plane, __global const float *gains,
-                           __global float *target) {
-  const size_t at = (size_t)stride * get_global_id(1) + get_global_id(0);
-  for (int c = 0; c < 3; ++c) target[(size_t)plane * c + at] /= gains[3 * photograph + c];
-}
-
-// image, gradient with respect to image -> partials: sums of the gradient with respect to the logs, divided by ln 2.
-__kernel void gain_sums(const int height, const int stride, const int plane, const int tiles_y,
-                        __global const float *image, __global const float *gradient, __global float *partials) {
-  const int x = get_global_id(0), y0 = get_global_id(1) * TILE, y1 = min(y0 + TILE, height);
-  for (int c = 0; c < 3; ++c) {
-    float sum = 0.0f;
-    for (int y = y0; y < y1; ++y) {
-      const size_t at = (size_t)plane * c + (size_t)stride * y + x;
-      sum = fma1(image[at], gradient[at], sum);
-    }
-    partials[((size_t)tiles_y * c + get_global_id(1)) * stride + x] = sum;
-  }
-}
 
 // partials -> columns.
 __kernel void column_sums(const int stride, const int tiles_y, __global const float *partials,

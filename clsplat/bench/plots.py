@@ -59,7 +59,7 @@ def check_plot(path: Path) -> None:
 
 
 def plot_files(path: Path) -> tuple[Path, Path]:
-    """Paths of the plot of exact switches and of the plot of approximate settings, in the folder of `path`."""
+    """Paths of two plots in the folder of `path`: exact switches, and approximate settings."""
     switches, error = (path.with_name(f"{path.stem}-{kind}{path.suffix}") for kind in ("switches", "error"))
     return switches, error
 
@@ -73,7 +73,7 @@ def plot_settings(path: Path, result: Mapping[str, Any], title: str) -> tuple[Pa
 
 
 def _draw_switches(result: Mapping[str, Any], title: str) -> Any:
-    """Bar chart of the times of a frame and of a step without each exact switch, divided by the times with all."""
+    """Bar chart of the slowdown of a frame and a step if one exact switch is off, relative to all switches on."""
     exact = _exact_point(result)
     rows = []
     if exact is not None:

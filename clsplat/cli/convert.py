@@ -171,7 +171,7 @@ def run(verb: ConvertVerb, services: Services) -> int:
     save(verb.target, edited, comments=comments, progress=StageProgress(after=SILENT_WRITE_SECONDS), **options)
     if space != colour_space(verb.target):
         warn(f"{verb.target}: {target_format.name} cannot store the colour space, which is {space}")
-    read = load(verb.target, doubts=False)  # no warnings: they were printed for the source already
+    read = load(verb.target, check_encoding=False)  # no warnings: they were printed for the source already
     if not isclose(read.near, edited.near, rel_tol=NEAR_PLANE_RELATIVE_TOLERANCE):
         warn(
             f"{verb.target}: {target_format.name} cannot store the near plane, which is {edited.near:.4g}; readers "

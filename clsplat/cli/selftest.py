@@ -116,7 +116,7 @@ def _bug_report(records: list[dict[str, object]]) -> dict[str, object]:
 
 
 def times(device: str) -> dict[str, object]:
-    """Times of a device in a view of the demo's scene: what `clsplat bench` measures, or `failed` with the reason."""
+    """Times by `clsplat bench` of a view of the demo's scene on a device; if it fails, `failed` with the reason."""
     from clsplat.bench.stages import bench
     from clsplat.bench.workload import Subject
     from clsplat.demo.measured_view import measured_view

@@ -259,8 +259,8 @@ class DeepConfig:
     """Slices of a deep EXR."""
 
     bins: int = 16
-    """Maximum number of slices by depth, which are the samples of a pixel. Each pixel has its own slices, at the depths
-    that contribute its light."""
+    """Maximum number of depth slices of a pixel, which are its samples in the file. Each pixel has its own slices, at
+    the depths that contribute its light."""
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value is invalid."""

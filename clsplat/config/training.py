@@ -315,8 +315,8 @@ class TrainConfig:
     """Refine focal lengths and principal points with the model. Photographs with the same lens share them. refined/
     in the run gets them. For photographs without distortion; not with batches."""
     lens_reach: float = 2.0
-    """Approximate limit of the change of the focal length, or the principal point, over a training, in hundredths of
-    the focal length."""
+    """Approximate limit, over a training, of the change of the focal length and the principal point, in percent of the
+    focal length."""
     refine_gate: float = 1.0
     """Tolerated loss of the held-out views' mean PSNR, in decibels. If the PSNR is below its best by more than this in
     two measurements in a row, training goes back to the best cameras and stops refining. At most 8 views are

@@ -22,8 +22,8 @@ COEFFICIENTS = 16
 def measured_view(count: int = MEASURED_GAUSSIANS) -> tuple[Gaussians, Camera, NDArray[np.uint8]]:
     """Gaussians on the surfaces of the demo's scene, the camera of its first photograph, and the photograph.
 
-    The Gaussians are those with which a training from so many points would start, with room for all SH degrees. A
-    surface has as many as its share of the scene's texels.
+    A training from `count` points would start with these Gaussians. They have room for all SH degrees. Each surface has
+    a share of them in proportion to its texels.
     """
     surfaces = still_life()
     bake(surfaces, seed=0)

@@ -144,8 +144,7 @@ class Warp:
         return max(JACOBIAN_CLAMP_HALF_FRAMES, float((2 * beyond / size).max()))
 
     def of_window(self, camera: Camera) -> tuple[Float64, Camera | None]:
-        """Positions (k height, k width, 2) of the samples of a picture, and the window of the straight frame that
-        contains them.
+        """Positions (k height, k width, 2) of a picture's samples in the straight frame, and the window around them.
 
         The window is None if nothing is visible.
         """

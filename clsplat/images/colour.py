@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Conversion between the colour spaces of a job: the model's, a linear one, and that of the output files.
+"""Conversion between a job's three colour spaces: of the model, linear, and of the output files.
 
 Gaussians are blended in the colour space of their training photographs. Operations that add light (filters, shutter,
 lens) work on linear values. OpenColorIO converts the output, by default with the configuration built into OpenImageIO.

@@ -64,7 +64,7 @@ class ListedPixels:
     """An image from projected Gaussians and tile lists. Until it is deleted, it keeps memory for its gradient.
 
     listing: function that makes the tile lists, in arrays of the workspace that it is given.
-    The other arguments are those of `PixelPass`.
+    gaussians, size, background, alpha_max, backward: as in `PixelPass`.
     """
 
     def __init__(

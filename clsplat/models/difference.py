@@ -26,7 +26,7 @@ ERROR_UNITS = {
 def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
     """Largest and mean error of each attribute in ERROR_UNITS, over all Gaussians.
 
-    The error of a position is a distance, that of a rotation an angle, otherwise that of the worst component. A scale
+    Position errors are distances, and rotation errors angles. Otherwise the worst component counts. A scale
     error is a fraction of the Gaussian's largest scale, because formats clamp the thickness of very thin discs. SH
     coefficients that one model lacks count as 0.
 

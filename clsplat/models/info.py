@@ -17,7 +17,7 @@ from clsplat.camera import DEFAULT_NEAR_PLANE
 from clsplat.errors import warn
 from clsplat.files.documents import is_file
 from clsplat.gaussians import Gaussians
-from clsplat.models.codec import soundness
+from clsplat.models.codec import repair
 from clsplat.models.codec import values as packing
 from clsplat.models.formats import Format, resolve
 
@@ -92,17 +92,17 @@ def _summary(blocks: Iterator[Gaussians], path: Path) -> ModelStatistics:
     not_finite = unturned = degree = used = 0
     for block in blocks:
         degree, origin = block.sh_degree, block.origin
-        soundness.mend(block)
-        good = soundness.finite_rows(block)
+        repair.replace_infinities(block)
+        good = repair.finite_rows(block)
         not_finite += int((~good).sum())
-        unturned += int((good & soundness.without_turn(block)).sum())
+        unturned += int((good & repair.without_rotation(block)).sum())
         used = max([used, *(band for band in range(1, degree + 1) if block.sh[:, band**2 : (band + 1) ** 2].any())])
         parts.append([array[good] for array in (block.means, block.log_scales, block.opacity_logits)])
     m, s, o = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     finite: ValueStatistics = {}
     if len(m):
-        for doubt in soundness.doubts(o, s):
-            warn(f"{path}: {doubt}")
+        for warning in repair.encoding_warnings(o, s):
+            warn(f"{path}: {warning}")
         finite = {
             "bounds": _bounds(m),
             "scale": _percentiles(np.exp(np.minimum(s.astype(np.float64), MAX_FLOAT64_LOG))),

@@ -76,7 +76,7 @@ class Track(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Changing:
-    """`Track` of a `ModelSeries`: the placements of `inner` with their `frame` set."""
+    """`Track` of a model that changes with time: places it as `inner` does, in its state at the shot's frame."""
 
     inner: Track
 

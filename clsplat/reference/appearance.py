@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gains of photographs, their gradient and their update by Adam: float64 twin of kernels/appearance.cl."""
+"""Entries of photographs and lenses: distances in a picture, pull, and update by Adam.
+
+Float64 twin of kernels/appearance.cl and kernels/shared/develop.h.
+"""
 
 from __future__ import annotations
 
@@ -8,19 +11,11 @@ import numpy as np
 from clsplat.arrays import Float64
 
 
-def removed(photograph: Float64, logs: Float64) -> Float64:
-    """Divide the photograph (H, W, 3) by its gains 2^logs (3,)."""
-    result: Float64 = photograph / np.exp2(logs)
-    return result
-
-
-def gradient(image: Float64, by_image: Float64) -> Float64:
-    """Gradient (3,) of a loss of the product image times 2^logs, with respect to logs at 0.
-
-    by_image: (H, W, 3), the gradient of the loss with respect to the product.
-    """
-    by_logs: Float64 = np.log(2) * (image * by_image).sum(axis=(0, 1))
-    return by_logs
+def spread(width: int, height: int, centre: tuple[float, float]) -> Float64:
+    """The squared distances (H, W) from the principal point, in half diagonals. centre: in pixels."""
+    x, y = np.arange(width) + 0.5 - centre[0], np.arange(height) + 0.5 - centre[1]
+    squared: Float64 = 4 * (x**2 + y[:, None] ** 2) / (width**2 + height**2)
+    return squared
 
 
 def pull(logs: Float64, start: Float64, weights: Float64) -> Float64:

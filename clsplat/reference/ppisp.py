@@ -21,13 +21,6 @@ def unmixing(mixes: Float64) -> Float64:
     return matrix
 
 
-def spread(width: int, height: int, centre: tuple[float, float]) -> Float64:
-    """The squared distances (H, W) from the principal point, in half diagonals. centre: in pixels."""
-    x, y = np.arange(width) + 0.5 - centre[0], np.arange(height) + 0.5 - centre[1]
-    squared: Float64 = 4 * (x**2 + y[:, None] ** 2) / (width**2 + height**2)
-    return squared
-
-
 def light(vignette: Float64, squared: Float64) -> Float64:
     """The fraction of light (H, W) that a lens with this vignette (3,) transmits at these squared distances."""
     result: Float64 = np.exp2(squared * (vignette[0] + squared * (vignette[1] + squared * vignette[2])))
@@ -41,14 +34,14 @@ def developed(photograph: Float64, entries: Float64, vignette: Float64, squared:
     return result
 
 
-def gradient(image: Float64, by_image: Float64, squared: Float64) -> Float64:
-    """Gradient (12,) of a loss with respect to the entries and the vignette, where these are 0.
+def terms(image: Float64, by_image: Float64, squared: Float64) -> Float64:
+    """Terms (H, W, 12) of the gradient of a loss with respect to the entries and the vignette, where these are 0.
 
     by_image: (H, W, 3), the gradient of the loss with respect to the image after they are applied.
     """
     each = image * by_image
     others = [image[:, :, (c + 1 + k) % 3] - image[:, :, c] for c in range(3) for k in range(2)]
-    mixes = [(other * by_image[:, :, place // 2]).sum() for place, other in enumerate(others)]
-    powers = [(squared**power * each.sum(axis=2)).sum() for power in (1, 2, 3)]
-    result: Float64 = np.concatenate([np.log(2) * each.sum(axis=(0, 1)), mixes, np.log(2) * np.array(powers)])
+    mixes = [other * by_image[:, :, place // 2] for place, other in enumerate(others)]
+    powers = [np.log(2) * squared**power * each.sum(axis=2) for power in (1, 2, 3)]
+    result: Float64 = np.concatenate([np.log(2) * each, np.stack([*mixes, *powers], axis=-1)], axis=-1)
     return result

@@ -235,7 +235,7 @@ class Scene:
 
     def check_pictures(self) -> None:
         """Decode every picture once, so that a truncated one is reported before training. Sets `digests` and
-        `glances`. If pictures are decoded later (`decoded_first`), it only sets `digests`.
+        `thumbnails`. If pictures are decoded later (`decoded_first`), it only sets `digests`.
 
         Raises InputError for the first picture in the order of names that does not decode.
         """
@@ -244,10 +244,10 @@ class Scene:
             return
         found = self._of_each(lambda view: (_digest(view), view.check()), self.views)
         self.__dict__["digests"] = {name: digest for name, (digest, _) in found.items()}
-        self.__dict__["glances"] = {name: glance for name, (_, glance) in found.items()}
+        self.__dict__["thumbnails"] = {name: thumbnail for name, (_, thumbnail) in found.items()}
 
     @cached_property
-    def glances(self) -> dict[str, Thumbnail]:
+    def thumbnails(self) -> dict[str, Thumbnail]:
         """Thumbnail of each sampled view's picture. The keys are the views' names. Raises InputError like
         `check_pictures`."""
         return self._of_each(View.check, self.sampled_views)

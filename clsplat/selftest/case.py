@@ -24,7 +24,7 @@ from clsplat.selftest.harness import Array, CaseBench, StageOutcome, joined
 Arrays = dict[str, Array]
 Read = Callable[[], Arrays]
 """Function that reads the results of a launch, by name."""
-Sure = NDArray[np.bool_] | EllipsisType
+Mask = NDArray[np.bool_] | EllipsisType
 """Mask of the elements that are compared; `...` compares all."""
 
 
@@ -42,41 +42,41 @@ class Inputs(SimpleNamespace):
 
 
 @dataclass(frozen=True, eq=False)
-class Wanted:
+class Expected:
     """The twin's values of a result, and how to compare them.
 
     bound: the largest error allowed. The reason for it is a comment beside it.
-    of: magnitudes that errors are relative to. None compares by the relative error in the 2-norm of all values.
-    sure: mask of the elements that are compared; the others depend on rounding.
+    magnitudes: errors are relative to these. None compares by the relative error in the 2-norm of all values.
+    compared: mask of the elements that are compared; the others depend on rounding.
     exact: True for results that must be equal, such as integers.
     """
 
     values: Array
     bound: float
-    of: ArrayLike | None = None
-    sure: Sure = ...
+    magnitudes: ArrayLike | None = None
+    compared: Mask = ...
     exact: bool = False
 
     def error_of(self, got: Array) -> float:
-        """The largest error, relative to `of`. For exact results, the number of wrong elements."""
+        """The largest error, relative to the magnitudes. For exact results, the number of wrong elements."""
         if got.shape != self.values.shape:
             return float("inf")
-        found, wanted = got[self.sure], self.values[self.sure]
+        found, wanted = got[self.compared], self.values[self.compared]
         if self.exact:
             return float(np.count_nonzero(found != wanted))
         if not np.isfinite(found).all():
             return float("inf")
         off = np.abs(found.astype(np.float64) - wanted)
-        if self.of is None:
+        if self.magnitudes is None:
             error, scale = np.linalg.norm(off), np.linalg.norm(wanted)
             return float(error / scale) if scale > 0 else float("inf") if error > 0 else 0.0
-        size = np.broadcast_to(np.asarray(self.of, np.float64), self.values.shape)[self.sure]
+        size = np.broadcast_to(np.asarray(self.magnitudes, np.float64), self.values.shape)[self.compared]
         return float((off / np.maximum(size, 1e-30)).max(initial=0.0))
 
 
-def exactly(values: Array) -> Wanted:
+def exactly(values: Array) -> Expected:
     """Values to which a result must be equal."""
-    return Wanted(values, 0.0, exact=True)
+    return Expected(values, 0.0, exact=True)
 
 
 class Deviation(NamedTuple):
@@ -109,7 +109,7 @@ class Case:
     sizes: Sequence[Any]
     random: Callable[[Generator, Any], Inputs]
     launch: Callable[[Device, Workspace, Inputs], Read]
-    twin: Callable[[Inputs, Arrays], Mapping[str, Wanted]]
+    twin: Callable[[Inputs, Arrays], Mapping[str, Expected]]
     frozen: Callable[[CaseBench], Sequence[Inputs]] | None = None
     digested: tuple[str, ...] = ()
     by_shape: bool = True
@@ -118,7 +118,7 @@ class Case:
     def errors(self, device: Device, given: Inputs, work: Workspace | None = None) -> dict[str, Deviation]:
         """Launch the kernels on the inputs. Returns errors and bounds by name."""
         got = self.launch(device, work or Workspace(device), given)()
-        return {name: Deviation(of.error_of(got[name]), of.bound) for name, of in self.twin(given, got).items()}
+        return {name: Deviation(each.error_of(got[name]), each.bound) for name, each in self.twin(given, got).items()}
 
     def outcome(self, bench: CaseBench) -> StageOutcome:
         """The outcome of this case as a stage of the self-test."""
@@ -134,9 +134,13 @@ class Case:
             return [got[name] for name in self.digested]
 
         _, outcome = bench.twice(lambda: self.launch(bench.device, work, given), take)
-        wanted = self.twin(given, got)
-        parts = {name: (got[name][of.sure], of.values[of.sure]) for name, of in wanted.items() if not of.exact}
-        wrong = {name: int(of.error_of(got[name])) for name, of in wanted.items() if of.exact}
+        expected = self.twin(given, got)
+        parts = {
+            name: (got[name][each.compared], each.values[each.compared])
+            for name, each in expected.items()
+            if not each.exact
+        }
+        wrong = {name: int(each.error_of(got[name])) for name, each in expected.items() if each.exact}
         return outcome.compared(parts, **wrong)
 
 

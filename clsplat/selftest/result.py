@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from clsplat.stages.appearance import COLOUR_MODELS
+
 FORWARD_STAGES = ("arithmetic", "project", "duplicate", "sort", "ranges", "blend")
 """Stages that render a frame."""
 CHANNEL_STAGES = ("features", "channels")
@@ -19,8 +21,8 @@ MASK_STAGES = ("masks",)
 """Further stages for training with masks or alpha."""
 BACKWARD_STAGES = ("append", "loss", "blend_grad", "project_grad", "penalties", "adam", "noise", "statistics")
 """Stages that training needs in addition to FORWARD_STAGES."""
-APPEARANCE_STAGES = ("appearance", "ppisp", "grid")
-"""Further stages for training with an appearance model."""
+APPEARANCE_STAGES = (*COLOUR_MODELS, "grid")
+"""Further stages for training with an appearance model, by value of the setting `appearance`."""
 DEPTH_STAGES = ("depth",)
 """Further stages for training with known depths."""
 POSE_STAGES = ("pose",)
@@ -59,11 +61,12 @@ STAGE_BOUNDS_ULP: dict[str, tuple[float, str]] = {
     "adam": (32, "2 measured; one root and one division"),
     "noise": (256, "15 measured; an ulp of o is 16 ulp of 100 (o - dead), and rotated axes cancel"),
     "statistics": (32, "1 measured; one root"),
-    "appearance": (1024, "202 measured; beta2 in float32 is off by 1e-5 of 1 - beta2, 84 ulp; sums of a picture"),
-    "ppisp": (1024, "as appearance"),
-    "grid": (1024, "227 measured; as appearance"),
+    **dict.fromkeys(
+        COLOUR_MODELS, (1024, "202 measured; beta2 in float32 is off by 1e-5 of 1 - beta2, 84 ulp; sums of a picture")
+    ),
+    "grid": (1024, "227 measured; as exposure"),
     "depth": (1024, "as blend_grad"),
-    "pose": (1024, "as appearance; sums of terms of both signs"),
+    "pose": (1024, "as exposure; sums of terms of both signs"),
     "lens": (1024, "19 measured; as pose"),
     "ewa": (1024, "95 measured, in the gradient of quaternions, whose terms cancel; else as project_grad"),
     "harmonics": (64, "10 measured; one root and one division"),

@@ -23,7 +23,7 @@ from clsplat.errors import ClsplatError, InputError, warn
 from clsplat.images.video import VideoWriter
 from clsplat.sequence.finished_frames import is_complete, remove_temporaries, stamp
 from clsplat.sequence.frame_renderer import FrameRenderer, open_frame_renderer
-from clsplat.sequence.job_models import load_cast
+from clsplat.sequence.job_models import load_job_models
 from clsplat.sequence.mattes import mattes_of, names_of
 from clsplat.sequence.task import Record, RenderOptions, Task
 from clsplat.sequence.workers import WRITE_QUEUE_BYTES, Result, encode_frame, encoded, frame_bytes, record_of
@@ -78,11 +78,13 @@ class _Held:
     def renderer_for(self, job: WorkerJob) -> FrameRenderer:
         if self.renderer is None or repr(job) != self.key:
             self.key = self.renderer = None  # frees memory before the next renderer takes some
-            cast = load_cast(Path(job.model))
-            if cast.digest != job.digest:
-                raise InputError(f"{job.model}: has SHA-256 {cast.digest[:12]} on a worker, expected {job.digest[:12]}")
-            model = cast.models if job.placed else cast.one
-            mattes = mattes_of(cast, job.options.channels, job.options.ids_from)
+            job_models = load_job_models(Path(job.model))
+            if job_models.digest != job.digest:
+                raise InputError(
+                    f"{job.model}: has SHA-256 {job_models.digest[:12]} on a worker, expected {job.digest[:12]}"
+                )
+            model = job_models.models if job.placed else job_models.one
+            mattes = mattes_of(job_models, job.options.channels, job.options.ids_from)
             if names_of(mattes) != job.options.mattes:
                 raise InputError(f"{job.model}: has other mattes on a worker than it had when the job began")
             self.renderer = open_frame_renderer(

@@ -146,32 +146,32 @@ class JobModels:
                 warn(f"{path}: has no file of the frame(s) {ranges(missing)}, made from the neighbouring files; {have}")
 
 
-def load_cast(path: Path, transform: KeyedTrack | None = None) -> JobModels:
+def load_job_models(path: Path, transform: KeyedTrack | None = None) -> JobModels:
     """Load the models that MODEL names: a run, a model file, one file per frame, a shot file or a USD stage.
 
     transform: applied to all models.
     Raises InputError for an unreadable file, and for models that differ in colour space or rendering method.
     """
     if is_layout(path):
-        cast = _of_layout(path)
+        job_models = _of_layout(path)
     elif is_sequence(path):
         series, files = open_sequence(path)
         space, track = colour_space(next(iter(files.values()))), Changing(KeyedTrack(str(path)))
         digested = digest_of_name(path)
-        cast = JobModels(path, (series,), (path.stem,), digested, space, (track,), (path,), numbered=(files,))
+        job_models = JobModels(path, (series,), (path.stem,), digested, space, (track,), (path,), numbered=(files,))
     else:
         file = model_file(path)
         stage = read_stage(file) if file.suffix.lower() in USD_SUFFIXES and format_of(file).name == "OpenUSD" else None
         if stage is not None:
-            cast = JobModels(file, stage.models, stage.names, stage.digest, stage.space, stage.tracks)
+            job_models = JobModels(file, stage.models, stage.names, stage.digest, stage.space, stage.tracks)
         else:
-            cast = JobModels(
+            job_models = JobModels(
                 file, (Gaussians.load(file),), (file.stem,), digest(file), colour_space(file), None, (file,)
             )
     if transform is None:
-        return cast
-    inner = cast.tracks or (KeyedTrack(str(path)),)
-    return replace(cast, tracks=tuple(Within(track, transform) for track in inner))
+        return job_models
+    inner = job_models.tracks or (KeyedTrack(str(path)),)
+    return replace(job_models, tracks=tuple(Within(track, transform) for track in inner))
 
 
 @dataclass(frozen=True)

@@ -21,21 +21,21 @@ MAX_MATTE_OBJECTS = 256
 """Limit of objects in a matte. Each takes a plane of floats while a frame is rendered."""
 
 
-def mattes_of(cast: JobModels, channels: Collection[str], ids_from: str = "") -> dict[str, Matte]:
+def mattes_of(models: JobModels, channels: Collection[str], ids_from: str = "") -> dict[str, Matte]:
     """Mattes among the channels, by name.
 
     ids_from: property of the model files that holds semantic ids.
     Raises InputError.
     """
     made = {}
-    if cast.changing and (asked := [name for name in CRYPTOMATTE_CHANNELS if name in channels]):
+    if models.changing and (asked := [name for name in CRYPTOMATTE_CHANNELS if name in channels]):
         raise InputError(
-            f"--channels {asked[0]}: {cast.path} changes over time, expected models whose Gaussians stay the same"
+            f"--channels {asked[0]}: {models.path} changes over time, expected models whose Gaussians stay the same"
         )
     if "objects" in channels:
-        made["objects"] = _objects(cast)
+        made["objects"] = _objects(models)
     if "semantic" in channels:
-        made["semantic"] = _semantic(cast, ids_from)
+        made["semantic"] = _semantic(models, ids_from)
     for name, matte in made.items():
         if len(matte.names) > MAX_MATTE_OBJECTS:
             raise InputError(
@@ -53,24 +53,24 @@ def names_of(mattes: Mapping[str, Matte]) -> tuple[MatteNames, ...]:
     )
 
 
-def _objects(cast: JobModels) -> Matte:
+def _objects(models: JobModels) -> Matte:
     """A matte with one object per model, and one per volume of a model, which takes precedence over the model's."""
-    names, owners = list(cast.names), []
-    for index, model in enumerate(cast.still):
+    names, owners = list(models.names), []
+    for index, model in enumerate(models.still):
         own = np.full(len(model), index, np.int32)
-        for volume in reversed(cast.volumes[index] if cast.volumes else ()):  # the first volume wins
+        for volume in reversed(models.volumes[index] if models.volumes else ()):  # the first volume wins
             own[volume.holds(model)] = len(names)
             names.append(volume.name)
         owners.append(own)
     return Matte(tuple(names), np.concatenate(owners))
 
 
-def _semantic(cast: JobModels, ids_from: str) -> Matte:
+def _semantic(models: JobModels, ids_from: str) -> Matte:
     """A matte with one object for each value of the property."""
-    if not cast.files:
-        raise InputError(f"--ids-from {ids_from}: {cast.path} is a stage, expected PLY files that have the property")
+    if not models.files:
+        raise InputError(f"--ids-from {ids_from}: {models.path} is a stage, expected PLY files that have the property")
     columns: list[NDArray[np.int64]] = []
-    for file, model in zip(cast.files, cast.still, strict=True):
+    for file, model in zip(models.files, models.still, strict=True):
         with unpacked(file) as (opened, form):
             if form.name != "3DGS PLY":
                 found = f"{file} is {form.name}, expected a 3DGS PLY that has the property"

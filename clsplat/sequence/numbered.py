@@ -31,7 +31,7 @@ def open_sequence(pattern: Path) -> tuple[ModelSeries, dict[int, Path]]:
         own = colour_space(files[index])
         if own != space:
             raise InputError(f"{files[index]}: is of the colour space {own}, expected {space} as {files[0]} is")
-        return load(files[index], doubts=index == 0)  # warnings about one file apply to all
+        return load(files[index], check_encoding=index == 0)  # warnings about one file apply to all
 
     return ModelSeries([float(number) for number in found], read, str(pattern)), found
 

@@ -39,7 +39,7 @@ MIN_DETAIL_SIZE_QUANTILE, MIN_DETAIL_SIZE_RATIO = 0.02, 1e-4
 """Sizes below which smaller Gaussians do not show more detail: this quantile of all sizes, and this fraction of the
 model's radius. Some files have Gaussians of size 0."""
 SCENE_RADIUS_MARGIN = 1.3
-"""Radius of the part of a scene that is shown, relative to the radius of its most detailed region."""
+"""Radius that an orbit shows, relative to the radius of the scene's most detailed region."""
 ORBIT_FRAMING_MARGIN = 1.1
 """Radius that a picture shows, relative to the subject's radius: a margin for strays."""
 RING_ELEVATIONS_RADIANS = (math.radians(20.0), math.radians(5.0), math.radians(40.0))

@@ -17,7 +17,7 @@ import numpy as np
 from clsplat.errors import examples, warn
 from clsplat.files.documents import digest
 from clsplat.gaussians import Gaussians
-from clsplat.models.codec.soundness import sound
+from clsplat.models.codec.repair import repaired
 from clsplat.models.formats.usd import (
     GAUSSIAN_PRIM_TYPE,
     gaussians_of,
@@ -141,7 +141,7 @@ def _model_of(path: Path, stage: Any, prim: Any, space: str) -> Gaussians | Mode
 
     def read(code: Any, held: Any = stage) -> Gaussians:  # noqa: ARG001
         with readable(path):
-            return sound(gaussians_of(where, prim, code, space), where)
+            return repaired(gaussians_of(where, prim, code, space), where)
 
     if not times:
         return read(Usd.TimeCode.EarliestTime())

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches appearance.cl: a photograph's gains, their gradient and their update by Adam."""
+"""Launches appearance.cl and a colour model's kernels: photographs without their colours, gradient, and update.
+
+A new colour model is a row of COLOUR_MODELS, a kernel file and its twin, both of the row's name.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,9 +22,80 @@ from clsplat.layouts.columns import TILE
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-GAINS_PIXEL_BYTES = 2
-"""Bytes of the partial sums per pixel, padding included."""
+GAIN_ENTRIES = 3
+"""Number of gains of a photograph, its first entries."""
 APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON = 0.9, 0.999, 1e-15
+
+
+@dataclass(frozen=True)
+class ColourModel:
+    """An appearance model that removes a photograph's own colours pixel by pixel.
+
+    kernels/STEM.cl has its formulas, and clsplat/reference/STEM.py is their twin.
+
+    of_photograph: the number of a photograph's entries by their name in appearance.json. The first three are base-2
+    logarithms of gains; the others are coefficients from -0.2 to 0.2.
+    of_lens: the same for a lens; three base-2 logarithms, or none.
+    """
+
+    stem: str
+    of_photograph: Mapping[str, int]
+    of_lens: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def entries(self) -> int:
+        """Number of entries of a photograph."""
+        return sum(self.of_photograph.values())
+
+    @property
+    def lens_entries(self) -> int:
+        """Number of entries of a lens; 0 if nothing is learnt of lenses."""
+        return sum(self.of_lens.values())
+
+    @property
+    def sums(self) -> int:
+        """Number of sums of the gradient."""
+        return self.entries + self.lens_entries
+
+    @property
+    def pixel_bytes(self) -> int:
+        """Bytes of the partial sums per pixel, padding included."""
+        return -(-2 * self.sums // 3)
+
+    @property
+    def lens_update(self) -> GainEntries:
+        """The update of a lens's entries. Their sums follow the photograph's; their mean over all lenses is kept."""
+        return GainEntries(first_row=self.entries, centred=False)
+
+
+COLOUR_MODELS = {
+    model.stem: model
+    for model in (
+        ColourModel("exposure", {"log2_gains": GAIN_ENTRIES}),
+        ColourModel("ppisp", {"log2_gains": GAIN_ENTRIES, "mixes": 6}, {"vignette": 3}),
+    )
+}
+"""Colour models by value of the setting `appearance`. The self-test has a stage for each."""
+
+
+@dataclass(frozen=True)
+class PhotoLens:
+    """Photograph and lens of a view, for the kernels.
+
+    photograph, lens: rows in the arrays of their entries.
+    centre: the principal point, as fractions of the image's width and height.
+    flat: False for a panorama, which cannot have a vignette.
+    """
+
+    photograph: int
+    lens: int
+    centre: tuple[float, float]
+    flat: bool = True
+
+    def place(self, width: int, height: int) -> tuple[float, float, float]:
+        """The principal point in pixels; then 1 / (half the image's diagonal)^2, or 0 for a panorama."""
+        scale = 4 / (width**2 + height**2) if self.flat else 0.0
+        return self.centre[0] * width, self.centre[1] * height, scale
 
 
 @dataclass(frozen=True)
@@ -87,38 +162,55 @@ def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[st
     return {name: upload(device, part) for name, part in parts.items()}
 
 
-@stage("appearance", remove_gains=1)
-def remove_gains(device: Device, gains: Gains, photograph: int, target: DeviceArray) -> None:
-    """Divide the colours, the first three planes of `target` (3 or more, rows, stride), by the photograph's gains."""
+@stage("appearance", develop=1)
+def develop(
+    device: Device,
+    model: ColourModel,
+    colours: Gains,
+    lenses: Gains | None,
+    taken: PhotoLens,
+    target: DeviceArray,
+    size: tuple[int, int],
+) -> None:
+    """Remove the colours of a photograph and its lens from `target`, in place.
+
+    colours: (photographs, model.entries).
+    lenses: (number of lenses, model.lens_entries); None if that is 0.
+    target: planes (3 or more, rows, stride) of the photograph, the first three of which are colours.
+    size: width and height in pixels.
+    """
     _, rows, stride = target.shape
-    kernel = device.kernels("appearance", {"LANES": 1}).remove_gains
-    launch_grid(device, kernel, (stride, rows), photograph, stride, rows * stride, gains.gains, target)
+    of_view = (taken.photograph, taken.lens, stride, rows * stride, *taken.place(*size))
+    entries = (colours.gains, colours.logs, (lenses or colours).logs)
+    kernel = device.kernels(model.stem).develop
+    launch_grid(device, kernel, (stride // device.shape.lanes, rows), *of_view, *entries, target)
 
 
 @stage("appearance")
-def gain_gradient(
+def entry_gradient(
     device: Device,
     work: Workspace,
+    model: ColourModel,
+    taken: PhotoLens,
     image: DeviceArray,
     gradient: DeviceArray,
-    height: int,
+    size: tuple[int, int],
     place: int = 0,
 ) -> DeviceArray:
-    """Column sums (3, stride) of the image times the gradient of the loss with respect to the image.
+    """Column sums (model.sums, stride) of the gradient with respect to the entries, where these are 0.
 
-    Summed over the columns and multiplied by ln 2, they are the gradient with respect to the photograph's logs.
-    place: the view's number in the batch; each has its own array.
+    Summed over the columns, and multiplied by ln 2 for logarithms, they are the gradient. place: the view's number in
+    the batch; each has its own array.
     """
     _, rows, stride = image.shape
     down = rows // TILE
-    partials, columns = (
-        work.array("appearance_partials", (3, down, stride)),
-        work.array(f"appearance_columns_{place}", (3, stride)),
-    )
-    kernels = device.kernels("appearance", {"LANES": 1})
-    sizes = (height, stride, rows * stride, down)
-    launch_grid(device, kernels.gain_sums, (stride, down), *sizes, image, gradient, partials)
-    launch_grid(device, kernels.column_sums, (stride, 3), stride, down, partials, columns)
+    partials = work.array("appearance_partials", (model.sums, down, stride))
+    columns = work.array(f"appearance_columns_{place}", (model.sums, stride))
+    sizes = (size[1], stride, rows * stride, down, *taken.place(*size))
+    kernel = device.kernels(model.stem).entry_sums
+    launch_grid(device, kernel, (stride // device.shape.lanes, down), *sizes, image, gradient, partials)
+    kernel = device.kernels("appearance", {"LANES": 1}).column_sums
+    launch_grid(device, kernel, (stride, model.sums), stride, down, partials, columns)
     return columns
 
 

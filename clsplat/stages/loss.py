@@ -33,7 +33,7 @@ class _Blocks:
     rows, columns: size of a block, pixels.
     groups: number of groups; if each block has its own group: the numbers of blocks across and down, and of channels.
     field: floats between two derivatives of a row, in groups that keep derivatives.
-    partials, sums: lengths of the arrays of partial derivatives and of partial sums, in floats.
+    partials, sums: lengths in floats of two arrays, the partial derivatives and the partial sums.
 
     The order of the sums depends on the number of columns. No other result depends on the blocks.
     """

@@ -36,7 +36,7 @@ def pose_rows(
     """Sum the pose gradient of these Gaussians into `sums` (ceil(n / POSE_ROWS), 6).
 
     device: the device with the kernel switches of the camera model.
-    first_row: row of the first of these Gaussians in the model, a multiple of POSE_ROWS.
+    first_row: these Gaussians start at this row of the model, a multiple of POSE_ROWS.
     """
     launch_items(
         device,

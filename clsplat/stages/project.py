@@ -45,7 +45,7 @@ class Projected:
 
     splats: (n, SPLAT).
     tile_counts: (n), 0 where culled.
-    shown: (n), 0 where a Gaussian has no splat, if culling is switched off. Otherwise None: tile_counts is 0 there.
+    shown: with culling switched off, (n), 0 for Gaussians without a splat. Otherwise None: their tile_counts are 0.
     """
 
     splats: DeviceArray
@@ -228,7 +228,8 @@ def project_step(
 ) -> None:
     """`project_grad` and `stages.adam.adam` in one kernel, which keeps no gradients in memory.
 
-    model: parameters, first and second moments. The other arguments are those of the two functions.
+    model: parameters, first and second moments.
+    The other arguments are passed on to the two functions.
     """
     parameters, config = model[0], step.config
     defines = {**_defines(parameters, slots, sh_rest=step.updates_sh_rest), "ADAM": True}

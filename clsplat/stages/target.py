@@ -25,7 +25,7 @@ TARGET_PIXEL_BYTES = 12 + SOURCE_PIXEL_BYTES
 
 
 def is_photograph(array: DeviceArray) -> bool:
-    """True for a photograph (H, W, 3), False for planes (3, rows, stride), whose last axis is at least a tile."""
+    """True for a photograph (H, W, 3), False for planes (3, rows, stride): a stride is never 3, but a tile or more."""
     return array.shape[-1] == 3
 
 

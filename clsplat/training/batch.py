@@ -122,7 +122,7 @@ class ViewOutcome:
 
     arrays: arrays of its rows, by name.
     gradients: gradients of its rows, by parameter group.
-    own: gradients with respect to the parameters of its parts.
+    own: gradients with respect to the parameters of each component, such as appearance; None where it has none.
     """
 
     arrays: dict[str, NDArray[Any]]

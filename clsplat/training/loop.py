@@ -198,7 +198,7 @@ class TrainingSession:
 
     def tell_the_rest(self) -> None:
         """Warn of the number of troubled steps that were only counted."""
-        self.trainer.mend()
+        self.trainer.repair()
         self.tell_trouble()
         if untold := self.troubles.total() - len(self.troubles):
             warnings.warn(f"{untold} more steps had values that were not finite")
@@ -321,7 +321,7 @@ class TrainingSession:
         self.seconds += time.perf_counter() - start
         self.tell_plan()
         if trainer.step == config.iterations:
-            trainer.mend(look=True)
+            trainer.repair(look=True)
         if self.go_back():
             return
         validated = trainer.validate()

@@ -225,7 +225,7 @@ class Trainer:
         self._begins = False
         if self.mark is None or self._looks_at_steps:
             self._note()
-        self.mend()
+        self.repair()
         self.validate()
         if not self.controlled:
             self._control_density()
@@ -310,7 +310,7 @@ class Trainer:
     def _begin_again(self) -> None:
         """Prepare for repeating a step. This invalidates `mark`."""
         self.mark = None
-        self.mend()
+        self.repair()
 
     def settle(self) -> None:
         """Wait for all launched steps, and repeat the incomplete ones (`SpeculativeSteps`)."""
@@ -401,7 +401,7 @@ class Trainer:
         self.rng.bit_generator.state = mark.rng
         return True
 
-    def mend(self, *, look: bool = False) -> None:
+    def repair(self, *, look: bool = False) -> None:
         """Repair Gaussians with non-finite values, if any were noticed.
 
         look: True to read `adam`'s counts first.
@@ -461,7 +461,7 @@ class Trainer:
         """Run the density control that is due after one of the last step's views."""
         steps = [step for step in range(self.step - self.last_views + 1, self.step + 1) if self.strategy.is_due(step)]
         for step in steps if self.step > 0 else ():
-            self.mend(look=True)
+            self.repair(look=True)
             if step == steps[0]:
                 self._note()
             self._rearrange(self.strategy.before_step(self._state(step)))
@@ -529,7 +529,7 @@ class Trainer:
 
         The whole model is finite, unless `monitor.retries.lost`.
         """
-        self.mend(look=True)
+        self.repair(look=True)
         arrays = self._arrays()
         if (
             repair := self.monitor.examine_all(arrays)

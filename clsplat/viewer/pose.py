@@ -20,7 +20,7 @@ from clsplat.shots.viewpoints import COLMAP_UP, extent_of, focus_point, look_at,
 MAX_PAGE_PICTURE_PIXELS = 4096 * 2304
 """Maximum number of pixels of a picture on a page, for any size that a browser requests."""
 MAX_PAGE_SIDE_PX = MAX_VIDEO_SIDE_PX
-"""Maximum side in pixels of a page and its pictures. It is that of a video, as a recorded path may become a video."""
+"""Maximum side in pixels of a page and its pictures: the limit of videos, as a recorded path may become one."""
 DEFAULT_FOV_Y_RADIANS = math.radians(60)
 """Vertical field of view in radians if no camera of the scene defines it."""
 MAX_START_FOV_Y_RADIANS = math.radians(120)

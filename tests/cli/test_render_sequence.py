@@ -22,7 +22,7 @@ from clsplat.cli.main import main
 from clsplat.gaussians import Gaussians
 from clsplat.models import edit
 from clsplat.models.formats import usd
-from clsplat.sequence.job_models import load_cast
+from clsplat.sequence.job_models import load_job_models
 
 MODEL = hidden_model(30)
 COUNT = 5
@@ -202,7 +202,7 @@ def test_what_is_wrong(model: str, flags: str, words: str, folder: Path, capsys:
 def test_the_plan(folder: Path, capsys: Capture) -> None:
     plan = json.loads(ran(capsys, render, folder, "capture.####.ply", "none", "--dry-run --json").out)
     assert (plan["gaussians"], len(plan["frames"])) == (30, COUNT)
-    assert load_cast(folder / "capture.####.ply").digest == plan["digest"]
+    assert load_job_models(folder / "capture.####.ply").digest == plan["digest"]
 
 
 # Stages

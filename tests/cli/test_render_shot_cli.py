@@ -31,7 +31,7 @@ from clsplat.reference.blend import layers
 from clsplat.reference.render import forward
 from clsplat.rendering.renderer import Renderer
 from clsplat.sequence.farm import Failure, WorkerJob, render_frame
-from clsplat.sequence.job_models import load_cast
+from clsplat.sequence.job_models import load_job_models
 from clsplat.sequence.shot_tasks import make_tasks
 from clsplat.sequence.task import RenderOptions
 from clsplat.shots import read_shot
@@ -361,15 +361,15 @@ def test_models_that_are_not_drawn_alike(folder: Path, tmp_path: Path, capsys: C
 def test_a_worker_places_what_it_has_read(folder: Path, tmp_path: Path) -> None:
     """Placements come with the tasks: of the shot it reads the models alone."""
     shot, channels = layout(folder, "farm", **MOVING), ("rgb", "motion")
-    cast, options = load_cast(shot), RenderOptions(channels)
+    job_models, options = load_job_models(shot), RenderOptions(channels)
     cameras = read_shot(folder / "cameras.json")
     tasks = make_tasks(cameras.only("2"), cameras, str(tmp_path / "#.exr"), lambda c: c, channels)
-    (task,) = cast.seen(tasks, options.pictures, channels)
+    (task,) = job_models.seen(tasks, options.pictures, channels)
     layout(folder, "farm")  # changed meanwhile
-    job = WorkerJob(str(shot), cast.digest, options, RasterizerConfig(), placed=True)
+    job = WorkerJob(str(shot), job_models.digest, options, RasterizerConfig(), placed=True)
     assert not isinstance(render_frame(pickle.loads(pickle.dumps(task)), job), Failure)
     renderer = Renderer()
-    here, there = cast.at(2), cast.at(3)
+    here, there = job_models.at(2), job_models.at(3)
     picture, made = renderer.render_channels(here, camera_at(2), ("motion",), after=camera_at(3), moved=there)
     found = pixels_of(tmp_path / "2.exr")
     np.testing.assert_allclose(found[:, :, :3], picture.image, atol=CLOSE)

@@ -17,7 +17,7 @@ from clsplat.cli.main import main
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.models import formats
-from clsplat.models.codec import soundness, values
+from clsplat.models.codec import repair, values
 from clsplat.models.formats import gltf
 from clsplat.models.info import model_info
 
@@ -37,14 +37,14 @@ def test_pruned_models_are_not_doubted(highest: float, least: float) -> None:
     if least < highest:
         logits = np.concatenate([trained(highest) for _ in range(5)])
         left = logits[values.opacities(logits) >= least]
-        assert soundness.doubts(left, np.resize(LOGS, (len(left), 3))) == []
+        assert repair.encoding_warnings(left, np.resize(LOGS, (len(left), 3))) == []
 
 
 @pytest.mark.parametrize("start", [0.5, 0.55, 0.6, 0.7])
 @pytest.mark.parametrize("moved", [0.0, 0.02, 0.1])
 def test_models_that_were_started_at_an_opacity_are_not_doubted(start: float, moved: float) -> None:
     logits = (np.log(start / (1 - start)) + np.abs(RNG.normal(0, moved, 3000))).astype(np.float32)
-    assert soundness.doubts(logits, LOGS) == []
+    assert repair.encoding_warnings(logits, LOGS) == []
 
 
 @pytest.mark.parametrize("highest", [0.95, 0.99, 1 - 1e-4])
@@ -52,7 +52,7 @@ def test_models_that_were_started_at_an_opacity_are_not_doubted(start: float, mo
 def test_opacities_of_trained_models_are_doubted(highest: float, least: float) -> None:
     opacity = np.r_[values.opacities(trained(highest)), highest].astype(np.float32)
     opacity = opacity[opacity >= least]
-    (text,) = soundness.doubts(opacity, np.resize(LOGS, (len(opacity), 3)))
+    (text,) = repair.encoding_warnings(opacity, np.resize(LOGS, (len(opacity), 3)))
     assert text.startswith("all opacities lie in ")
     assert "as opacities from 0 to 1 do" in text
 

@@ -52,7 +52,7 @@ def made(count: int = 32, distances: tuple[float, ...] = (4.0,)) -> Scene:
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     colors = rng.uniform(0.2, 0.8, (6000, 3)).astype(np.float32)
     lens = Lens("PINHOLE", ACROSS, DOWN, (0.9 * ACROSS, 0.9 * ACROSS, ACROSS / 2, DOWN / 2))
-    views, glances = [], {}
+    views, thumbnails = [], {}
     for index in range(count):
         camera = camera_at(2 * np.pi * index / count, distances[index % len(distances)])
         local = points @ camera.rotation.T + camera.translation
@@ -63,15 +63,15 @@ def made(count: int = 32, distances: tuple[float, ...] = (4.0,)) -> Scene:
             pixels[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2] = colors[one]
         view = View(f"{index:02d}.png", camera, Path(f"{index:02d}.png"), "train", lens)
         views.append(view)
-        glances[view.name] = Thumbnail(pixels, 0.0, 0.6 + 0.02 * (index % 5))
+        thumbnails[view.name] = Thumbnail(pixels, 0.0, 0.6 + 0.02 * (index % 5))
     scene = Scene("made", views, points, colors, (-np.ones(3), np.ones(3)))
-    scene.__dict__["glances"] = glances
+    scene.__dict__["thumbnails"] = thumbnails
     return scene
 
 
 def changed(scene: Scene, index: int, **changes: object) -> None:
     name = scene.views[index].name
-    scene.glances[name] = replace(scene.glances[name], **changes)  # type: ignore[arg-type]
+    scene.thumbnails[name] = replace(scene.thumbnails[name], **changes)  # type: ignore[arg-type]
 
 
 def kinds(scene: Scene) -> list[str]:
@@ -93,7 +93,7 @@ def test_exposures_that_differ(range_of: float) -> None:
     scene = made()
     gains = 2 ** np.random.default_rng(2).uniform(-range_of, range_of, len(scene.views))
     for index, gain in enumerate(gains):
-        pixels = scene.glances[scene.views[index].name].pixels * np.float32(gain)
+        pixels = scene.thumbnails[scene.views[index].name].pixels * np.float32(gain)
         changed(scene, index, pixels=np.clip(pixels, 0, 1))
     found = findings(scene)
     assert [finding.kind for finding in found] == (["exposure"] if range_of == 1 else [])
@@ -107,7 +107,7 @@ def test_exposures_that_differ(range_of: float) -> None:
 def test_a_cast_of_one_channel_is_an_exposure() -> None:
     scene = made()
     for index in range(0, 24, 2):
-        pixels = scene.glances[scene.views[index].name].pixels.copy()
+        pixels = scene.thumbnails[scene.views[index].name].pixels.copy()
         pixels[:, :, 2] *= 0.6
         changed(scene, index, pixels=pixels)
     assert kinds(scene) == ["exposure"]
@@ -181,7 +181,7 @@ def test_a_sky() -> None:
     scene = made()
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     for index, view in enumerate(scene.views):
-        pixels = scene.glances[view.name].pixels.copy()
+        pixels = scene.thumbnails[view.name].pixels.copy()
         pixels[: DOWN // 7] = (0.5, 0.6, 0.85)
         if index % 4 == 0:
             camera = replace(
@@ -204,23 +204,23 @@ def test_a_sky() -> None:
 def test_points_without_colours_say_nothing_of_exposures() -> None:
     scene = made()
     for index, view in enumerate(scene.views):
-        changed(scene, index, pixels=scene.glances[view.name].pixels * np.float32(2 ** (-index / 24)))
+        changed(scene, index, pixels=scene.thumbnails[view.name].pixels * np.float32(2 ** (-index / 24)))
     assert kinds(scene) == ["exposure"]
     assert kinds(replace_points(scene, colourless=np.ones(len(scene.points), bool))) == []
     assert kinds(replace_points(scene, point_colors=np.full_like(scene.point_colors, 0.5))) == []
 
 
 def replace_points(scene: Scene, **changes: object) -> Scene:
-    """The scene with other points, and the same glances."""
+    """The scene with other points, and the same thumbnails."""
     other = replace(scene, **changes)  # type: ignore[arg-type]
-    other.__dict__["glances"] = scene.glances
+    other.__dict__["thumbnails"] = scene.thumbnails
     return other
 
 
 def test_a_white_table_below_is_no_sky() -> None:
     scene = made()
     for index, view in enumerate(scene.views):
-        pixels = scene.glances[view.name].pixels.copy()
+        pixels = scene.thumbnails[view.name].pixels.copy()
         pixels[-DOWN // 6 :] = (0.97, 0.97, 0.97)
         changed(scene, index, pixels=pixels)
     assert kinds(scene) == []
@@ -244,7 +244,7 @@ def test_sharpness_is_of_the_blur_alone() -> None:
 def test_copies() -> None:
     scene = made()
     noise = np.random.default_rng(3).normal(0, 0.5 / 255, (DOWN, ACROSS, 3))
-    changed(scene, 9, pixels=(scene.glances["04.png"].pixels + noise).astype(np.float32))
+    changed(scene, 9, pixels=(scene.thumbnails["04.png"].pixels + noise).astype(np.float32))
     assert only(findings(scene)).text == "1 photographs are duplicates (09.png is 04.png)"
 
 
@@ -403,8 +403,8 @@ def test_auto_takes_what_answers(tmp_path: Path, capfd: Capture) -> None:
 def test_a_glance_is_small_and_true() -> None:
     image = np.zeros((640, 960, 4), np.float32)
     image[:, 480:] = 1
-    glance = thumbnail_of(image)
-    assert glance.pixels.shape == (64, 96, 3)
-    assert (glance.pixels[:, :48] == 0).all()
-    assert (glance.pixels[:, 48:] == 1).all()
-    assert glance.transparent == 0.5
+    thumbnail = thumbnail_of(image)
+    assert thumbnail.pixels.shape == (64, 96, 3)
+    assert (thumbnail.pixels[:, :48] == 0).all()
+    assert (thumbnail.pixels[:, 48:] == 1).all()
+    assert thumbnail.transparent == 0.5

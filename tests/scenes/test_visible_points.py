@@ -53,7 +53,7 @@ def test_groups_that_share_no_point_have_a_mean_of_their_own() -> None:
 def spread(scene: Scene, gains: np.ndarray) -> np.ndarray:
     """Exposures that are told of the scene with gains on its photographs, which do not clip."""
     for index, gain in enumerate(gains):
-        changed(scene, index, pixels=scene.glances[scene.views[index].name].pixels * np.float32(gain))
+        changed(scene, index, pixels=scene.thumbnails[scene.views[index].name].pixels * np.float32(gain))
     told = VisiblePoints(scene).exposures
     return np.array([told[view.name] for view in scene.views])
 
@@ -66,7 +66,7 @@ def test_gains_on_photographs_are_told_from_them_alone() -> None:
     assert np.abs(apart - apart.mean(axis=0)).max() < 0.1
     assert np.abs(apart - apart.mean(axis=0)).mean() < 0.01
     grey = replace(made(24), point_colors=np.full((6000, 3), 0.5, np.float32))
-    grey.__dict__["glances"] = made(24).glances
+    grey.__dict__["thumbnails"] = made(24).thumbnails
     assert np.array_equal(spread(grey, gains), found)
 
 
@@ -76,7 +76,7 @@ def test_a_dark_photograph_keeps_its_dark_points() -> None:
     dark = [made(24), made(24)]
     for scene in dark:
         for index, view in enumerate(scene.views):
-            pixels = scene.glances[view.name].pixels
+            pixels = scene.thumbnails[view.name].pixels
             changed(scene, index, pixels=np.where(pixels < 0.5, pixels * np.float32(0.06), pixels))
     apart = spread(dark[0], gains) - spread(dark[1], np.ones(24)) - np.log2(gains)[:, None]
     assert np.abs(apart - apart.mean(axis=0)).max() < 0.01
@@ -87,5 +87,5 @@ def test_few_points_tell_nothing(count: int) -> None:
     """And no photograph is looked at, of which there is no file here."""
     scene = made(24)
     few = replace(scene, points=scene.points[:count], point_colors=scene.point_colors[:count])
-    assert "glances" not in few.__dict__
+    assert "thumbnails" not in few.__dict__
     assert VisiblePoints(few).exposures == {}

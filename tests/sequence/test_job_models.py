@@ -23,7 +23,7 @@ from clsplat.images.frame_files import camera_matrices
 from clsplat.models import edit
 from clsplat.models.formats import usd
 from clsplat.models.instances import Placement, extrapolated, rows_of
-from clsplat.sequence.job_models import load_cast
+from clsplat.sequence.job_models import load_job_models
 from clsplat.sequence.shot_tasks import make_tasks
 from clsplat.sequence.task import RenderOptions, Task, camera_after, camera_before, header, model_times
 from clsplat.shots import Shot, read_shot
@@ -61,7 +61,7 @@ def assert_goes_along(model: Path, shot: Shot, sampling: SamplingConfig) -> None
     options = RenderOptions(BOTH_WAYS, pictures=PictureConfig(sampling=sampling))
     tasks = make_tasks(shot, shot, "#.exr", lambda camera: camera, BOTH_WAYS, sampling)
     wanted = None
-    for task in load_cast(model).seen(tasks, options.pictures, options.channels):
+    for task in load_job_models(model).seen(tasks, options.pictures, options.channels):
         middle = sampling.middle
         cameras = {time: task.at(time) for time in (middle, *(sampling.sample_times if sampling.moves else ()))}
         around = camera_before(task, options.pictures), camera_after(task, options.pictures)
@@ -117,8 +117,8 @@ def test_where_keys_go_on_they_count(tmp_path: Path) -> None:
     options = RenderOptions(("motion",))
     tasks = make_tasks(shot, shot, "#.exr", lambda camera: camera, options.channels)
     for further, wanted in (([], 0.0), ([{"frame": 4, "translate": [2, 0, 0]}], 1.0)):
-        cast = load_cast(layout(tmp_path, keys=keys + further))
-        placed = cast.seen(tasks, options.pictures, options.channels)[1].placed
+        job_models = load_job_models(layout(tmp_path, keys=keys + further))
+        placed = job_models.seen(tasks, options.pictures, options.channels)[1].placed
         assert placed[1][0].transform[0, 3] == wanted
 
 
@@ -168,7 +168,7 @@ def test_the_header_has_the_near_plane_of_the_middle(places: tuple[float, ...], 
     keys = [{"frame": 1, "scale": 1}, {"frame": 2, "scale": 5}]
     made = make_tasks(shot, shot, "#.exr", lambda camera: camera, options.channels, LATE)
     for model, near in ((tmp_path / "model.ply", 0.25), (layout(tmp_path, keys=keys), 0.5)):  # a quarter of a frame on
-        task = load_cast(model).seen(made[:1], options.pictures, options.channels)[0]
+        task = load_job_models(model).seen(made[:1], options.pictures, options.channels)[0]
         wanted = camera_matrices(replace(task.camera, near=near))["worldToNDC"]
         np.testing.assert_allclose(header(task, options).matrices["worldToNDC"], wanted, rtol=1e-12, atol=1e-12)
 

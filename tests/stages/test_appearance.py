@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""appearance.cl against the float64 twin, and the twin against finite differences."""
+"""The update of photographs' gains and mixes (appearance.cl), and the twins of colour models against differences."""
 
 from __future__ import annotations
 
+from importlib import import_module
+
 import numpy as np
+import pytest
 from compare import assert_close, assert_close_gradient, assert_same_bits
 from scipy.sparse import csr_array
 
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.layouts.columns import READBACK
-from clsplat.reference import appearance as reference
-from clsplat.stages.appearance import Gains, step_gains
+from clsplat.reference.appearance import spread
+from clsplat.stages.appearance import COLOUR_MODELS, ColourModel, Gains, step_gains
 
 
 def test_the_mean_stays(shaped_device: Device) -> None:
@@ -59,14 +62,16 @@ def test_a_step_that_stopped_or_is_not_finite(shaped_device: Device) -> None:
     assert_same_bits(gains.logs.get(), before)
 
 
-def test_the_twin_against_finite_differences() -> None:
-    """The loss of the render times 2^x against the photograph, exposed as the model is, has this gradient at x = 0."""
-    rng = np.random.default_rng(2)
-    image, photograph, logs = rng.random((4, 5, 3)), rng.random((4, 5, 3)), rng.uniform(-1, 1, 3)
-    target = reference.removed(photograph, logs)
-    by_logs = reference.gradient(image, 2 * (image - target))
-    step = 1e-6 * np.eye(3)
-    numeric = [
-        (np.square(image * np.exp2(d) - target) - np.square(image * np.exp2(-d) - target)).sum() / 2e-6 for d in step
+@pytest.mark.parametrize("model", COLOUR_MODELS.values(), ids=COLOUR_MODELS)
+def test_a_twin_against_finite_differences(model: ColourModel) -> None:
+    """Entries put on the render have the opposite derivative, where they are 0, of entries removed from it."""
+    twin, rng = import_module(f"clsplat.reference.{model.stem}"), np.random.default_rng(2)
+    image, by_image = rng.random((4, 5, 3)), rng.standard_normal((4, 5, 3))
+    squared = spread(5, 4, (2.25, 1.75))
+    assert_same_bits(twin.developed(image, *np.split(np.zeros(model.sums), [model.entries]), squared), image)
+    moved = [
+        [twin.developed(image, *np.split(step, [model.entries]), squared) for step in (-d, d)]
+        for d in 1e-6 * np.eye(model.sums)
     ]
-    assert_close_gradient(by_logs, numeric, 1e-7)
+    numeric = [(by_image * (before - after)).sum() / 2e-6 for before, after in moved]
+    assert_close_gradient(twin.terms(image, by_image, squared).sum(axis=(0, 1)), numeric, 1e-7)

@@ -10,7 +10,7 @@ from compare import assert_same_arrays
 
 from clsplat.device.buffers import Workspace
 from clsplat.device.context import Device
-from clsplat.selftest.case import Wanted, faults
+from clsplat.selftest.case import Expected, faults
 from clsplat.selftest.cases.table import CASES
 from clsplat.stages.blend import tile_items
 
@@ -71,11 +71,11 @@ def test_errors() -> None:
     """Relative to a size or in norm; a missing value, or one of another shape, is no small error."""
     values = np.array([1.0, 2.0, 0.0])
     off = values + np.array([0.0, 1e-3, 1e-3])
-    assert Wanted(values, 0, 1.0).error_of(off) == pytest.approx(1e-3)
-    assert Wanted(values, 0, 1.0, sure=values == 1).error_of(off) == 0
-    assert Wanted(values, 0, np.abs(values) + 1e-3).error_of(off) == pytest.approx(1.0)
-    assert Wanted(values, 0).error_of(off) == pytest.approx(1e-3 * (2 / 5) ** 0.5)
-    assert Wanted(np.zeros(3), 0).error_of(off) == np.inf
-    assert Wanted(values, 0, 1.0).error_of(np.array([1.0, np.nan, 0.0])) == np.inf
-    assert Wanted(values, 0, 1.0).error_of(off[:2]) == np.inf
-    assert Wanted(values, 0, exact=True).error_of(off) == 2
+    assert Expected(values, 0, 1.0).error_of(off) == pytest.approx(1e-3)
+    assert Expected(values, 0, 1.0, compared=values == 1).error_of(off) == 0
+    assert Expected(values, 0, np.abs(values) + 1e-3).error_of(off) == pytest.approx(1.0)
+    assert Expected(values, 0).error_of(off) == pytest.approx(1e-3 * (2 / 5) ** 0.5)
+    assert Expected(np.zeros(3), 0).error_of(off) == np.inf
+    assert Expected(values, 0, 1.0).error_of(np.array([1.0, np.nan, 0.0])) == np.inf
+    assert Expected(values, 0, 1.0).error_of(off[:2]) == np.inf
+    assert Expected(values, 0, exact=True).error_of(off) == 2

@@ -14,6 +14,7 @@ from memory_workload import by_elements
 
 from clsplat.device.source import kernel_root, kernel_source
 
+STEMS = sorted({stem for stems in kernels().values() for stem in stems})
 LOG = """
 Oclgrind - OpenCL runtime error detected
 \tFunction: clGetDeviceInfo
@@ -50,7 +51,13 @@ def test_findings_name_the_kernels_line() -> None:
     assert sum(accepted.values()) == 1
 
 
-@pytest.mark.parametrize("stem", sorted(set(kernels().values())))
+def test_a_kernel_of_several_files_has_a_place_in_each() -> None:
+    assert kernels()["develop"] == ["exposure", "ppisp"]
+    (found,), _ = findings("Invalid read\n\tKernel: develop\n\tAt line 9 of input.cl\n", kernels())
+    assert found.place == f"{places('exposure')[8]} or {places('ppisp')[8]}"
+
+
+@pytest.mark.parametrize("stem", STEMS)
 def test_places_are_those_of_the_text(stem: str) -> None:
     lines = kernel_source(stem).splitlines()
     listed = places(stem)
@@ -88,7 +95,7 @@ def test_vectors_are_made_of_elements() -> None:
     assert by_elements("x = (float8)(a.lo, b.hi);", 8) == (
         "x = (float8)(a.s0, a.s1, a.s2, a.s3, b.s4, b.s5, b.s6, b.s7);"
     )
-    for stem in set(kernels().values()):
+    for stem in STEMS:
         text = by_elements(kernel_source(stem), 8)
         assert text.count("\n") == kernel_source(stem).count("\n")  # or findings would name other lines
         assert not re.search(r"\(float8\)\(\w+\.(lo|s01)", text)

@@ -279,7 +279,7 @@ def test_a_view_without_a_finite_loss_is_named(scene: Scene, default_device: Dev
             trainer.batch.replicas[0].photographs._on_device.clear()
         trainer.photographs._on_device.clear()
         trainer.train_step()
-        trainer.mend(look=True)
+        trainer.repair(look=True)
         (incident,) = trainer.monitor.incidents
         assert (incident.stage, incident.view) == ("loss", bad)
         assert all(np.isfinite(trainer.parameters[group].get()).all() for group in PARAMETER_GROUPS)

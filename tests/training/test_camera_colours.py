@@ -22,13 +22,14 @@ from clsplat.errors import InputError
 from clsplat.evaluation import metrics
 from clsplat.gaussians import Gaussians
 from clsplat.models.edit import exposed
-from clsplat.reference.ppisp import light, spread, unmixing
+from clsplat.reference.appearance import spread
+from clsplat.reference.ppisp import light, unmixing
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.appearance import gains_of
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
-from clsplat.training.appearance.ppisp import PpispOfAll
+from clsplat.training.appearance.colours import ColoursOfAll
 from clsplat.training.trainer import Trainer
 
 OF_CAMERAS = replace(CONFIG, appearance="ppisp")
@@ -142,7 +143,7 @@ def test_lenses_move_by_themselves(default_device: Device, scene: Scene) -> None
     """A photograph's step moves its own lens's vignette alone."""
     trainer = Trainer(with_two_lenses(scene), OF_CAMERAS, default_device)
     appearance = trainer.appearance
-    assert isinstance(appearance, PpispOfAll)
+    assert isinstance(appearance, ColoursOfAll)
     assert appearance.arrays()["appearance/lenses_logs"].shape == (2, 3)
     trainer.train_step()
     assert appearance.arrays()["appearance/lenses_first"].any(axis=1).sum() == 1
@@ -176,7 +177,7 @@ def test_where_a_photograph_was_taken(default_device: Device, scene: Scene) -> N
     around = replace(second.camera, projection="equirectangular")
     views = [replace(first, camera=camera), replace(second, camera=around), *others]
     held = [replace(view, lens=replace(view.lens, model="unknown")) for view in scene.test_views]
-    appearance = PpispOfAll(OF_CAMERAS, default_device, replace(scene, views=[*views, *held]))
+    appearance = ColoursOfAll(OF_CAMERAS, default_device, replace(scene, views=[*views, *held]))
     taken = [view.taken for view in appearance.of_views([0, 1], 2)]
     assert [(each.photograph, each.lens, each.flat) for each in taken] == [(0, 0, True), (1, 1, False)]
     assert taken[0].centre == (0.25, 0.75)

@@ -27,8 +27,8 @@ from clsplat.runs.appearance import held_out_looks
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.scenes.analysis.visible_points import VisiblePoints
 from clsplat.scenes.scene import Scene, View
-from clsplat.training.appearance import exposure as gains
-from clsplat.training.appearance.exposure import GainsOfAll
+from clsplat.training.appearance import colours
+from clsplat.training.appearance.colours import ColoursOfAll
 from clsplat.training.trainer import Trainer
 
 EXPOSED = replace(CONFIG, appearance="exposure")
@@ -51,7 +51,7 @@ def test_gains_begin_where_the_points_have_them(
     first, second, *others = (view.name for view in scene.train_views)
     told = {first: np.array([1.0, 0.5, 0.0]), second: np.array([-1.0, 0.25, 0.0])}
     monkeypatch.setattr(VisiblePoints, "exposures", told)
-    arrays = GainsOfAll(EXPOSED, default_device, scene).arrays()
+    arrays = ColoursOfAll(EXPOSED, default_device, scene).arrays()
     start = np.array([told[first], told[second], *(np.zeros(3) for _ in others)])
     # rounded to a 1024th
     np.testing.assert_allclose(arrays["appearance/logs"], start - start.mean(axis=0), atol=2.0**-11)
@@ -71,7 +71,7 @@ def test_gains_that_points_tell_are_held_there(
     moved = {}
     for pulls in ((0.0, 0.0), (1e3, 0.0), (0.0, 1e3)):
         for name, pull in zip(("VIEW_PULL_WEIGHT", "NEIGHBOUR_PULL_WEIGHT"), pulls, strict=True):
-            monkeypatch.setattr(gains, name, pull)
+            monkeypatch.setattr(colours, name, pull)
         trainer = trained_to(30, scene, EXPOSED, default_device)
         arrays = trainer.checkpoint()[0]
         moved[pulls] = np.abs(arrays["appearance/logs"] - arrays["appearance/start"]).max()
@@ -152,7 +152,7 @@ def test_exposures_that_exif_tells(default_device: Device, scene: Scene, tmp_pat
     scene = replace(scene, views=[told(index, view) for index, view in enumerate(scene.views)])
     exposures = {view.name: exposure_of(view.path) for view in scene.views}
     assert [value is None for value in exposures.values()] == [index == 3 for index in range(len(exposures))]
-    appearance = GainsOfAll(EXPOSED, default_device, scene)
+    appearance = ColoursOfAll(EXPOSED, default_device, scene)
     record = appearance.record()
     assert record is not None
     known = [value for view in scene.train_views if (value := exposures[view.name]) is not None]

@@ -426,7 +426,7 @@ def test_photographs_of_large_scenes_are_decoded_later(
     scene.check_pictures()
     assert decoded == {}
     assert len(scene.digests) == len(scene.views)
-    assert list(scene.glances) == [view.name for view in scene.sampled_views]
+    assert list(scene.thumbnails) == [view.name for view in scene.sampled_views]
     assert len(scene.sampled_views) == len(decoded) == 3
     assert all(view.split == "train" for view in scene.sampled_views)
     trainer = Trainer(scene, CONFIG, default_device)

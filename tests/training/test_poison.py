@@ -116,7 +116,7 @@ def assert_well(trainer: Trainer) -> None:
     trainer.monitor.incidents.clear()
     for _ in range(3):
         assert np.isfinite(trainer.train_step().read()).all()
-    trainer.mend(look=True)
+    trainer.repair(look=True)
     assert trainer.monitor.incidents == []
 
 
@@ -187,7 +187,7 @@ def test_a_broken_gradient_costs_its_gaussian_alone(
         plain.train_step()
         assert poisoned.parameters[group].get().reshape(40, -1)[ROW, -1] == before, "it was not moved"
         assert_others_alike(poisoned, plain)
-        poisoned.mend(look=True)
+        poisoned.repair(look=True)
         (incident,) = poisoned.monitor.incidents
         # A finite one of which the square is not is the optimiser's own trouble.
         assert (incident.stage, incident.count) == ("adam" if value == 1e30 else "project_grad", 1)
@@ -213,7 +213,7 @@ def test_broken_moments_begin_again(scene: Scene, default_device: Device, which:
         assert poisoned.parameters[group].get().reshape(40, -1)[ROW, -1] == before
         for moments in (poisoned.first, poisoned.second):
             assert moments[group].get().reshape(40, -1)[ROW, -1] == 0
-        poisoned.mend(look=True)
+        poisoned.repair(look=True)
         (incident,) = poisoned.monitor.incidents
         assert incident.stage == "adam"
         assert poisoned.parameters.count == 40
@@ -292,7 +292,7 @@ def test_a_broken_loss_is_no_fault_of_the_gaussians(
     moved = (poisoned.parameters["means"].get() != plain.parameters["means"].get()).any(axis=1).sum()
     assert moved > 0
     assert moved < 40 or where == "target", "without SSIM's windows most Gaussians are out of the pixel's reach"
-    poisoned.mend(look=True)
+    poisoned.repair(look=True)
     (incident,) = poisoned.monitor.incidents
     assert incident.stage == "loss"
     assert incident.step == 4
@@ -321,7 +321,7 @@ def test_a_broken_slot_costs_its_gaussian_alone(
     plain.train_step()
     assert_others_alike(poisoned, plain)
     poisoned.train_step()
-    poisoned.mend()
+    poisoned.repair()
     (incident,) = poisoned.monitor.incidents
     assert (incident.stage, incident.count, incident.step) == ("project_grad", 1, 4)
     statistics = poisoned.statistics.named()
@@ -353,7 +353,7 @@ def test_rows_that_are_streamed_are_looked_after_too(many_points: Scene, default
     trainer.parameters["sh_dc"].set(values)
     trainer.train_step()
     trainer.train_step()
-    trainer.mend()
+    trainer.repair()
     (incident,) = trainer.monitor.incidents
     assert (incident.stage, incident.count) == ("parameters", 2)
     assert trainer.parameters.count == count - 2

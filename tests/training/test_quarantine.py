@@ -285,7 +285,7 @@ def test_a_bundle_of_a_sound_step_says_so(
     """Where the trouble was the machine's nothing shows it again: then all Gaussians are kept."""
     trainer = trained_to(7, scene, CONFIG, default_device)
     trainer.monitor.loss_failed()
-    trainer.mend()
+    trainer.repair()
     assert trainer.monitor.latest is not None
     path = repro_bundle.write_bundle(tmp_path, trainer, trainer.monitor.latest)
     assert repro_bundle.read_bundle(path).record["of"] == [40, 40]
@@ -299,7 +299,7 @@ def test_a_bundle_with_a_setting_of_an_earlier_version_loads(
     trainer = Trainer(scene, CONFIG, default_device)
     trainer.train_step()
     trainer.monitor.loss_failed()
-    trainer.mend()
+    trainer.repair()
     assert trainer.monitor.latest is not None
     path = repro_bundle.write_bundle(tmp_path, trainer, trainer.monitor.latest)
     saved = read_checkpoint(path)

@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from memory_workload import PARTS
 
-from clsplat.device.source import _INCLUDE, kernel_root
+from clsplat.device.source import _INCLUDE, kernel_root, kernel_source
 
 LIBRARY = "lib/oclgrind/liboclgrind-rt-icd.so"
 WORKLOAD = Path(__file__).with_name("memory_workload.py")
@@ -80,12 +81,14 @@ def library() -> Path | None:
     return next((path for prefix in prefixes if (path := prefix / LIBRARY).is_file()), None)
 
 
-def kernels() -> dict[str, str]:
-    """File stems, keyed by kernel name."""
+def kernels() -> dict[str, list[str]]:
+    """Stems of the files with a kernel, keyed by its name. Files that share a header have kernels of the same name."""
     pattern = re.compile(r"__kernel\s+void\s+(\w+)\s*\(")
-    return {
-        name: path.stem for path in sorted(kernel_root().glob("*.cl")) for name in pattern.findall(path.read_text())
-    }
+    found: dict[str, list[str]] = {}
+    for path in sorted(kernel_root().glob("*.cl")):
+        for name in dict.fromkeys(pattern.findall(kernel_source(path.stem))):
+            found.setdefault(name, []).append(path.stem)
+    return found
 
 
 def places(stem: str) -> list[str]:
@@ -107,7 +110,7 @@ def places(stem: str) -> list[str]:
     return found
 
 
-def findings(log: str, stems: dict[str, str]) -> tuple[Counter[Finding], Counter[str]]:
+def findings(log: str, stems: Mapping[str, Sequence[str]]) -> tuple[Counter[Finding], Counter[str]]:
     """Count the findings in a log, and the reasons of the ignored findings."""
     found: Counter[Finding] = Counter()
     accepted: Counter[str] = Counter()
@@ -122,10 +125,8 @@ def findings(log: str, stems: dict[str, str]) -> tuple[Counter[Finding], Counter
         message = message.split(" Kernel: ")[0]
         kernel = re.search(r"Kernel:\s+(\w+)", text)
         line = re.search(r"At line (\d+)", text)
-        place = ""
-        if kernel and line and kernel[1] in stems:
-            listed = places(stems[kernel[1]])
-            place = listed[int(line[1]) - 1] if int(line[1]) <= len(listed) else ""
+        listed = [places(stem) for stem in stems.get(kernel[1], [])] if kernel and line else []
+        place = " or ".join(lines[int(line[1]) - 1] for lines in listed if line and int(line[1]) <= len(lines))
         found[Finding(message, kernel[1] if kernel else "", place)] += 1
     return found, accepted
 
@@ -168,7 +169,7 @@ def run(shape: str, check: str, part: str, driver: Path, folder: Path) -> Result
     return Result(name, done.returncode, done.stdout, logged + done.stderr, time.monotonic() - start)
 
 
-def report(result: Result, stems: dict[str, str]) -> bool:
+def report(result: Result, stems: Mapping[str, Sequence[str]]) -> bool:
     """Print the findings of a child process. Returns True if there are none."""
     found, accepted = findings(result.log, stems)
     print(f"{result.name}: {sum(found.values())} findings, {result.seconds:.0f} s")

@@ -32,8 +32,9 @@ from clsplat.errors import InputError
 from clsplat.images.alpha import Image, composite
 from clsplat.images.reading import downscale, open_image, read_image
 from clsplat.images.writing import write_image
+from clsplat.reference.appearance import spread
 from clsplat.reference.cameras import cam_from_pixel, pixel_grid
-from clsplat.reference.ppisp import light, spread
+from clsplat.reference.ppisp import light
 from clsplat.runs.appearance import unmixing
 from clsplat.scenes.dataset import Lens
 from clsplat.scenes.loading import load_scene

@@ -45,9 +45,9 @@ def _document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
             frame["eye"] = task.eye
         frames.append(frame)
     return {
-        "model": str(job.cast.path),
-        "digest": job.cast.digest,
-        "gaussians": job.cast.count,
+        "model": str(job.models.path),
+        "digest": job.models.digest,
+        "gaussians": job.models.count,
         "channels": list(options.channels),
         "deep_bins": options.deep.bins if options.deep else 0,
         "model_colorspace": model,

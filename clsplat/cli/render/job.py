@@ -30,7 +30,7 @@ from clsplat.images.video import check_size, video_record
 from clsplat.progress import FrameProgress
 from clsplat.runs.appearance import gains_of
 from clsplat.sequence import finished_frames, workers
-from clsplat.sequence.job_models import JobModels, load_cast
+from clsplat.sequence.job_models import JobModels, load_job_models
 from clsplat.sequence.mattes import mattes_of, names_of
 from clsplat.sequence.numbered import is_sequence
 from clsplat.sequence.shot_tasks import held_out, make_views
@@ -48,7 +48,7 @@ class Job:
     """
 
     request: Request
-    cast: JobModels
+    models: JobModels
     tasks: list[Task]
     options: RenderOptions
     spaces: tuple[str, str]
@@ -74,10 +74,10 @@ def job_of(request: Request) -> Job:
     video = _video(flags, chosen.fps, tasks[0].path, sizes)
     for text in chosen.told(flags.cameras, *unapplied):
         warn(text)
-    cast = models()
+    job_models = models()
     gains = gains_of(flags.model, flags.appearance) if flags.appearance is not None else ()
-    tasks, mattes = cast.seen(tasks, pictures, channels), mattes_of(cast, channels, flags.ids_from or "")
-    colours = Colours(pictures.colour, cast.space)
+    tasks, mattes = job_models.seen(tasks, pictures, channels), mattes_of(job_models, channels, flags.ids_from or "")
+    colours = Colours(pictures.colour, job_models.space)
     colours.check_file(flags.output)
     options = RenderOptions(
         channels,
@@ -85,11 +85,11 @@ def job_of(request: Request) -> Job:
         request.encoding,
         attributes={
             "Software": f"clsplat {package_version()}",
-            "clsplat:model": cast.digest,
+            "clsplat:model": job_models.digest,
             "clsplat:colorspace": colours.output,
         },
         pictures=pictures,
-        recorded=cast.space,
+        recorded=job_models.space,
         deep=flags.slices if flags.deep else None,
         drawn=digest_of(flags.rasterizer),
         gains=gains,
@@ -97,7 +97,7 @@ def job_of(request: Request) -> Job:
         mattes=names_of(mattes),
         ids_from=flags.ids_from or "",
     )
-    return Job(request, cast, tasks, options, (colours.model, colours.output), video, mattes)
+    return Job(request, job_models, tasks, options, (colours.model, colours.output), video, mattes)
 
 
 def _models(flags: RenderVerb) -> JobModels:
@@ -107,7 +107,7 @@ def _models(flags: RenderVerb) -> JobModels:
         raise InputError(f"{wrong} is a shot of several")
     if flags.appearance is not None and is_sequence(flags.model):
         raise InputError(f"{wrong} has a file for each frame")
-    return load_cast(flags.model, None if flags.transform is None else parse_transform(flags.transform))
+    return load_job_models(flags.model, None if flags.transform is None else parse_transform(flags.transform))
 
 
 def _video(flags: RenderVerb, fps: float | None, path: Path, sizes: Collection[tuple[int, int]]) -> VideoConfig:
@@ -235,9 +235,9 @@ def write_frames(job: Job, renderers: Sequence[Any]) -> int:
             if flags.on_farm:
                 from clsplat.sequence.farm import WorkerJob, render_on_farm
 
-                cast, settings = job.cast, (flags.rasterizer, job.request.devices[0], job.request.memory_limit)
-                model, placed = str(cast.path.absolute()), cast.tracks is not None
-                worker_job = WorkerJob(model, cast.digest, options, *settings, placed)
+                job_models, settings = job.models, (flags.rasterizer, job.request.devices[0], job.request.memory_limit)
+                model, placed = str(job_models.path.absolute()), job_models.tracks is not None
+                worker_job = WorkerJob(model, job_models.digest, options, *settings, placed)
                 render_on_farm(left, worker_job, done, scheduler=flags.scheduler, workers=flags.workers, video=video)
             else:
                 shared = flags.skip_existing and not flags.is_video

@@ -82,7 +82,7 @@ def _stage_cameras(stereo: StereoConfig, cameras: Path | None, usd_camera: str |
 def _of_eyes(stereo: StereoConfig, shots: list[Shot], paths: dict[str, str]) -> dict[str, Shot]:
     """Shot of each eye. Without stereo there is one shot, under "".
 
-    shots: the cameras' shot, or that of each eye's camera in the stage.
+    shots: the shot of the cameras, or the two shots of the eyes' cameras in the stage.
     paths: path of each eye's camera in the stage.
     Raises InputError.
     """

@@ -23,7 +23,7 @@ def run(verb: RenderVerb, services: Services) -> int:
     job = job_of(request)
     renderers = [
         services.open_frame_renderer(
-            job.cast.drawn,
+            job.models.drawn,
             job.options,
             verb.rasterizer,
             device=selector,

@@ -91,7 +91,7 @@ _EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).
 
 
 def _flat_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
-    """Left, right, top and bottom (n, 4), in pixels, of the parts of boxes in front of a perspective camera."""
+    """Screen bounds (n, 4) in pixels: left, right, top and bottom of boxes, cut off at the near plane (perspective)."""
     corners = np.where(_CORNERS, high[:, None], low[:, None]) @ camera.rotation.T
     begins, ends = corners[:, _EDGES[:, 0]], corners[:, _EDGES[:, 1]]
     rise = ends[..., 2] - begins[..., 2]

@@ -91,8 +91,7 @@ def logits(opacity: NDArray[Any]) -> Float32:
 def byte_logits() -> Float32:
     """Logits (256,) of the opacities that bytes 0 to 255 encode.
 
-    Bytes 0 and 255 stand for half a step each. Their logits are those of its middle, which is finite and rounds to the
-    same byte.
+    0 and 255 become 0.25 and 254.75 before the conversion. These round to the same bytes, and have finite logits.
     """
     steps = np.arange(256, dtype=np.float64)
     steps[0], steps[-1] = 0.25, 254.75

@@ -23,10 +23,10 @@ from clsplat.errors import InputError, warn
 from clsplat.files.documents import is_file, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.images.colour import recorded_space
-from clsplat.models.codec import soundness
+from clsplat.models.codec import repair
 from clsplat.models.codec.gltf_asset import GAUSSIAN_EXTENSION
 from clsplat.models.codec.ply_file import MAX_PLY_HEADER_BYTES
-from clsplat.models.codec.soundness import Activated
+from clsplat.models.codec.repair import Activated
 from clsplat.models.formats import compressed_ply, gltf, ksplat, ply, sog, splat, spz, usd, zipped
 
 FORMAT_HEAD_BYTES = 1 << 16
@@ -212,16 +212,16 @@ def model_path(path: Path) -> Path:
     return next((path / name for name in names if is_file(path / name)), path)
 
 
-def load(path: str | os.PathLike[str], *, activated: Activated | None = None, doubts: bool = True) -> Gaussians:
-    """Read a model file of any format, and repair its values (`soundness.sound`).
+def load(path: str | os.PathLike[str], *, activated: Activated | None = None, check_encoding: bool = True) -> Gaussians:
+    """Read a model file of any format, and repair its values (`repair.repaired`).
 
     activated: values to convert to logits or logs, because the file stores opacities or scales.
-    doubts: warn if the file seems to need `activated`.
+    check_encoding: warn if the file seems to need `activated`.
     Raises InputError.
     """
     path, row = resolve(Path(path))
-    gaussians = soundness.sound(row.read(path), path, activated)
-    for text in soundness.doubts(gaussians.opacity_logits, gaussians.log_scales) if doubts else ():
+    gaussians = repair.repaired(row.read(path), path, activated)
+    for text in repair.encoding_warnings(gaussians.opacity_logits, gaussians.log_scales) if check_encoding else ():
         warn(f"{path}: {text}")
     if gaussians.near == DEFAULT_NEAR_PLANE:
         gaussians.near = _near_of(gaussians)

@@ -42,7 +42,7 @@ from clsplat.models.codec.ply_file import (
     read_header,
     read_vertices,
 )
-from clsplat.models.codec.soundness import finite_rows, mend
+from clsplat.models.codec.repair import finite_rows, replace_infinities
 from clsplat.models.codec.values import IO_BLOCK_ROWS
 from clsplat.models.edit import take
 
@@ -96,7 +96,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def read_whole_numbers(path: Path, name: str) -> NDArray[np.int64]:
-    """Values (n,) of an integer property, without the Gaussians that `soundness.sound` leaves out.
+    """Values (n,) of an integer property, without the Gaussians that `repair.repaired` leaves out.
 
     Raises InputError like `read`, and if the property is missing or has values that are not 32-bit integers.
     """
@@ -109,7 +109,7 @@ def read_whole_numbers(path: Path, name: str) -> NDArray[np.int64]:
         for block in read_vertices(file, header, "Gaussian"):
             gaussians = values.empty(len(block["x"]), _degree(rest))
             _fill(gaussians, block, rest)
-            mend(gaussians)
+            replace_infinities(gaussians)
             columns.append(np.asarray(block[name], np.float64)[finite_rows(gaussians)])
     column = np.concatenate(columns)
     if not (np.abs(column) < 2**31).all() or (column != np.round(column)).any():

@@ -58,7 +58,7 @@ COORDINATE_SYSTEM_SIGNS: tuple[Signs, ...] = (
     *(RUB_SIGNS, (-1, 1, -1), (1, 1, -1), (-1, -1, -1), RUB_SIGNS),  # unspecified, LDB, RDB, LUB, RUB
     *((-1, 1, 1), (1, 1, 1), (-1, -1, 1), (1, -1, 1)),  # LDF, RDF, LUF, RUF
 )
-"""Signs between clsplat's axes and those of each value of the coordinate system extension. Larger values have z up."""
+"""Signs between clsplat's axes and a file's, by value of its coordinate system extension. Larger values have z up."""
 MAX_EXTENSION_BYTES = 1 << 20
 MAX_ZSTD_WINDOW_BYTES = 1 << 27
 """Largest window in bytes that a Zstandard frame may require: the default limit of the Zstandard library."""
@@ -235,7 +235,7 @@ def _next(stream: Stream, count: int, path: Path, what: str) -> bytes:
 
 
 def _rest(stream: Any, path: Path) -> bytes:
-    """Bytes after the Gaussians, at most MAX_EXTENSION_BYTES + 1. At its end gzip verifies its checksum."""
+    """Bytes after the Gaussians, at most MAX_EXTENSION_BYTES + 1. A read to the end also verifies gzip's checksum."""
     with _decompressing(path, "at its end"):
         return bytes(stream.read(MAX_EXTENSION_BYTES + 1))
 

@@ -146,8 +146,8 @@ class Instancer:
     def of(self, key: Key, code: Any) -> tuple[Any, bool]:
         """USD's matrix from the prototype's parent to the world, and visibility, of the instance `key`.
 
-        An instance that does not exist at that time is invisible. Its matrix is then that of the last time at which it
-        existed, or else of the next. Raises InputError.
+        An instance that does not exist at that time is invisible. It keeps its last matrix, or has its next one if it
+        has not existed before. Raises InputError.
         """
         places, hidden = self._at(code)
         if key in places:

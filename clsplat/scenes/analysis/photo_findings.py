@@ -218,7 +218,7 @@ def _strange_masks(scene: Scene, reason: str) -> Finding | None:
 def _alpha(scene: Scene, use: MaskUse) -> Finding | None:
     if use.alpha != "blend":
         return None
-    shares = np.array([scene.glances[view.name].transparent for view in _sampled_training_views(scene)])
+    shares = np.array([scene.thumbnails[view.name].transparent for view in _sampled_training_views(scene)])
     if (shares >= TRANSPARENT_PIXEL_FRACTION).mean() < 0.5:
         return None
     part = f"{100 * shares.mean():.0f} %"
@@ -293,7 +293,7 @@ def _sky_part(visible: VisiblePoints, view: View) -> float:
 
     Sky is a bright, smooth, blue or white region at the upper border, above the horizon, with hardly any points.
     """
-    pixels = visible.scene.glances[view.name].pixels
+    pixels = visible.scene.thumbnails[view.name].pixels
     up = visible.up @ view.camera.rotation.T
     turns = int(np.round(np.arctan2(up[0], -up[1]) / (np.pi / 2))) % 4  # quarter turns that make the picture upright
     upright = np.rot90(pixels, turns)
@@ -329,7 +329,7 @@ def _elevation(view: View, part: NDArray[np.bool_], up: Float64) -> float:
 
 def _blur(scene: Scene) -> Finding | None:
     names = [view.name for view in _sampled_training_views(scene)]
-    logs = np.log([max(scene.glances[name].sharpness, 1e-6) for name in names])
+    logs = np.log([max(scene.thumbnails[name].sharpness, 1e-6) for name in names])
     if len(names) < 5:
         return None
     low, middle, high = np.quantile(logs, (0.25, 0.5, 0.75))
@@ -346,14 +346,14 @@ def _duplicates(scene: Scene) -> Finding | None:
     """Find photographs with nearly identical thumbnails."""
     by_size: dict[tuple[int, ...], list[str]] = {}
     for view in scene.sampled_views:
-        by_size.setdefault(scene.glances[view.name].pixels.shape, []).append(view.name)
+        by_size.setdefault(scene.thumbnails[view.name].pixels.shape, []).append(view.name)
     copies = []
     for names in by_size.values():
-        flat = np.array([scene.glances[name].pixels[::4, ::4].ravel() for name in names], np.float64)
+        flat = np.array([scene.thumbnails[name].pixels[::4, ::4].ravel() for name in names], np.float64)
         squares = (flat * flat).sum(axis=1)
         apart = (squares[:, None] + squares - 2 * flat @ flat.T) / flat.shape[1]
         for one, other in np.argwhere(np.triu(apart <= 4 * DUPLICATE_RMS * DUPLICATE_RMS, 1)):
-            a, b = (scene.glances[names[index]].pixels for index in (one, other))
+            a, b = (scene.thumbnails[names[index]].pixels for index in (one, other))
             if (
                 a.std(axis=(0, 1)).max() > FEATURELESS_THUMBNAIL_STD
                 and float(np.square(a - b).mean()) <= DUPLICATE_RMS * DUPLICATE_RMS

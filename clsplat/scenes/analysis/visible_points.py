@@ -61,7 +61,7 @@ class VisiblePoints:
         return mean / max(float(np.linalg.norm(mean)), 1e-9)
 
     def _place(self, view: View) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Float64]:
-        height, width = self.scene.glances[view.name].pixels.shape[:2]
+        height, width = self.scene.thumbnails[view.name].pixels.shape[:2]
         camera = view.camera.resized(width, height)
         rows, columns, inside = pixels_of(self.points, camera, view.lens)
         where = np.flatnonzero(inside)
@@ -79,7 +79,7 @@ class VisiblePoints:
         """
         found = {}
         for name, (which, rows, columns, _) in self.places.items():
-            seen, known = self.scene.glances[name].pixels[rows, columns], self.colors[which]
+            seen, known = self.scene.thumbnails[name].pixels[rows, columns], self.colors[which]
             both = np.concatenate([seen, known], axis=1)
             good = ((both > MIN_EXPOSURE_COLOUR) & (both < MAX_EXPOSURE_COLOUR)).all(axis=1) & self._coloured[which]
             if good.sum() >= MIN_POINTS_PER_VIEW:
@@ -113,7 +113,7 @@ class VisiblePoints:
     def _logs(self, name: str) -> tuple[NDArray[np.int64], Float64]:
         """Points (n,) that are neither too dark nor clipped in a view, and log2 of their colours there, (n, 3)."""
         which, rows, columns, _ = self.places[name]
-        pixels = self.scene.glances[name].pixels
+        pixels = self.scene.thumbnails[name].pixels
         seen, most = (
             pixels[rows, columns].astype(np.float64),
             MAX_EXPOSURE_COLOUR if pixels.max(initial=0) <= 1 else np.inf,

@@ -308,8 +308,8 @@ class _Pictures:
 def _staged(names: Iterable[str]) -> list[list[_Staged]]:
     """Groups of photographs with the same stem in the same folders. Classified folders are ignored.
 
-    Each group has at least two kinds. Folders above a folder of undistorted pictures may be those of another program
-    and are also ignored.
+    Each group has at least two kinds. Folders above a folder of undistorted pictures are also ignored, as another
+    program may have made them.
     """
     groups: dict[tuple[Hashable, ...], list[_Staged]] = defaultdict(list)
     for name in names:

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Case of appearance: gains of photographs, their gradient and their update by Adam."""
+"""Cases of the colour models: photographs without their colours, the gradient, and the update by Adam."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
+from importlib import import_module
 
 import numpy as np
 from numpy.random import Generator
@@ -13,13 +16,25 @@ from clsplat.arrays import Float32, Float64
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.reference import appearance as reference
-from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly, fresh_readback, read_of
+from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly, fresh_readback, read_of
 from clsplat.selftest.cases.loss import random_pictures
 from clsplat.selftest.harness import CaseBench, cropped, planes_of
 from clsplat.selftest.scenes import evenly
-from clsplat.stages.appearance import Gains, gain_gradient, remove_gains, step_gains
+from clsplat.stages.appearance import (
+    COLOUR_MODELS,
+    GAIN_ENTRIES,
+    ColourModel,
+    GainEntries,
+    Gains,
+    PhotoLens,
+    develop,
+    entry_gradient,
+    step_gains,
+)
 
-GAINS_PHOTOGRAPH = 1
+MIX_RATE_FACTOR = 0.125
+MAX_FALLOFF_OCTAVES, MAX_MIX = 16.0, 0.2
+"""Limits in the kernels: octaves of a vignette, and absolute value of entries after the gains."""
 
 
 def random_gradient(rng: Generator, image: Float32) -> Float32:
@@ -42,103 +57,156 @@ def frozen_pictures(bench: CaseBench, photograph_seed: int, gradient_seed: int) 
     return Inputs(**{name: cropped(each, bench.camera) for name, each in planes.items()})
 
 
-def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
-    """Gains of 1/256 to 256, and gradients of any magnitude."""
+def _random(model: ColourModel, rng: Generator, size: tuple[int, int]) -> Inputs:
+    """Gains of 1/256 to 256, other entries up to their limits, gradients of any magnitude, and principal points outside
+    the picture too."""
     image, photograph = random_pictures(rng, size)
     by_image = random_gradient(rng, image)
-    pull = rng.choice([0.0, 1e-3, 1.0]) * rng.uniform(0, 0.5, (3, 3)) * np.abs(by_image).sum()
+    scale = float(np.abs(by_image).sum())
+    ends = np.where(np.arange(model.entries) < GAIN_ENTRIES, 8.0, MAX_MIX)
     return Inputs(
         image=image,
         photograph=photograph,
         by_image=by_image,
-        logs=rng.uniform(-8, 8, (3, 3)).astype(np.float32),
-        start=rng.uniform(-1, 1, (3, 3)).astype(np.float32),
-        pull=pull.astype(np.float32),
-        moments=random_moments(rng, (3, 3), float(np.abs(by_image).sum())),
+        taken=PhotoLens(1, 1, (rng.uniform(-0.5, 1.5), rng.uniform(-0.5, 1.5)), flat=bool(rng.random() < 0.9)),
+        entries=rng.uniform(-ends, ends, (3, model.entries)).astype(np.float32),
+        start=rng.uniform(-1, 1, (3, model.entries)).astype(np.float32),
+        pull=(rng.choice([0.0, 1e-3, 1.0]) * rng.uniform(0, 0.5, (3, 3)) * scale).astype(np.float32),
+        lenses=rng.uniform(-1, 0.2, (2, model.lens_entries)).astype(np.float32),
+        of_entries=random_moments(rng, (3, model.entries), scale),
+        of_lenses=random_moments(rng, (2, model.lens_entries), scale),
         number=int(rng.integers(1, 500)),
-        rate=0.05,
+        rate=float(rng.choice([0.01, 0.05])),
     )
 
 
-def _frozen(bench: CaseBench) -> list[Inputs]:
-    """Inputs with gains for three photographs, one of which is used."""
-    ends = {41: (-1.0, 1.0), 43: (-1.0, 1.0), 44: (0.0, 0.5)}
-    logs, start, pull = (evenly(seed, (3, 3), *ends[seed]).astype(np.float32) for seed in ends)
-    pull[2] = pull[:, 2] = 0  # this photograph is not pulled
-    learnt = Inputs(logs=logs, start=start, pull=pull, moments=np.zeros((2, 3, 3), np.float32), number=5, rate=0.03125)
-    return [Inputs(**vars(frozen_pictures(bench, 45, 42)), **vars(learnt))]
+def _frozen(model: ColourModel, bench: CaseBench) -> list[Inputs]:
+    """Inputs with three photographs and two lenses; photograph 1 is used, taken with lens 1.
+
+    In a model of gains alone, two photographs are pulled.
+    """
+    pulled = model.sums == GAIN_ENTRIES
+    pictures, seed, end = ((45, 42), 41, 1.0) if pulled else ((48, 49), 46, 0.125)
+    entries = evenly(seed, (3, model.entries), -end, end).astype(np.float32)
+    pull = pulled * evenly(44, (3, 3), 0.0, 0.5).astype(np.float32)
+    pull[2] = pull[:, 2] = 0
+    learnt = Inputs(
+        taken=PhotoLens(photograph=1, lens=1, centre=(0.4375, 0.5625)),
+        entries=entries,
+        start=evenly(43, (3, model.entries), -1.0, 1.0).astype(np.float32) if pulled else entries,
+        pull=pull,
+        lenses=evenly(47, (2, model.lens_entries), -0.5, 0.25).astype(np.float32),
+        of_entries=np.zeros((2, 3, model.entries), np.float32),
+        of_lenses=np.zeros((2, 2, model.lens_entries), np.float32),
+        number=5,
+        rate=0.03125,
+    )
+    return [Inputs(**vars(frozen_pictures(bench, *pictures)), **vars(learnt))]
 
 
-def uploaded(device: Device, given: Inputs) -> list[DeviceArray]:
-    """Planes of the photograph with alpha, the render, and the gradient; its padding rows, never written, are NaN."""
+def _gains(device: Device, entries: Float32, moments: Sequence[Float32], pull: csr_array | None = None) -> Gains:
+    first, second = (upload(device, moment) for moment in moments)
+    return replace(Gains.on(device, entries, pull), first=first, second=second)
+
+
+def _launch(model: ColourModel, device: Device, work: Workspace, given: Inputs) -> Read:
+    colours = _gains(device, given.entries, given.of_entries, csr_array(given.pull))
+    colours = replace(colours, start=upload(device, given.start))
+    lenses = _gains(device, given.lenses, given.of_lenses) if model.of_lens else None
     planes, below = planes_of(given.photograph), planes_of(given.by_image)
-    below[:, given.size[1] :] = np.nan
-    return [upload(device, each) for each in (np.concatenate([planes, planes[:1]]), planes_of(given.image), below)]
+    below[:, given.size[1] :] = np.nan  # padding rows, which are never written
+    target = upload(device, np.concatenate([planes, planes[:1]]))  # with alpha
+    image, gradient = upload(device, planes_of(given.image)), upload(device, below)
+    develop(device, model, colours, lenses, given.taken, target, given.size)
+    columns = entry_gradient(device, work, model, given.taken, image, gradient, given.size)
+    step = (columns, given.number, given.rate, fresh_readback(device))
+    step_gains(device, colours, given.taken.photograph, *step, GainEntries(mix_rate=MIX_RATE_FACTOR))
+    made = {"entries": colours.logs, "start": colours.start, "gains": colours.gains, "columns": columns}
+    if lenses is not None:
+        step_gains(device, lenses, given.taken.lens, *step, model.lens_update)
+        made["lenses"] = lenses.logs
+    read = read_of(**made, first=colours.first, second=colours.second)
+    return lambda: {**read(), **_pictures_read(given, target, gradient)}
 
 
-def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
-    start, first, second = (upload(device, array) for array in (given.start, *given.moments))
-    gains = replace(Gains.on(device, given.logs, csr_array(given.pull)), start=start, first=first, second=second)
-    target, image, gradient = uploaded(device, given)
-    remove_gains(device, gains, GAINS_PHOTOGRAPH, target)
-    columns = gain_gradient(device, work, image, gradient, given.size[1])
-    step_gains(device, gains, GAINS_PHOTOGRAPH, columns, given.number, given.rate, fresh_readback(device))
-    read = read_of(logs=gains.logs, first=first, second=second, gains=gains.gains, columns=columns, start=start)
-    return lambda: {**read(), **pictures_read(given, target, gradient)}
-
-
-def pictures_read(given: Inputs, target: DeviceArray, gradient: DeviceArray) -> Arrays:
+def _pictures_read(given: Inputs, target: DeviceArray, gradient: DeviceArray) -> Arrays:
     """The photograph after the launch, and the planes that must not change: its alpha, and the gradient."""
-    planes = target.get()
-    return {
-        "target": cropped(planes[:3], given.size),
-        "alpha": planes[3],
-        "gradient": cropped(gradient.get(), given.size),
-    }
+    planes, by_image = target.get(), cropped(gradient.get(), given.size)
+    return {"target": cropped(planes[:3], given.size), "alpha": planes[3], "gradient": by_image}
 
 
-def unchanged(given: Inputs) -> dict[str, Wanted]:
-    """The planes that must not change."""
-    return {"alpha": exactly(planes_of(given.photograph)[0]), "gradient": exactly(given.by_image)}
-
-
-def moment(values: Float64) -> Wanted:
+def moment(values: Float64) -> Expected:
     """A moment of Adam. The bound: beta2 in float32 is off by 1e-8, which is 1e-5 of 1 - beta2 = 1e-3."""
-    return Wanted(values, 3e-5, np.abs(values).max())
+    return Expected(values, 3e-5, np.abs(values).max())
 
 
-def stepped(values: Float64, rate: float | Float64) -> Wanted:
+def stepped(values: Float64, rate: float | Float64) -> Expected:
     """Values after a step of Adam. The bound: beta2 is 1e-5 of a step, and a sum of 16 floats may nearly cancel."""
-    return Wanted(values, 1e-4, rate + 1e-2 * np.abs(values))
+    return Expected(values, 1e-4, rate + 1e-2 * np.abs(values))
 
 
-def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
-    image, by_image, photograph, logs, start, pull, moments = given.wide(
-        *("image", "by_image", "photograph", "logs", "start", "pull", "moments")
+def _developed(model: ColourModel, given: Inputs, squared: Float64) -> Expected:
+    """The expected photograph after gains, other entries and the lens are removed."""
+    twin = import_module(f"clsplat.reference.{model.stem}")
+    photograph, entries, lenses = given.wide("photograph", "entries", "lenses")
+    own, lens = entries[given.taken.photograph], lenses[given.taken.lens]
+    wanted = twin.developed(photograph, own, lens, squared)
+    if model.sums == GAIN_ENTRIES:
+        return Expected(wanted, 3e-7, wanted)  # two roundings: 2^log and a quotient
+    white, none = np.ones_like(photograph), np.zeros_like(own)
+    octaves, most = (np.log2(twin.developed(white, none, each, squared)) for each in (lens, -np.abs(lens)))
+    largest = np.maximum(np.abs(wanted), photograph / np.exp2(own[:GAIN_ENTRIES])).max(axis=2, keepdims=True)
+    # a few roundings for each octave of the lens
+    return Expected(wanted, 1.2e-6, largest * (0.4 + most), np.abs(octaves) < MAX_FALLOFF_OCTAVES)
+
+
+def _twin(model: ColourModel, given: Inputs, got: Arrays) -> dict[str, Expected]:
+    image, by_image, entries, start, pull, lenses, of_entries, of_lenses = given.wide(
+        *("image", "by_image", "entries", "start", "pull", "lenses", "of_entries", "of_lenses")
     )
-    got["by gains"] = np.log(2) * got["columns"].sum(axis=1, dtype=np.float64)
-    gradients = np.zeros_like(logs)  # from the device's sums: their error does not count again
-    gradients[GAINS_PHOTOGRAPH] = got["by gains"] + reference.pull(logs, start, pull)[GAINS_PHOTOGRAPH]
-    after, first, second = reference.step(logs, moments[0], moments[1], gradients, given.number, given.rate)
-    removed = reference.removed(photograph, logs[GAINS_PHOTOGRAPH])
-    terms = np.log(2) * np.abs(image * by_image).sum(axis=(0, 1))
+    (width, height), taken, count = given.size, given.taken, model.entries
+    squared = reference.spread(width, height, (taken.centre[0] * width, taken.centre[1] * height))
+    squared *= taken.flat  # a panorama has no vignette
+    terms = import_module(f"clsplat.reference.{model.stem}").terms(image, by_image, squared)
+    is_gain = np.arange(count) < GAIN_ENTRIES
+    is_log = np.concatenate([is_gain, np.full(model.lens_entries, fill_value=True)])
+    found = np.where(is_log, np.log(2), 1.0) * got["columns"].sum(axis=1, dtype=np.float64)
+    got |= {"by gains": found[:GAIN_ENTRIES], "by the rest": found[GAIN_ENTRIES:]}
+    sums, sizes = terms.sum(axis=(0, 1)), np.abs(terms).sum(axis=(0, 1))
+    by_entries, by_lenses = np.zeros_like(entries), np.zeros_like(lenses)
+    # from the device's sums: their error does not count again
+    by_entries[taken.photograph] = found[:count] + reference.pull(entries, start, pull)[taken.photograph]
+    by_lenses[taken.lens] = found[count:]
+    rates = given.rate * np.where(is_gain, 1.0, MIX_RATE_FACTOR)
+    after, first, second = reference.step(entries, of_entries[0], of_entries[1], by_entries, given.number, rates)
+    after[:, GAIN_ENTRIES:] = np.clip(after[:, GAIN_ENTRIES:], -MAX_MIX, MAX_MIX)
+    lenses, _, _ = reference.step(
+        lenses, of_lenses[0], of_lenses[1], by_lenses, given.number, given.rate, centred=False
+    )
     return {
-        "target": Wanted(removed, 3e-7, removed),  # two roundings: 2^log and a quotient
-        "by gains": Wanted(reference.gradient(image, by_image), 1e-6, terms),  # a few roundings of partial sums
-        "logs": stepped(after, given.rate),
-        "gains": Wanted(np.exp2(after), 1e-5, np.exp2(after)),
+        "target": _developed(model, given, squared),
+        # a few roundings of partial sums, and of distances, relative to the sum of magnitudes
+        "by gains": Expected(sums[:GAIN_ENTRIES], 1e-6, sizes[:GAIN_ENTRIES]),
+        "by the rest": Expected(sums[GAIN_ENTRIES:], 2e-6, sizes[GAIN_ENTRIES:]),
+        "entries": stepped(after, rates),
+        "gains": Expected(np.exp2(after), 1e-5, np.exp2(after), np.broadcast_to(is_gain, after.shape)),
         "first": moment(first),
         "second": moment(second),
         "start": exactly(given.start),
-        **unchanged(given),
+        "alpha": exactly(planes_of(given.photograph)[0]),
+        "gradient": exactly(given.by_image),
+        **({"lenses": stepped(lenses, given.rate)} if model.of_lens else {}),
     }
 
 
-APPEARANCE_CASE = Case(
-    sizes=((17, 33), (16, 16), (1, 1), (40, 15)),
-    random=_random,
-    launch=_launch,
-    twin=_twin,
-    frozen=_frozen,
-    digested=("logs", "first", "second", "gains", "columns", "target"),
-)
+COLOUR_CASES = {
+    name: Case(
+        sizes=((17, 33), (16, 16), (1, 1), (40, 15)),
+        random=partial(_random, model),
+        launch=partial(_launch, model),
+        twin=partial(_twin, model),
+        frozen=partial(_frozen, model),
+        digested=("entries", "first", "second", "lenses" if model.of_lens else "gains", "columns", "target"),
+    )
+    for name, model in COLOUR_MODELS.items()
+}

@@ -96,8 +96,8 @@ def _project(bench: CaseBench) -> StageOutcome:
 
 
 def _box_tiles(projected: reference_project.ProjectedTwin, tiles: tuple[int, int]) -> NDArray[np.int64]:
-    """Upper bound of each Gaussian's number of tiles: those in its bounding box, enlarged by half a pixel. 0 if it is
-    not visible."""
+    """Number of tiles in each Gaussian's bounding box, enlarged by half a pixel: an upper bound. 0 if it is not
+    visible."""
     low = np.floor((projected.means2d - projected.half_extents - 0.5) / TILE)
     high = np.floor((projected.means2d + projected.half_extents + 0.5) / TILE) + 1
     spans = np.clip(high, 0, tiles) - np.clip(low, 0, tiles)

@@ -16,7 +16,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import SPLAT
 from clsplat.optimisation.density_rules import MarkRules
 from clsplat.reference import density as reference
-from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly, faults
+from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly, faults
 from clsplat.selftest.harness import WHITENING_FACTOR, CaseBench, StageOutcome
 from clsplat.selftest.scenes import evenly
 from clsplat.stages.density import CONTRIBUTION_STATISTICS, DeviceMarker, add_statistics, new_statistics
@@ -56,7 +56,7 @@ def _launch(device: Device, _: Workspace, given: Inputs) -> Read:
     return lambda: {name: array.get() for name, array in statistics.named().items()}
 
 
-def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
     sums, seen, radii, doubtful = (np.zeros(len(got["seen"]), kind) for kind in (float, float, float, bool))
     to_ndc = 0.5 * np.array([given.camera.width, given.camera.height])
     for splats, tiles, screen in given.views:
@@ -72,7 +72,7 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     found = got["radii"]
     radii = np.where(doubtful & (np.abs(found - radii) <= 1), found, radii)
     # rounding of a square root and two sums
-    return {"gradient_sums": Wanted(sums, 1e-6, sums), "seen": exactly(seen), "radii": exactly(radii)}
+    return {"gradient_sums": Expected(sums, 1e-6, sums), "seen": exactly(seen), "radii": exactly(radii)}
 
 
 STATISTICS_CASE = Case(
@@ -118,7 +118,7 @@ def _launch_marks(device: Device, work: Workspace, given: Inputs) -> Read:
     return lambda: found
 
 
-def _twin_of_marks(given: Inputs, _: Arrays) -> dict[str, Wanted]:
+def _twin_of_marks(given: Inputs, _: Arrays) -> dict[str, Expected]:
     known, gaussians, wanted = given.statistics, given.gaussians, {}
     for index, rules in enumerate(given.rules):
         rows, halves = reference.rows(rules, known, gaussians.log_scales, gaussians.opacity_logits)

@@ -11,7 +11,7 @@ from numpy.random import Generator
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.reference import grid as reference
-from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly, fresh_readback, read_of
+from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly, fresh_readback, read_of
 from clsplat.selftest.cases.appearance import moment, random_gradient, random_moments, stepped
 from clsplat.selftest.cases.loss import random_pictures
 from clsplat.selftest.harness import CaseBench, cropped, planes_of
@@ -63,7 +63,7 @@ def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
     return lambda: {**read(), **{name: cropped(array.get(), given.size) for name, array in planes.items()}}
 
 
-def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
     image, held, by_seen, moments = given.wide("image", "grids", "by_seen", "moments")
     at, (first, second) = GRID_PHOTOGRAPH, moments
     own = held[at].copy()
@@ -80,10 +80,10 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     level = image @ reference.LUMINANCE_WEIGHTS * (GRID_SHAPE[0] - 1)
     centred = reference.centre(held)
     return {
-        "seen": Wanted(seen, 1.2e-6, max(1.0, terms.max())),  # about twelve roundings
+        "seen": Expected(seen, 1.2e-6, max(1.0, terms.max())),  # about twelve roundings
         # sums of a hundred terms of both signs
-        "gradient": Wanted(by_image, 1e-5, sure=np.abs(level - np.rint(level)) > MIN_LEVEL_DISTANCE),
-        "by grid": Wanted(by_grid, 1e-5),
+        "gradient": Expected(by_image, 1e-5, compared=np.abs(level - np.rint(level)) > MIN_LEVEL_DISTANCE),
+        "by grid": Expected(by_grid, 1e-5),
         "first": moment(first),
         "second": moment(second),
         "grids": stepped(centred, given.rate),

@@ -19,7 +19,7 @@ from clsplat.reference import ewa as reference_ewa
 from clsplat.reference import splats as reference_splats
 from clsplat.reference import values as reference_values
 from clsplat.reference.sh import sh_basis_grad
-from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly
+from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly
 from clsplat.selftest.harness import WHITENING_FACTOR, Array, CaseBench, StageOutcome
 from clsplat.selftest.scenes import evenly
 from clsplat.spherical_harmonics import sh_basis
@@ -164,7 +164,7 @@ def _launch_splats(device: Device, work: Workspace, given: Inputs) -> Read:
     return read
 
 
-def _twin_of_splats(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+def _twin_of_splats(given: Inputs, got: Arrays) -> dict[str, Expected]:
     conics, opacities = given.wide("conics", "opacities")
     wanted = reference_splats.splats(conics, opacities, given.radii)
     seen = wanted.drawn & (got["tiles"] > 0)
@@ -178,11 +178,11 @@ def _twin_of_splats(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     logs = np.log2(opacities)
     return {
         # three roundings, of a root and two quotients; relative to the largest entry, as l12 may be near 0
-        "whitening": Wanted(wanted.whitenings, 5e-7, size, seen),
+        "whitening": Expected(wanted.whitenings, 5e-7, size, seen),
         # the extent depends on a difference of logarithms; the tile test has 0.01 px of slack
-        "half extents": Wanted(wanted.half_extents, 1e-4, 1 + wanted.half_extents, seen),
-        "LOG2O": Wanted(logs, 1.4e-6, 1.0, seen),  # an ulp of the logarithm changes the opacity by 1e-6
-        "means": Wanted(given.means2d[seen], 6e-8, 1.0),  # the fraction of a pixel is a float32 below 1
+        "half extents": Expected(wanted.half_extents, 1e-4, 1 + wanted.half_extents, seen),
+        "LOG2O": Expected(logs, 1.4e-6, 1.0, seen),  # an ulp of the logarithm changes the opacity by 1e-6
+        "means": Expected(given.means2d[seen], 6e-8, 1.0),  # the fraction of a pixel is a float32 below 1
         "values": exactly(given.values[seen]),
         "shown": exactly(np.zeros_like(got["shown"])),
     }
@@ -287,7 +287,7 @@ def launch_harmonics(device: Device, work: Workspace, given: Inputs, *, add: boo
     return lambda: {name: array.get() for name, array in made.items()}
 
 
-def _twin_of_harmonics(given: Inputs, _: Arrays) -> dict[str, Wanted]:
+def _twin_of_harmonics(given: Inputs, _: Arrays) -> dict[str, Expected]:
     directions, sh, d_colours = given.wide("directions", "sh", "by")
     away, used = directions - (0.0 if given.centre is None else given.centre), (given.degree + 1) ** 2
     length = np.linalg.norm(away, axis=1, keepdims=True)
@@ -303,10 +303,10 @@ def _twin_of_harmonics(given: Inputs, _: Arrays) -> dict[str, Wanted]:
     by_unit = np.einsum("nkd,nkc,nc->nd", slopes, sh, d_colours)
     d_directions = (by_unit - unit * (unit * by_unit).sum(axis=1, keepdims=True)) / length
     # sums of up to 25 products near 1, each off by 1e-7
-    wanted = {"colours": Wanted(colours, 4e-6, 1.0), "sh": Wanted(d_sh, 2e-6)}
-    wanted["directions"] = Wanted(d_directions, 2e-6) if given.degree else exactly(np.zeros_like(d_directions))
+    wanted = {"colours": Expected(colours, 4e-6, 1.0), "sh": Expected(d_sh, 2e-6)}
+    wanted["directions"] = Expected(d_directions, 2e-6) if given.degree else exactly(np.zeros_like(d_directions))
     if given.centre is not None:
-        wanted["centre"] = Wanted(-d_directions.sum(axis=0), 2e-6, (np.abs(by_unit) / length).sum(axis=0))
+        wanted["centre"] = Expected(-d_directions.sum(axis=0), 2e-6, (np.abs(by_unit) / length).sum(axis=0))
     return wanted
 
 

@@ -11,7 +11,7 @@ from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.reference.depth import depth_loss
 from clsplat.reference.loss import alpha_loss, l1_dssim, masked_l1_dssim
-from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly
+from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly
 from clsplat.selftest.harness import Array, CaseBench, cropped, planes_of
 from clsplat.selftest.scenes import evenly
 from clsplat.stages.blend import Blended, tile_items
@@ -76,16 +76,16 @@ def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
     return lambda: {**first, "photograph": np.array([0.0, *differing])}
 
 
-def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
     x, y = given.wide("image", "photograph")
     value, gradient = l1_dssim(x, y, given.weight)
     squared = np.square(x - y).mean()
     return {
         # a difference of pixels is off by 1e-7 of their brightness, which is at most 1.5
-        "gradient": Wanted(gradient, 1e-5),
+        "gradient": Expected(gradient, 1e-5),
         "beside": exactly(np.zeros_like(got["beside"])),
-        "loss": Wanted(np.array([value]), 1e-6, max(1.0, value)),  # roundings of partial sums
-        "squared error": Wanted(np.array([squared]), 1e-5, squared),
+        "loss": Expected(np.array([value]), 1e-6, max(1.0, value)),  # roundings of partial sums
+        "squared error": Expected(np.array([squared]), 1e-5, squared),
         "photograph": exactly(np.zeros_like(got["photograph"])),
     }
 
@@ -147,7 +147,7 @@ def _launch_masks(device: Device, work: Workspace, given: Inputs) -> Read:
     return read
 
 
-def _twin_of_masks(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+def _twin_of_masks(given: Inputs, got: Arrays) -> dict[str, Expected]:
     seen, left, parts, background = given.wide("image", "left", "photograph", "background")
     alpha, counts = parts[:, :, 3], parts[:, :, 4]
     truth = parts[:, :, :3] * alpha[:, :, None] + (1 - alpha)[:, :, None] * background
@@ -156,11 +156,11 @@ def _twin_of_masks(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     total, sure = value + of_alpha, (counts > 0) & (np.abs(seen - truth).min(axis=2) > MIN_LOSS_DIFFERENCE)
     return {
         # the gradient of blending skips masked pixels
-        "gradient": Wanted(gradient, 1e-5, sure=sure),
-        "gradient by transmittance": Wanted(by_left, 1e-6, sure=np.abs(1 - left - alpha) > MIN_LOSS_DIFFERENCE),
+        "gradient": Expected(gradient, 1e-5, compared=sure),
+        "gradient by transmittance": Expected(by_left, 1e-6, compared=np.abs(1 - left - alpha) > MIN_LOSS_DIFFERENCE),
         "masked pixels": exactly(np.zeros_like(got["masked pixels"])),
         # SSIM of masked windows cancels
-        "loss": Wanted(np.array([total]), 1e-6, max(1.0, total, counts.size / counts.sum())),
+        "loss": Expected(np.array([total]), 1e-6, max(1.0, total, counts.size / counts.sum())),
     }
 
 
@@ -197,12 +197,12 @@ def _launch_depth_loss(device: Device, work: Workspace, given: Inputs) -> Read:
     }
 
 
-def _twin_of_depth_loss(given: Inputs, _: Arrays) -> dict[str, Wanted]:
+def _twin_of_depth_loss(given: Inputs, _: Arrays) -> dict[str, Expected]:
     nearness, aims, weights = given.wide("nearness", "aims", "weights")
     value, gradient = depth_loss(nearness, aims, weights, given.factor)
     return {
-        "gradient": Wanted(gradient, 3e-7, np.abs(gradient)),  # rounding of a product
-        "loss": Wanted(np.array([value]), 1e-6, max(1.0, value)),  # only the depth term: the pictures are equal
+        "gradient": Expected(gradient, 3e-7, np.abs(gradient)),  # rounding of a product
+        "loss": Expected(np.array([value]), 1e-6, max(1.0, value)),  # only the depth term: the pictures are equal
     }
 
 

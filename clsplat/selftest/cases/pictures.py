@@ -26,7 +26,7 @@ from clsplat.reference import every_pixel
 from clsplat.reference import holdout as reference_holdout
 from clsplat.reference import rays as reference_rays
 from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
-from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted
+from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read
 from clsplat.selftest.harness import (
     MIN_DECISION_MARGIN,
     WHITENING_FACTOR,
@@ -171,13 +171,13 @@ def launch_deep_merge(device: Device, work: Workspace, given: Inputs) -> Read:
     return read
 
 
-def _twin_of_deep_merge(given: Inputs, _: Arrays) -> dict[str, Wanted]:
+def _twin_of_deep_merge(given: Inputs, _: Arrays) -> dict[str, Expected]:
     pictures, weights = given.wide("pictures", "weights")
     twin = reference_deep_merge.deep_merge(pictures, weights)
     sure = np.broadcast_to(twin.margin > MIN_MERGED_MARGIN, twin.slices.shape[:3])
     # a slice's colour is a sum of up to 16 x bins products, times a transmittance of as many factors; depth is copied
     bounds = {"colour": 1e-5, "alpha": 1e-5, "depth": 0.0}
-    return {name: Wanted(twin.slices[..., at], bounds[name], 1.0, sure) for name, at in DEEP_SLICE_PARTS.items()}
+    return {name: Expected(twin.slices[..., at], bounds[name], 1.0, sure) for name, at in DEEP_SLICE_PARTS.items()}
 
 
 DEEP_MERGE_CASE = Case(

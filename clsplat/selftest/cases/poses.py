@@ -13,7 +13,7 @@ from clsplat.layouts.columns import POSE_ROWS
 from clsplat.reference.pose import pose_gradient as reference
 from clsplat.reference.project import lens_grad
 from clsplat.reference.render import parameters, project_model
-from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted
+from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read
 from clsplat.selftest.cases.steps import random_scene
 from clsplat.selftest.harness import Array, CaseBench, StageOutcome
 from clsplat.selftest.scenes import evenly
@@ -56,7 +56,7 @@ def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
     return lambda: {"sums": total.get()[0]}
 
 
-def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
     seen, arrays = given.seen, given.gaussians.arrays()
     means, quaternions, sh = (arrays[name][seen].astype(np.float64) for name in ("means", "quaternions", "sh"))
     by = {group: values[seen].astype(np.float64) for group, values in given.by.items()}
@@ -65,7 +65,7 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     wanted = reference(means, quaternions, sh, given.camera, degree, by)
     got |= {"turn": got["sums"][:3], "shift": got["sums"][3:]}
     # terms of both signs: a sum of 4000 is about 60 times a term, and off by roundings of partial sums
-    return {"turn": Wanted(wanted[:3], 2e-6), "shift": Wanted(wanted[3:], 2e-6)}
+    return {"turn": Expected(wanted[:3], 2e-6), "shift": Expected(wanted[3:], 2e-6)}
 
 
 POSE_CASE = Case(

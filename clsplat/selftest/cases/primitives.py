@@ -15,7 +15,7 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
 from clsplat.layouts.columns import READBACK, SPLAT, TILE
 from clsplat.reference.append import lists_of
-from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly, fresh_readback, read_of
+from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly, fresh_readback, read_of
 from clsplat.selftest.harness import Array, CaseBench
 from clsplat.selftest.scenes import keys
 from clsplat.stages.append import append
@@ -44,13 +44,13 @@ def _launch_probe(device: Device, _: Workspace, given: Inputs) -> Read:
     return lambda: {name: out.get()[row] for row, (name, out) in enumerate(outs.items())}
 
 
-def _twin_of_probe(given: Inputs, _: Arrays) -> dict[str, Wanted]:
+def _twin_of_probe(given: Inputs, _: Arrays) -> dict[str, Expected]:
     exact = {name: function(given.x[name].astype(np.float64)) for name, (_, _, function) in PROBED.items()}
     return {
-        "exp": Wanted(exact["exp"], 2.4e-7, exact["exp"]),  # 2 ulp: the polynomial and the range reduction
-        "log2": Wanted(exact["log2"], 2.4e-7, np.maximum(np.abs(exact["log2"]), 1)),  # its values pass through 0
-        "sigmoid": Wanted(exact["sigmoid"], 3.6e-7, exact["sigmoid"]),  # 3 ulp
-        "exp2": Wanted(exact["exp2"], 2.1e-7, exact["exp2"]),  # 0.8e-7 from the polynomial, the rest from rounding
+        "exp": Expected(exact["exp"], 2.4e-7, exact["exp"]),  # 2 ulp: the polynomial and the range reduction
+        "log2": Expected(exact["log2"], 2.4e-7, np.maximum(np.abs(exact["log2"]), 1)),  # its values pass through 0
+        "sigmoid": Expected(exact["sigmoid"], 3.6e-7, exact["sigmoid"]),  # 3 ulp
+        "exp2": Expected(exact["exp2"], 2.1e-7, exact["exp2"]),  # 0.8e-7 from the polynomial, the rest from rounding
     }
 
 
@@ -93,7 +93,7 @@ def _launch_sort(device: Device, work: Workspace, given: Inputs) -> Read:
     return read_of(keys=found[0], places=found[1])
 
 
-def _twin_of_sort(given: Inputs, _: Arrays) -> dict[str, Wanted]:
+def _twin_of_sort(given: Inputs, _: Arrays) -> dict[str, Expected]:
     order = np.argsort(given.keys, kind="stable")
     return {"keys": exactly(given.keys[order]), "places": exactly(order)}
 
@@ -241,7 +241,7 @@ def _digits(lengths: NDArray[np.integer]) -> NDArray[np.int64]:
     return np.array([int(length).bit_length() for length in lengths], np.int64)
 
 
-def _twin_of_lists(given: Inputs, got: Arrays) -> Mapping[str, Wanted]:
+def _twin_of_lists(given: Inputs, got: Arrays) -> Mapping[str, Expected]:
     tiles, stops = given.tiles[0] * given.tiles[1], given.counts.sum() > given.capacity
     twin = lists_of(tiles_of_boxes(given.boxes, given.tiles[0]), given.depths, tiles)
     ranges = 0 * twin.ranges if stops else twin.ranges

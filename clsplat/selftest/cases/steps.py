@@ -18,7 +18,7 @@ from clsplat.layouts.columns import SLOT_PLAIN
 from clsplat.optimisation.step_noise import Exploration, step_key
 from clsplat.reference.adam import adam as reference
 from clsplat.reference.noise import displacements, penalty_grad
-from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly, fresh_readback
+from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly, fresh_readback
 from clsplat.selftest.harness import Array, CaseBench
 from clsplat.selftest.scenes import evenly
 from clsplat.stages.adam import AdamStep, adam
@@ -94,7 +94,7 @@ def _launch_adam(device: Device, _: Workspace, given: Inputs) -> Read:
     }
 
 
-def _twin_of_adam(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+def _twin_of_adam(given: Inputs, got: Arrays) -> dict[str, Expected]:
     moved = given.visible if given.sparse else np.ones_like(given.visible)
     made: dict[str, list[Array]] = {name: [] for name in ("parameters", "first", "second", "steps", "terms", "rows")}
     for group, rate in given.rates.items():
@@ -108,9 +108,9 @@ def _twin_of_adam(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     parameters, first, second, steps, terms, rows = (np.concatenate(found) for found in made.values())
     wanted = {
         # beta2 in float32 is off by 1e-8, which is 1e-5 of 1 - beta2 = 1e-3 and so of a step
-        "parameters": Wanted(parameters, 1e-4, steps + 1e-2 * np.abs(parameters), rows),
-        "first": Wanted(first, 1e-6, terms, rows),  # a few roundings
-        "second": Wanted(second, 3e-5, second, rows),
+        "parameters": Expected(parameters, 1e-4, steps + 1e-2 * np.abs(parameters), rows),
+        "first": Expected(first, 1e-6, terms, rows),  # a few roundings
+        "second": Expected(second, 3e-5, second, rows),
         "gradients": exactly(np.zeros_like(got["gradients"])),
     }
     for name in ("parameters", "first", "second"):
@@ -167,15 +167,15 @@ def _launch_noise(device: Device, _: Workspace, given: Inputs) -> Read:
     return lambda: {name: held[name].get() for name in ("means", *GEOMETRY_ARRAYS)}
 
 
-def _twin_of_noise(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+def _twin_of_noise(given: Inputs, got: Arrays) -> dict[str, Expected]:
     quaternions, log_scales, logits = given.wide(*GEOMETRY_ARRAYS)
     wanted = displacements(given.explore, quaternions, log_scales, logits)
     stays = given.opacity_logits >= highest_logit(given.explore.dead)
     got |= {"moves": got["means"][~stays], "means of the opaque": got["means"][stays]}
     size = np.abs(wanted) + 0.1 * np.abs(wanted).max(initial=0)
     return {
-        "means": Wanted(wanted, 5e-6),  # an ulp of o changes 100 (o - dead), up to 16, by 1e-6
-        "moves": Wanted(wanted[~stays], 1e-4, size[~stays]),
+        "means": Expected(wanted, 5e-6),  # an ulp of o changes 100 (o - dead), up to 16, by 1e-6
+        "moves": Expected(wanted[~stays], 1e-4, size[~stays]),
         "means of the opaque": exactly(np.zeros_like(got["means of the opaque"])),
         **{name: exactly(getattr(given, name)) for name in GEOMETRY_ARRAYS},
     }
@@ -207,7 +207,7 @@ def random_scene(rng: Generator, count: int) -> Inputs:
 
 
 def _launch_penalties(device: Device, work: Workspace, given: Inputs) -> Read:
-    """Compute the gradient of the penalties alone: that of the loss is zero."""
+    """Compute the gradient of the penalties alone: the loss's gradient is zero."""
     model, camera_array = upload_gaussians(device, given.gaussians), upload(device, pack_camera(given.camera))
     projected = project(device, work, model, given.camera, camera_array)
     gradients = allocate_gaussians(device, model.count, model.coefficients, zero=True)
@@ -220,14 +220,14 @@ def _launch_penalties(device: Device, work: Workspace, given: Inputs) -> Read:
     }
 
 
-def _twin_of_penalties(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+def _twin_of_penalties(given: Inputs, got: Arrays) -> dict[str, Expected]:
     gaussians, shown = given.gaussians, got.pop("shown")
     parts = penalty_grad(given.explore, *(getattr(gaussians, name).astype(np.float64) for name in GEOMETRY_ARRAYS[1:]))
-    wanted: dict[str, Wanted] = {}
+    wanted: dict[str, Expected] = {}
     for name, values in zip(GEOMETRY_ARRAYS[1:], parts, strict=True):
         got[f"{name} out of view"] = got[name][~shown]
         wanted |= {
-            name: Wanted(values, 1e-6, sure=shown),
+            name: Expected(values, 1e-6, compared=shown),
             f"{name} out of view": exactly(np.zeros_like(values[~shown])),
         }
     others = [group for group in PARAMETER_GROUPS if group not in GEOMETRY_ARRAYS[1:]]

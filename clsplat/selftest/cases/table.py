@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from clsplat.selftest.case import Case
-from clsplat.selftest.cases.appearance import APPEARANCE_CASE
+from clsplat.selftest.cases.appearance import COLOUR_CASES
 from clsplat.selftest.cases.core import CORE_STAGES
 from clsplat.selftest.cases.density import MARKS_CASE, STATISTICS_CASE, of_statistics
 from clsplat.selftest.cases.depth import of_depth
@@ -15,7 +15,6 @@ from clsplat.selftest.cases.library import HARMONICS_CASE, SPLATS_CASE, of_ewa, 
 from clsplat.selftest.cases.loss import DEPTH_LOSS_CASE, LOSS_CASE, MASKS_CASE
 from clsplat.selftest.cases.pictures import DEEP_MERGE_CASE, PICTURE_CASES
 from clsplat.selftest.cases.poses import POSE_CASE, of_lens
-from clsplat.selftest.cases.ppisp import PPISP_CASE
 from clsplat.selftest.cases.primitives import APPEND_CASE, BITONIC_CASE, ELEMENTARY_CASE, SCAN_CASE, SORT_CASE
 from clsplat.selftest.cases.steps import ADAM_CASE, NOISE_CASE, PENALTIES_CASE
 from clsplat.selftest.harness import CaseBench, StageOutcome
@@ -32,8 +31,7 @@ CASES: dict[str, Case] = {
     "penalties": PENALTIES_CASE,
     "adam": ADAM_CASE,
     "noise": NOISE_CASE,
-    "appearance": APPEARANCE_CASE,
-    "ppisp": PPISP_CASE,
+    **COLOUR_CASES,
     "grid": GRID_CASE,
     "pose": POSE_CASE,
     "harmonics": HARMONICS_CASE,

@@ -8,18 +8,17 @@ from typing import TYPE_CHECKING
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
+from clsplat.stages.appearance import COLOUR_MODELS
 from clsplat.training.appearance.base import Appearance
 from clsplat.training.appearance.bilateral_grid import GridsOfAll
-from clsplat.training.appearance.exposure import GainsOfAll
-from clsplat.training.appearance.ppisp import PpispOfAll
+from clsplat.training.appearance.colours import ColoursOfAll
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
 
 
 APPEARANCE_MODELS: dict[str, Callable[[TrainConfig, Device, Scene], Appearance]] = {
-    "exposure": GainsOfAll,
-    "ppisp": PpispOfAll,
+    **dict.fromkeys(COLOUR_MODELS, ColoursOfAll),
     "grid": GridsOfAll,
 }
 """Appearance models by value of the setting `appearance`."""

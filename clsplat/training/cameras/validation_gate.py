@@ -59,7 +59,7 @@ class Drift:
     shift: Float64
 
     def taken_along(self, camera: Camera) -> Camera:
-        """Camera that sees in the drifted world what `camera` sees in the original world."""
+        """`camera`, moved to the drifted world, where it sees the same as before in the original world."""
         rotation = camera.rotation @ self.rotation.T
         position = self.scale * self.rotation @ camera.position + self.shift
         return camera.posed(rotation, -rotation @ position)

@@ -174,10 +174,10 @@ def draw_halves(config: DensityConfig, split: Mapping[str, Float32], *, rng: np.
 
 
 def long_halves(split: Mapping[str, Float32]) -> dict[str, Float32]:
-    """New means, log scales and opacities of halves, which lie on both sides of the mean along the longest axis: all
-    first halves, then all second halves.
+    """Split Gaussians into two halves, one on each side of the mean along the longest axis (docs/gradients.md, (102)).
 
-    docs/gradients.md, (102). split: the groups SPLIT_GROUPS and opacity_logits of the split Gaussians.
+    split: the groups SPLIT_GROUPS and opacity_logits of the Gaussians.
+    Returns means, log scales and opacity logits of all first halves, then of all second halves.
     """
     log_scales = split["log_scales"].astype(np.float64)
     longest = log_scales.argmax(axis=1)

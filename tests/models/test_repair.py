@@ -18,7 +18,7 @@ from splats import lopsided, with_origin
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.models import edit, formats
-from clsplat.models.codec import soundness, values
+from clsplat.models.codec import repair, values
 from clsplat.models.formats import gltf, ply
 from clsplat.shots.usd_models import read_stage
 
@@ -348,5 +348,5 @@ def test_ordinary_models_keep_their_bits() -> None:
     model = random_gaussians(1000, 3)
     before = edit.take(model, np.arange(1000))
     with no_warnings():
-        assert soundness.sound(model, "model") is model
+        assert repair.repaired(model, "model") is model
     assert_equal(model, before)

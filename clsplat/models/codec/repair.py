@@ -28,7 +28,7 @@ Activated = Literal["opacities", "scales", "both"]
 
 DRAWN_QUATERNION_SQUARES = (1e-29, 1e29)
 """Squared lengths of quaternions that are left as they are; project.cl accepts 1e-30 to 1e30."""
-MIN_GAUSSIANS_FOR_DOUBTS = 100
+MIN_GAUSSIANS_FOR_ENCODING_WARNINGS = 100
 """Least number of Gaussians from whose values the encoding can be guessed."""
 BYTE_LOGIT_ERROR = 0.02
 """Largest error of a logit between 0 and 1 after conversion to an 8-bit format."""
@@ -47,7 +47,7 @@ CLIPPED_OPACITY_SHARE = (1e-3, 0.02)
 """Values are opacities of a neural network, clipped at 1, if at least the second fraction of them is within the first
 distance of 1. Logits do not cluster there."""
 PERCENTAGE_MAXIMA = (40.0, 100.0)
-"""Range of the largest opacity in percent. If the values were levels from 0 to 255, no opacity would exceed 0.4."""
+"""Whole numbers whose largest is in this range are percentages. As levels from 0 to 255, all would be below 0.4."""
 ZERO_SCALE_LOG_LIMIT = float(np.log(values.MIN_SCALE)) + 1
 """Log scales below this stand for scales of 0, and do not show how the other scales are encoded."""
 LENGTH_SKEW_RATIO = 3.0
@@ -57,7 +57,7 @@ Lengths vary by a factor of e or more on both sides of the median, which gives a
 """
 
 
-def mend(gaussians: Gaussians) -> None:
+def replace_infinities(gaussians: Gaussians) -> None:
     """Replace the infinite logits and log scales that stand for finite values, in place."""
     logits, scales = gaussians.opacity_logits, gaussians.log_scales
     if not values.all_finite(logits):
@@ -76,12 +76,12 @@ def finite_rows(gaussians: Gaussians) -> NDArray[np.bool_]:
     return rows
 
 
-def without_turn(gaussians: Gaussians) -> NDArray[np.bool_]:
+def without_rotation(gaussians: Gaussians) -> NDArray[np.bool_]:
     """Mask (n,), True for Gaussians with a quaternion of 0."""
     return np.asarray(~gaussians.quaternions.any(axis=1))
 
 
-def sound(gaussians: Gaussians, where: Path | str, activated: Activated | None = None) -> Gaussians:
+def repaired(gaussians: Gaussians, where: Path | str, activated: Activated | None = None) -> Gaussians:
     """Repair a model as the module's docstring says. Works in place unless Gaussians are left out.
 
     activated: values to convert to logits or logs, because the file stores opacities or scales.
@@ -89,7 +89,7 @@ def sound(gaussians: Gaussians, where: Path | str, activated: Activated | None =
     Warns once for each kind of repair, with the Gaussians' indices in the file. Raises InputError if no Gaussian is
     left.
     """
-    mend(gaussians)
+    replace_infinities(gaussians)
     good = finite_rows(gaussians)
     numbers = np.flatnonzero(good)
     if not good.all():
@@ -128,12 +128,12 @@ def _turn(gaussians: Gaussians, numbers: NDArray[np.intp], count: int, where: Pa
         )
 
 
-def doubts(logits: Float32, log_scales: Float32) -> list[str]:
+def encoding_warnings(logits: Float32, log_scales: Float32) -> list[str]:
     """Warnings, without the file's name, about values that look like opacities or scales instead of logits or logs.
 
-    There are none for a model of fewer than MIN_GAUSSIANS_FOR_DOUBTS Gaussians.
+    There are none for a model of fewer than MIN_GAUSSIANS_FOR_ENCODING_WARNINGS Gaussians.
     """
-    if len(logits) < MIN_GAUSSIANS_FOR_DOUBTS:
+    if len(logits) < MIN_GAUSSIANS_FOR_ENCODING_WARNINGS:
         return []
     seen = {"opacities": _seen_opacities(logits), "scales": _seen_scales(log_scales)}
     which = "both" if all(seen.values()) else "".join(name for name, found in seen.items() if found)

@@ -1,0 +1,23 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gains of photographs and their gradient: float64 twin of kernels/exposure.cl."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clsplat.arrays import Float64
+
+
+def developed(photograph: Float64, entries: Float64, lens: Float64, squared: Float64) -> Float64:  # noqa: ARG001
+    """Divide the photograph (H, W, 3) by its gains 2^entries (3,)."""
+    result: Float64 = photograph / np.exp2(entries)
+    return result
+
+
+def terms(image: Float64, by_image: Float64, squared: Float64) -> Float64:  # noqa: ARG001
+    """Terms (H, W, 3) of the gradient of a loss of the product image times 2^entries, where entries are 0.
+
+    by_image: (H, W, 3), the gradient of the loss with respect to the product.
+    """
+    result: Float64 = np.log(2) * image * by_image
+    return result

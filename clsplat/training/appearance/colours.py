@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Entries of a colour model for each photograph and lens, learnt with the model: use in a step, and checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array
+
+from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
+from clsplat.device.context import Device
+from clsplat.device.launch import only_tried
+from clsplat.images.colour import SRGB, photos_space
+from clsplat.images.exif import exposure_of
+from clsplat.scenes.analysis.visible_points import VisiblePoints
+from clsplat.stages.appearance import (
+    COLOUR_MODELS,
+    GAIN_ENTRIES,
+    ColourModel,
+    GainEntries,
+    Gains,
+    PhotoLens,
+    develop,
+    entry_gradient,
+    rows_on,
+    step_gains,
+)
+from clsplat.training.appearance.base import Appearance
+from clsplat.training.appearance.schedule import loaded, rate_at, saved
+from clsplat.training.appearance.view_neighbours import common
+from clsplat.training.step.inputs import ViewPart
+
+if TYPE_CHECKING:
+    from clsplat.scenes.scene import Scene, View
+
+CODED_OCTAVES_PER_LIGHT_OCTAVE = 1 / 2.2
+"""Octaves by which a stored colour value changes per octave of light, approximately.
+
+Initial gains come from the colours of points. If points give none, they come from EXIF exposures in octaves, multiplied
+by this number.
+"""
+
+START_GAIN_STEP_OCTAVES = 2.0**-10
+"""Gains from points are rounded to multiples of this, in octaves, so that they do not depend on the order of sums."""
+
+VIEW_PULL_WEIGHT, NEIGHBOUR_PULL_WEIGHT = 0.02, 0.7
+"""Weights of two terms of the loss's gradient that pull gains towards the gains from points, per octave of distance.
+
+The first pulls the gains of each photograph. The second pulls the part that gains of neighbouring photographs have in
+common. Without it neighbours may all become slightly too bright, where no other photograph shows a dark surface. Gains
+without points are not pulled, because the pull would hold them at the mean.
+"""
+
+GAIN_RATE_END_FRACTION = 0.001
+"""Fraction of the learning rate that is left at the last step.
+
+Adam's steps are as large as the rate even at the optimum. With ten times this fraction and 127 photographs, the last
+steps change a photograph's gain by 0.25 %.
+"""
+
+GAIN_CHECKPOINT_ARRAYS = ("logs", "start", "first", "second", "gains")
+"""Arrays of `Gains` in a checkpoint. A further array, `told`, is 1 for photographs with gains from points, else 0."""
+LENS_CHECKPOINT_ARRAYS = ("logs", "first", "second")
+"""Arrays of the lenses' `Gains` in a checkpoint."""
+
+MIX_RATE_FRACTION = 0.3
+"""Learning rate of mixes, as a fraction of the gains' rate. At the full rate they absorb colours of the scene."""
+_COLOUR_UPDATE = GainEntries(mix_rate=MIX_RATE_FRACTION)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewColours(ViewPart):
+    """Entries of one view and its lens in one step.
+
+    lenses: None if the model has no entries of lenses.
+    place: the view's place in a batch.
+    """
+
+    device: Device
+    model: ColourModel
+    colours: Gains
+    lenses: Gains | None
+    taken: PhotoLens
+    step: int
+    rate: float
+    lens_rate: float
+    place: int = 0
+    changes_target = True
+
+    def on(self, device: Device, values: NDArray[np.float32]) -> ViewColours:
+        """The same colours on another device, made from `values`, to apply them and to compute their gradient."""
+        parts = (np.ascontiguousarray(part) for part in np.split(values, [self.model.entries], axis=1))
+        colours, lenses = (Gains(*[upload(device, part)] * len(fields(Gains))) if part.size else None for part in parts)
+        assert colours is not None, "each model has gains"
+        taken = replace(self.taken, photograph=0, lens=0)
+        return replace(self, device=device, colours=colours, lenses=lenses, taken=taken)
+
+    def values(self) -> NDArray[np.float32]:
+        """The entries of the photograph and its lens, in the form that `on` takes; gains as factors."""
+        row, lens = self.taken.photograph, self.taken.lens
+        gains, logs = (array.get_rows(row, row + 1) for array in (self.colours.gains, self.colours.logs))
+        of_lens = [] if self.lenses is None else [self.lenses.logs.get_rows(lens, lens + 1)]
+        return np.concatenate([gains[:, :GAIN_ENTRIES], logs[:, GAIN_ENTRIES:], *of_lens], axis=1)
+
+    def compare(self, work: Workspace, image: DeviceArray, target: DeviceArray, size: tuple[int, int]) -> DeviceArray:  # noqa: ARG002
+        """Remove the colours of the photograph and its lens from `target`. Returns the unchanged image."""
+        develop(self.device, self.model, self.colours, self.lenses, self.taken, target, size)
+        return image
+
+    def gradient(
+        self, work: Workspace, image: DeviceArray, gradient: DeviceArray, size: tuple[int, int]
+    ) -> DeviceArray:
+        """Sums that `update` needs. The kernels of `update` are tried here in the sandbox, before anything changes."""
+        columns = entry_gradient(self.device, work, self.model, self.taken, image, gradient, size, self.place)
+        if self.step == 1:
+            with only_tried(self.device):
+                self.update(columns, columns)
+        return columns
+
+    def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
+        """Take Adam's step for the entries of the photograph and of its lens."""
+        assert own is not None, "made by `gradient`"
+        row, lens, step = self.taken.photograph, self.taken.lens, self.step
+        step_gains(self.device, self.colours, row, own, step, self.rate, readback, _COLOUR_UPDATE)
+        if self.lenses is not None:
+            step_gains(self.device, self.lenses, lens, own, step, self.lens_rate, readback, self.model.lens_update)
+
+
+def centre(view: View) -> tuple[float, float]:
+    """Principal point, as fractions of the picture's width and height."""
+    camera = view.camera
+    return camera.cx / camera.width, camera.cy / camera.height
+
+
+def panorama(view: View) -> bool:
+    """True for panoramas, which have no vignette."""
+    return view.camera.model.wraps
+
+
+def _from_mean(told: Sequence[float | None], of: Sequence[float | None]) -> NDArray[np.float64]:
+    """Exposures from EXIF (`told`), relative to the mean of the known exposures in `of`; NaN where unknown."""
+    known = [value for value in of if value is not None]
+    return np.array([np.nan if value is None or not known else value - np.mean(known) for value in told], np.float64)
+
+
+def _named(sizes: Mapping[str, int], entries: NDArray[np.float64]) -> dict[str, list[float]]:
+    """Entries by name. sizes: the number of entries of each name, in order."""
+    parts = np.split(entries, np.cumsum(list(sizes.values()))[:-1])
+    return {name: part.tolist() for name, part in zip(sizes, parts, strict=True)}
+
+
+class ColoursOfAll(Appearance):
+    """Entries of all training views and their lenses. Views of one lens share its entries.
+
+    Gains are pulled to where they start; other entries of photographs are pulled to 0 in the same way.
+    """
+
+    def __init__(self, config: TrainConfig, device: Device, scene: Scene) -> None:
+        self._config, self._device, self._scene = config, device, scene
+        self._model = COLOUR_MODELS[config.appearance]
+        self._told = [exposure_of(view.path) for view in scene.train_views]
+        self._lens_rows = {lens: row for row, lens in enumerate(dict.fromkeys(view.lens for view in scene.train_views))}
+        self._taken = [
+            PhotoLens(row, self._lens_rows[view.lens], centre(view), not panorama(view))
+            for row, view in enumerate(scene.train_views)
+        ]
+        shape = (len(self._lens_rows), self._model.lens_entries)
+        self._lenses = Gains.on(device, np.zeros(shape, np.float32)) if self._model.of_lens else None
+
+    @cached_property
+    def _gains(self) -> Gains:
+        """Initial gains, unless a checkpoint has been loaded. Computed on first use, because sampling the photographs
+        takes time."""
+        scene = self._scene
+        curve = CODED_OCTAVES_PER_LIGHT_OCTAVE if photos_space(view.path for view in scene.views) == SRGB else 1.0
+        by_exif = curve * np.nan_to_num(_from_mean(self._told, self._told))
+        by_points = {
+            name: np.round(told / START_GAIN_STEP_OCTAVES) * START_GAIN_STEP_OCTAVES
+            for name, told in VisiblePoints(scene).exposures.items()
+        }
+        views = zip(scene.train_views, by_exif, strict=True)
+        start = np.zeros((len(scene.train_views), self._model.entries))
+        start[:, :GAIN_ENTRIES] = [by_points.get(view.name, np.full(3, told)) for view, told in views]
+        self._by_points = np.array([view.name in by_points for view in scene.train_views])
+        return Gains.on(self._device, (start - start.mean(axis=0)).astype(np.float32), self._pull)
+
+    @property
+    def _pull(self) -> csr_array:
+        told, cameras = self._by_points, [view.camera for view in self._scene.train_views]
+        return csr_array(
+            VIEW_PULL_WEIGHT * diags_array(told.astype(np.float64)) + NEIGHBOUR_PULL_WEIGHT * common(cameras, told)
+        )
+
+    @property
+    def pixel_bytes(self) -> int:
+        """Bytes per pixel on the device."""
+        return self._model.pixel_bytes
+
+    def of_views(self, views: Sequence[int], step: int) -> list[ViewColours]:
+        """Colours of the views of a step.
+
+        step: number of the last view.
+        """
+        numbers = range(step - len(views) + 1, step + 1)
+        return [
+            ViewColours(
+                self._device,
+                self._model,
+                self._gains,
+                self._lenses,
+                self._taken[view],
+                number,
+                rate_at(self._config, number, len(self._taken), ends=GAIN_RATE_END_FRACTION),
+                rate_at(self._config, number, len(self._lens_rows), ends=GAIN_RATE_END_FRACTION),
+                place,
+            )
+            for place, (view, number) in enumerate(zip(views, numbers, strict=True))
+        ]
+
+    def record(self) -> dict[str, Any]:
+        """Content of appearance.json, by the names of the views.
+
+        Nothing is learnt about held-out photographs. If EXIF has their exposure, their gains follow from a linear fit
+        of the training photographs' gains to their exposures. They have the entries of their lens, or the mean of all
+        lenses if no training photograph has their lens.
+        """
+        entries, scene, model = self._gains.logs.get().astype(np.float64), self._scene, self._model
+        photographs = {
+            view.name: _named(model.of_photograph, row) for view, row in zip(scene.train_views, entries, strict=True)
+        }
+        expected = zip(scene.test_views, self._expected(entries[:, :GAIN_ENTRIES]).tolist(), strict=True)
+        held_out = {view.name: {"log2_gains": row} for view, row in expected}
+        if self._lenses is not None:
+            lenses = self._lenses.logs.get().astype(np.float64)
+            for view in scene.train_views:
+                photographs[view.name] |= self._of_lens(view, lenses[self._lens_rows[view.lens]])
+            for view in scene.test_views:
+                row = self._lens_rows.get(view.lens)
+                usual = lenses.mean(axis=0) if row is None else lenses[row]
+                held_out[view.name] |= self._of_lens(view, np.zeros_like(usual) if panorama(view) else usual)
+        return {"kind": self._config.appearance, "photographs": photographs, "held_out": held_out}
+
+    def _expected(self, logs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Expected gains of the held-out photographs, from the training photographs' (photographs, 3)."""
+        told = _from_mean(self._told, self._told)
+        known = ~np.isnan(told)
+        spread = np.square(told[known]).sum()
+        slopes = told[known] @ logs[known] / spread if spread > 0 else np.zeros(GAIN_ENTRIES)
+        held_out = _from_mean([exposure_of(view.path) for view in self._scene.test_views], self._told)
+        expected: NDArray[np.float64] = np.nan_to_num(held_out)[:, None] * slopes
+        return expected
+
+    def _of_lens(self, view: View, entries: NDArray[np.float64]) -> dict[str, list[float]]:
+        """A view's record of its lens. The centre is in fractions of the picture's size."""
+        return _named(self._model.of_lens, entries) | {"centre": list(centre(view))}
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a checkpoint, by name."""
+        held = saved({name: getattr(self._gains, name) for name in GAIN_CHECKPOINT_ARRAYS})
+        told = np.repeat(self._by_points[:, None], self._model.entries, axis=1)
+        lenses = {} if self._lenses is None else vars(self._lenses)
+        of_lenses = {f"lenses_{name}": lenses[name] for name in LENS_CHECKPOINT_ARRAYS if name in lenses}
+        return {**held, "appearance/told": told.astype(np.float32), **saved(of_lenses)}
+
+    def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Load the arrays of a checkpoint. Raises ValueError if one is missing, or belongs to other photographs."""
+        lenses = self._lenses and self._loaded_lenses(arrays)
+        shape = (len(self._scene.train_views), self._model.entries)
+        values = loaded(self._device, arrays, (*GAIN_CHECKPOINT_ARRAYS, "told"), shape)
+        self._by_points = values.pop("told").get()[:, 0] > 0
+        moved = allocate(self._device, shape, np.float32)
+        self._gains = Gains(**values, moved=moved, **rows_on(self._device, shape[0], self._pull))
+        self._lenses = lenses
+
+    def _loaded_lenses(self, arrays: Mapping[str, NDArray[Any]]) -> Gains:
+        shape = (len(self._lens_rows), self._model.lens_entries)
+        held = loaded(self._device, arrays, [f"lenses_{name}" for name in LENS_CHECKPOINT_ARRAYS], shape)
+        logs, first, second = held.values()
+        spare = [allocate(self._device, shape, np.float32) for _ in range(2)]
+        start = upload(self._device, np.zeros(shape, np.float32))
+        return Gains(logs, start, first, second, *spare, **rows_on(self._device, shape[0], None))

@@ -1,0 +1,51 @@
+// The kernels of an appearance model that develops photographs pixel by pixel: appearance.cl updates its entries. A
+// model's file defines, before it includes this header:
+//   ENTRIES, LENS_ENTRIES: numbers of entries of a photograph, of which the first three are gains, and of a lens.
+//   developed: converts LANES pixels of a photograph to the model's colours, in place.
+//   add_terms: adds the terms of LANES pixels to the gradient's ENTRIES + LENS_ENTRIES sums. Those of gains and lenses
+//     are divided by ln 2.
+// s is the pixels' squared distance from the principal point, in half diagonals; 0 for panoramas.
+//
+// Owner: A work-item owns LANES neighbouring pixels (develop), or LANES columns of a tile row (entry_sums). Sums are
+//   added in the same order on every device, with any LANES and ITEMS.
+// Launch: Grids of stride / LANES x rows and stride / LANES x tiles_y.
+// Buffers: Planes (3, rows, stride) of colour, or the loss's gradient with respect to it; gains, logs (photographs,
+//   ENTRIES): gains are 2^logs; lenses (lenses, LENS_ENTRIES); partials (ENTRIES + LENS_ENTRIES, tiles_y, stride).
+
+#define SUMS (ENTRIES + LENS_ENTRIES)
+
+// Squared distances of pixels from (across, down), times scale.
+static inline floatL spread(const int x, const int y, const float across, const float down, const float scale) {
+  const floatL from_x = (floatL)((float)x + 0.5f) + LANE_INDEX - across;
+  const float from_y = (float)y + 0.5f - down;
+  return fmaL(from_x, from_x, (floatL)(from_y * from_y)) * scale;
+}
+
+// gains, logs, lenses, target -> target: the photograph without them, to which the render is compared.
+__kernel void develop(const int photograph, const int lens, const int stride, const int plane, const float across,
+                      const float down, const float scale, __global const float *gains, __global const float *logs,
+                      __global const float *lenses, __global float *target) {
+  const int x = LANES * get_global_id(0), y = get_global_id(1);
+  const size_t at = (size_t)stride * y + x, next = plane + at, last = (size_t)plane * 2 + at;
+  floatL colour[3] = {LOADL(target + at), LOADL(target + next), LOADL(target + last)};
+  developed(colour, spread(x, y, across, down, scale), gains + ENTRIES * photograph, logs + ENTRIES * photograph,
+            lenses + LENS_ENTRIES * lens);
+  STOREL(colour[0], target + at), STOREL(colour[1], target + next), STOREL(colour[2], target + last);
+}
+
+// image, gradient with respect to image -> partials: sums of the gradients with respect to the entries.
+__kernel void entry_sums(const int height, const int stride, const int plane, const int tiles_y, const float across,
+                         const float down, const float scale, __global const float *image,
+                         __global const float *gradient, __global float *partials) {
+  const int x = LANES * get_global_id(0), y0 = get_global_id(1) * TILE, y1 = min(y0 + TILE, height);
+  floatL sums[SUMS];
+  for (int k = 0; k < SUMS; ++k) sums[k] = (floatL)(0.0f);
+  for (int y = y0; y < y1; ++y) {
+    const size_t at = (size_t)stride * y + x, next = plane + at, last = (size_t)plane * 2 + at;
+    const floatL colour[3] = {LOADL(image + at), LOADL(image + next), LOADL(image + last)};
+    const floatL by_colour[3] = {LOADL(gradient + at), LOADL(gradient + next), LOADL(gradient + last)};
+    add_terms(sums, colour, by_colour, spread(x, y, across, down, scale));
+  }
+  const size_t of_sum = (size_t)tiles_y * stride;
+  for (int k = 0; k < SUMS; ++k) STOREL(sums[k], partials + k * of_sum + (size_t)stride * get_global_id(1) + x);
+}
