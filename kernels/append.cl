@@ -250,9 +250,9 @@ GROUP __kernel void append_pairs(const uint n, const int tiles_x, const int tile
   }
 }
 
-// order, ranges of list_offsets; pairs, gaussian_from_slot (pairs) of append_pairs -> gaussian_from_sorted,
-// slot_from_sorted (pairs). depths, slots (fit), in local memory: fit, a power of two, is how many pairs they hold. A
-// longer list is sorted in parts, then merged in ever larger blocks, in `pairs`.
+// order and ranges, which list_offsets writes; pairs and gaussian_from_slot (pairs), which append_pairs writes ->
+// gaussian_from_sorted, slot_from_sorted (pairs). fit, a power of two: the number of pairs that depths and slots, in
+// local memory, hold. A longer list is sorted in parts, then merged in ever larger blocks, in `pairs`.
 GROUP __kernel void sort_lists(const uint fit, __global const uint *order, __global const uint *ranges,
                                __global const uint *gaussian_from_slot, __global uint2 *pairs,
                                __global uint *gaussian_from_sorted, __global uint *slot_from_sorted,

@@ -122,8 +122,8 @@ __kernel void order_counts(ELEMENTS(visible), __global const uint *order, __glob
   counts[rank] = tile_counts[i];
 }
 
-// tile_counts (n): numbers of tiles on the whole image -> counts (tiles), zero before: the length of each tile's list.
-// Integer sums do not depend on the order of the atomics.
+// tile_counts (n): how many tiles of the whole image each Gaussian reaches -> counts (tiles), which the caller has set
+// to zero: the length of each tile's list. Integer sums do not depend on the order of the atomics.
 __kernel void count_by_tile(const uint n, const int tiles_x, const int tiles_y, __global const uint *tile_counts,
                             __global const float *splats, __global uint *counts) {
   const uint i = get_global_id(0);

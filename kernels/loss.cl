@@ -428,9 +428,10 @@ static INLINE void derivatives(const Block block, __local const float *near, __l
   }
 }
 
-// near = sums over vertical windows of the three partials; after them, middle pixels of image and target. Partials in
-// the cells above and below are relative to the middle pixels there. So to the first sum are added the other two
-// partials times the differences of the middle pixels.
+// near = sums over vertical windows of the three partials, by mean, variance and covariance; behind these sums in
+// memory, the middle pixels of image and target. Partials of the cells above and below are relative to those cells'
+// middle pixels. To move them to this cell's, the sum by mean gains the partial by variance times the difference of the
+// image's middle pixels, and the partial by covariance times that of the target's.
 static INLINE void adjoint_moments(const Block block, __local float *near) {
   FOR_PARTS(part, PARTS) {
     COLUMN_OF_PART(block, part)

@@ -109,7 +109,7 @@ def chart(
             note=note,
             label=f"{title}: {y} against {x}. "
             + " ".join(_described(curve) for curve in drawn if curve.kind != "faint"),
-            # later shapes are in front: means before faint curves, lower areas of a stack before higher
+            # later shapes are drawn over earlier ones: mean curves over faint ones, lower areas of a stack over higher
             shapes=sorted(shapes[:: -1 if drawn[0].kind == "area" else 1], key=lambda shape: shape["kind"] != "faint"),
             width=CHART_WIDTH_PX,
             height=CHART_HEIGHT_PX,

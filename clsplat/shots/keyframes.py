@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Key frames and smooth interpolation between them: cubic Hermite splines of positions and rotations, monotone cubics
-of scalars. docs/cameras.md (Between key frames) gives the reasons."""
+of scalars. docs/cameras.md (Between key frames) gives the reasons. `shots/readers` reads key frames from files."""
 
 from __future__ import annotations
 

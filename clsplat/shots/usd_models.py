@@ -118,7 +118,7 @@ def read_here(path: Path) -> StageModels | None:
             elif place.instance is not None:
                 sums.update(f"again {list(known).index(own)}\n".encode())
         models = tuple(known[place.prim.GetPath()] for place in places)
-        if any(isinstance(model, ModelSeries) for model in models):  # samples are not read yet: digest the files
+        if any(isinstance(model, ModelSeries) for model in models):  # time samples are read frame by frame later
             for name in sorted(str(layer.realPath) for layer in layers):
                 sums.update(digest(Path(name)).encode() if name else b"")
         tracks: list[Track] = [StageTrack(f"{path}: {place.name}", place, stage) for place in places]

@@ -15,7 +15,7 @@ from clsplat.stages.duplicate import Band, Pairs
 from clsplat.stages.sort import SORT_KEY_BYTES, sort
 
 TILE_SORT_PAIR_BYTES = SORT_KEY_BYTES + 8
-"""Bytes per pair: its key and position in the sort by tile, and the two lists."""
+"""Bytes per pair: its key and position in the sort by tile, `gaussian_from_sorted` and `slot_from_sorted`."""
 RANGE_TILE_BYTES = 8
 """Bytes per tile: the begin and end of its list."""
 

@@ -130,7 +130,7 @@ class Cameras(Component):
         return 4 * LENS_NUMBERS * self._config.refine_lenses
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:
-        """Views with sums of the gradients with respect to the cameras that this step refines."""
+        """The views. One whose pose or lens this step refines gets a `CameraSums` for the gradient by its camera."""
         if self.gate.ended is not None or not self._config.refines:
             return inputs
         return [self._joined(each, step, count) for each in inputs]
