@@ -137,7 +137,10 @@ class KernelBuildError(ClsplatError):
 
 
 class DriverError(ClsplatError):
-    """Error about a driver that aborted, hung or returned an invalid kernel. It names the driver, shape and kernel."""
+    """Error about a driver that aborted, hung, returned an invalid kernel or failed in a command.
+
+    It names the driver, and for a kernel also the shape and the kernel.
+    """
 
 
 class CapacityError(ClsplatError):

@@ -65,7 +65,7 @@ class DeviceArray:
         self._check(values)
         if values.size:
             self.device.calls.writes += 1
-            event = cl.enqueue_copy(self.device.queue, self.buffer, values, is_blocking=False)
+            event = self._copied(_WRITING, self.buffer, values, is_blocking=False)
             self._note("write", event)
             self.device.under_way.append(event)  # keeps the event alive: its deletion would wait
 
@@ -98,7 +98,7 @@ class DeviceArray:
         Returns a function that waits for this copy only and returns the host array.
         """
         host = np.empty(self.shape, self.dtype) if into is None else into
-        copying = partial(cl.enqueue_copy, self.device.queue, host, self.buffer, is_blocking=False)
+        copying = partial(self._copied, _READING, host, self.buffer, is_blocking=False)
         self.device.calls.reads += 1
         event = copying()
         self._note("read", event)
@@ -108,7 +108,10 @@ class DeviceArray:
             event = copying()
 
         def finish() -> NDArray[Any]:
-            event.wait()
+            try:
+                event.wait()
+            except cl.Error as error:
+                raise self.device.failed(_READING, error) from None
             return host
 
         for commands in self.device.command_buffers:
@@ -129,7 +132,7 @@ class DeviceArray:
         """Fill a host array with the rows that begin at `start`, and wait."""
         if host.size:
             self.device.calls.blocking_reads += 1
-            event = cl.enqueue_copy(self.device.queue, host, self.buffer, src_offset=self._at(start), is_blocking=True)
+            event = self._copied(_READING, host, self.buffer, src_offset=self._at(start), is_blocking=True)
             self._note("read", event, host.nbytes)
             self.device.under_way.clear()  # the queue is in order: all earlier work is done
 
@@ -138,9 +141,16 @@ class DeviceArray:
         if values.size:
             self.device.calls.blocking_writes += 1
             host = np.ascontiguousarray(values, self.dtype)
-            event = cl.enqueue_copy(self.device.queue, self.buffer, host, dst_offset=self._at(start), is_blocking=True)
+            event = self._copied(_WRITING, self.buffer, host, dst_offset=self._at(start), is_blocking=True)
             self._note("write", event, host.nbytes)
             self.device.under_way.clear()
+
+    def _copied(self, work: str, *ends: Any, **how: Any) -> cl.Event:
+        """The event of a copy. Raises DriverError if it fails, or a kernel or the device before it."""
+        try:
+            return cl.enqueue_copy(self.device.queue, *ends, **how)
+        except cl.Error as error:
+            raise self.device.failed(work, error) from None
 
     def _at(self, row: int) -> int:
         """The byte offset of a row. An array without dimensions has only row 0."""
@@ -157,6 +167,9 @@ class DeviceArray:
     def reshaped(self, *shape: int) -> DeviceArray:
         """The same memory in another shape, which must not be larger."""
         return DeviceArray(self.device, self.buffer, shape, self.dtype)
+
+
+_READING, _WRITING = "reading its memory", "writing to its memory"
 
 
 def _poison() -> NDArray[np.uint32] | None:

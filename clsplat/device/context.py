@@ -268,7 +268,8 @@ class Device:
             if self.waits:
                 self._wait_for(event, kernel)
             elif wait:  # then the last kernel in the log is the kernel that failed
-                self.finish()
+                self.queue.finish()
+                self.under_way.clear()
         except cl.Error as error:
             raise self._not_launched(kernel, error) from None
         for commands in self.command_buffers:
@@ -320,9 +321,16 @@ class Device:
             raise self.trials.error(kernel.variant, kernel.name, f"failed with OpenCL's status {status}")
 
     def finish(self) -> None:
-        """Wait until the device is idle."""
-        self.queue.finish()
+        """Wait until the device is idle. Raises DriverError."""
+        try:
+            self.queue.finish()
+        except cl.Error as error:
+            raise self.failed("waiting for the device", error) from None
         self.under_way.clear()
+
+    def failed(self, work: str, error: cl.Error) -> DriverError:
+        """The error of a command that is no launch. A kernel's failure, or a lost device, may show only there."""
+        return DriverError(f"{title(self.cl_device)}: {work} failed ({' '.join(str(error).split())})")
 
     def timed(self, work: Callable[[], T]) -> tuple[T, float]:
         """The result of `work`, and the milliseconds that it took. The device is idle before and after."""

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.device import cl
 from clsplat.device.drivers.worker_process import TrialInterrupted
 from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError
 from clsplat.evaluation.depths import keep_depths
@@ -144,7 +143,8 @@ class TrainingSession:
     def rescue(self) -> str:
         """Write a checkpoint of the state at the start of the step, if that is intact.
 
-        Called after a failed or interrupted trial of kernels, and for a photograph that cannot be read.
+        Called after a failed or interrupted trial of kernels, a failed command of the driver, and for a photograph that
+        cannot be read.
 
         Returns the end of an error message, which names the checkpoint, or "".
         """
@@ -152,8 +152,9 @@ class TrainingSession:
             return ""
         try:
             self.save()
-        except (ClsplatError, OSError, cl.Error) as error:
-            return f"; its checkpoint could not be written ({error})"
+        except (ClsplatError, OSError) as error:
+            earlier = f"; {self.run.resume_command} continues from the last one" if self.run.checkpoints() else ""
+            return f"; its checkpoint could not be written ({error}){earlier}"
         if not 0 < self.trainer.step <= self.saved:
             return ""
         return f"; a checkpoint of step {self.trainer.step} is written: {self.run.resume_command} continues from it"

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from calls import Capture, noted, train
 from compare import assert_same_arrays
@@ -18,7 +19,7 @@ from dying import ALWAYS, DRIVER, LATE, Standing, call, error_of, forget, number
 from clsplat.api import train as train_on
 from clsplat.cli.main import main
 from clsplat.config.training import TrainConfig
-from clsplat.device import launch
+from clsplat.device import buffers, launch
 from clsplat.device.context import Device
 from clsplat.device.drivers import driver_records
 from clsplat.device.drivers.worker_process import DRIVER_TIMEOUT_VARIABLE, TrialInterrupted
@@ -80,6 +81,32 @@ def test_nothing_is_lost(
     if step and isinstance(error, DriverError):
         assert str(raised.value).startswith(f"it failed; a checkpoint of step {step} is written: clsplat train -o ")
     resumed = train_on(loaded, WITHOUT, device=default_device, run=Run.open(run.path), resume=True)
+    assert_same_arrays(resumed.arrays(), whole.arrays())
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_read_that_fails(
+    lost: bool, scene: Path, tmp_path: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch, whole: Gaussians
+) -> None:
+    """The failure of a kernel, or a device that is lost, often shows where the host reads."""
+    run = Run.create(tmp_path / "run", replace(WITHOUT, checkpoint_every=5), scene=scene)
+    copy, reads = cl.enqueue_copy, 0
+
+    def copied(queue: cl.CommandQueue, into: object, *given: object, **how: object) -> cl.Event:
+        nonlocal reads
+        reads += isinstance(into, np.ndarray) and len(run.checkpoints()) == 2
+        if isinstance(into, np.ndarray) and (reads == 3 or (lost and reads > 3)):  # a step reads once
+            raise cl.RuntimeError("clEnqueueReadBuffer failed: OUT_OF_RESOURCES")
+        return copy(queue, into, *given, **how)
+
+    with monkeypatch.context() as patch, pytest.raises(DriverError) as raised:
+        patch.setattr(buffers.cl, "enqueue_copy", copied)
+        train_on(load_scene(scene), run.config, device=default_device, run=run)
+    text = str(raised.value)
+    assert "reading its memory failed (clEnqueueReadBuffer failed: OUT_OF_RESOURCES)" in text
+    assert text.endswith(f"{run.resume_command} continues from {'the last one' if lost else 'it'}")
+    assert ("; its checkpoint could not be written (" in text) == lost
+    resumed = train_on(load_scene(scene), run.config, device=default_device, run=Run.open(run.path), resume=True)
     assert_same_arrays(resumed.arrays(), whole.arrays())
 
 
