@@ -49,9 +49,9 @@
 #define COUNT(statements)
 #endif
 
-// `t` is the transmittance of open pixels. In a finished pixel, t is such that weights are 0 without a further test: on
-// a CPU t is 0, and `kept`, rarely written, has the final transmittance; on a GPU, to save instructions, t is minus the
-// final transmittance, and so below TRANSMITTANCE_MIN.
+// `t` is the transmittance of open pixels. In a finished pixel, t is such that weights are 0 without a test of their
+// own. On a CPU t is 0, and `kept`, rarely written, has the final transmittance. On a GPU, to save instructions, t is
+// minus the final transmittance, which fails the test against TRANSMITTANCE_MIN.
 typedef struct {
   floatL t;
 #if ITEMS == 1

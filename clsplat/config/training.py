@@ -216,9 +216,9 @@ class TrainConfig:
     from 0 at the first step to this value at the last. In that step the other Gaussians are more opaque. 0.2 is as
     published; 0 leaves none out."""
     penalty: float = 0.0
-    """Weight in the loss of the mean opacity and of the mean scale relative to the scene's length unit. Only Gaussians
-    in the step's view add to these means. 0.02 helps against fog if there are few photographs. --density.growth mcmc
-    has weights of its own instead."""
+    """Weight of two penalties in the loss: the mean opacity, and the mean scale relative to the scene's length unit.
+    Only Gaussians in the step's view add to these means. 0.02 helps against fog if there are few photographs.
+    --density.growth mcmc has weights of its own instead."""
     antialiased: bool = False
     """Train for pictures of any size (Mip-Splatting). A narrower low-pass filter preserves a Gaussian's light, and no
     Gaussian is smaller than the photographs can show. The model file records this, and renders do the same."""

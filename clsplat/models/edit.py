@@ -212,7 +212,8 @@ def transform_camera(camera: Camera, matrix: Float64) -> Camera:
 
 
 def _turned(quaternions: Float32, turn: Float64) -> Float32:
-    """Quaternions w x y z of the rotations Q R, lengths unchanged. For a reflection, -Q gives the same covariance."""
+    """Quaternions w x y z of the given rotations followed by `turn`, with the same lengths. A reflection is replaced by
+    -turn, which gives the same covariances."""
     from scipy.spatial.transform import Rotation
 
     proper = turn if np.linalg.det(turn) > 0 else -turn

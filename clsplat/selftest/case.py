@@ -95,12 +95,13 @@ def faults(found: Mapping[str, Deviation]) -> list[str]:
 class Case:
     """The comparison of a stage with its float64 twin.
 
-    sizes: edge sizes for its kernels, such as a group plus one: numbers of rows, or (width, height).
+    sizes: numbers of rows, or (width, height), at the edges of its kernels, such as one row more than a group has.
     random: function that makes random inputs of a size.
     launch: function that launches the kernels, and returns a function that reads the results.
     twin: function from inputs and results to the wanted values by name. It gets the device's results because a
     gradient, for example, depends on the device's projection.
-    frozen: function from a frozen scene to a list of inputs for the self-test; None if this is not a self-test stage.
+    frozen: function from the self-test's scene, which never changes, to a list of inputs; None if this is no stage of
+    the self-test.
     digested: names of the results in the self-test's digest, in order.
     by_shape: True if the kernels or their launches depend on the kernel shape.
     own_bits_of_groups: True if kernel shapes of several items have another digest than shapes of one item.

@@ -51,7 +51,7 @@ class Features:
 
     @property
     def floats(self) -> int:
-        """Floats of a row."""
+        """Number of floats in a row of features."""
         return sum(FEATURE_WIDTHS[name] for name in self.names)
 
     @property

@@ -25,7 +25,8 @@ MAX_PAIRS_PER_BAND = 2**31 - 1024
 
 
 DUPLICATE_GAUSSIAN_BYTES = 3 * 4 + SORT_KEY_BYTES + 3 * 4
-"""Bytes per Gaussian: first slots, visible Gaussians, their keys; Gaussians and keys sorted; counts and offsets."""
+"""Bytes per Gaussian: its first slot, place among the visible and depth key; the sort's buffers; and in order of depth
+its index, its number of tiles and their offset."""
 BAND_GAUSSIAN_BYTES = 4
 """Additional bytes per Gaussian if there are several bands: its number of tiles in the current band."""
 BAND_TILE_BYTES = 4

@@ -387,7 +387,7 @@ class Batch:
         return step.run(model, inputs, probes(inputs, step), gradients, reads_loss=True)
 
     def _take(self, sums: AnyGaussians, outcome: ViewOutcome, step: _AddedView, probe: StepProbe) -> Loss:
-        """Add a view's results from another device, in the memory that a view on this device would use."""
+        """Add the results of a view that another device computed. Uses the scratch memory of a view on this device."""
         device, work = step.device, self.rasterizer.work
         probe.loss(outcome.loss)
         for start, stop, (part,) in parts(work, sums, keep=True):

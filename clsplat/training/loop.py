@@ -208,7 +208,9 @@ class TrainingSession:
         """Write a bundle that reproduces the trouble into the run's folder, and raise ClsplatError."""
         incident = self.trainer.monitor.latest
         assert incident is not None, "retries are used up only after trouble"
-        trouble = f"{incident}, and {MAX_CHECKPOINT_RETURNS} returns with smaller steps did not help"
+        trouble = (
+            f"{incident}, and {MAX_CHECKPOINT_RETURNS} returns to a checkpoint with smaller learning rates did not help"
+        )
         if self.run is None:
             raise ClsplatError(f"{trouble}: with run=..., a file that reproduces it would be written there")
         path = write_bundle(self.run.path, self.trainer, incident)

@@ -150,7 +150,7 @@ static inline uint stage(__local Staged *place, uint gaussian, uint slot, uint a
   return s.blocks;
 }
 
-// The blocks whose number is above `floor`.
+// A bit for each block b of which numbers[b] is above `floor`.
 static inline uint blocks_above(int floor, __local const int *numbers) {
   uint blocks = 0;
   _Pragma("unroll") for (int block = 0; block < BLOCKS; ++block) blocks |= (uint)(numbers[block] > floor) << block;

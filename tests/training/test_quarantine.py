@@ -241,7 +241,7 @@ def test_what_cannot_be_helped_stops_with_a_bundle(scene: Scene, default_device:
         train(scene, config, device=default_device, run=run)
     assert caught.value.exit_status == 1
     message = re.fullmatch(
-        r"step (\d+), view (\S+), stage adam: .*, and 3 returns with smaller steps did not help: (\S+) reproduces it "
+        r"step (\d+), view (\S+), stage adam: .*, and 3 returns to a checkpoint .* did not help: (\S+) reproduces it "
         r"\(python -m clsplat\.training\.repro_bundle\)",
         str(caught.value),
     )

@@ -433,7 +433,8 @@ def test_a_loss_that_is_never_finite_stops_it(
     with (
         pytest.warns(UserWarning, match=r"step 20, view \d\d\.png, stage loss: the loss is not finite"),
         pytest.raises(
-            ClsplatError, match=r"the loss is not finite; .*, and 3 returns with smaller steps did not"
+            ClsplatError,
+            match=r"the loss is not finite; .*, and 3 returns to a checkpoint with smaller learning rates did",
         ) as caught,
     ):
         train(scene, config, device=default_device, run=run)

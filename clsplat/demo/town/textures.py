@@ -209,7 +209,7 @@ def _plain(_: int, brush: Brush) -> Pixels:
 
 
 def _packed(image: Pixels) -> NDArray[np.uint32]:
-    """Pack red, green and blue in [0, 1] into the bytes of a number, (h, w)."""
+    """Pack red, green and blue in [0, 1] into the bytes of one integer per texel, (h, w)."""
     levels = np.zeros((*image.shape[:2], 4), np.uint8)
     levels[..., :3] = np.rint(np.clip(image, 0, 1) * 255)
     return levels.view(np.uint32)[..., 0]

@@ -157,7 +157,7 @@ class _Rays:
         self._longest = float(np.sqrt((x**2 + y**2 + z**2).max()))  # the longest ray is at a corner
 
     def slices(self, part: _Part) -> Slices:
-        """Slices of samples, rows and columns: the part of these rays that is in a part of the picture."""
+        """Index (samples, rows, columns) of the rays that fall into a part of the picture."""
         rows = slice(max(part.top - self.first, 0), max(part.bottom - self.first, 0))
         return slice(None), rows, slice(part.left, part.right)
 

@@ -29,7 +29,7 @@ class Capabilities:
     local_memory: maximum bytes of a group's local memory.
     allocation: maximum bytes of a buffer.
     exact_division: True if the device supports correctly rounded division and square roots.
-    contraction: True if the compiler may be tested for fusing a*b + c (`Device._probe_fma`).
+    contraction: False to skip the probe that finds out whether the compiler fuses a*b + c (`Device._probe_fma`).
     atomics: True if the device has 32-bit integer atomics in global and in local memory.
     """
 

@@ -38,8 +38,7 @@ MORTON_BITS_PER_AXIS = 21
 MAX_FLOAT_HIGHLIGHT = 2.0
 """Largest float colour up to which white is taken to be 1, unless all colours are whole numbers."""
 UNIT_COLOUR_SHARE = 0.95
-"""White is also taken to be 1 if at least this fraction of float colours is at most 1, however bright the others are.
-"""
+"""Least fraction of float colours of at most 1 that makes white 1, however bright the others are."""
 UNIT_RANGE_TOLERANCE = 1e-3
 """Tolerance of colours above white (relative) and of opacities outside [0, 1], because of half floats and averages."""
 GAUSSIAN_ARRAY_NOUNS = ("a position", "a rotation", "a scale", "an opacity", "a colour")

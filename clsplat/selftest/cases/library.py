@@ -96,7 +96,7 @@ def of_ewa(bench: CaseBench) -> StageOutcome:
     wanted = reference_ewa.project(exact["means"], covariances, view, exact["opacities"] * alone.compensations)
     off = np.abs(got["radii"] - wanted.radii)
     both = wanted.visible & (got["radii"][:, 0] > 0)
-    wrong = int((off[both] > 1).sum()) + max(int((off > 0).sum()) - 2, 0)  # two may be rounded differently
+    wrong = int((off[both] > 1).sum()) + max(int((off > 0).sum()) - 2, 0)  # up to two radii may be rounded differently
     wanted = replace(wanted, radii=got["radii"])
     back = reference_ewa.project_grad(
         exact["means"], covariances, view, wanted, {name: array.astype(np.float64) for name, array in by.items()}
