@@ -110,7 +110,7 @@ class CommandBuffer:
         """Append a launch that has just been made."""
         own = kernel.spare.pop() if kernel.spare else cl.Kernel(kernel.program, kernel.name)
         self._owned.append((kernel, own))
-        description = []
+        description: list[object] = []
         for index, value in enumerate(values):
             own.set_arg(index, typed(value))
             if isinstance(value, (LaunchParameter, LaunchParameterWord)):
