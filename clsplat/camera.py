@@ -99,6 +99,13 @@ class Window:
     clamp: float = JACOBIAN_CLAMP_HALF_FRAMES
 
 
+def _is_set(option: object) -> bool:
+    """True if a camera's option is True, or has a number that is not zero. A training step asks several times."""
+    if isinstance(option, bool):
+        return option
+    return any(option) if isinstance(option, tuple) else bool(np.any(option))  # type: ignore[call-overload]
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A camera and its pose. It is a pinhole unless `projection` says otherwise.
@@ -175,7 +182,7 @@ class Camera:
     def model(self) -> CameraModel:
         """The camera model: properties, formulas and kernels."""
         for model in CAMERA_MODELS:
-            if model.option and model.projection == self.projection and np.any(getattr(self, model.option)):
+            if model.option and model.projection == self.projection and _is_set(getattr(self, model.option)):
                 return model
         return PROJECTIONS[self.projection]
 
@@ -237,7 +244,7 @@ class Camera:
         if self.projection not in PROJECTIONS:
             raise InputError(f"camera: projection is {self.projection!r}, expected one of {', '.join(PROJECTIONS)}")
         for model in CAMERA_MODELS:
-            if model.option and model.projection != self.projection and np.any(getattr(self, model.option)):
+            if model.option and model.projection != self.projection and _is_set(getattr(self, model.option)):
                 raise InputError(
                     f"camera: {model.option} is {getattr(self, model.option)} but projection is {self.projection!r}, "
                     f"expected {model.projection!r}"

@@ -333,7 +333,12 @@ class Workspace:
         self._renewed = 0
 
     def replayed(
-        self, of: object, key: tuple[object, ...], make: Callable[[], R], numbers: tuple[float, ...] = ()
+        self,
+        of: object,
+        key: tuple[object, ...],
+        make: Callable[[], R],
+        numbers: tuple[float, ...] = (),
+        given: tuple[DeviceArray, ...] = (),
     ) -> R:
         """Return the result of `make`. From the second call with the same key on, a command buffer replays the commands
         that `make` put on the queue.
@@ -342,19 +347,20 @@ class Workspace:
 
         of: an object whose arrays `make` uses, in addition to the workspace's. When it is deleted, its command buffers
         are dropped.
-        key: all other inputs of `make`, except `numbers`.
+        key: all other inputs of `make`, except `numbers` and `given`.
         numbers: the values that `make` passes to kernels as `LaunchParameter`, in order.
+        given: arrays that `make` passes to kernels; for the same key, they may be others of the same shape and type.
         """
         if self._poison is not None or self._use == "0" or not self._device.replays:
             return make()
         command_buffers = self._command_buffers.get(of)
         known = None if command_buffers is None else command_buffers.get(key)
         if known is not None and self._use != CHECK_TAPES:
-            known[1].set(numbers)
+            known[1].set(numbers, [array.buffer for array in given])
             self._device.replay(known[1])
             return known[0]  # type: ignore[no-any-return]  # the result of this key's `make`
         renewed = self._renewed
-        result, commands = self._device.record(make)
+        result, commands = self._device.record(make, [array.buffer for array in given])
         if commands is None or self._renewed != renewed:
             return result
         if known is not None:

@@ -62,22 +62,27 @@ class CommandBuffer:
 
     entries: functions that put one command each on the queue; with its kernel if the command is a launch.
     calls: the number of calls of each kind.
-    anew: setter and argument index of each `LaunchParameter`.
+    anew: setter, argument index and type of each `LaunchParameter`.
     reads: the entries that copy to the host.
 
     Each launch has its own kernel object, whose other arguments stay set. When a command buffer is dropped, its kernel
     objects are kept for later command buffers, because pyopencl takes at least 0.2 ms to make a kernel object. A
     command buffer keeps no array alive: its owner must drop it before one of its arrays is freed.
+
+    given: buffers of the recorded launches that other buffers may take the place of in each replay.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, given: Sequence[cl.Buffer] = ()) -> None:
         self.entries: list[tuple[Kernel | None, Callable[[], Any]]] = []
         self.calls = Calls()
-        self.anew: list[tuple[Callable[[int, Any], None], int]] = []
+        self.anew: list[tuple[Callable[[int, Any], None], int, Callable[[float], Any]]] = []
         self.reads: list[Callable[[], Any]] = []
         self._owned: list[tuple[Kernel, cl.Kernel]] = []
         self._described: list[tuple[object, ...]] = []
         self._numbers: list[float] = []
+        self._given = {buffer.int_ptr: number for number, buffer in enumerate(given)}
+        self._places: list[tuple[Callable[[int, Any], None], int, int]] = []
+        """Setter and argument index of each given buffer, and its number."""
 
     def __del__(self) -> None:
         for kernel, own in self._owned:
@@ -105,21 +110,29 @@ class CommandBuffer:
         """Append a launch that has just been made."""
         own = kernel.spare.pop() if kernel.spare else cl.Kernel(kernel.program, kernel.name)
         self._owned.append((kernel, own))
-        description = []
+        description: list[object] = []
         for index, value in enumerate(values):
             own.set_arg(index, typed(value))
-            if given := isinstance(value, (LaunchParameter, LaunchParameterWord)):
+            if isinstance(value, (LaunchParameter, LaunchParameterWord)):
                 set_bytes = getattr(own, "_set_arg_buf", own.set_arg)  # faster than set_arg: no type checks
-                self.anew.append((set_bytes, index))
+                kind = np.float32 if isinstance(value, float) else np.uint32
+                self.anew.append((set_bytes, index, kind))
                 self._numbers.append(value)
-            description.append(None if given else described(value))
+                description.append(None)
+            elif isinstance(value, cl.MemoryObjectHolder) and value.int_ptr in self._given:
+                self._places.append((own.set_arg, index, self._given[value.int_ptr]))
+                description.append(("given", self._given[value.int_ptr]))
+            else:
+                description.append(described(value))
         self.entries.append((kernel, partial(cl.enqueue_nd_range_kernel, queue, own, size, local)))
         self._described.append((kernel.name, kernel.variant, size, local, *description))
 
-    def set(self, numbers: Iterable[float]) -> None:
-        """Set the values of the launch parameters, in order."""
-        for (set_bytes, index), number in zip(self.anew, numbers, strict=True):
-            set_bytes(index, typed(number))
+    def set(self, numbers: Iterable[float], given: Sequence[cl.Buffer] = ()) -> None:
+        """Set the values of the launch parameters, in order, and the buffers in place of those given at first."""
+        for (set_bytes, index, kind), number in zip(self.anew, numbers, strict=True):
+            set_bytes(index, kind(number))
+        for set_buffer, index, place in self._places:
+            set_buffer(index, given[place])
 
     def check(self, fresh: CommandBuffer, numbers: Sequence[float]) -> None:
         """Raise AssertionError if a replay with these numbers would differ from `fresh`, which was just recorded."""

@@ -279,10 +279,13 @@ class Device:
     def _not_launched(self, kernel: Kernel, error: cl.Error) -> DriverError:
         return self.trials.error(kernel.variant, kernel.name, f"cannot be launched: {' '.join(str(error).split())}")
 
-    def record(self, work: Callable[[], T]) -> tuple[T, CommandBuffer | None]:
+    def record(self, work: Callable[[], T], given: Sequence[cl.Buffer] = ()) -> tuple[T, CommandBuffer | None]:
         """The result of `work`, and a command buffer of the commands that it put on the queue; None if they cannot be
-        replayed."""
-        commands, before = CommandBuffer(), copy(self.calls)
+        replayed.
+
+        given: buffers that a replay may exchange for others (`CommandBuffer`).
+        """
+        commands, before = CommandBuffer(given), copy(self.calls)
         self.command_buffers.append(commands)
         try:
             result = work()

@@ -120,7 +120,8 @@ class Rasterizer:
         self._antialiased: bool | None = None
         self.antialias(on=antialiased)
         self.work = work or Workspace(device)
-        self._packs: WeakKeyDictionary[Camera, NDArray[np.float32]] = WeakKeyDictionary()  # training has few cameras
+        self._sent: WeakKeyDictionary[Camera, NDArray[np.float32]] = WeakKeyDictionary()  # training has few cameras
+        """A camera and its last background, as `_send` sends them. The device may still read them."""
         aligned = -(-len(CAMERA) // device.row_alignment) * device.row_alignment
         self._view = allocate(device, (aligned + 3,), np.float32)
         self._camera, self._background = self._view.reshaped(len(CAMERA)), self._view.rows(aligned, aligned + 3)
@@ -155,15 +156,17 @@ class Rasterizer:
 
     def _send(self, camera: Camera, background: NDArray[np.float32] | DeviceArray) -> tuple[DeviceArray, DeviceArray]:
         """Camera and background on the device. A background on the host is sent with the camera, in one copy."""
-        pack = self._packs.get(camera)
-        if pack is None:
-            pack = self._packs[camera] = pack_camera(camera)
+        sent = self._sent.get(camera)
+        if sent is None:
+            sent = self._sent[camera] = np.zeros(self._view.shape, np.float32)
+            sent[: len(CAMERA)] = pack_camera(camera)
         if isinstance(background, DeviceArray):
-            self._camera.send(pack)
+            self._camera.send(sent[: len(CAMERA)])
             return self._camera, background
-        values = np.zeros(self._view.shape, np.float32)
-        values[: len(pack)], values[-3:] = pack, background
-        self._view.send(values)
+        if sent[-3:].tobytes() != background.tobytes():
+            sent = self._sent[camera] = sent.copy()
+            sent[-3:] = background
+        self._view.send(sent)
         return self._camera, self._background
 
     def forward(

@@ -130,7 +130,8 @@ class Slots:
         """The slots of the Gaussians [start, stop)."""
         if self.first_slots is None:
             return replace(self, values=self.values.rows(start, stop))
-        return replace(self, first_slots=self.first_slots.rows(start, stop))
+        first_slots = self.first_slots.rows(start, stop)
+        return self if first_slots is self.first_slots else replace(self, first_slots=first_slots)
 
 
 @dataclass(frozen=True, eq=False)

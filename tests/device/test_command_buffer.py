@@ -12,7 +12,7 @@ import pytest
 from calls import raising
 
 from clsplat.device import command_buffer
-from clsplat.device.buffers import Workspace, allocate
+from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups, only_tried
 from clsplat.device.program import Kernel, Kernels, Variant, build
@@ -103,6 +103,42 @@ def test_numbers_that_are_given_anew(made: Work) -> None:
         assert got[:, :2].tolist() == [[2, 2**32 - 7]] * 2
         assert got[:, 2].tolist() == np.array(values, np.float32).view(np.uint32).tolist()
     assert made.made == 1
+
+
+def test_arrays_that_are_given_anew(made: Work) -> None:
+    """They take the place of the array that was recorded, in each of its launches, and no other array's."""
+    kept, kernel = made.work.array("kept", (3,), np.uint32), made.kernel
+    kept.fill(0)
+    for number in range(3):
+        given = allocate(made.device, (3,), np.uint32)
+        given.fill(number)
+
+        def make(given: DeviceArray = given) -> None:
+            made.made += 1
+            for array in (given, kept, given):
+                launch_groups(made.device, kernel, 1, 1, 10, -7, 0.5, array, cl.LocalMemory(4))
+
+        made.work.replayed(made.owner, ("given",), make, given=(given,))
+        assert given.get()[0] == number + 20
+        assert kept.get()[0] == 10 * (number + 1)
+    assert made.made == 1
+
+
+def test_a_given_array_in_another_place_is_noticed(made: Work, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(command_buffer.TAPES_VARIABLE, command_buffer.CHECK_TAPES)
+    work = Workspace(made.device)
+    one, other = (allocate(made.device, (3,), np.uint32) for _ in range(2))
+
+    def launched(array: DeviceArray, given: DeviceArray) -> None:
+        def make() -> None:
+            launch_groups(made.device, made.kernel, 1, 1, 10, -7, 0.5, array, cl.LocalMemory(4))
+
+        work.replayed(made.owner, ("given",), make, given=(given,))
+
+    launched(one, one)
+    launched(other, other)
+    with pytest.raises(AssertionError, match="a replay of words would have other arguments: numbers \\[3\\]"):
+        launched(one, other)
 
 
 def test_a_tape_goes_with_a_buffer(made: Work) -> None:

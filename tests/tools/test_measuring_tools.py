@@ -10,6 +10,8 @@ from types import ModuleType
 from typing import Any
 
 import bench_growth
+import bench_host
+import bench_launches
 import bench_library
 import bench_sort
 import compare_peer
@@ -18,6 +20,8 @@ import pytest
 from calls import Capture, printed
 from measuring import sizes
 from tiny import HEIGHT, WIDTH, write_scene
+
+from clsplat.device.context import Device
 
 
 def one_error(capsys: Capture, tool: str) -> str:
@@ -61,6 +65,37 @@ def test_library(capsys: Capture) -> None:
         assert rows[call]["ratio"] == pytest.approx(rows[call]["ms"] / rows[base]["ms"])
         assert rows[base]["ratio"] == 1
     assert (result["gaussians"], result["width"], result["height"]) == (300, 40, 30)
+
+
+def test_host(scene_folder: Path, capsys: Capture) -> None:
+    """In groups: a step's launches are all replayed."""
+    flags = ["--size", WIDTH, "--steps", "20", "--shape", "1x64", "--repeat", "3"]
+    result = measured(capsys, bench_host, scene_folder, *flags)
+    assert 0 < result["calls"]["launches"] <= 12
+    assert (result["calls"]["blocking_reads"], result["calls"]["blocking_writes"]) == (0, 0)
+    assert set(result["us"]) == {*bench_host.CAUSES, bench_host.REST}
+    assert result["us"]["driver's calls of a replay"] > 0
+    assert 0 < result["least_us"] <= result["step_us"]
+
+
+def test_causes_have_their_own_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cause that calls another has its time without the other's."""
+    watch, now = bench_host.Stopwatch(), [0]
+    monkeypatch.setattr(bench_host.time, "thread_time_ns", lambda: now[0])
+
+    def busy(us: int) -> None:
+        now[0] += 1000 * us
+
+    inner = watch.around("inner", lambda: busy(20))
+    watch.around("outer", lambda: (busy(5), inner(), inner()))()
+    assert watch.taken == {"inner": 40.0, "outer": 5.0}
+
+
+def test_launches(capsys: Capture, default_device: Device) -> None:
+    ways = measured(capsys, bench_launches, "--repeat", "2")["ways"]
+    has_buffers = "cl_khr_command_buffer" in default_device.cl_device.extensions.split()
+    assert list(ways) == ["pyopencl, with events", "ctypes, without", "command buffer"][: 2 + has_buffers]
+    assert all(0 < row["least_us"] <= row["us"] for row in ways.values())
 
 
 def test_deviation_from_linear_growth() -> None:
@@ -122,6 +157,7 @@ def test_line_of_relative_residuals() -> None:
         (bench_library, "--gaussians 0", "--gaussians 0: expected at least 1"),
         (bench_library, "--size 0x30", "--size 0x30: expected a width and a height in pixels"),
         (bench_library, "--repeat 0", "--repeat 0: expected at least 1"),
+        (bench_host, "scene --steps 9", "--steps 9: expected at least 10"),
         (bench_sort, "--max 9999", "--max 9999: expected at least 10000"),
         (bench_sort, "--repeat 0", "--repeat 0: expected at least 1"),
         (bench_sort, "--plot sort.pdf", "sort.pdf"),

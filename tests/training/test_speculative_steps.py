@@ -15,7 +15,7 @@ from clsplat.bench import workload as bench_subject
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.rendering import rasterizer
-from clsplat.rendering.rasterizer import ForwardPass
+from clsplat.rendering.rasterizer import MAX_COUNTED_PASSES, ForwardPass
 from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import upload_gaussians
 from clsplat.training.density import ModelState, RowPlan
@@ -82,6 +82,25 @@ def test_a_step_by_capacity_waits_for_no_number(
         assert (calls.blocking_reads, calls.blocking_writes, calls.reads) == (0, 0, 1)
         assert 0 < calls.launches <= (12 if device.shape.items > 1 else 40)
     assert len(device.under_way) < 10, "what the device has read is let go of"
+
+
+@pytest.mark.parametrize("items", quick((1, 64), 64))
+def test_a_step_in_groups_is_all_from_command_buffers(
+    default_device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch, items: int
+) -> None:
+    """Whichever photograph it has. Where an item has a tile, the photograph's way to the planes is launched."""
+    monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
+    device = default_device.with_shape(lanes=1, items=items)
+    trainer = Trainer(scene, short(iterations=200, sh_degree=0, density={"every": 0}), device)
+    run_steps(1 + MAX_COUNTED_PASSES * len(trainer.views), trainer)  # then the most pairs of a view are known
+    launched: list[str] = []
+    noted(monkeypatch, Device, "enqueue", lambda _, kernel, *arguments, **options: launched.append(kernel.name))
+    for _ in range(2 * len(trainer.views)):
+        launched.clear()
+        calls = bench_stages.calls_of(device, trainer.train_step)
+        assert (calls.launches <= 12) == (items > 1)
+        assert (calls.blocking_reads, calls.blocking_writes) == (0, 0)
+        assert launched == ([] if items > 1 else ["target"])
 
 
 def test_long_lists_are_sorted_by_radix(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

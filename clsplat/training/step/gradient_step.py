@@ -142,9 +142,12 @@ class GradientStep:
             )
 
         keys = tuple(term.key for term in terms)
-        if None in keys or is_photograph(planes):  # each photograph has a buffer of its own
+        if None in keys:
             return compared()
-        return self.replayed(of, (frame.listed, image.buffer, inputs.kept, keys, self.turn), compared)
+        key = (frame.listed, image.buffer, inputs.kept, keys, self.turn)
+        if is_photograph(planes):  # each photograph has a buffer of its own
+            return self.replayed(of, (*key, planes.shape, planes.dtype), compared, given=(planes,))
+        return self.replayed(of, key, compared)
 
     def _rows(
         self,
@@ -193,7 +196,12 @@ class GradientStep:
         probe.after_rows(rows)
 
     def replayed(
-        self, of: object, key: tuple[object, ...], make: Callable[[], R], numbers: tuple[float, ...] = ()
+        self,
+        of: object,
+        key: tuple[object, ...],
+        make: Callable[[], R],
+        numbers: tuple[float, ...] = (),
+        given: tuple[DeviceArray, ...] = (),
     ) -> R:
         """The result of `make`, from a command buffer (`Workspace.replayed`) if the step is launched by capacity.
 
@@ -201,7 +209,7 @@ class GradientStep:
         """
         if self.room is None:
             return make()
-        return self.rasterizer.work.replayed(of, key, make, numbers)
+        return self.rasterizer.work.replayed(of, key, make, numbers, given)
 
     def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
         """Take Adam's step for the view's parts, along the gradients `own`."""

@@ -8,7 +8,7 @@ import threading
 from collections import OrderedDict, deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ Key = tuple[int, float]
 """A view's index, and the divisor of its size."""
 
 
+@cache  # the system takes longer to count than all else of `read_ahead`
 def reading_threads() -> int:
     """Number of threads that read ahead, which is also the number of views that are read ahead."""
     return min(2 * (os.cpu_count() or 1), MAX_READING_THREADS)
