@@ -15,6 +15,14 @@
 #define RUNS (COLUMNS / RUN) // runs in a row; ROWS * RUNS <= PARTS
 #define TALL (ROWS + 2 * REACH)
 #define WIDE (RUN + 2 * REACH)
+// adjoint_moments and differences know the middle pixels of a cell and of those next to it, so a window must not reach
+// further. Smaller cells would give wrong gradients.
+#if ROWS < REACH || RUN < REACH
+#error "LOSS_GROUP_ROWS and RUN must be at least REACH, 5"
+#endif
+#if COLUMNS + 2 * REACH != PARTS || COLUMNS % RUN != 0 || ROWS * RUNS > PARTS
+#error "LOSS_PARTS must be the columns of a block and its margins, and at least its runs"
+#endif
 #define INLINE inline __attribute__((always_inline)) // PoCL computes wrong results if it does not inline
 #define FOR_PARTS(part, count) for (int part = get_local_id(0) % ITEMS; part < (count); part += ITEMS)
 
