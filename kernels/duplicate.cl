@@ -60,13 +60,15 @@ GROUP __kernel void compact_visible(const uint n, const uint chunk, __global con
 #endif
 ) {
   __local uint scratch[ITEMS], extremes[2];
-  if (get_local_id(0) == 0) extremes[0] = extremes[1] = 0;
+  if (get_local_id(0) == 0) extremes[0] = 0xffffffff, extremes[1] = 0;
   BARRIER_LOCAL();
   const uint group = get_group_id(0), groups = get_num_groups(0);
   const uint begin = group * chunk, end = min(begin + chunk, n);
   uint visible = group_sum(sums, group, scratch);
   ulong pairs = group_sum(sums + groups, group, scratch);
-  uint complement = 0, largest = 0;
+  // Not the largest ~key: in groups of 2 to 8 items, Intel's CPU runtime inverts it with a vector register that it
+  // never sets.
+  uint least = 0xffffffff, largest = 0;
   for (uint first = begin; first < end; first += ITEMS) {
     const uint i = first + get_local_id(0);
     const uint is_shown = i < end && shown[i] != 0, count = i < end ? tile_counts[i] : 0;
@@ -80,15 +82,15 @@ GROUP __kernel void compact_visible(const uint n, const uint chunk, __global con
       const uint key = as_uint(splats[(size_t)SPLAT_SIZE * i + SPLAT_DEPTH]);
       gaussian_from_visible[rank] = i;
       depth_keys[rank] = key;
-      complement = max(complement, ~key);
+      least = min(least, key);
       largest = max(largest, key);
     }
   }
-  atomic_max(extremes, complement);
+  atomic_min(extremes, least);
   atomic_max(extremes + 1, largest);
   BARRIER_LOCAL();
   if (get_local_id(0) != 0) return;
-  atomic_max(readback + READBACK_KEY_COMPLEMENT, extremes[0]);
+  atomic_max(readback + READBACK_KEY_COMPLEMENT, ~extremes[0]);
   atomic_max(readback + READBACK_LARGEST_KEY, extremes[1]);
   if (group + 1 == groups) {
     int goes_on = 1;

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from models import random_gaussians
-from quality.experiments import UNITS, psnr_of
+from quality.experiments import UNITS
 from quality.made_scenes import in_units
+from quality.trainings import psnr_of
 from tiny import cameras, short
 
 from clsplat.api import train

@@ -99,7 +99,6 @@ def test_lists_are_the_radix_sort_s(device: Device) -> None:
 
 @pytest.mark.parametrize("items", quick((2, 16, 64, 256), 64))
 def test_lists_longer_than_local_memory(device: Device, items: int) -> None:
-    """Beside the twin: Intel's driver gives the radix sort a wrong least key in groups of 2."""
     boxes, depths, tiles = long_lists(0, 2047, 1, 2048, 2049, 20_000, 4097)
     lists, twin = Lists(shaped(device, 1, items), boxes, depths, tiles), lists_of(boxes[:, :1], depths, tiles[0])
     wanted = [each.astype(np.uint32) for each in (twin.ranges, twin.gaussian_from_sorted, twin.slot_from_sorted)]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scenes
 from numpy.typing import NDArray
-from pipeline import Pipeline
+from pipeline import Pipeline, shaped
 from quick import quick
 
 from clsplat.config.rasterizer import BenchSwitches
@@ -165,6 +165,15 @@ def test_key_bits_are_those_in_which_the_visible_depths_differ(shaped_device: De
     np.testing.assert_array_equal(got.gaussian_from_visible.get(), np.flatnonzero(visible))
     every = counted(shaped_device, depths, visible, all_bits=True)
     assert (every.least_key, every.key_bits) == (0, 32)
+
+
+@pytest.mark.parametrize("items", quick((2, 4, 8)))
+def test_key_bits_in_small_groups(device: Device, items: int) -> None:
+    """Intel's CPU driver inverts keys wrongly there in a loop that takes a maximum."""
+    depths = np.linspace(7, 3, 65).astype(np.float32)
+    got = counted(shaped(device, 1, items), depths, depths < 6)
+    keys = depths[depths < 6].view(np.uint32)
+    assert (got.least_key, got.key_bits) == (keys.min(), int(keys.max() - keys.min()).bit_length())
 
 
 def test_key_bits_of_no_gaussian_and_of_equal_ones(shaped_device: Device) -> None:

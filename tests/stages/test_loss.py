@@ -12,7 +12,10 @@ from compare import assert_close, assert_same_bits
 
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
+from clsplat.device.drivers.driver_records import BREAK_KERNEL_VARIABLE
+from clsplat.errors import KernelBuildError
 from clsplat.images.reading import read_image
+from clsplat.layouts.columns import LOSS_GROUP_ROWS
 from clsplat.reference.loss import l1_dssim
 from clsplat.selftest.case import Inputs, faults
 from clsplat.selftest.cases.loss import LOSS_CASE
@@ -20,6 +23,9 @@ from clsplat.selftest.harness import planes_of
 from clsplat.stages.blend import tile_items
 from clsplat.stages.loss import loss, scratch_bytes
 from clsplat.stages.target import target
+
+REACH = 5
+"""Pixels from the middle of a window to its edge."""
 
 
 def test_dssim_alone(shaped_device: Device) -> None:
@@ -29,6 +35,31 @@ def test_dssim_alone(shaped_device: Device) -> None:
     errors = LOSS_CASE.errors(shaped_device, Inputs(image=x, photograph=y, weight=1.0))
     # variances are differences of windowed moments in float32: 1e-7 against C2 = 9e-4
     assert errors["gradient"].error < 1e-4 and errors["loss"].error < 1e-5
+
+
+def with_block_rows(device: Device, monkeypatch: pytest.MonkeyPatch, rows: int) -> Device:
+    """The device in groups of 64 items, with blocks of so many rows; it builds kernels of its own."""
+    change = f"loss: #define LOSS_GROUP_ROWS {LOSS_GROUP_ROWS} => #define LOSS_GROUP_ROWS {rows}"
+    monkeypatch.setenv(BREAK_KERNEL_VARIABLE, change)
+    monkeypatch.setattr("clsplat.stages.loss.LOSS_GROUP_ROWS", rows)
+    return device.with_shape(lanes=1, items=64)
+
+
+@pytest.mark.parametrize(("rows", "why"), [(REACH - 1, "must be at least REACH"), (8, "at least its runs")])
+def test_blocks_that_would_be_wrong_do_not_build(
+    default_device: Device, monkeypatch: pytest.MonkeyPatch, rows: int, why: str
+) -> None:
+    device = with_block_rows(default_device, monkeypatch, rows)
+    with pytest.raises(KernelBuildError) as raised:
+        device.kernels("loss", {"ITEMS": 64})
+    assert why in raised.value.log
+
+
+@pytest.mark.slow
+def test_the_fewest_rows_of_a_block(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    device = with_block_rows(default_device, monkeypatch, REACH)
+    for size in LOSS_CASE.sizes[:4]:
+        assert faults(LOSS_CASE.errors(device, LOSS_CASE.random(np.random.default_rng(0), size))) == []
 
 
 def test_equal_images_have_no_loss(shaped_device: Device) -> None:

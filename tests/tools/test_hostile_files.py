@@ -34,6 +34,7 @@ from hostile import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pictures import write_pixels
+from quick import quick
 from spoilers import SPOILERS, npy
 from stress_files import stress, verdict
 from systems import links, posix
@@ -356,10 +357,19 @@ def test_documents_that_are_none(text: str, tmp_path: Path) -> None:
     assert str(path) in refusal(lambda: transforms.read_transforms(path))
 
 
-def test_names_that_no_file_can_have(tmp_path: Path) -> None:
-    for name in ("x" * 300, "y/" * 3000, "images/" + "z" * 255):
-        path = change(tmp_path / "scene", file_path=name)
-        assert "are missing" in refusal(lambda path=path: transforms.read_transforms(path))
+NAMES_OF_NO_FILE = {
+    "long": "x" * 300,
+    "path": ("y" * 200 + "/") * 25,
+    "folders": "y/" * 3000,
+    "ending": "images/" + "z" * 255,
+}
+"""Too long as a whole, as a path of possible folders, and with an ending."""
+
+
+@pytest.mark.parametrize("name", quick(NAMES_OF_NO_FILE, "long", "path", "ending"))  # folders: many seconds
+def test_names_that_no_file_can_have(tmp_path: Path, name: str) -> None:
+    path = change(tmp_path, file_path=NAMES_OF_NO_FILE[name])
+    assert "are missing" in refusal(lambda: transforms.read_transforms(path))
 
 
 def test_only_the_listed_folders_are_looked_into(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

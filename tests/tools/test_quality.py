@@ -12,9 +12,10 @@ import pycolmap
 import pytest
 from calls import printed, python
 from quality import experiments, made_scenes
-from quality.experiments import EXPERIMENTS, words_of
+from quality.experiments import EXPERIMENTS
 from quality.run import main
 from quality.tables import AUTO
+from quality.trainings import words_of
 from tiny import HEIGHT, VIEWS, WIDTH, write_scene
 
 from clsplat.cli.main import parse

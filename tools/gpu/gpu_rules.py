@@ -329,7 +329,7 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "compact_visible": (
         _group_sum(lambda run: run.sums_before),
         Rule("for (uint first = begin; first < end; first += ITEMS)", _of_item),
-        Rule("atomic_max(extremes, complement)", lambda run: run.wave),  # AMD's compiler loops over a wave's items
+        Rule("atomic_min(extremes, least)", lambda run: run.wave),  # AMD's compiler loops over a wave's items
         Rule("atomic_max(extremes + 1, largest)", lambda run: run.wave),
     ),
     "order_counts": (),

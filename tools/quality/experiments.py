@@ -4,18 +4,13 @@
 from __future__ import annotations
 
 import hashlib
-import json
-import sys
 from argparse import Namespace
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import redirect_stdout
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from quality.made_scenes import (
     Changes,
     baked,
@@ -24,13 +19,10 @@ from quality.made_scenes import (
     disturbed,
     fisheye_of,
     in_units,
-    own_blocks,
     photograph,
     picked,
     refocused,
-    rescaled,
     rgbd,
-    single_blocks,
     turntable,
     with_block,
     without_colours,
@@ -38,29 +30,22 @@ from quality.made_scenes import (
     write_strip,
     write_transforms,
 )
+from quality.towns import towns
+from quality.trainings import Rows, picture_of, psnr_of, trained
 
 from clsplat.camera import Camera
-from clsplat.cli.main import main as clsplat
-from clsplat.cli.session import Services
 from clsplat.config.cli_defaults import TEST_EVERY
 from clsplat.config.training import TrainConfig
 from clsplat.demo.ray_caster import cameras
 from clsplat.device.context import open_device
 from clsplat.evaluation import metrics
-from clsplat.evaluation.held_out import EvaluatedModel, evaluate
-from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import Image, background_colour, composite
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.appearance import held_out_looks
-from clsplat.runs.run import Run
-from clsplat.runs.scene_record import length_unit_of
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene, View
 from clsplat.training.held_out_alignment import aligned
 from clsplat.training.trainer import Trainer
-
-Rows = Generator[tuple[object, ...] | str, None, int | None]
-"""Yields rows of tables, the first row of each being its head, and lines of text. Returns the exit status."""
 
 POINTS = {"scene": (1000, 40_000), "turntable": (1000, 20_000), "poses": (5000, 5000)}
 """Numbers of sparse and dense points in synthetic scenes. Structure from motion finds about the sparse number."""
@@ -83,98 +68,6 @@ EXPOSED = (
 """Rows of the exposure experiment: name, True if gains change the photographs, True if appearance is learnt."""
 UNITS = (*((factor, 0.0) for factor in (1.0, 1e-7, 1e-4, 1e4, 1e7)), (1.0, 1e6))
 """Factors by which a scene's world is scaled, and distances by which it is moved."""
-BLOCK = "0000_0000/"
-"""Beginning of the names of the photographs of a town's first block."""
-
-
-@dataclass(frozen=True)
-class Trained:
-    """A finished training."""
-
-    run: Path
-
-    @property
-    def model(self) -> Gaussians:
-        """The model, read from its file."""
-        return Gaussians.load(self.run / "model.ply")
-
-    @property
-    def last(self) -> dict[str, Any]:
-        """The last evaluation; "mean" has the means over the held-out views."""
-        return _json(self.run / "eval.json")
-
-    def psnr_by_step(self) -> dict[int, float]:
-        """Mean PSNR of the held-out views in dB, keyed by step."""
-        lines = map(json.loads, (self.run / "metrics.jsonl").read_text("utf-8").splitlines())
-        psnr = {line["step"]: line["eval"]["mean"]["psnr"] for line in lines if "eval" in line}
-        return psnr | {self.last["step"]: self.last["mean"]["psnr"]}
-
-    @property
-    def appearance(self) -> dict[str, dict[str, list[float]]]:
-        """Learnt appearance of each photograph, keyed by name."""
-        photographs: dict[str, dict[str, list[float]]] = _json(self.run / "appearance.json")["photographs"]
-        return photographs
-
-
-def _json(path: Path) -> dict[str, Any]:
-    document: dict[str, Any] = json.loads(path.read_text("utf-8"))
-    return document
-
-
-def words_of(settings: str, **usual: object) -> list[str]:
-    """Arguments of `clsplat train` for settings `name=value,...`, which take precedence over the usual settings."""
-    values = {name: str(value) for name, value in usual.items() if value is not None}
-    for setting in filter(None, settings.split(",")):
-        name, value = setting.split("=", 1)
-        values[name] = value
-    flags = ((f"--{name.replace('_', '-')}", value) for name, value in values.items())
-    return [word for flag, value in flags for word in ((flag,) if value.lower() == "true" else (flag, value))]
-
-
-def trained(
-    given: Namespace, name: str, scene: Path | Scene, *words: str, settings: str = "", **usual: object
-) -> Trained:
-    """Train a row, or continue its interrupted training. A finished run is not repeated.
-
-    scene: a folder, or a scene that `clsplat train` gets instead of a folder's contents.
-    settings, usual: settings in addition to iterations, resolution and seed. `settings` take precedence over `usual`,
-    and these over the settings of --with.
-    """
-    settings = settings or getattr(given, "settings", "")
-    usual = {
-        "iterations": given.iterations,
-        "seed": given.seed,
-        "resolution": getattr(given, "resolution", None),
-    } | usual
-    every = [*words_of(settings, **usual), *words]
-    folder = scene if isinstance(scene, Path) else given.folder
-    label = scene.name if isinstance(scene, Path) else f"{scene.name} {len(scene.train_views)}"
-    digest = hashlib.blake2b(repr((label, every)).encode(), digest_size=4).hexdigest()
-    run = given.folder / "runs" / f"{name.replace(', ', '-').replace(' ', '-').replace('/', '-')}-{digest}"
-    if not (run / "eval.json").is_file():
-        more = ["--resume"] if (run / "config.toml").is_file() else every
-        services = None if isinstance(scene, Path) else Services(load_scene=lambda *_, **__: scene)
-        call(["train", str(folder), "-o", str(run), "--no-report", *more], services)
-    return Trained(run)
-
-
-def call(words: list[str], services: Services | None = None) -> None:
-    """Call `clsplat`. Raises SystemExit with its status if that is not 0."""
-    with redirect_stdout(sys.stderr):  # standard output is for the table
-        status = clsplat(words, services)
-    if status:
-        raise SystemExit(status)
-
-
-def picture_of(renderer: Renderer, model: Gaussians, view: View) -> Image:
-    """The picture of a model from a view."""
-    return renderer.render(model, view.camera).image
-
-
-def psnr_of(draw: Callable[[View], Image], views: Sequence[View], background: ArrayLike = (0, 0, 0)) -> float:
-    """Mean PSNR of rendered views in dB."""
-    mean = evaluate(draw, views, background, model=EvaluatedModel(None, 0, None))["mean"]
-    return float(mean["psnr"])
 
 
 def masks(given: Namespace) -> Rows:
@@ -490,58 +383,6 @@ def units(given: Namespace) -> Rows:
         cells = f"{moved.extent:.3g}", f"{getattr(model, 'near', 0.01):.2g}", f"{len(model):,}"
         yield f"{factor:g}", f"{offset:g}", *cells, f"{psnr:.2f}", f"{psnr - wanted:+.3f}"
     return int(off > 0)
-
-
-def towns(given: Namespace) -> Rows:
-    """Towns of growing size, then a town in metres, millimetres and kilometres: each is trained with the length unit of
-    its depths, and with its extent where that differs.
-
-    All towns have as many photographs and Gaussians a block, and as many passes. PSNR is that of all held-out
-    photographs, of those in the first town, and of those of block 0, 0. With --own-block the growing towns' photographs
-    count only where they show their own block, and in the first row each block of the first town is trained alone.
-    """
-    renderer = Renderer(open_device())
-    yield "town", "metres a unit", "unit", "steps", "Gaussians", "PSNR, dB", "first town", "block 0, 0", "seconds"
-    load, masks = (own_blocks, "masks=ignore") if given.own_block else (load_scene, "")
-    towns = [(size, 1.0, load, masks) for size in given.towns.split(",")]
-    for metres in (1.0, 1e-3, 1e3):
-        scaled = load_scene if metres == 1 else lambda town, by=1 / metres: load_scene(rescaled(town, by))
-        towns.append((given.scaled, metres, scaled, ""))
-
-    def train(name: str, scene: Scene, masks: str) -> tuple[Trained, list[float]]:
-        blocks = len({view.name.split("/")[0] for view in scene.views})
-        limit = f"density.growth=budget,density.max-gaussians={given.sky + given.gaussians * blocks}"
-        settings = ",".join([limit, f"sky={given.sky}", masks, given.settings])
-        passes = {"iterations": given.iterations or None, "passes": None if given.iterations else given.passes}
-        done = trained(given, name, scene, settings=settings, **passes)
-        draw = partial(picture_of, renderer, done.model)
-        shown = ([view for view in scene.test_views if view.name.startswith(part)] for part in ("", first, BLOCK))
-        return done, [psnr_of(draw, views) if views else np.nan for views in shown]
-
-    first: tuple[str, ...] = ()
-    for size, metres, load, masks in towns:
-        folder = given.folder / size
-        if not folder.exists():
-            town = "--town", size, "--town-photos", str(given.town_photos), "--town-size", given.town_size
-            call(["demo", *town, "-o", str(folder)])
-        scene = load(folder)
-        if not first:
-            first = tuple({f"{view.name.split('/')[0]}/" for view in scene.views})
-            rows = [train(f"{block.name} alone", block, masks) for block in single_blocks(scene)] if masks else []
-            if rows:
-                of_all = (sum(done.last[name] for done, _ in rows) for name in ("step", "gaussians", "seconds"))
-                steps, gaussians, seconds = of_all
-                mean = f"{np.mean([psnr[0] for _, psnr in rows]):.2f}"
-                alone = f"{steps:,}", f"{gaussians:,}", mean, mean, f"{rows[0][1][0]:.2f}", f"{seconds:.0f}"
-                yield f"{size}, each block alone", "1", "", *alone
-        for kind, unit in (("depths", None), ("extent", scene.extent)):
-            done, psnr = train(f"{size} {metres:g} {kind}", replace(scene, unit=unit), masks)
-            used = length_unit_of(Run.open(done.run), scene)
-            cells = f"{used:.3g}", f"{done.last['step']:,}", f"{done.last['gaussians']:,}"
-            yield size, f"{metres:g}", *cells, *(f"{each:.2f}" for each in psnr), f"{done.last['seconds']:.0f}"
-            if used == scene.extent:
-                break
-    return 0
 
 
 def numbers(text: str) -> list[int]:

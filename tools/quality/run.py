@@ -22,7 +22,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
 
 from quality import tables
-from quality.experiments import EXPERIMENTS, Rows
+from quality.experiments import EXPERIMENTS
+from quality.trainings import Rows
 
 from clsplat.errors import ClsplatError, InputError
 
