@@ -125,11 +125,11 @@ def run_of(frame: Mapping[str, Any], launch: Mapping[str, Any], items: int, wave
     """The numbers of a frame and a launch on which loops depend."""
     tiles = -(-frame["width"] // TILE) * -(-frame["height"] // TILE)
     numbers = dict(zip(NUMBERS.get(launch["kernel"], ()), map(int, launch["scalars"]), strict=False))
-    lists: dict[str, Any] = {"lists": tiles}
+    more: dict[str, Any] = {name: numbers[name] for name in ("elements", "digits") if name in numbers}
     if launch["kernel"] in APPENDING:
-        lists["boxes"] = boxes_of(frame, items)
+        more["boxes"] = boxes_of(frame, items)
     if launch["kernel"] == SORTING:
-        lists["sorting"] = sorting_of(lists_of(frame), items)
+        more["sorting"] = sorting_of(lists_of(frame), items)
     return Run(
         items,
         wave,
@@ -138,8 +138,8 @@ def run_of(frame: Mapping[str, Any], launch: Mapping[str, Any], items: int, wave
         **blocks_of(frame, items),
         coefficients=(frame["sh_degree"] + 1) ** 2,
         groups=math.prod(launch["size"]) // items,
-        **lists,
-        **{name: numbers[name] for name in ("elements", "digits") if name in numbers},
+        lists=tiles,
+        **more,
     )
 
 
