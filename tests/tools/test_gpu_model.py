@@ -315,7 +315,7 @@ def test_ci_holds_the_predictions(
     (gpu,) = [each for each in GPUS if each.name == "H200"]
     one = Measured(gpu, "made up, 1 M", "", {"blend": measured}, [Work("blend", 0, instructions=gpu.issued * 0.5)])
     for name, value in {
-        "counted": ([], {}, ([one], Constants(efficiency=1.0), [])),
+        "counted": ([], {}, ([one], Constants(efficiency=1.0), [], {})),
         "broken": [],
         "loss_faults": [],
         "missed_goals": [],
@@ -394,9 +394,17 @@ def test_the_walk_of_a_tile() -> None:
 
 def test_a_frame_that_was_measured_elsewhere() -> None:
     row = {"name": "fox", "gaussians": 100, "visible": 80, "listed": 200, "walked": 190, "reached": 3.0}
-    row |= {"list_99": 20, "longest": 30, "slowest": 25}
+    row |= {
+        "list_99": 20,
+        "longest": 30,
+        "slowest": 25,
+        "longest_listed": 32,
+        "list_tiles": [0, 7],
+        "list_pairs": [0, 14],
+    }
     scene = {"frame": "fox", "gaussians": 150, "visible": 110, "pairs": {"listed": 300}}
     lists = {"walked": 285, "list_99": 30, "longest": 45, "slowest": 38, "counted": 100}
+    lists |= {"longest_listed": 48, "list_pairs": [0, 21]}
     assert as_measured(row, [{"scenes": [{"scene": "another"}, scene]}]) == {
         **row,
         **lists,

@@ -477,13 +477,15 @@ def test_what_is_not_known_is_told(arguments: list[str], capsys: Capture) -> Non
 
 
 def test_a_rehearsed_step_is_the_packages() -> None:
+    """And a frame, whose lists are made by radix sorts."""
     frame = {**json.loads(FRAMES.read_text())["frames"][0], "listed": 1_000_000}
-    (launches,) = ask_package("1x64", [frame])
-    sources = sources_of(launches)
+    launches, of_picture = ask_package("1x64", [frame, {**frame, "picture": True}])
+    sources = sources_of([*launches, *of_picture])
     assert {source.stem for source in sources} >= set(NO_STACK)
-    assert {source.items for source in sources} == {64}
+    assert {source.items for source, kernels in sources.items() if "list_offsets" not in kernels} == {64}
     stages = {launch["stage"] for launch in launches}
-    assert {"project", "duplicate", "ranges", "blend", "loss", "blend_grad"} <= stages
+    assert {"project", "append", "blend", "loss", "blend_grad"} <= stages
+    assert not stages & {"duplicate", "ranges"}
     (blend,) = [launch for launch in launches if launch["kernel"] == "blend"]
     tiles = -(-frame["width"] // 16) * -(-frame["height"] // 16)
     assert (blend["size"], blend["local"]) == ([64 * tiles], [64])
@@ -499,6 +501,7 @@ def test_tables_have_a_place_in_the_page() -> None:
         "constants",
         "measured",
         "now",
+        "wanted",
         "stages",
         "goals",
         "steps",

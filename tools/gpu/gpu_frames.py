@@ -24,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bench"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
+from gpu_lists import OWN_BOX
 from gpu_measured import CALIBRATION
 from gpu_rules import BATCH_BACK, BLOCKS, VISITS, WARPS, together
 from gpu_scenes import subject_of
@@ -73,6 +74,51 @@ def count(name: str, subject: Subject) -> dict[str, Any]:
         "listed": counted.pairs,
         "key_bits": counted.key_bits,
         **summary(np.array(walks)),
+        **lists_in(np.diff(lists.ranges.get().astype(np.int64)).ravel()),
+        **boxes_in(splats, frame.projected.tile_counts.get(), (tiles.shape[1], tiles.shape[0])),
+    }
+
+
+WAVE = 32
+"""Neighbouring Gaussians whose items run in step."""
+
+
+def lists_in(lengths: np.ndarray) -> dict[str, Any]:
+    """Keys of a frame's row, from the lengths of its tiles' lists: the longest; for 1, 2, 4, ... the number of lists up
+    to this length and over half of it; and their pairs."""
+    doublings = np.ceil(np.log2(np.maximum(lengths, 1))).astype(np.int64)
+    return {
+        "longest_listed": int(lengths.max()),
+        "list_tiles": np.bincount(doublings).tolist(),
+        "list_pairs": np.bincount(doublings, lengths).astype(np.int64).tolist(),
+    }
+
+
+def boxes_in(splats: np.ndarray, pairs: np.ndarray, tiles: tuple[int, int]) -> dict[str, Any]:
+    """Keys of a frame's row: the fields of `gpu_lists.Boxes`; wide: a fraction of all Gaussians. splats, pairs: of each
+    Gaussian. tiles: across and down."""
+    field = dict(zip(SPLAT, splats.T, strict=False))
+
+    def side(mean: str, rest: str, half: str, count: int) -> np.ndarray:
+        at = field[mean] + field[rest]
+        low, high = ((at + sign * field[half]) / TILE for sign in (-1, 1))
+        return np.where(pairs > 0, np.clip(np.floor(high) + 1, 0, count) - np.clip(np.floor(low), 0, count), 0)
+
+    with np.errstate(invalid="ignore", over="ignore"):  # of Gaussians that are culled
+        columns, rows = side("PIXEL_X", "SUB_X", "HALF_W", tiles[0]), side("PIXEL_Y", "SUB_Y", "HALF_H", tiles[1])
+    is_wide = columns * rows > OWN_BOX
+    wide = max(int(is_wide.sum()), 1)
+
+    def of_waves(values: np.ndarray) -> float:
+        own = np.pad(np.where(is_wide, 0, values), (0, -len(values) % WAVE))
+        return round(float(own.reshape(-1, WAVE).max(1).mean()), 3)
+
+    return {
+        "wave_rows": of_waves(rows),
+        "wave_pairs": of_waves(pairs),
+        "wide": round(float(is_wide.mean()), 6),
+        "wide_rows": round(float(rows[is_wide].sum()) / wide, 3),
+        "wide_columns": round(float(columns[is_wide].sum()) / wide, 3),
     }
 
 
@@ -179,7 +225,9 @@ def as_measured(row: Mapping[str, Any], calibration: Sequence[Mapping[str, Any]]
     if scene is None:
         return dict(row)
     longer = scene["pairs"]["listed"] / row["listed"]
-    lists = {name: round(row[name] * longer) for name in ("walked", "list_99", "longest", "slowest")}
+    lengths = ("walked", "list_99", "longest", "slowest", "longest_listed")
+    lists: dict[str, Any] = {name: round(row[name] * longer) for name in lengths}
+    lists["list_pairs"] = [round(pairs * longer) for pairs in row["list_pairs"]]
     numbers = {"gaussians": scene["gaussians"], "visible": scene["visible"], "listed": scene["pairs"]["listed"]}
     return {**row, **numbers, **lists, "counted": row["gaussians"]}
 

@@ -38,15 +38,21 @@ PARTS = {
     "statistics": ("statistics",),
 }
 """Parts of a step, with the names of their stages."""
+ATOMICS = (1450, 6700)
+"""Counters of the measured atomics in global memory."""
 OF_FRAME = ("project", "duplicate", "ranges", "blend")
 """Stages of a frame."""
 WALLS = ("frame, wall", "step, wall")
+DRAWN = ", drawn"
+"""After the name of a frame, in the names of the launches that only draw it: lists of a step by capacity are made in
+another way."""
 
 
 @dataclass(frozen=True)
 class Measured:
     """A scene of a row. code: its commit and date. ms: what was measured, by part and WALLS. works: of the launches
-    that were measured. now: of those of the present kernels, if the frame has counts."""
+    that were measured. now: of those of the present kernels, if the frame has counts. drawn: of those that only draw
+    the frame."""
 
     gpu: Gpu
     frame: str
@@ -54,6 +60,7 @@ class Measured:
     ms: Mapping[str, float]
     works: Sequence[Work | None]
     now: Sequence[Work | None] = ()
+    drawn: Sequence[Work | None] = ()
 
     def predicted(self, constants: Constants) -> dict[str, float]:
         """Milliseconds of all that was measured."""
@@ -61,13 +68,15 @@ class Measured:
         return {name: found[name] for name in self.ms}
 
 
-def milliseconds(works: Sequence[Work | None], gpu: Gpu, constants: Constants) -> dict[str, float]:
-    """Milliseconds of PARTS and WALLS."""
+def milliseconds(
+    works: Sequence[Work | None], gpu: Gpu, constants: Constants, drawn: Sequence[Work | None] = ()
+) -> dict[str, float]:
+    """Milliseconds of PARTS and WALLS. drawn: the launches of a frame, if they are not among those of the step."""
     stages = stages_of(works, gpu, constants)
     found = {
         part: sum((stages[name] for name in members if name in stages), Stage()).ms for part, members in PARTS.items()
     }
-    drawn = [work for work in works if work is None or work.stage in OF_FRAME]
+    drawn = drawn or [work for work in works if work is None or work.stage in OF_FRAME]
     for name, each in zip(WALLS, (drawn, filter(None, works)), strict=True):
         found[name] = wall(each, gpu, constants)
     return found
@@ -127,13 +136,13 @@ def read(rows: Sequence[Mapping[str, Any]], now: Works) -> tuple[list[Measured],
                 parts[part] = parts.get(part, 0) + ms
             parts = {part: parts[part] for part in PARTS if part in parts}
             parts |= dict(zip(WALLS, (scene["frame_ms"], scene["step_ms"]), strict=True))
-            today = now.get((gpu.target, scene["frame"]), ())
-            found.append(Measured(gpu, scene["frame"], code, parts, works, today))
+            today = (now.get((gpu.target, scene["frame"] + suffix), ()) for suffix in ("", DRAWN))
+            found.append(Measured(gpu, scene["frame"], code, parts, works, *today))
     return found, unused
 
 
-Fit = tuple[Sequence[Measured], Constants, Sequence[str]]
-"""Scenes that were measured, the constants, and descriptions of rows that are not used."""
+Fit = tuple[Sequence[Measured], Constants, Sequence[str], Works]
+"""Scenes that were measured, the constants, descriptions of rows that are not used, and the work of present kernels."""
 
 
 def fit_constants(rows: Sequence[Mapping[str, Any]], measured: Sequence[Measured]) -> Constants:
@@ -141,8 +150,13 @@ def fit_constants(rows: Sequence[Mapping[str, Any]], measured: Sequence[Measured
     those that small kernels measured are taken from the rows."""
     limits = next(row["limits"] for row in rows if "limits" in row and "copy float4 x1, 1024" in row["limits"])
     gpu = next(each for row in rows if row.get("limits") is limits for each in GPUS if each.name == row["gpu"])
+    few, many = (limits[f"3.4 M atomic_inc on {counters}, ms"] / 3.4 for counters in ATOMICS)  # nanoseconds
+    counter = (few - many) / (1 / ATOMICS[0] - 1 / ATOMICS[1])
     begin = Constants(
-        copy=limits["copy float4 x1, 1024"] / gpu.gb, groups=limits["groups G/s, 64"] * 1e3 / limits["clock"]
+        copy=limits["copy float4 x1, 1024"] / gpu.gb,
+        groups=limits["groups G/s, 64"] * 1e3 / limits["clock"],
+        atomic=many - counter / ATOMICS[1],
+        counter=counter,
     )
 
     def error(constants: Constants) -> float:

@@ -2,9 +2,9 @@
 """Predict the milliseconds of a training step on a GPU, and fit the model's few constants to measured steps.
 
 A launch takes the time of its bytes, and after that the longest of: starting its instructions, looking up its cache
-lines, starting its groups, and the chains of its warps (`gpu_chain.py`), as many at a time as fit, or the chain of the
-slowest tile's alone. No launch takes less than LAUNCH. Bytes are added because an H100 and an H200, which differ in
-nothing but memory, differ in each stage by the time of its bytes. Every constant is shared by all stages.
+lines, its atomics, starting its groups, and the chains of its warps (`gpu_chain.py`), as many at a time as fit, or the
+chain of the slowest tile's alone. No launch takes less than LAUNCH. Bytes are added because an H100 and an H200, which
+differ in nothing but memory, differ in each stage by the time of its bytes. Every constant is shared by all stages.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any
 from gpu_chain import NOTHING, Chain
 from gpu_compilers import Built, Source
 from gpu_devices import ARCHITECTURES, Gpu, waves_at_a_time
+from gpu_lists import boxes_of, lists_of, sorting_of
 from gpu_loops import Cost, cost_of, rules_of
 from gpu_rules import BLOCKS, BY_PAIR, NUMBERS, VISITS, WARPS, Run
 
@@ -31,19 +32,24 @@ LINES = 2
 """Cache lines that a unit looks up per cycle."""
 DRIVERS_ITEMS = 256
 """Items per group where the driver chooses."""
+APPENDING, SORTING = ("count_tiles", "append_pairs"), "sort_lists"
+"""Kernels of lists by append with an atomic in global memory for each pair, and the one that sorts the lists."""
 
 
 @dataclass(frozen=True)
 class Constants:
     """efficiency: fraction of a unit's issue slots that are used when it has enough to do. access: nanoseconds of an
     access to global memory. host: milliseconds in which the host queues a launch. copy: fraction of the data sheet's
-    bandwidth. groups: started per cycle."""
+    bandwidth. groups: started per cycle. atomic: nanoseconds of an atomic in global memory, of those of a whole device.
+    counter: nanoseconds between two on one counter."""
 
     efficiency: float = 0.71
     access: float = 600
     host: float = 0.04
     copy: float = 0.9
     groups: float = 0.83
+    atomic: float = 0.0079
+    counter: float = 82
 
 
 FITTED = {"efficiency": (0.5, 1, 0.01), "access": (100, 1000, 10), "host": (0.005, 0.1, 0.001)}
@@ -68,7 +74,8 @@ class Stage:
 @dataclass(frozen=True)
 class Work:
     """The work of a launch. kernel: its name, of a fill `fill`. instructions: of all waves. resident: waves that
-    fit in a unit. chain: of an average wave. longest: of a wave in the slowest tile."""
+    fit in a unit. chain: of an average wave. longest: of a wave in the slowest tile. atomics: in global memory, spread
+    over so many counters."""
 
     stage: str
     bytes: float
@@ -79,6 +86,8 @@ class Work:
     chain: Chain = NOTHING
     longest: Chain = NOTHING
     kernel: str = ""
+    atomics: float = 0.0
+    counters: int = 1
 
     def on(self, gpu: Gpu, constants: Constants) -> Stage:
         """The launch's part of its stage."""
@@ -90,8 +99,9 @@ class Work:
         issue, chain = self.instructions / gpu.issued / constants.efficiency, max(waited) / gpu.ghz * 1e-6
         lines = self.waves * self.chain.lines / LINES / gpu.units / gpu.ghz * 1e-6
         starts = self.groups / constants.groups / gpu.ghz * 1e-6
+        counted = self.atomics * (constants.atomic + constants.counter / self.counters) * 1e-6
         memory = self.bytes / gpu.gb / constants.copy * 1e-6
-        return Stage(issue, memory, chain, max(LAUNCH, memory + max(issue, lines, starts, chain)), 1)
+        return Stage(issue, memory, chain, max(LAUNCH, memory + max(issue, lines, starts, chain, counted)), 1)
 
 
 def blocks_of(frame: Mapping[str, Any], items: int) -> dict[str, Any]:
@@ -115,6 +125,11 @@ def run_of(frame: Mapping[str, Any], launch: Mapping[str, Any], items: int, wave
     """The numbers of a frame and a launch on which loops depend."""
     tiles = -(-frame["width"] // TILE) * -(-frame["height"] // TILE)
     numbers = dict(zip(NUMBERS.get(launch["kernel"], ()), map(int, launch["scalars"]), strict=False))
+    more: dict[str, Any] = {name: numbers[name] for name in ("elements", "digits") if name in numbers}
+    if launch["kernel"] in APPENDING:
+        more["boxes"] = boxes_of(frame, items)
+    if launch["kernel"] == SORTING:
+        more["sorting"] = sorting_of(lists_of(frame), items)
     return Run(
         items,
         wave,
@@ -123,7 +138,8 @@ def run_of(frame: Mapping[str, Any], launch: Mapping[str, Any], items: int, wave
         **blocks_of(frame, items),
         coefficients=(frame["sh_degree"] + 1) ** 2,
         groups=math.prod(launch["size"]) // items,
-        **{name: numbers[name] for name in ("elements", "digits") if name in numbers},
+        lists=tiles,
+        **more,
     )
 
 
@@ -172,6 +188,9 @@ def _work_of(
         pairs = frame["walked"] * run.waves / waves
         slow = costs(source, name, replace(run, listed=frame["slowest"], **longest_of(frame, source.items)))
         longest = slow.first + slow.then.times(frame["slowest"])
+    if name == SORTING:
+        slow = costs(source, name, replace(run, sorting=sorting_of([(1, frame["longest_listed"])], source.items)))
+        longest = slow.first + slow.then
     return Work(
         launch["stage"],
         launch["bytes"],
@@ -182,6 +201,7 @@ def _work_of(
         cost.first + cost.then.times(pairs),
         longest,
         name,
+        **({"atomics": frame["listed"], "counters": run.lists} if name in APPENDING else {}),
     )
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 from gpu_chain import NEAR
 from gpu_devices import GPUS, occupancy
 from gpu_intel import INTEL, IntelBuilt
-from gpu_measured import PARTS, WALLS, Fit, Measured, milliseconds
+from gpu_measured import PARTS, WALLS, Fit, Measured, Works, milliseconds
 from gpu_model import LAUNCH, LINES, Constants, Stage
 from plotting import plot_stacks
 
@@ -30,6 +31,14 @@ VKSPLAT, VKSPLAT_GPU = (19, 25, 25, 32, 130, 131, 5), "RTX 3090"
 """Seconds of the parts in VkSplat's trainings of 30,000 steps: means of seven scenes, from its project's page."""
 WANTED, FRAMES_WANTED, LITEGS = 8, 400, 4.0
 """Maximum milliseconds of a step, and minimum pictures per second; milliseconds of a step of LiteGS."""
+
+WANTED_STEPS = (
+    ("H200", "made up, 1 M", 2.6),
+    ("H100 SXM", "made up, 1 M", 2.8),
+    ("H200", "fox, step 7000", 1.2),
+    ("RTX 4090", "made up, 1 M", 3.9),
+)
+"""GPUs and frames, with the maximum milliseconds of a step that is wanted there."""
 
 Predictions = Mapping[tuple[str, str, str], Mapping[str, Stage]]
 """Stages of a step, keyed by shape, GPU and frame."""
@@ -181,6 +190,8 @@ def constant_table(constants: Constants) -> str:
         ["a launch, at least", f"{LAUNCH * 1e3:.0f} µs", "H100, its shortest kernels"],
         ["memory, of the data sheet's bandwidth", f"{constants.copy:.0%}", "H100, copying"],
         ["groups started a cycle", f"{constants.groups:.2f}", "H100, empty groups"],
+        ["an integer atomic in global memory", f"{constants.atomic * 1e3:.0f} ps", "H100, 3.4 M of them"],
+        ["the next one on the same counter", f"{constants.counter:.0f} ns", "H100, 3.4 M on 1450 and 6700 counters"],
         ["lines looked up a cycle and unit", f"{LINES}", "assumed; `project` agrees"],
     ]
     return markdown(lines)
@@ -205,13 +216,34 @@ def now_table(measured: Sequence[Measured], constants: Constants) -> str:
     """Table of the predictions of the code that was measured, and of the present kernels, with their ratio."""
     held = [each for each in measured if each.now]
     lines = [["stage", *(f"{each.gpu.name}, {each.frame}: then, now, ratio" for each in held)]]
-    pairs = [[milliseconds(works, each.gpu, constants) for works in (each.works, each.now)] for each in held]
+    pairs = [
+        [milliseconds(works, each.gpu, constants, drawn) for works, drawn in ((each.works, ()), (each.now, each.drawn))]
+        for each in held
+    ]
     for name in (*PARTS, *WALLS):
         cells = []
         for each, (then, now) in zip(held, pairs, strict=True):
             of_both = f"{then[name]:.3f}, {now[name]:.3f}, **{now[name] / then[name]:.2f}**" if name in each.ms else ""
             cells.append(of_both)
         lines.append([name, *cells])
+    return markdown(lines)
+
+
+def wanted_table(measured: Sequence[Measured], constants: Constants, now: Works) -> str:
+    """Table of the steps of WANTED_STEPS: predicted of the code that was measured and of the present kernels, and how
+    far the model is from what was measured there, in the step and on average in its parts."""
+    lines = [["step", "then, ms", "now, ms", "wanted, ms", "met", "error of fit: step, parts"]]
+    for name, frame, most in WANTED_STEPS:
+        (gpu,) = (each for each in GPUS if each.name == name)
+        ms = milliseconds(now[gpu.target, frame], gpu, constants)[WALLS[1]]
+        then, error = "not counted", "not measured"
+        for each in measured:
+            if (each.gpu.name, each.frame) == (name, frame):
+                ratios = {part: found / each.ms[part] for part, found in each.predicted(constants).items()}
+                of_parts = [math.log(ratio) ** 2 for part, ratio in ratios.items() if part not in WALLS]
+                then = f"{each.predicted(constants)[WALLS[1]]:.2f}"
+                error = f"{ratios[WALLS[1]] - 1:+.0%}, {math.sqrt(sum(of_parts) / max(len(of_parts), 1)):.0%}"
+        lines.append([f"{name}, {frame}", then, f"{ms:.2f}", f"{most:.1f}", "yes" if ms <= most else "no", error])
     return markdown(lines)
 
 
@@ -274,8 +306,9 @@ def tables_of(
         "steps": device_table(predictions, names, picture),
         "devices": gpu_table(fitted[0]),
         "constants": constant_table(fitted[1]),
-        "measured": measured_table(*fitted),
+        "measured": measured_table(*fitted[:3]),
         "now": now_table(*fitted[:2]),
+        "wanted": wanted_table(*fitted[:2], fitted[3]),
     }
     if intel:
         tables["intel"] = intel_table(intel)

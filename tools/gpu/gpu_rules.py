@@ -10,8 +10,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
+
+from gpu_lists import Boxes, Sorting
 
 from clsplat.device.launch import DEFAULT_GROUP_ITEMS
 from clsplat.layouts.columns import LOSS_PARTS, PLAIN_SLOTS
@@ -54,8 +56,8 @@ class Run:
     only those of warps that walk it and for which it is not dense. visits, dense: fractions of the tile's warps that
     walk a pair, and for which it is dense. turns_back, whole_back, rounds_back: a warp's pairs, those that reach a
     whole strip, and rounds in the gradient's walk; others_reached, others_taken: blocks of the tile that it visits for
-    the other pairs (`gpu_frames.py`).
-    coefficients: of SH. groups, elements: of the launch. digits: of a pass of the sort."""
+    the other pairs (`gpu_frames.py`). coefficients: of SH. groups, elements: of the launch. digits: of a pass of the
+    sort. lists: number of the frame's tiles. boxes, sorting: of lists by append."""
 
     items: int
     wave: int = 32
@@ -77,6 +79,9 @@ class Run:
     groups: int = 1
     elements: int = 1
     digits: int = 256
+    lists: int = 1
+    boxes: Boxes = field(default_factory=Boxes)
+    sorting: Sorting = field(default_factory=Sorting)
 
     @property
     def waves(self) -> int:
@@ -317,6 +322,24 @@ ABREAST = 4
 ADAM = Rule("for (uint k = own, bit = 1; k < count; k += stride, bit += bit)", _adam, mark=("global", 6))
 """Adam's loop in `project_step`."""
 
+_OVER_TILES = (
+    Rule("for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {", lambda run: run.boxes.wave_rows),
+    Rule("for (uint k = 0; k < wides; ++k) {", lambda run: run.boxes.wide),
+)
+"""Rules of kernels in which an item goes over a Gaussian's tiles, and a group over those of wide boxes."""
+
+
+def _of_run(run: Run) -> float:
+    """Elements of each item in the larger of the two groups of `list_offsets`."""
+    return max(run.elements, run.lists) / run.items
+
+
+def _over_list(function: str, rounds: Rounds, text: str = "k < count; k += ITEMS") -> Rule:
+    return Rule(f"for (uint k = get_local_id(0); {text}", rounds, function=function)
+
+
+_OF_COMPARISONS = "first_of(k, step) + 1 < count; k += ITEMS"
+
 BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "project": (
         Rule("for (int ty = e->tile_y0; ty < e->tile_y1; ++ty)", _side, ends=("count += x1 - x0;",), mark=("fp32", 60)),
@@ -331,6 +354,46 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
         Rule("for (uint first = begin; first < end; first += ITEMS)", _of_item),
         Rule("atomic_min(extremes, least)", lambda run: run.wave),  # AMD's compiler loops over a wave's items
         Rule("atomic_max(extremes + 1, largest)", lambda run: run.wave),
+    ),
+    "count_tiles": (
+        *_OVER_TILES,
+        Rule("for (int tx = x0; tx < x1; ++tx) atomic_inc(", lambda run: run.boxes.wave_pairs, mark=("global", 1)),
+        Rule("for (int row = e.tile_y0 + (int)item / SIDE;", lambda run: run.boxes.shared_rows(run.items)),
+        Rule(
+            "for (int tx = x0 + (int)item % SIDE;",
+            lambda run: run.boxes.shared_rows(run.items) * run.boxes.shared_columns,
+        ),
+    ),
+    "list_offsets": (  # its elements are the groups of count_tiles
+        Rule("for (uint k = begin; k < end; ++k) {", _of_run, mark=("global", 1)),
+        Rule("for (uint tile = begin; tile < end; ++tile) {", _of_run, mark=("shared", 1)),
+        Rule("for (uint k = begin; k < end_of_tiles; ++k)", lambda run: run.lists / run.items, mark=("shared", 1)),
+        Rule("atomic_max(&longest, most);", lambda run: run.wave),  # AMD's compiler loops over a wave's items
+    ),
+    "append_pairs": (
+        *_OVER_TILES,
+        Rule("for (int tx = x0; tx < x1; ++tx, ++slot)", lambda run: run.boxes.wave_pairs, mark=("global", 3)),
+        Rule("for (int row = e.tile_y0; row < e.tile_y1; ++row)", lambda run: run.boxes.wide * run.boxes.wide_rows),
+        Rule(  # a wave has rows of its own
+            "for (int tx = x0 + (int)item % SIDE;",
+            lambda run: run.boxes.wide * run.boxes.wide_rows / run.waves * run.boxes.shared_columns,
+        ),
+    ),
+    "sort_lists": (
+        Rule("for (uint stage = fit / 2;", lambda run: run.sorting.stages),
+        Rule("for (uint step = stage; step >= fit; step /= 2)", lambda run: run.sorting.far_steps),
+        _over_list(" order_step_far(", lambda run: run.sorting.ordered_far, _OF_COMPARISONS),
+        Rule(
+            "for (uint first = 0; first < count; first += fit) {",
+            lambda run: run.sorting.parts,
+            ends=("BARRIER_LOCAL();",),
+        ),
+        _over_list(" fetch_pairs(", lambda run: run.sorting.fetched),
+        Rule("for (uint half_block = sorts", lambda run: run.sorting.blocks),
+        Rule("for (uint step = half_block; step > 0; step /= 2) {", lambda run: run.sorting.steps),
+        _over_list(" order_step(", lambda run: run.sorting.ordered, _OF_COMPARISONS),
+        _over_list(" store_pairs(", lambda run: run.sorting.stored),
+        _over_list(" sort_lists(", lambda run: run.sorting.listed),
     ),
     "order_counts": (),
     "duplicate": (
@@ -398,6 +461,7 @@ APART = (
     (r"\bf\[0\]", 4 * 45),
     (r"splat\[|rgb\[|fields\[k\]", 64),
     (r"\+= slot\[|\[place\]|\[from\]|pair_ids\[pair_from|slots\[i\]|\[order\[|tile_counts\[i\];", 128),
+    (r"APPEND\(|atomic_inc\((counts|places)|gaussian_from_slot\[|max\(most|values\[tile\]", 128),
     (r"GATHER\(\w+, 3|FROM_CAMERA\(means|dc\[0\]", 12),
     (r"GATHER\(quaternions", 16),
 )
@@ -414,6 +478,7 @@ def lines_touched(each: Instruction, text: str, run: Run) -> float:
 
 
 NUMBERS = {
+    "list_offsets": ("tiles", "elements"),
     "visible_sums": ("elements",),
     "compact_visible": ("elements",),
     "scan_sums": ("elements",),

@@ -45,7 +45,7 @@ from gpu_compilers import TARGETS, Built, Source, ask_package, build_builtins, c
 from gpu_devices import ARCHITECTURES, GPUS, occupancy
 from gpu_intel import IntelBuilt, compiled_for_intel, ocloc
 from gpu_loops import UnknownLoopError, by_pair, cost_of, loop_table, rules_of, unused_rules
-from gpu_measured import CALIBRATION, Fit, Works, beyond, fit_constants, read, with_inputs
+from gpu_measured import CALIBRATION, DRAWN, Fit, Works, beyond, fit_constants, read, with_inputs
 from gpu_model import blocks_of, stages_of, works_of
 from gpu_page import PAGE, SHAPE, Predictions, missed_goals, stale_tables, tables_of, trained_and_picture, write_page
 from gpu_rules import ABREAST, ADAM, BY_PAIR, WALK, Rule, Run
@@ -415,14 +415,19 @@ def counted(frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], 
         for gpu in GPUS
         if gpu.target == target
     }
-    return rows, predictions, (measured, constants, unread)
+    return rows, predictions, (measured, constants, unread, works[SHAPE])
 
 
 def works_in(shape: str, frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], Works]:
-    """The rows of a step's kernels in a shape for every target, and the work of each frame's launches."""
+    """The rows of a step's and a picture's kernels in a shape for every target, and the work of each frame's launches.
+    In SHAPE also of those that only draw a frame which is trained."""
+    largest = trained_and_picture(frames)[0][-1]
+    if shape == SHAPE:
+        trained = (frame for frame in frames if not frame.get("picture"))
+        frames = [*frames, *({**frame, "name": frame["name"] + DRAWN, "picture": True} for frame in trained)]
     steps = ask_package(shape, frames)
     sources = sources_of(launch for step in steps for launch in step)
-    rows = compiled(sources, TARGETS, jobs, partial(note_of, shape), trained_and_picture(frames)[0][-1])
+    rows = compiled(sources, TARGETS, jobs, partial(note_of, shape), largest)
     works = {}
     for target in TARGETS:
         built = {(row.source, row.built.kernel): row.built for row in rows if row.built.target == target}

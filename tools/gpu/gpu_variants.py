@@ -180,7 +180,10 @@ def _step(rehearsed: Rehearsed, whole: VariedDevice, frame: Mapping[str, Any]) -
     gaussians = Gaussians(means, quaternions, sizes, logits, sh)
     photograph = np.zeros((height, width, 3), np.uint8)
     trainer = trainer_of(Subject("rehearsed", gaussians, camera, photograph), device, RasterizerConfig())
-    trainer.pending.on = False  # launches then have exactly the items with work, for bytes and times
+    # By capacity, of as many pairs as there are: launches then have exactly the items with work, for bytes and times.
+    trainer.pending.room = lambda *_: frame["listed"]  # type: ignore[method-assign]
+    trainer.rasterizer.work.tight = False
+    device.atomics_faults.append("")
 
     def forward() -> None:
         trainer.rasterizer.forward(trainer.parameters, camera, np.zeros(3, np.float32), backward=False)

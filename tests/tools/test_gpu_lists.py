@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lists by append in the model of a GPU's step: rounds of their loops, atomics, and the steps that are wanted."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from dataclasses import asdict
+
+import gpu_page
+import numpy as np
+import pytest
+from gpu_devices import GPUS
+from gpu_frames import boxes_in, lists_in
+from gpu_lists import OWN_BOX, SIDE, Boxes, Sorting, boxes_of, lists_of, sorting_of
+from gpu_measured import ATOMICS, CALIBRATION, DRAWN, Measured, fit_constants, read
+from gpu_model import Constants, Work
+from gpu_page import now_table, wanted_table
+
+from clsplat.device.source import kernel_root
+from clsplat.layouts.columns import SPLAT
+from clsplat.stages.append import LOCAL_PAIRS
+
+(H200,) = [each for each in GPUS if each.name == "H200"]
+
+
+def walked(count: int, items: int) -> Sorting:
+    """The loops of sort_lists (append.cl) for a list, counted while they run, for the first item of a group."""
+    found: Counter[str] = Counter()
+
+    def rounds(pairs: int) -> int:
+        return len(range(0, pairs, items))
+
+    stage = LOCAL_PAIRS // 2
+    while stage == LOCAL_PAIRS // 2 or stage < count:
+        found["stages"] += 1
+        step = stage
+        while step >= LOCAL_PAIRS:
+            found["far_steps"] += 1
+            found["ordered_far"] += rounds(count // 2)
+            step //= 2
+        for first in range(0, count, LOCAL_PAIRS):
+            here, sorts = min(LOCAL_PAIRS, count - first), stage < LOCAL_PAIRS
+            found["parts"] += 1
+            found["fetched"] += rounds(here)
+            half = 1 if sorts else LOCAL_PAIRS // 2
+            while half < (here if sorts else LOCAL_PAIRS):
+                found["blocks"] += 1
+                step = half
+                while step:
+                    found["steps"] += 1
+                    found["ordered"] += rounds(here // 2)
+                    step //= 2
+                half *= 2
+            found["stored"] += rounds(here) if count > LOCAL_PAIRS else 0
+        stage *= 2
+    found["listed"] = rounds(count)
+    return Sorting(**found)
+
+
+@pytest.mark.parametrize("items", [32, 256])
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 64, 430, 2048, 4096, 16384])
+def test_rounds_of_a_sort_are_those_of_its_loops(count: int, items: int) -> None:
+    """Of lists of whole parts. A list is taken to have parts of one length."""
+    assert asdict(sorting_of([(1, count)], items)) == asdict(walked(count, items))
+
+
+@pytest.mark.parametrize("count", [2049, 3611, 5000])
+def test_rounds_of_a_sort_in_unequal_parts(count: int) -> None:
+    """A short last part has fewer doublings: at most a part's 66 steps are too many."""
+    found, wanted = sorting_of([(1, count)], 64), walked(count, 64)
+    assert (found.stages, found.parts, found.far_steps, found.listed) == (
+        wanted.stages,
+        wanted.parts,
+        wanted.far_steps,
+        wanted.listed,
+    )
+    assert 0 <= found.steps - wanted.steps <= 66
+    assert found.ordered == pytest.approx(wanted.ordered, rel=0.15)
+
+
+def test_a_sort_of_several_lists_is_their_mean() -> None:
+    frame = lists_in(np.array([1, 3, 4, 4, 60]))
+    assert frame == {
+        "longest_listed": 60,
+        "list_tiles": [1, 0, 3, 0, 0, 0, 1],
+        "list_pairs": [1, 0, 11, 0, 0, 0, 60],
+    }
+    assert lists_of(frame) == [(1, 1), (3, 11 / 3), (1, 60)]
+    found = sorting_of(lists_of(frame), 32)
+    assert found.steps == (0 + 3 * 3 + 21) / 5
+    assert found.listed == (1 + 3 + 2) / 5
+
+
+def test_boxes_of_a_frame() -> None:
+    """Two Gaussians of 1 and 3 x 2 tiles, one of 7 x 6, which is wide, and one that is culled."""
+    splats = np.zeros((33, len(SPLAT)), np.float32)
+    column = {name: SPLAT.index(name) for name in ("PIXEL_X", "PIXEL_Y", "HALF_W", "HALF_H")}
+    for place, at in enumerate([(8, 8, 4, 4), (24, 16, 17, 4), (104, 96, 50, 47), (8, 8, 1000, 1000)]):
+        splats[place, list(column.values())] = at
+    pairs = np.zeros(33, np.int64)
+    pairs[:3] = (1, 5, 40)
+    found = boxes_in(splats, pairs, (20, 20))
+    assert found == {
+        "wave_rows": 1.0,  # 2 in the first wave, and none in the second
+        "wave_pairs": 2.5,
+        "wide": round(1 / 33, 6),
+        "wide_rows": 6.0,
+        "wide_columns": 7.0,
+    }
+    boxes = boxes_of(found, 64)
+    assert boxes.wide == pytest.approx(64 / 33, rel=1e-4)
+    assert boxes.shared_rows(64) == boxes.wide, "all rows in one round"
+    assert boxes.shared_rows(32) == pytest.approx(boxes.wide * 6 / 4)
+    assert boxes.shared_columns == 1
+    assert Boxes(wide_columns=20).shared_columns == 20 / 8
+
+
+def test_sizes_are_the_kernels() -> None:
+    text = (kernel_root() / "append.cl").read_text()
+    assert re.findall(r"^#define OWN_BOX (\d+)$", text, re.MULTILINE) == [str(OWN_BOX)]
+    assert f"#define SIDE (ITEMS < {SIDE} ? ITEMS : {SIDE})\n" in text
+
+
+def test_atomics_take_what_an_h100_took() -> None:
+    """The two constants are solved from two measurements; the model gives these back."""
+    calibration = json.loads(CALIBRATION.read_text())
+    constants = fit_constants(calibration, [])
+    limits = next(row["limits"] for row in calibration if "limits" in row)
+    for counters in ATOMICS:
+        work = Work("append", 0, atomics=3.4e6, counters=counters)
+        assert work.on(H200, constants).ms == pytest.approx(limits[f"3.4 M atomic_inc on {counters}, ms"])
+
+
+def test_a_present_frame_is_that_of_its_own_launches() -> None:
+    """A step has no radix sorts, and a frame no lists by append."""
+    step, frame = (
+        [Work(stage, 0, instructions=H200.issued * ms)] for stage, ms in (("append", 1.0), ("duplicate", 2.0))
+    )
+    then = asdict(Work("project", 0, instructions=H200.issued * 4))
+    scene = {"scene": "s", "frame": "f", "frame_ms": 4.0, "step_ms": 5.0, "parts_ms": {}, "inputs": [then]}
+    rows = [{"device": "NVIDIA H200", "gpu": "H200", "date": "today", "commit": "abc", "scenes": [scene]}]
+    ((one,), _) = read(rows, {("sm_90", "f"): step, ("sm_90", "f" + DRAWN): frame})
+    assert (one.now, one.drawn) == (step, frame)
+    (told,) = [line for line in now_table([one], Constants(1.0, host=0)).splitlines() if line.startswith("| frame")]
+    assert "4.000, 2.000, **0.50**" in told
+
+
+def test_steps_that_are_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu_page, "WANTED_STEPS", (("H200", "f", 1.0), ("RTX 4090", "f", 0.1)))
+    (ada,) = [each for each in GPUS if each.name == "RTX 4090"]
+    then, now = ([Work("blend", 0, instructions=H200.issued * ms)] for ms in (2.0, 0.5))
+    one = Measured(H200, "f", "", {"blend": 1.0, "step, wall": 4.0}, then, now)
+    works = {("sm_90", "f"): now, ("sm_89", "f"): [Work("blend", 0, instructions=ada.issued * 0.5)]}
+    *_, first, second = wanted_table([one], Constants(1.0, host=0), works).splitlines()
+    assert first == "| H200, f | 2.00 | 0.50 | 1.0 | yes | -50%, 69% |"
+    assert second == "| RTX 4090, f | not counted | 0.50 | 0.1 | no | not measured |"

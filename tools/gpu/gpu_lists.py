@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How often the loops of append.cl run, from a frame's boxes and the lengths of its lists."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from clsplat.stages.append import LOCAL_PAIRS
+
+OWN_BOX = 32
+"""Tiles of the largest box that an item processes alone: OWN_BOX in append.cl."""
+SIDE = 8
+"""Items that share a row of tiles of a wide box: SIDE in append.cl."""
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """Of Gaussians in tiles. wave_rows, wave_pairs: of 32 neighbours, the most rows and pairs of one whose box is not
+    wide, on average. wide: wide boxes of a group. wide_rows, wide_columns: of a wide box, on average."""
+
+    wave_rows: float = 1
+    wave_pairs: float = 1
+    wide: float = 0
+    wide_rows: float = 0
+    wide_columns: float = 0
+
+    def shared_rows(self, items: int) -> float:
+        """Rounds over the rows of a group's wide boxes, if its items share them."""
+        return self.wide * max(self.wide_rows * SIDE / items, 1)
+
+    @property
+    def shared_columns(self) -> float:
+        """Rounds over a row of a wide box."""
+        return max(self.wide_columns / SIDE, 1)
+
+
+def boxes_of(frame: Mapping[str, Any], items: int) -> Boxes:
+    """The boxes of a frame, for groups of so many items."""
+    found = {each.name: frame[each.name] for each in fields(Boxes)}
+    return Boxes(**{**found, "wide": found["wide"] * items})
+
+
+@dataclass(frozen=True)
+class Sorting:
+    """Mean rounds of a list's sort. A list of over LOCAL_PAIRS is sorted in parts, which are merged in further stages.
+    stages: in all. parts: over all stages. blocks, steps: of Batcher's network in local memory, over all parts.
+    far_steps: those through global memory. The others are an item's: ordered, ordered_far: comparisons. fetched,
+    stored: pairs copied to local memory and back. listed: pairs written."""
+
+    stages: float = 0
+    parts: float = 0
+    blocks: float = 0
+    steps: float = 0
+    far_steps: float = 0
+    ordered: float = 0
+    ordered_far: float = 0
+    fetched: float = 0
+    stored: float = 0
+    listed: float = 0
+
+
+def sorting_of(lists: Iterable[tuple[float, float]], items: int) -> Sorting:
+    """The mean over lists. lists: numbers of lists, with the mean length of these."""
+    each = [(number, _sorting(length, items)) for number, length in lists]
+    whole = sum(number for number, _ in each)
+    return Sorting(*(sum(number * getattr(one, of.name) for number, one in each) / whole for of in fields(Sorting)))
+
+
+def _sorting(length: float, items: int) -> Sorting:
+    parts, doublings = math.ceil(length / LOCAL_PAIRS), math.ceil(math.log2(max(min(length, LOCAL_PAIRS), 1)))
+    merges = math.ceil(math.log2(max(length / LOCAL_PAIRS, 1)))
+    of_merge = math.ceil(math.log2(LOCAL_PAIRS))
+    a_part = length / max(parts, 1)
+    steps = parts * (doublings * (doublings + 1) / 2 + of_merge * merges)
+    far_steps = merges * (merges + 1) / 2
+    copied = (1 + merges) * parts * math.ceil(a_part / items)
+    return Sorting(
+        stages=1 + merges,
+        parts=(1 + merges) * parts,
+        blocks=parts * (doublings + merges),
+        steps=steps,
+        far_steps=far_steps,
+        ordered=steps * math.ceil(a_part / 2 / items),
+        ordered_far=far_steps * math.ceil(length / 2 / items),
+        fetched=copied,
+        stored=copied if merges else 0,
+        listed=math.ceil(length / items),
+    )
+
+
+def lists_of(frame: Mapping[str, Any]) -> list[tuple[float, float]]:
+    """A frame's lists by length: numbers of lists, with the mean length of these."""
+    lists = zip(frame["list_tiles"], frame["list_pairs"], strict=True)
+    return [(tiles, pairs / tiles) for tiles, pairs in lists if tiles]
