@@ -11,6 +11,7 @@ from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
 from clsplat.device.profile import stage
+from clsplat.stages.blend import frame_items
 from clsplat.stages.duplicate import Band, Totals
 from clsplat.stages.probe_atomics import atomics_fault
 from clsplat.stages.project import Projected
@@ -73,7 +74,8 @@ def append(
     gaussian_from_sorted = work.array("gaussian_from_sorted", (capacity,), np.uint32)
     slot_from_sorted = work.array("slot_from_sorted", (capacity,), np.uint32)
     arrays = (order, ranges, gaussian_from_slot, pairs, gaussian_from_sorted, slot_from_sorted)
-    local = cl.LocalMemory(4 * LOCAL_PAIRS)
-    launch_groups(device, kernels.sort_lists, number, items, LOCAL_PAIRS, *arrays, local, local)
+    local, sharing = cl.LocalMemory(4 * LOCAL_PAIRS), frame_items(device, number)
+    sort = device.kernels("append", {"ITEMS": sharing}).sort_lists
+    launch_groups(device, sort, number, sharing, LOCAL_PAIRS, *arrays, local, local)
     lists = TileLists(Band(0, number), ranges, gaussian_from_sorted, slot_from_sorted, order)
     return Totals(tile_counts, slots, n, capacity, on_device=readback, arriving=arriving), lists

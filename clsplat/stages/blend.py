@@ -85,11 +85,11 @@ _BUSY_ITEMS = 4096
 work-items or 32 of 128, as predicted for NVIDIA's GPUs (docs/gpu-static.md)."""
 
 
-def blend_items(device: Device, tiles: int) -> int:
-    """Number of work-items that share a tile in `blend`, for so many tiles. It does not change the result.
+def frame_items(device: Device, tiles: int) -> int:
+    """Number of work-items that share a tile in `blend` and `sort_lists`, for so many tiles. No result depends on it.
 
-    A warp walks the pairs that reach its part of the tile, one after the other. A frame with few tiles for a GPU's
-    units waits for the longest of these walks. More warps then walk shorter ones.
+    A frame with few tiles for a GPU's units waits for its longest lists. More work-items sort such a list in less time,
+    and more warps walk shorter parts of it.
     """
     items = tile_items(device)
     if device.kind != "gpu" or items == 1:
@@ -140,7 +140,7 @@ def blend(
 
     record: keep the cells that the gradient has to visit, if the kernel shape supports it.
     nearness: also blend 1 / depth.
-    items: number of work-items that share a tile; None for `blend_items`.
+    items: number of work-items that share a tile; None for `frame_items`.
     """
     width, height = inputs.width, inputs.height
     planes, near = _planes(work, width, height, kept=lists.band.first > 0), None
@@ -154,7 +154,7 @@ def blend(
     arrays = (lists.ranges, lists.gaussian_from_sorted, inputs.splats, inputs.background, *planes, *extra)
     switches = (("NEARNESS", near), ("RECORD_CELLS", cells), ("TILE_ORDER", lists.order))
     defines = {name: True for name, on in switches if on}
-    items = items or blend_items(device, lists.band.tiles)
+    items = items or frame_items(device, lists.band.tiles)
     launch_tiles(device, "blend", defines, lists, -(-width // TILE), width, height, *arrays, items=items)
     return Blended(*planes, cells, near)
 

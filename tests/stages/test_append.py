@@ -4,6 +4,8 @@ case too."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from compare import assert_same_bits
@@ -114,6 +116,22 @@ def test_every_number_of_merges(device: Device, monkeypatch: pytest.MonkeyPatch,
     lengths = [local * factor + off for factor in (1, 2, 3, 4, 5, 8, 9) for off in (-1, 0, 1)]
     lists = Lists(grouped, *long_lists(*lengths))
     assert_same_lists(lists.appended(), lists.radix())
+
+
+def test_a_gpu_sorts_few_lists_in_larger_groups(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    device = shaped(default_device, 1, GROUP_ITEMS)
+    boxes, depths, tiles = long_lists(3000, 5, 700)
+    wanted, groups = Lists(device, boxes, depths, tiles).appended(), {}
+
+    def launch(given: Device, kernel: Any, number: int, items: int, *arguments: Any) -> None:
+        groups[kernel.name] = items
+        launch_groups(given, kernel, number, items, *arguments)
+
+    monkeypatch.setattr(device, "kind", "gpu")
+    monkeypatch.setattr(stages_append, "launch_groups", launch)
+    assert_same_lists(Lists(device, boxes, depths, tiles).appended(), wanted)
+    assert groups["sort_lists"] == 256, "3 tiles for the units of a CPU"
+    assert groups["append_pairs"] == GROUP_ITEMS
 
 
 def test_groups_in_any_order(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,7 +27,7 @@ from clsplat.models.edit import take
 from clsplat.reference import render as reference
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.stages.blend import blend_items
+from clsplat.stages.blend import frame_items
 from clsplat.stages.device_gaussians import upload_gaussians
 
 SIZES = ((1, 1), (15, 16), (16, 16), (17, 15), (33, 1), (1, 40), (64, 48))
@@ -95,7 +95,7 @@ def test_a_group_of_any_size_has_the_bits_of_a_lone_item(default_device: Device,
 def test_few_tiles_are_shared_by_more_items(kind: str, group: int, units: int, tiles: int, items: int) -> None:
     limits = SimpleNamespace(max_compute_units=units)
     device = SimpleNamespace(kind=kind, max_group=group, cl_device=limits, shape=Shape(lanes=1, items=64, chunks=8))
-    assert blend_items(cast("Device", device), tiles) == items
+    assert frame_items(cast("Device", device), tiles) == items
 
 
 def test_a_gpu_blends_few_tiles_in_larger_groups(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
