@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from clsplat.arrays import Float32, Float64
 from clsplat.config.training import OptimiserConfig
-from clsplat.gaussians import PARAMETER_GROUPS
 
 MOST_MISSED = 256
 """Largest number of steps that a Gaussian may miss. All Gaussians are settled after so many steps, which costs one
@@ -19,15 +18,16 @@ dense step in 256. In the 256th missed step a parameter moves by 2e-12 of what i
 class MissedSteps:
     """Factors for Gaussians that missed the last 0 to MOST_MISSED steps.
 
+    groups: names of the parameter groups.
     factors: (MOST_MISSED + 1, groups, 3): how far a parameter moves, as a multiple of its first moment over the root
     of its second; the factor of the first moment; that of the second.
     """
 
-    def __init__(self, config: OptimiserConfig, factors: Float64 | None = None) -> None:
+    def __init__(self, config: OptimiserConfig, groups: Sequence[str], factors: Float64 | None = None) -> None:
         if factors is None:
-            factors = np.zeros((MOST_MISSED + 1, len(PARAMETER_GROUPS), 3))
+            factors = np.zeros((MOST_MISSED + 1, len(groups), 3))
             factors[:, :, 1:] = 1.0
-        self.factors = factors
+        self.groups, self.factors = tuple(groups), factors
         # The kernels of Adam have the decays in float32: over 256 steps 0.999 differs by 3e-6 from that.
         self._decays = np.array([config.beta1, config.beta2], np.float32).astype(np.float64)
 
@@ -38,7 +38,7 @@ class MissedSteps:
         """
         self.factors[1:] = self.factors[:-1]
         self.factors[0] = 0.0, 1.0, 1.0
-        for index, group in enumerate(PARAMETER_GROUPS):
+        for index, group in enumerate(self.groups):
             if group in scales:
                 missed = self.factors[1:, index]
                 missed[:, 1:] *= self._decays

@@ -33,7 +33,11 @@ def trained(device: Device, config: OptimiserConfig) -> list[dict[str, np.ndarra
         for _ in range(4)
     ]
     parameters, gradients, *moments = models
-    late, missed, readback = (parameters, *moments), MissedSteps(config), fresh_readback(device)
+    late, missed, readback = (
+        (parameters, *moments),
+        MissedSteps(config, tuple(PARAMETER_GROUPS)),
+        fresh_readback(device),
+    )
     last, often = upload(device, np.zeros(COUNT, np.uint32)), np.linspace(0.005, 1, COUNT)
     for number in range(1, STEPS + 1):
         shown = rng.random(COUNT) < (often if number % 60 < 40 else 0)  # every row rests for 20 steps now and then
@@ -70,7 +74,8 @@ def test_late_is_dense_to_rounding(device: Device, sh_rest_every: int) -> None:
 
 def settled(device: Device, stopped: bool, spoilt: float = 0.5) -> tuple[Mapping[str, np.ndarray], np.ndarray]:
     """Means and opacity logits of 3 rows after 5 missed steps, and the last steps. Row 1 is hidden."""
-    config, missed = OptimiserConfig(late=True), MissedSteps(OptimiserConfig())
+    config = OptimiserConfig(late=True)
+    missed = MissedSteps(config, tuple(PARAMETER_GROUPS))
     for number in range(1, 6):
         missed.add(AdamStep(config, number, RATES).scales)
     model = tuple(

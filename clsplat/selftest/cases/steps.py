@@ -163,7 +163,8 @@ def _random_missed(rng: Generator, count: int) -> Inputs:
 
 
 def _launch_settle(device: Device, _: Workspace, given: Inputs) -> Read:
-    config, missed = OptimiserConfig(sh_rest_every=given.every), MissedSteps(OptimiserConfig())
+    config = OptimiserConfig(sh_rest_every=given.every)
+    missed = MissedSteps(config, tuple(PARAMETER_GROUPS))
     for index, number in enumerate(range(given.first_step + 1, given.step + 1)):
         step = AdamStep(config, number, {group: rates[index] for group, rates in given.rates.items()})
         missed.add(step.scales)
@@ -188,7 +189,7 @@ def _twin_of_settle(given: Inputs, got: Arrays) -> dict[str, Wanted]:  # noqa: A
         for row in np.flatnonzero(taken):
             numbers = [number for number in range(given.last[row] + 1, given.step + 1) if number % every == 0]
             due = [rates[number - given.first_step - 1] for number in numbers]
-            found = missed_steps(*(array[row] for array in after), int(given.last[row]) // every, due)
+            found = missed_steps(after[0][row], after[1][row], after[2][row], int(given.last[row]) // every, due)
             for array, values in zip(after, found, strict=True):
                 array[row] = values
         for values, into in zip((*after, np.abs(after[0] - before) + np.abs(before)), made.values(), strict=True):

@@ -24,6 +24,7 @@ from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostA
 from clsplat.stages.settle import settle
 from clsplat.training.step.inputs import StepRows
 
+_GROUPS = tuple(PARAMETER_GROUPS)
 ROW_BYTES = 4
 """Bytes per Gaussian: the last step that it took."""
 
@@ -36,7 +37,7 @@ class LateAdam:
 
     def __init__(self, device: Device, config: OptimiserConfig, count: int) -> None:
         self._device, self._config = device, config
-        self._begin(np.zeros(count, np.uint32), MissedSteps(config), 0)
+        self._begin(np.zeros(count, np.uint32), MissedSteps(config, _GROUPS), 0)
 
     def _begin(self, last: NDArray[np.uint32], missed: MissedSteps, step: int) -> None:
         self._last, self._missed, self.step = upload(self._device, last), missed, step
@@ -103,11 +104,11 @@ class LateAdam:
 
         Raises ValueError.
         """
-        saved, missed = named("late/"), MissedSteps(self._config)
+        saved, missed = named("late/"), MissedSteps(self._config, _GROUPS)
         last = saved.get("last", np.full(count, step, np.uint32))
         factors = saved.get("missed", missed.factors)
         if last.shape != (count,) or last.dtype != np.uint32 or factors.shape != missed.factors.shape:
             raise ValueError(f"late/last has shape {last.shape} of {last.dtype}, late/missed {factors.shape}")
         if not np.isfinite(factors).all() or np.any(last > step) or np.any(last + MOST_MISSED < step):
             raise ValueError(f"late/last or late/missed does not belong to step {step}")
-        self._begin(last, MissedSteps(self._config, factors.astype(np.float64)), step)
+        self._begin(last, MissedSteps(self._config, _GROUPS, factors.astype(np.float64)), step)
