@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-from compare import assert_close
+from compare import assert_close, assert_same_arrays
 
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import upload
@@ -70,6 +70,12 @@ def test_late_is_dense_to_rounding(device: Device, sh_rest_every: int) -> None:
         # The first moment is a sum of both signs; a rounding counts by its largest term, a tenth of a gradient.
         assert_close(late[1][group], dense[1][group], absolute=1e-6)
         assert_close(late[2][group], dense[2][group], relative=3e-5)
+
+
+def test_every_driver_has_the_same_bits(device: Device, default_device: Device) -> None:
+    config = OptimiserConfig(late=True)
+    for got, wanted in zip(trained(device, config), trained(default_device, config), strict=True):
+        assert_same_arrays(got, wanted)
 
 
 def settled(device: Device, stopped: bool, spoilt: float = 0.5) -> tuple[Mapping[str, np.ndarray], np.ndarray]:

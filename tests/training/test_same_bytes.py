@@ -201,7 +201,7 @@ def test_two_devices_have_the_bytes_of_one(name: str, folder: Path, default_devi
     assert_same_arrays(found[1], found[0])
 
 
-@pytest.mark.parametrize("name", quick(["contributions", "MCMC", "all"], "contributions"))
+@pytest.mark.parametrize("name", quick(["contributions", "MCMC", "late", "all"], "contributions"))
 def test_every_driver_trains_alike(name: str, folder: Path, device: Device, default_device: Device) -> None:
     """In one shape of the kernels."""
     config, found = SETTINGS[name], []
