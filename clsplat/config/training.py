@@ -54,6 +54,9 @@ class OptimiserConfig:
     """Learning rate of the rotations, as quaternions."""
     sparse: bool = False
     """Do not update Gaussians that a step's view does not show, nor their Adam moments (approximate)."""
+    late: bool = False
+    """Leave Gaussians that a step's view does not show, and update them for the missed steps when a view shows them
+    again (approximate: that view shows them as they were). Not with batches."""
     sh_rest_every: int = 1
     """Steps between updates of the higher SH bands (approximate above 1)."""
     cooldown: int = 0
@@ -81,8 +84,19 @@ class OptimiserConfig:
         )
         check_kinds(self, "--optimiser.")
         check_rules(self, "--optimiser.", rules)
+        if self.late and self.sparse:
+            raise InputError("--optimiser.late: excludes --optimiser.sparse, which drops the missed steps")
+        if self.late and self.beta1**2 >= self.beta2:  # the sum of missed steps would grow without limit
+            raise InputError(
+                f"--optimiser.late: expected beta1^2 < beta2, but beta1 is {self.beta1} and beta2 {self.beta2}"
+            )
         if self.means_rate > 0 and self.means_rate_end == 0:  # a log-linear rate would be 0 from the first step
             raise InputError("--optimiser.means-rate-end 0.0: expected more than 0; the rate falls to it log-linearly")
+
+    @property
+    def visible_only(self) -> bool:
+        """True if a step updates only the Gaussians that its view shows."""
+        return self.sparse or self.late
 
 
 @dataclass(frozen=True)
@@ -392,6 +406,10 @@ class TrainConfig:
         if self.refines and self.batch > 1:
             raise InputError(
                 f"{self._refining}: not supported with --batch {self.batch} or several devices, expected --batch 1"
+            )
+        if self.optimiser.late and self.batch > 1:
+            raise InputError(
+                f"--optimiser.late: not supported with --batch {self.batch} or several devices, expected --batch 1"
             )
         if self.depth != "maps" and self.depth_maps != "metric":
             raise InputError(f"--depth-maps {self.depth_maps}: no depth maps are used, expected --depth maps too")

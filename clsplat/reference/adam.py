@@ -30,6 +30,19 @@ def adam(
     return parameters - rate * mean / (spread + epsilon), first, second
 
 
+def missed_steps(
+    parameters: Float64, first: Float64, second: Float64, step: int, rates: Sequence[float]
+) -> tuple[Float64, Float64, Float64]:
+    """Eq. (42) without a gradient, once for each rate: the parameters and moments after the steps from `step` + 1 on.
+
+    It is the twin of kernels/settle.cl, which has the closed form (190) to (192).
+    """
+    none = np.zeros_like(parameters)
+    for number, rate in enumerate(rates, step + 1):
+        parameters, first, second = adam(parameters, none, first, second, number, rate)
+    return parameters, first, second
+
+
 def add_views(gradients: Sequence[Float64], seen: Sequence[NDArray[np.bool_]]) -> Float64:
     """Sum the gradients (n, ...) of several views. Each view adds the rows of its visible Gaussians (`seen`, (n,))."""
     total = np.zeros_like(gradients[0])

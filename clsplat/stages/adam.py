@@ -38,6 +38,13 @@ class AdamStep:
         updates = self.number // config.sh_rest_every if group == "sh_rest" else self.number
         return self.rates[group] / (1.0 - config.beta1**updates), (1.0 - config.beta2**updates) ** -0.5
 
+    @property
+    def scales(self) -> dict[str, float]:
+        """rate sqrt(1 - beta2^t) / (1 - beta1^t) of the groups that the step updates."""
+        groups = [group for group in self.rates if group != "sh_rest" or self.updates_sh_rest]
+        by_group = {group: self.corrected(group) for group in groups}
+        return {group: rate / root for group, (rate, root) in by_group.items()}
+
 
 @stage("adam", adam=4)
 def adam(
@@ -52,7 +59,7 @@ def adam(
 ) -> None:
     """Update the parameters by Adam, and set the gradients to zero.
 
-    tile_counts: (n,) uint32, 0 for a Gaussian that is not visible in the view; used by `OptimiserConfig.sparse`.
+    tile_counts: (n,) uint32, 0 for a Gaussian that is not visible in the view; used by `OptimiserConfig.visible_only`.
     readback: (READBACK_SIZE,) uint32. Its last four entries count the elements that were not updated, by reason
     (`columns.REFUSED`).
     """
@@ -70,7 +77,7 @@ def adam(
         size, rows = parameters[group].size, parameters.count
         if size == 0:
             continue
-        if config.sparse:
+        if config.visible_only:
             kernel = device.kernels("adam", {"WIDTH": size // rows}).adam_visible
             launch_items(device, kernel, -(-rows // abreast), rows, *constants, tile_counts, *arrays)
         else:

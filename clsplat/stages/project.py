@@ -234,7 +234,7 @@ def project_step(
     """
     parameters, config = model[0], step.config
     defines = {**_defines(parameters, slots, sh_rest=step.updates_sh_rest), "ADAM": True}
-    if config.sparse:
+    if config.visible_only:
         defines["SPARSE"] = True
     numbers = [LaunchParameter(number) for number in step_numbers(step, explore)]
     weights = len(explore.weights)

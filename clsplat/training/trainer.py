@@ -50,6 +50,7 @@ from clsplat.training.stability.non_finite import NonFiniteMonitor, Repair
 from clsplat.training.step.component import Component
 from clsplat.training.step.gradient_step import GradientStep, StepProbe, slot_fields, view_gradients
 from clsplat.training.step.inputs import ViewInputs
+from clsplat.training.step.late_adam import ROW_BYTES, LateAdam
 from clsplat.training.step.monitor import StepMonitor
 from clsplat.training.step.speculative_steps import SpeculativeSteps
 from clsplat.training.supervision.depth_targets import DepthTargets
@@ -143,6 +144,7 @@ class Trainer:
             self.device, self.rasterizer.work, self._make_plan, counts_contributions=contributions
         )
         self.model.begin(initial)
+        self.late = LateAdam(self.device, self.config.optimiser, len(initial)) if self.config.optimiser.late else None
 
     def _make_plan(self, count: int) -> Plan:
         """Plan the device's memory for `count` Gaussians with their final number of SH coefficients."""
@@ -152,7 +154,8 @@ class Trainer:
             photographs=sum(view.camera.width * view.camera.height for view in self.views),
             turns=self.pending.turns,
             masks=self.config.mask_use != NO_MASKS,
-            row_bytes=sum(component.row_bytes for component in self.components),
+            row_bytes=sum(component.row_bytes for component in self.components)
+            + ROW_BYTES * self.config.optimiser.late,
             pixel_bytes=sum(component.pixel_bytes for component in self.components),
         )
 
@@ -233,6 +236,8 @@ class Trainer:
         if self.mark is None:
             self._note()
         views = self.views_ahead
+        if self.late is not None and self.late.is_due(self.step):
+            self.catch_up()
         self.step += views
         self._raise_sh_degree()
         self._prepare_components(views)
@@ -262,7 +267,7 @@ class Trainer:
     def _prepare_components(self, views: int) -> None:
         """Let the components do the work that is due before a step of `views` views."""
         if due := [component for component in self.components if component.is_due(self.step, views)]:
-            self.settle()
+            self.catch_up()
             for component in due:
                 component.before_step(self.parameters)
 
@@ -286,6 +291,7 @@ class Trainer:
             explore=exploration_of(
                 self.config, self.step, rates["means"], self.parameters.count, self.scene.length_unit
             ),
+            late=self.late,
         )
 
     def _run(
@@ -315,6 +321,18 @@ class Trainer:
     def settle(self) -> None:
         """Wait for all launched steps, and repeat the incomplete ones (`SpeculativeSteps`)."""
         self.pending.settle()
+
+    def catch_up(self) -> None:
+        """Let all Gaussians take the steps that they missed (`LateAdam`), after all launched steps are done."""
+        self.settle()
+        if self.late is not None:
+            self.late.settle(self.rasterizer.work, tuple(self.models().values()), self.rasterizer.readback)
+
+    @property
+    def complete_parameters(self) -> AnyGaussians:
+        """Parameters with all steps that Gaussians missed (`LateAdam`): a copy, so that looking changes no bit."""
+        self.settle()
+        return self.parameters if self.late is None else self.late.settled(tuple(self.models().values()))
 
     def _pixels(self, view: int) -> NDArray[Any]:
         """Photograph of a view at the step's size, on the host."""
@@ -368,9 +386,8 @@ class Trainer:
 
     def draw(self, camera: Camera) -> RenderResult:
         """Render the current model with a camera in world coordinates, over the background of evaluations."""
-        self.settle()
         background = background_colour(self.config.background)
-        return self.renderer.render(self.parameters, self.local(camera), background)
+        return self.renderer.render(self.complete_parameters, self.local(camera), background)
 
     def validate(self) -> bool:
         """Validate the refined cameras, if that is due. Returns True if they were measured."""
@@ -464,6 +481,7 @@ class Trainer:
             self.repair(look=True)
             if step == steps[0]:
                 self._note()
+            self.catch_up()
             self._rearrange(self.strategy.before_step(self._state(step)))
         if steps:
             self.mark = None  # rows may have moved, and random numbers may have been drawn
@@ -482,6 +500,8 @@ class Trainer:
             self.batch.changed()
         if moved is None:
             return
+        if self.late is not None:
+            self.late.moved(moved.get())
         for component in self.components:
             component.rows_moved()
         if type(self.strategy).rearranged is not Strategy.rearranged:
@@ -490,7 +510,7 @@ class Trainer:
 
     def finish(self) -> None:
         """Remove Gaussians that a finished model does not need."""
-        self.settle()
+        self.catch_up()
         self._rearrange(self.strategy.at_end(self._state()))
 
     def close(self) -> None:
@@ -516,8 +536,7 @@ class Trainer:
 
     def gaussians(self) -> Gaussians:
         """Model so far, on the host, with room for its final SH degree."""
-        self.settle()
-        model = download_gaussians(self.parameters)
+        model = download_gaussians(self.complete_parameters)
         full = np.zeros((len(model), (self.config.sh_degree + 1) ** 2, 3), np.float32)
         full[:, : model.sh.shape[1]] = model.sh
         model.sh, model.origin, model.near = full, self.origin, self.near
@@ -544,6 +563,7 @@ class Trainer:
         arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
         arrays.update({f"strategy/{name}": array for name, array in self.strategy.arrays().items()})
         arrays |= self.model.arrays()
+        arrays |= {} if self.late is None else self.late.arrays()
         for component in self.components:
             arrays |= component.arrays()
         return arrays
@@ -588,6 +608,8 @@ class Trainer:
         try:
             for component in self.components:
                 component.load(checkpoint.named, self.parameters.count)
+            if self.late is not None:
+                self.late.load(checkpoint.named, self.step, self.parameters.count)
         except ValueError as error:
             raise unusable(checkpoint, str(error)) from None
 

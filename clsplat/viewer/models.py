@@ -119,7 +119,7 @@ class LiveModel:
             raise InputError("the training leaves no memory for this: only unedited colour and alpha can be shown")
         if key is None:
             local = trainer.local(camera)
-            return render_picture(self._renderer, trainer.parameters, local, look, self.background, self.space)
+            return render_picture(self._renderer, trainer.complete_parameters, local, look, self.background, self.space)
         if self._edited is None or self._edited[0] != (trainer.step, key):
             self._edited = ((trainer.step, key), edited(trainer.gaussians(), key))
         self._other = self._other or Renderer(trainer.device, config=trainer.config.rasterizer)

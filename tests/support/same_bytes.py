@@ -49,6 +49,7 @@ SETTINGS: dict[str, TrainConfig] = {
     "ignored": replace(PLAIN, masks="ignore", alpha="transparent"),
     "transparent": replace(PLAIN, masks="transparent"),
     "shortcuts": replace(PLAIN, optimiser=replace(PLAIN.optimiser, sparse=True, sh_rest_every=3)),
+    "late": replace(PLAIN, thinning=0.5, optimiser=replace(PLAIN.optimiser, late=True, sh_rest_every=2)),
     "points": replace(PLAIN, depth="points", depth_weight=0.05),
     "maps": replace(PLAIN, depth="maps", thinning=0.2, penalty=0.01),
     "poses": replace(PLAIN, refine_poses=True, refine_gate=0.0),

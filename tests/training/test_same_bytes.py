@@ -42,11 +42,20 @@ STOPS = {
     "MCMC": (7, 15, 16, 20, 40),
     "long axis": (7, 15, 16, 20, 40),
     "shortcuts": (1, 4, 15, 20, 33),
+    "late": (1, 4, 15, 20, 33),
     "antialiased": (7, 23),
 }
 """Steps to stop after: at the seams of epochs (8 views), of resets, of passes and of what is gathered."""
 QUICK_STOPS = [
-    *(("contributions", 8), ("contributions", 20), ("MCMC", 16), ("MCMC", 40), ("long axis", 16), ("long axis", 40)),
+    *(
+        ("contributions", 8),
+        ("contributions", 20),
+        ("MCMC", 16),
+        ("MCMC", 40),
+        ("long axis", 16),
+        ("long axis", 40),
+        ("late", 33),
+    ),
     *(
         (name, 17)
         for name in ("background", "exposure", "ppisp", "grid", "ignored", "points", "thinning", "penalty", "cameras")
@@ -89,7 +98,7 @@ def test_stopping_and_going_on(
     assert_same_arrays(got, undisturbed(name))
 
 
-@pytest.mark.parametrize("name", ["exposure", "ppisp", "grid", "points", "long axis", "MCMC"])
+@pytest.mark.parametrize("name", ["exposure", "ppisp", "grid", "points", "long axis", "MCMC", "late"])
 def test_by_capacity(
     name: str, folder: Path, default_device: Device, undisturbed: Outcomes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -192,7 +201,7 @@ def test_two_devices_have_the_bytes_of_one(name: str, folder: Path, default_devi
     assert_same_arrays(found[1], found[0])
 
 
-@pytest.mark.parametrize("name", quick(["contributions", "MCMC", "all"], "contributions"))
+@pytest.mark.parametrize("name", quick(["contributions", "MCMC", "late", "all"], "contributions"))
 def test_every_driver_trains_alike(name: str, folder: Path, device: Device, default_device: Device) -> None:
     """In one shape of the kernels."""
     config, found = SETTINGS[name], []

@@ -16,7 +16,7 @@ from clsplat.selftest.cases.loss import DEPTH_LOSS_CASE, LOSS_CASE, MASKS_CASE
 from clsplat.selftest.cases.pictures import DEEP_MERGE_CASE, PICTURE_CASES
 from clsplat.selftest.cases.poses import POSE_CASE, of_lens
 from clsplat.selftest.cases.primitives import APPEND_CASE, BITONIC_CASE, ELEMENTARY_CASE, SCAN_CASE, SORT_CASE
-from clsplat.selftest.cases.steps import ADAM_CASE, NOISE_CASE, PENALTIES_CASE
+from clsplat.selftest.cases.steps import ADAM_CASE, NOISE_CASE, PENALTIES_CASE, SETTLE_CASE
 from clsplat.selftest.harness import CaseBench, StageOutcome
 
 CASES: dict[str, Case] = {
@@ -30,6 +30,7 @@ CASES: dict[str, Case] = {
     "depth loss": DEPTH_LOSS_CASE,
     "penalties": PENALTIES_CASE,
     "adam": ADAM_CASE,
+    "settle": SETTLE_CASE,
     "noise": NOISE_CASE,
     **COLOUR_CASES,
     "grid": GRID_CASE,

@@ -24,6 +24,7 @@ from clsplat.stages.project import Slots, project_grad, project_step, step_numbe
 from clsplat.stages.target import is_photograph, target
 from clsplat.training.density import StatisticsNeeds
 from clsplat.training.step.inputs import StepRows, ViewInputs, ViewRows
+from clsplat.training.step.late_adam import LateAdam
 from clsplat.training.step.loss_terms import loss_terms
 
 R = TypeVar("R")
@@ -56,6 +57,7 @@ class GradientStep:
     turn: number of the array for the loss's sums (`stages.loss.loss`).
     room: capacity in pairs (`Rasterizer.forward`).
     explore: noise and penalties of the step.
+    late: last steps of the Gaussians, if the optimiser is late.
     """
 
     device: Device
@@ -68,6 +70,7 @@ class GradientStep:
     turn: int = 0
     room: PairCapacity | None = None
     explore: Exploration = NO_EXPLORATION
+    late: LateAdam | None = None
 
     @property
     def adam_step(self) -> AdamStep:
@@ -219,6 +222,8 @@ class GradientStep:
     def update(self, rows: StepRows) -> None:
         """Take Adam's step for some rows; compute the gradient of projection if that is not done yet."""
         step, readback = self.adam_step, self.rasterizer.readback
+        if self.late is not None:
+            self.late.before_adam(rows, step, readback)
         if rows.gradients is not None:
             parameters, first, second = rows.model
             models = (parameters, rows.gradients, first, second)

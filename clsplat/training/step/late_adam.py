@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Late Adam: Gaussians that no view shows are left as they are, and take their missed steps when they are next shown
+(docs/decisions/0048-late-adam.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float32
+from clsplat.config.training import OptimiserConfig
+from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
+from clsplat.device.context import Device
+from clsplat.gaussians import PARAMETER_GROUPS
+from clsplat.optimisation.density_rules import FRESH
+from clsplat.optimisation.missed_steps import MOST_MISSED, MissedSteps
+from clsplat.rendering.rasterizer import MAX_COUNTED_PASSES
+from clsplat.stages.adam import AdamStep
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostArray, HostGaussians, parts
+from clsplat.stages.settle import settle
+from clsplat.training.step.inputs import StepRows
+
+_GROUPS = tuple(PARAMETER_GROUPS)
+ROW_BYTES = 4
+"""Bytes per Gaussian: the last step that it took."""
+
+
+class LateAdam:
+    """The last step that each Gaussian of a training took, and the factors of the steps since.
+
+    step: the last step launched.
+    """
+
+    def __init__(self, device: Device, config: OptimiserConfig, count: int) -> None:
+        self._device, self._config = device, config
+        self._begin(np.zeros(count, np.uint32), MissedSteps(config, _GROUPS), 0)
+
+    def _begin(self, last: NDArray[np.uint32], missed: MissedSteps, step: int) -> None:
+        self._last, self._missed, self.step = upload(self._device, last), missed, step
+        self._tables: dict[int, Float32] = {step: missed.rounded()}  # of the steps that may have to be repeated too
+        self._table = allocate(self._device, self._tables[step].shape, np.float32)
+
+    def is_due(self, step: int) -> bool:
+        """True if all Gaussians must be settled before the step after this one."""
+        return step % MOST_MISSED == 0
+
+    def before_adam(self, rows: StepRows, step: AdamStep, readback: DeviceArray) -> None:
+        """Settle the rows that a step's view shows, before Adam's step. A step that is repeated is the same again."""
+        if step.number > self.step:
+            self._missed.add(step.scales)
+            self.step = step.number
+            self._tables[step.number] = self._missed.rounded()
+            self._tables.pop(step.number - MAX_COUNTED_PASSES - 2, None)
+        last = self._last.rows(rows.start, rows.stop)
+        self._settle(rows.model, step.number - 1, last, readback, rows.projected.tile_counts)
+
+    def settle(self, work: Workspace, models: tuple[AnyGaussians, ...], readback: DeviceArray) -> None:
+        """Settle all rows, in place. models: parameters, first and second moments."""
+        for start, stop, part in parts(work, *models, keep=True):
+            self._settle(part, self.step, self._last.rows(start, stop), readback)
+
+    def _settle(
+        self,
+        model: tuple[DeviceGaussians, ...],
+        step: int,
+        last: DeviceArray,
+        readback: DeviceArray,
+        tile_counts: DeviceArray | None = None,
+    ) -> None:
+        self._table.send(self._tables[step])
+        settle(self._device, self._config, model, step, last, self._table, readback, tile_counts)
+
+    def settled(self, models: tuple[AnyGaussians, ...]) -> AnyGaussians:
+        """The parameters with all rows settled, a copy if rows have missed steps: a model that is looked at keeps its
+        bits."""
+        (parameters, first, second), missed = models, self.step - self._last.get()
+        if not missed.any():
+            return parameters
+        factors, found = self._tables[self.step][missed], {}
+        for index, group in enumerate(PARAMETER_GROUPS):
+            p, m, v = (model[group].get() for model in (parameters, first, second))
+            drift = factors[:, index, 0].reshape(-1, *[1] * (p.ndim - 1))
+            with np.errstate(invalid="ignore", over="ignore"):
+                moved = p - drift * (m / (np.sqrt(v) + np.float32(self._config.epsilon)))
+            found[group] = np.where(np.isfinite(moved), moved, p)
+        if isinstance(parameters, HostGaussians):
+            return replace(parameters, arrays={group: HostArray(values) for group, values in found.items()})
+        return replace(parameters, arrays={group: upload(self._device, values) for group, values in found.items()})
+
+    def moved(self, entries: NDArray[np.uint32]) -> None:
+        """Follow rows that density control has moved. entries: as in `DeviceRowList`. Fresh rows have zero moments."""
+        self._last = upload(self._device, self._last.get()[entries & ~np.uint32(FRESH)])
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a checkpoint."""
+        return {"late/last": self._last.get(), "late/missed": self._missed.factors.copy()}
+
+    def load(self, named: Callable[[str], dict[str, NDArray[Any]]], step: int, count: int) -> None:
+        """Continue from a checkpoint's arrays, or, without them, as if all rows had taken every step.
+
+        Raises ValueError.
+        """
+        saved, missed = named("late/"), MissedSteps(self._config, _GROUPS)
+        last = saved.get("last", np.full(count, step, np.uint32))
+        factors = saved.get("missed", missed.factors)
+        if last.shape != (count,) or last.dtype != np.uint32 or factors.shape != missed.factors.shape:
+            raise ValueError(f"late/last has shape {last.shape} of {last.dtype}, late/missed {factors.shape}")
+        if not np.isfinite(factors).all() or np.any(last > step) or np.any(last + MOST_MISSED < step):
+            raise ValueError(f"late/last or late/missed does not belong to step {step}")
+        self._begin(last, MissedSteps(self._config, _GROUPS, factors.astype(np.float64)), step)
