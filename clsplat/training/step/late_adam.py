@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Late Adam: Gaussians that no view shows are left as they are, and take their missed steps when they are next shown
-(docs/decisions/0048-late-adam.md)."""
+(docs/decisions/0049-late-adam.md)."""
 
 from __future__ import annotations
 
