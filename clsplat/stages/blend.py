@@ -94,9 +94,12 @@ def frame_items(device: Device, tiles: int) -> int:
     items = tile_items(device)
     if device.kind != "gpu" or items == 1:
         return items
-    most = min(TILE * TILE, device.max_group)
-    busy = _BUSY_ITEMS * int(device.cl_device.max_compute_units)
-    while 2 * items <= most and 2 * items * tiles <= busy:
+    return items_for(tiles, int(device.cl_device.max_compute_units), items, min(TILE * TILE, device.max_group))
+
+
+def items_for(tiles: int, units: int, items: int, most: int) -> int:
+    """Number of `frame_items` on a GPU with so many compute units. items, most: the least and the greatest."""
+    while 2 * items <= most and 2 * items * tiles <= _BUSY_ITEMS * units:
         items *= 2
     return items
 

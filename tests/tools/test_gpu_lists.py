@@ -17,6 +17,7 @@ from gpu_lists import OWN_BOX, SIDE, Boxes, Sorting, boxes_of, lists_of, sorting
 from gpu_measured import ATOMICS, CALIBRATION, DRAWN, Measured, fit_constants, read
 from gpu_model import Constants, Work
 from gpu_page import now_table, wanted_table
+from gpu_static import on_each_gpu
 
 from clsplat.device.source import kernel_root
 from clsplat.layouts.columns import SPLAT
@@ -141,10 +142,27 @@ def test_a_present_frame_is_that_of_its_own_launches() -> None:
     then = asdict(Work("project", 0, instructions=H200.issued * 4))
     scene = {"scene": "s", "frame": "f", "frame_ms": 4.0, "step_ms": 5.0, "parts_ms": {}, "inputs": [then]}
     rows = [{"device": "NVIDIA H200", "gpu": "H200", "date": "today", "commit": "abc", "scenes": [scene]}]
-    ((one,), _) = read(rows, {("sm_90", "f"): step, ("sm_90", "f" + DRAWN): frame})
+    ((one,), _) = read(rows, {("H200", "f"): step, ("H200", "f" + DRAWN): frame})
     assert (one.now, one.drawn) == (step, frame)
     (told,) = [line for line in now_table([one], Constants(1.0, host=0)).splitlines() if line.startswith("| frame")]
     assert "4.000, 2.000, **0.50**" in told
+
+
+def test_frames_of_few_tiles_have_larger_groups() -> None:
+    """On the GPUs whose units would be idle, in the kernels whose groups follow the frame."""
+    frames = [{"name": "small", "width": 16 * 1450, "height": 16}, {"name": "large", "width": 16 * 6700, "height": 16}]
+    works = {
+        f"1x{items}": {
+            ("sm_90", name): [None, *(Work(kernel, items, kernel=kernel) for kernel in ("blend", "sort_lists", "adam"))]
+            for name in ("small", "small" + DRAWN, "large")
+        }
+        for items in (64, 128, 256)
+    }
+    found = on_each_gpu(works, frames)
+    assert {gpu for gpu, _ in found} == {"H100 SXM", "H200"}
+    assert [work and work.bytes for work in found["H200", "small"]] == [None, 256, 256, 64]
+    assert found["H200", "small" + DRAWN] == found["H200", "small"]
+    assert found["H200", "large"] == works["1x64"]["sm_90", "large"]
 
 
 def test_steps_that_are_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,7 +170,7 @@ def test_steps_that_are_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
     (ada,) = [each for each in GPUS if each.name == "RTX 4090"]
     then, now = ([Work("blend", 0, instructions=H200.issued * ms)] for ms in (2.0, 0.5))
     one = Measured(H200, "f", "", {"blend": 1.0, "step, wall": 4.0}, then, now)
-    works = {("sm_90", "f"): now, ("sm_89", "f"): [Work("blend", 0, instructions=ada.issued * 0.5)]}
+    works = {("H200", "f"): now, ("RTX 4090", "f"): [Work("blend", 0, instructions=ada.issued * 0.5)]}
     *_, first, second = wanted_table([one], Constants(1.0, host=0), works).splitlines()
     assert first == "| H200, f | 2.00 | 0.50 | 1.0 | yes | -50%, 69% |"
     assert second == "| RTX 4090, f | not counted | 0.50 | 0.1 | no | not measured |"

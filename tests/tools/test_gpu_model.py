@@ -263,7 +263,7 @@ def test_a_row_keeps_the_inputs_of_the_code_that_was_measured() -> None:
     kept = with_inputs(given, {("sm_90", "made up, 1 M"): []})
     assert json.loads(kept) == given, "inputs that are there already are of another code"
     assert sum(line.strip().startswith(('{"stage"', "null")) for line in kept.splitlines()) == len(STEP)
-    now = {("sm_90", "made up, 1 M"): STEP[1:]}
+    now = {("H200", "made up, 1 M"): STEP[1:]}
     ((one,), _) = read(given, now)
     assert one.works == [replace(STEP[0], instructions=123457000.0), *STEP[1:]], "six digits"
     assert one.now == STEP[1:]

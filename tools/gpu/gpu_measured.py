@@ -83,7 +83,7 @@ def milliseconds(
 
 
 Works = Mapping[tuple[str, str], Sequence[Work | None]]
-"""The work of a step's launches, by target and frame."""
+"""The work of a step's launches, by target or GPU, and by frame."""
 
 
 def with_inputs(rows: Sequence[Mapping[str, Any]], works: Works) -> str:
@@ -114,7 +114,10 @@ def _work(given: Mapping[str, Any] | None) -> Work | None:
 
 
 def read(rows: Sequence[Mapping[str, Any]], now: Works) -> tuple[list[Measured], list[str]]:
-    """The scenes that can be compared, and descriptions of what is not used. now: of the present kernels."""
+    """The scenes that can be compared, and descriptions of what is not used.
+
+    now: work of the present kernels, by GPU and frame.
+    """
     found, unused = [], []
     of_stage = {stage: part for part, members in PARTS.items() for stage in members}
     for row in rows:
@@ -136,7 +139,7 @@ def read(rows: Sequence[Mapping[str, Any]], now: Works) -> tuple[list[Measured],
                 parts[part] = parts.get(part, 0) + ms
             parts = {part: parts[part] for part in PARTS if part in parts}
             parts |= dict(zip(WALLS, (scene["frame_ms"], scene["step_ms"]), strict=True))
-            today = (now.get((gpu.target, scene["frame"] + suffix), ()) for suffix in ("", DRAWN))
+            today = (now.get((gpu.name, scene["frame"] + suffix), ()) for suffix in ("", DRAWN))
             found.append(Measured(gpu, scene["frame"], code, parts, works, *today))
     return found, unused
 

@@ -121,9 +121,15 @@ def longest_of(frame: Mapping[str, Any], items: int) -> dict[str, Any]:
     return blocks_of({**longest, **halves}, items)
 
 
+def tiles_of(frame: Mapping[str, Any]) -> int:
+    """Number of a frame's tiles."""
+    columns, rows = (-(-int(frame[side]) // TILE) for side in ("width", "height"))
+    return columns * rows
+
+
 def run_of(frame: Mapping[str, Any], launch: Mapping[str, Any], items: int, wave: int) -> Run:
     """The numbers of a frame and a launch on which loops depend."""
-    tiles = -(-frame["width"] // TILE) * -(-frame["height"] // TILE)
+    tiles = tiles_of(frame)
     numbers = dict(zip(NUMBERS.get(launch["kernel"], ()), map(int, launch["scalars"]), strict=False))
     more: dict[str, Any] = {name: numbers[name] for name in ("elements", "digits") if name in numbers}
     if launch["kernel"] in APPENDING:

@@ -235,7 +235,7 @@ def wanted_table(measured: Sequence[Measured], constants: Constants, now: Works)
     lines = [["step", "then, ms", "now, ms", "wanted, ms", "met", "error of fit: step, parts"]]
     for name, frame, most in WANTED_STEPS:
         (gpu,) = (each for each in GPUS if each.name == name)
-        ms = milliseconds(now[gpu.target, frame], gpu, constants)[WALLS[1]]
+        ms = milliseconds(now[gpu.name, frame], gpu, constants)[WALLS[1]]
         then, error = "not counted", "not measured"
         for each in measured:
             if (each.gpu.name, each.frame) == (name, frame):

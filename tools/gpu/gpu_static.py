@@ -46,14 +46,15 @@ from gpu_devices import ARCHITECTURES, GPUS, occupancy
 from gpu_intel import IntelBuilt, compiled_for_intel, ocloc
 from gpu_loops import UnknownLoopError, by_pair, cost_of, loop_table, rules_of, unused_rules
 from gpu_measured import CALIBRATION, DRAWN, Fit, Works, beyond, fit_constants, read, with_inputs
-from gpu_model import blocks_of, stages_of, works_of
+from gpu_model import blocks_of, stages_of, tiles_of, works_of
 from gpu_page import PAGE, SHAPE, Predictions, missed_goals, stale_tables, tables_of, trained_and_picture, write_page
 from gpu_rules import ABREAST, ADAM, BY_PAIR, WALK, Rule, Run
 from measuring import plain_parser, require, tool
 
 from clsplat.files.atomic import atomic_write
-from clsplat.layouts.columns import LOSS_GROUP_COLUMNS, LOSS_GROUP_ROWS, LOSS_PARTS
+from clsplat.layouts.columns import LOSS_GROUP_COLUMNS, LOSS_GROUP_ROWS, LOSS_PARTS, TILE
 from clsplat.progress import aligned
+from clsplat.stages.blend import items_for
 
 SHAPES = ("1x32", "1x64", "1x128", "1x256")
 FORMS = ("1x32g", "1x64g", "1x32s", "1x64s")
@@ -61,6 +62,8 @@ FORMS = ("1x32g", "1x64g", "1x32s", "1x64s")
 FRAMES = Path(__file__).with_name("gpu_frames.json")
 CHECKED = (("1x64", "1x32g"), ("sm_89", "sm_90", "gfx1100", "gfx90a"))
 """Shapes and targets that have ceilings."""
+BY_FRAME = ("blend", "sort_lists")
+"""Kernels whose groups follow the frame (`clsplat.stages.blend.frame_items`)."""
 NO_STACK = ("blend", "blend_grad", "project_grad", "sort_radix")
 """Kernel files that must use no stack memory and no spills on NVIDIA's GPUs."""
 NO_SCRATCH = ("blend", "blend_grad", "project_grad")
@@ -405,17 +408,35 @@ def counted(frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], 
         rows += compiled(formed, TARGETS, jobs, partial(note_of, shape), trained[-1])
     if unused := unused_rules(used):
         raise UnknownLoopError("; ".join(unused))
+    now = on_each_gpu(works, frames)
     calibration = json.loads(CALIBRATION.read_text())
-    measured, unread = read(calibration, works[SHAPE])
+    measured, unread = read(calibration, now)
     constants = fit_constants(calibration, measured)
     predictions = {
-        (shape, gpu.name, frame): stages_of(each, gpu, constants)
+        (shape, gpu.name, frame): stages_of(now[gpu.name, frame] if shape == SHAPE else each, gpu, constants)
         for shape, of_shape in works.items()
         for (target, frame), each in of_shape.items()
         for gpu in GPUS
         if gpu.target == target
     }
-    return rows, predictions, (measured, constants, unread, works[SHAPE])
+    return rows, predictions, (measured, constants, unread, now)
+
+
+def on_each_gpu(works: Mapping[str, Works], frames: Sequence[Mapping[str, Any]]) -> Works:
+    """The work of each frame's launches in SHAPE, by GPU and frame, with larger groups where a frame has few tiles.
+
+    works: of each shape, by target and frame.
+    """
+    sizes = {frame["name"]: tiles_of(frame) for frame in frames}
+    found = {}
+    for gpu in GPUS:
+        for (target, name), launches in works[SHAPE].items():
+            if target == gpu.target:
+                frame = name.removesuffix(DRAWN)
+                shape = f"1x{items_for(sizes[frame], gpu.units, int(SHAPE[2:]), TILE * TILE)}"
+                wide = {work.kernel: work for work in works[shape][target, frame] if work and work.kernel in BY_FRAME}
+                found[gpu.name, name] = [work and wide.get(work.kernel, work) for work in launches]
+    return found
 
 
 def works_in(shape: str, frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], Works]:

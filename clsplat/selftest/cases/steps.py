@@ -179,7 +179,7 @@ def _launch_settle(device: Device, _: Workspace, given: Inputs) -> Read:
     }
 
 
-def _twin_of_settle(given: Inputs, got: Arrays) -> dict[str, Wanted]:  # noqa: ARG001  # as every twin
+def _twin_of_settle(given: Inputs, got: Arrays) -> dict[str, Expected]:  # noqa: ARG001  # as every twin
     taken = np.ones_like(given.visible) if given.all_rows else given.visible
     made: dict[str, list[Array]] = {name: [] for name in ("parameters", "first", "second", "moves")}
     for group, rates in given.rates.items():
@@ -199,9 +199,9 @@ def _twin_of_settle(given: Inputs, got: Arrays) -> dict[str, Wanted]:  # noqa: A
     return {
         # A rounding of the sum and a few of the movement. The betas in float32 are off by 3e-8, which is 1e-6 of a sum
         # of some 30 steps.
-        "parameters": Wanted(parameters, 3e-6, moves),
-        "first": Wanted(first, 2e-5, np.abs(first)),  # beta1 is off by 2.6e-8: 7e-6 after 256 steps
-        "second": Wanted(second, 1e-5, second),  # beta2 is off by 1.3e-8: 3e-6 after 256 steps
+        "parameters": Expected(parameters, 3e-6, moves),
+        "first": Expected(first, 2e-5, np.abs(first)),  # beta1 is off by 2.6e-8: 7e-6 after 256 steps
+        "second": Expected(second, 1e-5, second),  # beta2 is off by 1.3e-8: 3e-6 after 256 steps
         "last": exactly(np.where(taken, mark, given.last).astype(np.uint32)),
     }
 
