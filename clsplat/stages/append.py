@@ -27,7 +27,7 @@ work, as all steps beyond 2,048 pairs go through global memory: the radix sort i
 LOCAL_PAIRS = 2048
 """Pairs that a group sorts in local memory: 16 KiB of them, half of every device's minimum. A power of two."""
 
-_OFFSET_ITEMS = 256
+_OFFSET_ITEMS = 1024
 """Work-items of each group of `list_offsets`, which has all tiles or all groups of `count_tiles`."""
 
 

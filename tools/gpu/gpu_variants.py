@@ -54,11 +54,11 @@ def noted(variant: program.Variant) -> dict[str, Any]:
 
 
 class _Buffer:
-    """Replaces a buffer. It has only a size."""
+    """Replaces a buffer. It has only a size and an address."""
 
     def __init__(self, context: object, flags: object, size: int) -> None:
         del context, flags
-        self.size = size
+        self.size, self.int_ptr = size, id(self)
 
     def get_sub_region(self, origin: int, size: int) -> _Buffer:
         del origin
