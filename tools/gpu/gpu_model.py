@@ -106,7 +106,7 @@ class Work:
 
 def blocks_of(frame: Mapping[str, Any], items: int) -> dict[str, Any]:
     """The numbers of a frame that tell how a group's warps walk a pair. A group has a warp for each 32 items."""
-    warps = max(items // 32, 1)
+    warps = min(max(items // 32, 1), WARPS[-1])  # kernels in larger groups walk no pairs
     found = {name: frame[name][WARPS.index(warps)] for name in VISITS}
     for name in ("visits", "dense", "turns_back", "whole_back", "rounds_back"):
         found[name] /= warps
@@ -115,7 +115,7 @@ def blocks_of(frame: Mapping[str, Any], items: int) -> dict[str, Any]:
 
 def longest_of(frame: Mapping[str, Any], items: int) -> dict[str, Any]:
     """The same, as if each warp had the pairs of the longest one in the slowest tile."""
-    warps = max(items // 32, 1)
+    warps = min(max(items // 32, 1), WARPS[-1])
     longest = {name: [value * warps for value in frame[f"longest_{name}"]] for name in VISITS}
     halves = {name: BLOCKS / 4 * frame[f"longer_{name}"] for name in ("reached", "taken")}
     return blocks_of({**longest, **halves}, items)
