@@ -48,7 +48,7 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
     if run is None or path is None or not path.exists():
         raise InputError(
             f"--appearance {photograph}: {model} has learnt no appearances (no appearance.json), expected a run of "
-            "clsplat train --appearance exposure or ppisp"
+            f"clsplat train --appearance {' or '.join(KINDS_WITH_GAINS)}"
         )
     record = _document(path)
     kind = record.get("kind") if isinstance(record, dict) else None
