@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from clsplat.stages.appearance import COLOUR_MODELS
+from clsplat.config.colour_models import COLOUR_MODELS
 
 FORWARD_STAGES = ("arithmetic", "project", "duplicate", "sort", "ranges", "blend")
 """Stages that render a frame."""

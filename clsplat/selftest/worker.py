@@ -36,6 +36,7 @@ DEFAULT_DEFINES: dict[str, dict[str, object]] = {
     "deep_merge": {"LANES": 1},
     "grid": {"LANES": 1},
     "noise": {"LANES": 1},
+    "settle": {"LANES": 1},
     "pose": {"LANES": 1},
     "probe_atomics": {"PROBED": 1},
     "project_rays": {"LANES": 1, **next(model.defines for model in CAMERA_MODELS if model.along_rays)},

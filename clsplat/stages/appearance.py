@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Launches appearance.cl and a colour model's kernels: photographs without their colours, gradient, and update.
 
-A new colour model is a row of COLOUR_MODELS, a kernel file and its twin, both of the row's name.
+A new colour model is a row of COLOUR_MODELS (config/colour_models.py), a kernel file and its twin of the same name.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.config.colour_models import ColourModel
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid, launch_items
@@ -22,60 +22,7 @@ from clsplat.layouts.columns import TILE
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-GAIN_ENTRIES = 3
-"""Number of gains of a photograph, its first entries."""
 APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON = 0.9, 0.999, 1e-15
-
-
-@dataclass(frozen=True)
-class ColourModel:
-    """An appearance model that removes a photograph's own colours pixel by pixel.
-
-    kernels/STEM.cl has its formulas, and clsplat/reference/STEM.py is their twin.
-
-    of_photograph: the number of a photograph's entries by their name in appearance.json. The first three are base-2
-    logarithms of gains; the others are coefficients from -0.2 to 0.2.
-    of_lens: the same for a lens; three base-2 logarithms, or none.
-    """
-
-    stem: str
-    of_photograph: Mapping[str, int]
-    of_lens: Mapping[str, int] = field(default_factory=dict)
-
-    @property
-    def entries(self) -> int:
-        """Number of entries of a photograph."""
-        return sum(self.of_photograph.values())
-
-    @property
-    def lens_entries(self) -> int:
-        """Number of entries of a lens; 0 if nothing is learnt of lenses."""
-        return sum(self.of_lens.values())
-
-    @property
-    def sums(self) -> int:
-        """Number of sums of the gradient."""
-        return self.entries + self.lens_entries
-
-    @property
-    def pixel_bytes(self) -> int:
-        """Bytes of the partial sums per pixel, padding included."""
-        return -(-2 * self.sums // 3)
-
-    @property
-    def lens_update(self) -> GainEntries:
-        """The update of a lens's entries. Their sums follow the photograph's; their mean over all lenses is kept."""
-        return GainEntries(first_row=self.entries, centred=False)
-
-
-COLOUR_MODELS = {
-    model.stem: model
-    for model in (
-        ColourModel("exposure", {"log2_gains": GAIN_ENTRIES}),
-        ColourModel("ppisp", {"log2_gains": GAIN_ENTRIES, "mixes": 6}, {"vignette": 3}),
-    )
-}
-"""Colour models by value of the setting `appearance`. The self-test has a stage for each."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +57,11 @@ class GainEntries:
     first_row: int = 0
     mix_rate: float = 1.0
     centred: bool = True
+
+    @classmethod
+    def of_lens(cls, model: ColourModel) -> GainEntries:
+        """The update of a lens's entries. Their sums follow the photograph's; their mean over all lenses is kept."""
+        return cls(first_row=model.entries, centred=False)
 
 
 PLAIN_GAINS = GainEntries()

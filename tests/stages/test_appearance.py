@@ -10,11 +10,12 @@ import pytest
 from compare import assert_close, assert_close_gradient, assert_same_bits
 from scipy.sparse import csr_array
 
+from clsplat.config.colour_models import COLOUR_MODELS, ColourModel
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.layouts.columns import READBACK
 from clsplat.reference.appearance import spread
-from clsplat.stages.appearance import COLOUR_MODELS, ColourModel, Gains, step_gains
+from clsplat.stages.appearance import Gains, step_gains
 
 
 def test_the_mean_stays(shaped_device: Device) -> None:

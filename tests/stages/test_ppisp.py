@@ -6,13 +6,14 @@ from __future__ import annotations
 import numpy as np
 from compare import assert_close
 
+from clsplat.config.colour_models import COLOUR_MODELS
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.layouts.columns import READBACK
 from clsplat.reference import ppisp
 from clsplat.reference.appearance import spread
 from clsplat.runs.appearance import held_out_looks, unmixing
-from clsplat.stages.appearance import COLOUR_MODELS, Gains, step_gains
+from clsplat.stages.appearance import Gains, step_gains
 
 PPISP = COLOUR_MODELS["ppisp"]
 

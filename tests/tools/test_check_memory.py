@@ -12,8 +12,8 @@ from calls import printed
 from check_memory import CHECKS, Finding, Result, findings, kernels, places, report, report_planted
 from memory_workload import by_elements
 
+from clsplat.config.colour_models import COLOUR_MODELS
 from clsplat.device.source import kernel_root, kernel_source
-from clsplat.stages.appearance import COLOUR_MODELS
 
 STEMS = sorted({stem for stems in kernels().values() for stem in stems})
 LOG = """

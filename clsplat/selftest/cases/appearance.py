@@ -13,6 +13,7 @@ from numpy.random import Generator
 from scipy.sparse import csr_array
 
 from clsplat.arrays import Float32, Float64
+from clsplat.config.colour_models import COLOUR_MODELS, GAIN_ENTRIES, ColourModel
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.reference import appearance as reference
@@ -21,9 +22,6 @@ from clsplat.selftest.cases.loss import random_pictures
 from clsplat.selftest.harness import CaseBench, cropped, planes_of
 from clsplat.selftest.scenes import evenly
 from clsplat.stages.appearance import (
-    COLOUR_MODELS,
-    GAIN_ENTRIES,
-    ColourModel,
     GainEntries,
     Gains,
     PhotoLens,
@@ -123,7 +121,7 @@ def _launch(model: ColourModel, device: Device, work: Workspace, given: Inputs) 
     step_gains(device, colours, given.taken.photograph, *step, GainEntries(mix_rate=MIX_RATE_FACTOR))
     made = {"entries": colours.logs, "start": colours.start, "gains": colours.gains, "columns": columns}
     if lenses is not None:
-        step_gains(device, lenses, given.taken.lens, *step, model.lens_update)
+        step_gains(device, lenses, given.taken.lens, *step, GainEntries.of_lens(model))
         made["lenses"] = lenses.logs
     read = read_of(**made, first=colours.first, second=colours.second)
     return lambda: {**read(), **_pictures_read(given, target, gradient)}

@@ -6,9 +6,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from clsplat.config.colour_models import COLOUR_MODELS
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
-from clsplat.stages.appearance import COLOUR_MODELS
 from clsplat.training.appearance.base import Appearance
 from clsplat.training.appearance.bilateral_grid import GridsOfAll
 from clsplat.training.appearance.colours import ColoursOfAll

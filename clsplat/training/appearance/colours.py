@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 
+from clsplat.config.colour_models import COLOUR_MODELS, GAIN_ENTRIES, ColourModel
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
@@ -20,9 +21,6 @@ from clsplat.images.colour import SRGB, photos_space
 from clsplat.images.exif import exposure_of
 from clsplat.scenes.analysis.visible_points import VisiblePoints
 from clsplat.stages.appearance import (
-    COLOUR_MODELS,
-    GAIN_ENTRIES,
-    ColourModel,
     GainEntries,
     Gains,
     PhotoLens,
@@ -129,7 +127,8 @@ class ViewColours(ViewPart):
         row, lens, step = self.taken.photograph, self.taken.lens, self.step
         step_gains(self.device, self.colours, row, own, step, self.rate, readback, _COLOUR_UPDATE)
         if self.lenses is not None:
-            step_gains(self.device, self.lenses, lens, own, step, self.lens_rate, readback, self.model.lens_update)
+            update = GainEntries.of_lens(self.model)
+            step_gains(self.device, self.lenses, lens, own, step, self.lens_rate, readback, update)
 
 
 def centre(view: View) -> tuple[float, float]:
