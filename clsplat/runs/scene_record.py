@@ -110,12 +110,13 @@ def read(run: Run) -> dict[str, Any] | None:
     return dict(record)
 
 
-def length_unit_of(run: Run, scene: Scene) -> float:
-    """Length unit of the run's training. Without a recorded unit, as in runs of earlier versions, the extent.
+def length_unit_of(run: Run) -> float | None:
+    """Length unit of the run's training, if it is not the extent. Runs of earlier versions have the extent.
 
     Raises InputError like `read`.
     """
-    return float((read(run) or {}).get("length_unit", scene.extent))
+    unit = (read(run) or {}).get("length_unit")
+    return None if unit is None else float(unit)
 
 
 def own_cameras(run: Run | None) -> list[Camera]:

@@ -26,6 +26,12 @@ from clsplat.images.alpha import associate, unassociate
 from clsplat.images.reading import downscale
 from clsplat.process import undisturbed
 
+MIN_TRACKED_POINTS_IN_VIEW = 0.1
+"""Minimum fraction of tracked points that the scene's cameras project into the photographs of their tracks.
+
+The fraction is 0.4 for an undistorted fisheye of 200 degrees. It was 0.001 for cameras in another coordinate frame.
+"""
+
 with undisturbed():  # on Ctrl-C pycolmap's import says "not installed", and its SIGTERM handler prints a stack trace
     import pycolmap
 

@@ -15,7 +15,7 @@ from clsplat.config.depth import DepthUse
 from clsplat.errors import InputError, examples, warn
 from clsplat.files.documents import is_file
 from clsplat.images.depth_maps import DEPTH_MAP_SUFFIXES, map_header, read_map
-from clsplat.scenes.dataset import pixels_of
+from clsplat.scenes.dataset import MIN_TRACKED_POINTS_IN_VIEW, pixels_of
 from clsplat.scenes.readers import colmap
 from clsplat.scenes.sidecar_files import bases_of, beside, owned
 from clsplat.scenes.supervision.depth_samples import KnownDepth, sampled
@@ -28,11 +28,6 @@ DEPTH_FOLDERS = ("depths", "depth")
 """Names of the depth map folder, next to the photographs' folder or inside it."""
 MIN_DEPTH_FIT_POINTS = 10
 """Minimum number of points in a photograph for a fit of its relative depth map."""
-MIN_TRACKED_POINTS_IN_VIEW = 0.1
-"""Minimum fraction of tracked points that the scene's cameras project into the photographs of their tracks.
-
-The fraction is 0.4 for an undistorted fisheye of 200 degrees. It was 0.001 for cameras in another coordinate frame.
-"""
 MAX_DEPTH_SCALE_RATIO = 5.0
 """Largest factor by which the scale fitted to a relative depth map may differ from the median scale of all maps."""
 

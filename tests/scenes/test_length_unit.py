@@ -79,6 +79,28 @@ def test_tracks_tell_what_a_photograph_shows(tmp_path: Path, monkeypatch: pytest
     assert length_unit_of(scene) == pytest.approx(DEPTH_TO_UNIT * 2)
 
 
+def test_tracks_of_another_world_frame_do_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = street(tmp_path / "scene")
+    wanted = length_unit_of(scene)
+    view = scene.train_views[0]
+    behind = view.camera.position - np.array([[1.0], [2.0], [3.0]]) * view.camera.rotation[2]
+    ahead = 0.1 * view.camera.position + np.array([[100.0, 40, 30]])  # before the camera, but far beside its picture
+    tracks = Tracks(np.concatenate([behind, ahead]), np.zeros(4), {view.name: np.arange(4)})
+    monkeypatch.setattr("clsplat.scenes.readers.colmap.find_model", lambda _: tmp_path)
+    monkeypatch.setattr("clsplat.scenes.readers.colmap.read_tracks", lambda _: tracks)
+    assert length_unit_of(replace(scene, source=tmp_path / "scene")) == wanted
+
+
+def test_the_extent_of_cameras_in_one_place_follows_the_start_points(tmp_path: Path) -> None:
+    scene = load_scene(write_scene(tmp_path / "scene"), test_every=0)
+    views = [replace(view, camera=replace(view.camera, translation=np.zeros(3))) for view in scene.views]
+    spot = replace(scene, views=views, points=np.empty((0, 3)), point_colors=np.empty((0, 3), np.float32))
+    made = prepared(spot, short())
+    assert made.unit is None
+    far = replace(made, points=np.full((5, 3), 7.0), point_colors=np.zeros((5, 3), np.float32))
+    assert far.length_unit == far.extent == pytest.approx(7 * np.sqrt(3))
+
+
 def test_rates_and_sizes_count_in_the_unit(tmp_path: Path, default_device: Device) -> None:
     scene = prepared(street(tmp_path / "scene"), short())
     trainer = Trainer(scene, short(), default_device)
@@ -97,6 +119,21 @@ def test_a_run_keeps_its_unit(tmp_path: Path, default_device: Device) -> None:
     unit = prepared(scene, config).length_unit
     assert (scene_record.read(run) or {})["length_unit"] == unit
     assert prepared(scene, config, run).length_unit == unit
+
+
+def test_a_run_that_ended_before_its_scene_was_recorded_begins_with_its_unit(tmp_path: Path) -> None:
+    scene, config = street(tmp_path / "scene"), short(iterations=2)
+    run = Run.create(tmp_path / "run", config, scene=tmp_path / "scene")
+    assert prepared(scene, config, run).length_unit == prepared(scene, config).length_unit < scene.extent
+
+
+def test_a_run_whose_record_was_removed_is_warned_of(tmp_path: Path, default_device: Device) -> None:
+    scene, config = street(tmp_path / "scene"), short(iterations=2)
+    run = Run.create(tmp_path / "run", config, scene=tmp_path / "scene")
+    train(scene, config, device=default_device, run=run)
+    (run.path / scene_record.SCENE_RECORD_FILE_NAME).unlink()
+    with pytest.warns(UserWarning, match=r"scene\.json: is missing, so lengths are relative to the extent"):
+        assert prepared(scene, config, run).length_unit == scene.extent
 
 
 def test_a_run_of_an_earlier_version_keeps_the_extent(tmp_path: Path, default_device: Device) -> None:

@@ -66,7 +66,7 @@ def towns(given: Namespace) -> Rows:
                 yield f"{size}, each block alone", "1", "", *alone
         for kind, unit in (("depths", None), ("extent", scene.extent)):
             done, psnr = train(f"{size} {metres:g} {kind}", replace(scene, unit=unit), masks)
-            used = length_unit_of(Run.open(done.run), scene)
+            used = length_unit_of(Run.open(done.run)) or scene.extent
             cells = f"{used:.3g}", f"{done.last['step']:,}", f"{done.last['gaussians']:,}"
             yield size, f"{metres:g}", *cells, *(f"{each:.2f}" for each in psnr), f"{done.last['seconds']:.0f}"
             if used == scene.extent:
