@@ -38,20 +38,15 @@ def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None) -> S
 
 def _length_unit(scene: Scene, resumed: Run | None) -> float | None:
     """Length unit in world units; None for the extent, which in some scenes depends on the start points."""
-    began = resumed is not None and (scene_record.read(resumed) is not None or resumed.checkpoints())
-    if scene.unit is not None and not began:
-        return scene.unit
-    own = length_unit_of(scene)
-    if not began:
-        return own if own != scene.extent else None
-    assert resumed is not None
-    unit = scene_record.length_unit_of(resumed)
-    if scene_record.read(resumed) is None and own != scene.extent:
+    if resumed is None or not (scene_record.read(resumed) is not None or resumed.checkpoints()):
+        unit = scene.unit or length_unit_of(scene)
+        return unit if scene.unit is not None or unit != scene.extent else None
+    if scene_record.read(resumed) is None and scene.unit is None and (unit := length_unit_of(scene)) != scene.extent:
         warnings.warn(
             f"{resumed.path / scene_record.SCENE_RECORD_FILE_NAME}: is missing, so lengths are relative to the extent, "
-            f"{scene.extent:.4g}; if the training began relative to {own:.4g}, begin it anew"
+            f"{scene.extent:.4g}; if the training began relative to {unit:.4g}, begin it anew"
         )
-    return unit
+    return scene_record.length_unit_of(resumed)
 
 
 def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:
