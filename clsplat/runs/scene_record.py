@@ -110,12 +110,9 @@ def read(run: Run) -> dict[str, Any] | None:
     return dict(record)
 
 
-def length_unit_of(run: Run) -> float | None:
-    """Length unit of the run's training, if it is not the extent. Runs of earlier versions have the extent.
-
-    Raises InputError like `read`.
-    """
-    unit = (read(run) or {}).get("length_unit")
+def length_unit_of(record: dict[str, Any]) -> float | None:
+    """Length unit of a record's training, if it is not the extent. Runs of earlier versions have the extent."""
+    unit = record.get("length_unit")
     return None if unit is None else float(unit)
 
 

@@ -26,12 +26,6 @@ from clsplat.images.alpha import associate, unassociate
 from clsplat.images.reading import downscale
 from clsplat.process import undisturbed
 
-MIN_TRACKED_POINTS_IN_VIEW = 0.1
-"""Minimum fraction of tracked points that the scene's cameras project into the photographs of their tracks.
-
-The fraction is 0.4 for an undistorted fisheye of 200 degrees. It was 0.001 for cameras in another coordinate frame.
-"""
-
 with undisturbed():  # on Ctrl-C pycolmap's import says "not installed", and its SIGTERM handler prints a stack trace
     import pycolmap
 
@@ -348,6 +342,26 @@ def pixels_of(
     x, y = camera.fx * local[:, 0] / by + camera.cx, camera.fy * local[:, 1] / by + camera.cy
     inside = ahead & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     return y[inside].astype(np.int64), x[inside].astype(np.int64), inside
+
+
+MIN_TRACKED_POINTS_IN_VIEW = 0.1
+"""Minimum fraction of tracked points that the scene's cameras project into the photographs of their tracks.
+
+The fraction is 0.4 for an undistorted fisheye of 200 degrees. It was 0.001 for cameras in another coordinate frame.
+"""
+
+
+def tracked_in_view(tracked: Iterable[tuple[Camera, Lens | None, Float64]]) -> tuple[int, int, bool]:
+    """Numbers of tracked points that their photographs show, and of all, and whether enough of them are shown.
+
+    tracked: camera, lens and points (k, 3) of each photograph. If hardly any point is shown, the cameras have another
+    world frame than the points.
+    """
+    seen = whole = 0
+    for camera, lens, points in tracked:
+        seen += int(np.count_nonzero(pixels_of(points, camera, lens)[2]))
+        whole += len(points)
+    return seen, whole, seen >= MIN_TRACKED_POINTS_IN_VIEW * whole
 
 
 def occlusion_cell(camera: Camera, points: int) -> float:

@@ -15,7 +15,7 @@ from clsplat.config.depth import DepthUse
 from clsplat.errors import InputError, examples, warn
 from clsplat.files.documents import is_file
 from clsplat.images.depth_maps import DEPTH_MAP_SUFFIXES, map_header, read_map
-from clsplat.scenes.dataset import MIN_TRACKED_POINTS_IN_VIEW, pixels_of
+from clsplat.scenes.dataset import tracked_in_view
 from clsplat.scenes.readers import colmap
 from clsplat.scenes.sidecar_files import bases_of, beside, owned
 from clsplat.scenes.supervision.depth_samples import KnownDepth, sampled
@@ -77,13 +77,11 @@ def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
 def _check_frame(scene: Scene, known: Mapping[str, KnownDepth], model: Path) -> None:
     """Raise InputError if hardly any tracked point is projected into its photographs: the cameras then have another
     world frame."""
-    seen = whole = 0
-    for view in scene.train_views:
-        if view.name in known:
-            camera = view.camera.before(scene.near)
-            seen += int(np.count_nonzero(pixels_of(known[view.name].points, camera, view.lens)[2]))
-            whole += len(known[view.name].points)
-    if seen < MIN_TRACKED_POINTS_IN_VIEW * whole:
+    views = [view for view in scene.train_views if view.name in known]
+    seen, whole, enough = tracked_in_view(
+        (view.camera.before(scene.near), view.lens, known[view.name].points) for view in views
+    )
+    if not enough:
         raise InputError(
             f"{model}: the scene's cameras project {seen:,} of {whole:,} tracked points into their photographs, "
             "expected most of them; take cameras and points from the same model"

@@ -37,16 +37,26 @@ def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None) -> S
 
 
 def _length_unit(scene: Scene, resumed: Run | None) -> float | None:
-    """Length unit in world units; None for the extent, which in some scenes depends on the start points."""
-    if resumed is None or not (scene_record.read(resumed) is not None or resumed.checkpoints()):
-        unit = scene.unit or length_unit_of(scene)
-        return unit if scene.unit is not None or unit != scene.extent else None
-    if scene_record.read(resumed) is None and scene.unit is None and (unit := length_unit_of(scene)) != scene.extent:
-        warnings.warn(
-            f"{resumed.path / scene_record.SCENE_RECORD_FILE_NAME}: is missing, so lengths are relative to the extent, "
-            f"{scene.extent:.4g}; if the training began relative to {unit:.4g}, begin it anew"
-        )
-    return scene_record.length_unit_of(resumed)
+    """Length unit in world units; None for the extent, which in some scenes depends on the start points.
+
+    A run that has begun keeps its unit, which is the extent if its record is missing.
+    """
+    record = None if resumed is None else scene_record.read(resumed)
+    if record is not None:
+        return scene_record.length_unit_of(record)
+    began = resumed is not None and bool(resumed.checkpoints())
+    if scene.unit is not None:
+        return None if began else scene.unit
+    unit = length_unit_of(scene)
+    if unit == scene.extent:
+        return None
+    if resumed is None or not began:
+        return unit
+    warnings.warn(
+        f"{resumed.path / scene_record.SCENE_RECORD_FILE_NAME}: is missing, so lengths are relative to the extent, "
+        f"{scene.extent:.4g}; if the training began relative to {unit:.4g}, begin it anew"
+    )
+    return None
 
 
 def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:

@@ -14,7 +14,7 @@ from quality.trainings import Rows, Trained, call, picture_of, psnr_of, trained
 from clsplat.device.context import open_device
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
-from clsplat.runs.scene_record import length_unit_of
+from clsplat.runs.scene_record import length_unit_of, read
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 
@@ -66,7 +66,7 @@ def towns(given: Namespace) -> Rows:
                 yield f"{size}, each block alone", "1", "", *alone
         for kind, unit in (("depths", None), ("extent", scene.extent)):
             done, psnr = train(f"{size} {metres:g} {kind}", replace(scene, unit=unit), masks)
-            used = length_unit_of(Run.open(done.run)) or scene.extent
+            used = length_unit_of(read(Run.open(done.run)) or {}) or scene.extent
             cells = f"{used:.3g}", f"{done.last['step']:,}", f"{done.last['gaussians']:,}"
             yield size, f"{metres:g}", *cells, *(f"{each:.2f}" for each in psnr), f"{done.last['seconds']:.0f}"
             if used == scene.extent:

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from clsplat.arrays import Float64
-from clsplat.scenes.dataset import MIN_TRACKED_POINTS_IN_VIEW, nearest_around, occlusion_cell, pixels_of
+from clsplat.scenes.dataset import nearest_around, occlusion_cell, pixels_of, tracked_in_view
 from clsplat.scenes.readers import colmap
 from clsplat.scenes.scene import Scene, View
 
@@ -57,18 +57,10 @@ def _tracked(scene: Scene, views: Sequence[View]) -> dict[str, Float64]:
         return {}
     tracks = colmap.read_tracks(model)
     found = {name: tracks.points[rows] for name, rows in tracks.shown_in([view.name for view in views]).items()}
-    return found if _fits(views, found, NEAR_PER_EXTENT * scene.extent) else {}
-
-
-def _fits(views: Sequence[View], tracked: Mapping[str, Float64], near: float) -> bool:
-    """True if the cameras project tracked points into their photographs. Else they have another world frame than the
-    COLMAP model, as those of a transforms.json often do."""
-    seen = whole = 0
-    for view in views:
-        points = tracked.get(view.name, np.empty((0, 3)))
-        seen += int(np.count_nonzero(pixels_of(points, view.camera.before(near), view.lens)[2]))
-        whole += len(points)
-    return seen >= MIN_TRACKED_POINTS_IN_VIEW * whole
+    near = NEAR_PER_EXTENT * scene.extent
+    shown = [view for view in views if view.name in found]
+    *_, enough = tracked_in_view((view.camera.before(near), view.lens, found[view.name]) for view in shown)
+    return found if enough else {}
 
 
 def _nearest(points: Float64, view: View, near: float) -> Float64:
