@@ -70,7 +70,7 @@ class ByLens:
     lens: Lens
 
     def size(self, frame: Camera) -> tuple[int, int]:
-        """Width and height of the warped picture: those of the straight frame."""
+        """Width and height of the warped picture, which has the straight frame's size."""
         return frame.width, frame.height
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:

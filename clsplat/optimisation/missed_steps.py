@@ -12,7 +12,7 @@ from clsplat.config.training import OptimiserConfig
 
 MOST_MISSED = 256
 """Largest number of steps that a Gaussian may miss. All Gaussians are settled after so many steps, which costs one
-dense step in 256. In the 256th missed step a parameter moves by 2e-12 of what it moved in the first."""
+dense step in 256. The 256th missed step moves a parameter by 2e-12 of the first one's movement."""
 
 
 class MissedSteps:
