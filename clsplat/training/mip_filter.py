@@ -52,7 +52,7 @@ class MipFilter(Component):
         if self._least is not None:
             limit_scales(self._device, self._work, gaussians, self._least)
 
-    def rows_moved(self) -> None:
+    def rows_moved(self, listed: DeviceArray) -> None:  # noqa: ARG002
         """Forget the limits."""
         self._least = None
 
@@ -60,7 +60,7 @@ class MipFilter(Component):
         """Arrays of a checkpoint, by name."""
         return {} if self._least is None else {"sampling/least": self._least.get()}
 
-    def load(self, named: Named, count: int) -> None:
+    def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002
         """Load the arrays of a checkpoint of `count` Gaussians. Raises ValueError for another number of Gaussians."""
         least = named("sampling/").get("least") if self._on else None
         if least is not None and least.shape != (count,):

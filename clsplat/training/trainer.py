@@ -50,7 +50,7 @@ from clsplat.training.stability.non_finite import NonFiniteMonitor, Repair
 from clsplat.training.step.component import Component
 from clsplat.training.step.gradient_step import GradientStep, StepProbe, slot_fields, view_gradients
 from clsplat.training.step.inputs import ViewInputs
-from clsplat.training.step.late_adam import ROW_BYTES, LateAdam
+from clsplat.training.step.late_adam import LateAdam
 from clsplat.training.step.monitor import StepMonitor
 from clsplat.training.step.speculative_steps import SpeculativeSteps
 from clsplat.training.supervision.depth_targets import DepthTargets
@@ -138,13 +138,13 @@ class Trainer:
         self._cameras: dict[int, tuple[Camera, Camera]] = {}
         cameras = [self.local(view.camera) for view in self.views]
         mip_filter = MipFilter(self.config, self.device, self.rasterizer.work, cameras)
-        self.components: tuple[Component, ...] = (mip_filter, self.appearance, self.cameras, self.depths)
+        late = [LateAdam(self.config.optimiser, self.rasterizer, len(initial))] if self.config.optimiser.late else []
+        self.components: tuple[Component, ...] = (*late, mip_filter, self.appearance, self.cameras, self.depths)
         contributions = self.strategy.needs().contributions
         self.model = TrainedModel(
             self.device, self.rasterizer.work, self._make_plan, counts_contributions=contributions
         )
         self.model.begin(initial)
-        self.late = LateAdam(self.device, self.config.optimiser, len(initial)) if self.config.optimiser.late else None
 
     def _make_plan(self, count: int) -> Plan:
         """Plan the device's memory for `count` Gaussians with their final number of SH coefficients."""
@@ -154,8 +154,7 @@ class Trainer:
             photographs=sum(view.camera.width * view.camera.height for view in self.views),
             turns=self.pending.turns,
             masks=self.config.mask_use != NO_MASKS,
-            row_bytes=sum(component.row_bytes for component in self.components)
-            + ROW_BYTES * self.config.optimiser.late,
+            row_bytes=sum(component.row_bytes for component in self.components),
             pixel_bytes=sum(component.pixel_bytes for component in self.components),
         )
 
@@ -236,8 +235,6 @@ class Trainer:
         if self.mark is None:
             self._note()
         views = self.views_ahead
-        if self.late is not None and self.late.is_due(self.step):
-            self.catch_up()
         self.step += views
         self._raise_sh_degree()
         self._prepare_components(views)
@@ -291,7 +288,6 @@ class Trainer:
             explore=exploration_of(
                 self.config, self.step, rates["means"], self.parameters.count, self.scene.length_unit
             ),
-            late=self.late,
         )
 
     def _run(
@@ -323,16 +319,19 @@ class Trainer:
         self.pending.settle()
 
     def catch_up(self) -> None:
-        """Let all Gaussians take the steps that they missed (`LateAdam`), after all launched steps are done."""
+        """Make all changes to Gaussians that components have postponed, after all launched steps are done."""
         self.settle()
-        if self.late is not None:
-            self.late.settle(self.rasterizer.work, tuple(self.models().values()), self.rasterizer.readback)
+        for component in self.components:
+            component.complete(self.parameters, self.first, self.second)
 
     @property
     def complete_parameters(self) -> AnyGaussians:
-        """Parameters with all steps that Gaussians missed (`LateAdam`): a copy, so that looking changes no bit."""
+        """Parameters as `catch_up` would leave them. They may be a copy, so that looking changes no bit."""
         self.settle()
-        return self.parameters if self.late is None else self.late.settled(tuple(self.models().values()))
+        parameters = self.parameters
+        for component in self.components:
+            parameters = component.completed(parameters, self.first, self.second)
+        return parameters
 
     def _pixels(self, view: int) -> NDArray[Any]:
         """Photograph of a view at the step's size, on the host."""
@@ -500,10 +499,8 @@ class Trainer:
             self.batch.changed()
         if moved is None:
             return
-        if self.late is not None:
-            self.late.moved(moved.get())
         for component in self.components:
-            component.rows_moved()
+            component.rows_moved(moved)
         if type(self.strategy).rearranged is not Strategy.rearranged:
             entries = moved.get()
             self.strategy.rearranged(entries & ~FRESH, entries >= FRESH)
@@ -563,7 +560,6 @@ class Trainer:
         arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
         arrays.update({f"strategy/{name}": array for name, array in self.strategy.arrays().items()})
         arrays |= self.model.arrays()
-        arrays |= {} if self.late is None else self.late.arrays()
         for component in self.components:
             arrays |= component.arrays()
         return arrays
@@ -607,9 +603,7 @@ class Trainer:
         self.strategy.load(checkpoint.named("strategy/"))
         try:
             for component in self.components:
-                component.load(checkpoint.named, self.parameters.count)
-            if self.late is not None:
-                self.late.load(checkpoint.named, self.step, self.parameters.count)
+                component.load(checkpoint.named, self.step, self.parameters.count)
         except ValueError as error:
             raise unusable(checkpoint, str(error)) from None
 

@@ -39,7 +39,7 @@ class Appearance(Component):
         """Arrays of appearance.npz, by name; empty if there is no such file."""
         return {}
 
-    def load(self, named: Named, count: int) -> None:  # noqa: ARG002
+    def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002
         """Load the arrays of a checkpoint. Raises ValueError for arrays of other photographs."""
         self.take(named("appearance/"))
 

@@ -171,7 +171,7 @@ class Cameras(Component):
         """Arrays of a checkpoint, by name."""
         return self.refined_arrays() | self.gate.arrays()
 
-    def load(self, named: Named, count: int) -> None:  # noqa: ARG002
+    def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002
         """Load the arrays of a checkpoint. Raises ValueError for arrays of other views."""
         self.poses.load(named("poses/"))
         self.lenses.load(named("lenses/"))

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Components of a training in addition to the Gaussians: appearance, refined cameras, mip filter, known depths.
+"""Components of a training in addition to the Gaussians: appearance, refined cameras, mip filter, known depths, late
+Adam.
 
 `Trainer` loops over a list of components. A new one is a subclass of `Component` and a line in `Trainer._start`.
 """
@@ -11,6 +12,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from clsplat.device.buffers import DeviceArray
 from clsplat.runs.run import Run
 from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.training.step.inputs import ViewInputs
@@ -55,15 +57,26 @@ class Component:
     def after_adam(self, gaussians: AnyGaussians) -> None:
         """Change the parameters after Adam's step."""
 
-    def rows_moved(self) -> None:
-        """Forget data about individual rows, because rows have moved."""
+    def complete(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
+        """Make all changes to the parameters and their moments that are postponed, because all rows are now needed."""
+
+    def completed(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> AnyGaussians:  # noqa: ARG002
+        """The parameters as `complete` would leave them, without changing any array."""
+        return parameters
+
+    def rows_moved(self, listed: DeviceArray) -> None:
+        """Follow rows that have moved, or forget data about individual rows.
+
+        listed: the old row of each row, or FRESH (`DeviceRowList`).
+        """
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a checkpoint, by name."""
         return {}
 
-    def load(self, named: Named, count: int) -> None:
-        """Load the arrays of a checkpoint of `count` Gaussians. Raises ValueError for arrays of other views."""
+    def load(self, named: Named, step: int, count: int) -> None:
+        """Load the arrays of a checkpoint of `count` Gaussians after `step` views. Raises ValueError for arrays of
+        other views."""
 
     def write(self, run: Run) -> None:
         """Write the files of a finished training."""

@@ -24,7 +24,6 @@ from clsplat.stages.project import Slots, project_grad, project_step, step_numbe
 from clsplat.stages.target import is_photograph, target
 from clsplat.training.density import StatisticsNeeds
 from clsplat.training.step.inputs import StepRows, ViewInputs, ViewRows
-from clsplat.training.step.late_adam import LateAdam
 from clsplat.training.step.loss_terms import loss_terms
 
 R = TypeVar("R")
@@ -57,7 +56,6 @@ class GradientStep:
     turn: number of the array for the loss's sums (`stages.loss.loss`).
     room: capacity in pairs (`Rasterizer.forward`).
     explore: noise and penalties of the step.
-    late: last steps of the Gaussians, if the optimiser is late.
     """
 
     device: Device
@@ -70,7 +68,6 @@ class GradientStep:
     turn: int = 0
     room: PairCapacity | None = None
     explore: Exploration = NO_EXPLORATION
-    late: LateAdam | None = None
 
     @property
     def adam_step(self) -> AdamStep:
@@ -115,7 +112,7 @@ class GradientStep:
         )
         probe.pair_gradients(slots)
         for start, stop, part in parts(work, *model, keep=True):
-            self._change(self._rows(start, stop, part, inputs, frame, slots, gradients), inputs, probe)
+            self._step_rows(self._rows(start, stop, part, inputs, frame, slots, gradients), inputs, probe)
         self.learn(inputs, own)
         return result
 
@@ -177,7 +174,7 @@ class GradientStep:
             next((room for room in by_lens if room is not None), None),
         )
 
-    def _change(self, rows: StepRows, inputs: ViewInputs, probe: StepProbe) -> None:
+    def _step_rows(self, rows: StepRows, inputs: ViewInputs, probe: StepProbe) -> None:
         """Take Adam's step for some rows."""
         if rows.gradients is not None:
             project_grad(
@@ -195,8 +192,14 @@ class GradientStep:
             for part in inputs.parts:
                 part.add_rows(rows)
         probe.before_rows(rows)
-        self.update(rows)
+        self.change(rows, inputs)
         probe.after_rows(rows)
+
+    def change(self, rows: StepRows, inputs: ViewInputs) -> None:
+        """Take Adam's step for some rows, after the changes of the view's parts."""
+        for part in inputs.parts:
+            part.before_adam(rows, self.adam_step)
+        self.update(rows)
 
     def replayed(
         self,
@@ -222,8 +225,6 @@ class GradientStep:
     def update(self, rows: StepRows) -> None:
         """Take Adam's step for some rows; compute the gradient of projection if that is not done yet."""
         step, readback = self.adam_step, self.rasterizer.readback
-        if self.late is not None:
-            self.late.before_adam(rows, step, readback)
         if rows.gradients is not None:
             parameters, first, second = rows.model
             models = (parameters, rows.gradients, first, second)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
+from clsplat.stages.adam import AdamStep
 from clsplat.stages.device_gaussians import DeviceGaussians
 from clsplat.stages.loss_terms import DepthTerm
 from clsplat.stages.project import Projected, Screen, Slots
@@ -124,6 +125,9 @@ class ViewPart:
 
     def add_rows(self, rows: StepRows) -> None:
         """Sum the gradients of these rows, before the rows change."""
+
+    def before_adam(self, rows: StepRows, step: AdamStep) -> None:
+        """Change these rows just before Adam's step does. It is called twice if the sandbox tries the step first."""
 
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
         """Take Adam's step along the part's own gradient. It changes nothing if the step's pass has stopped."""

@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,30 +13,28 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.config.training import OptimiserConfig
-from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
-from clsplat.device.context import Device
+from clsplat.device.buffers import DeviceArray, allocate, upload
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.optimisation.density_rules import FRESH
 from clsplat.optimisation.missed_steps import MOST_MISSED, MissedSteps
-from clsplat.rendering.rasterizer import MAX_COUNTED_PASSES
+from clsplat.rendering.rasterizer import MAX_COUNTED_PASSES, Rasterizer
 from clsplat.stages.adam import AdamStep
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostArray, HostGaussians, parts
 from clsplat.stages.settle import settle
-from clsplat.training.step.inputs import StepRows
+from clsplat.training.step.component import Component, Named
+from clsplat.training.step.inputs import StepRows, ViewInputs, ViewPart
 
 _GROUPS = tuple(PARAMETER_GROUPS)
-ROW_BYTES = 4
-"""Bytes per Gaussian: the last step that it took."""
 
 
-class LateAdam:
+class LateAdam(Component):
     """The last step that each Gaussian of a training took, and the factors of the steps since.
 
     step: the last step launched.
     """
 
-    def __init__(self, device: Device, config: OptimiserConfig, count: int) -> None:
-        self._device, self._config = device, config
+    def __init__(self, config: OptimiserConfig, rasterizer: Rasterizer, count: int) -> None:
+        self._device, self._config, self._rasterizer = rasterizer.device, config, rasterizer
         self._begin(np.zeros(count, np.uint32), MissedSteps(config, _GROUPS), 0)
 
     def _begin(self, last: NDArray[np.uint32], missed: MissedSteps, step: int) -> None:
@@ -44,11 +42,20 @@ class LateAdam:
         self._tables: dict[int, Float32] = {step: missed.rounded()}  # of the steps that may have to be repeated too
         self._table = allocate(self._device, self._tables[step].shape, np.float32)
 
-    def is_due(self, step: int) -> bool:
-        """True if all Gaussians must be settled before the step after this one."""
-        return step % MOST_MISSED == 0
+    @property
+    def row_bytes(self) -> int:
+        """Bytes per Gaussian: the last step that it took."""
+        return 4
 
-    def before_adam(self, rows: StepRows, step: AdamStep, readback: DeviceArray) -> None:
+    def is_due(self, step: int, views: int) -> bool:
+        """True if all Gaussians must be settled before a step of `views` views that ends with view number `step`."""
+        return (step - views) % MOST_MISSED == 0
+
+    def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
+        """The views, each with a part that settles the rows that it shows."""
+        return [replace(each, parts=(*each.parts, _ShownRows(self))) for each in inputs]
+
+    def settle_shown(self, rows: StepRows, step: AdamStep) -> None:
         """Settle the rows that a step's view shows, before Adam's step. A step that is repeated is the same again."""
         if step.number > self.step:
             self._missed.add(step.scales)
@@ -56,28 +63,28 @@ class LateAdam:
             self._tables[step.number] = self._missed.rounded()
             self._tables.pop(step.number - MAX_COUNTED_PASSES - 2, None)
         last = self._last.rows(rows.start, rows.stop)
-        self._settle(rows.model, step.number - 1, last, readback, rows.projected.tile_counts)
+        self._settle(rows.model, step.number - 1, last, rows.projected.tile_counts)
 
-    def settle(self, work: Workspace, models: tuple[AnyGaussians, ...], readback: DeviceArray) -> None:
-        """Settle all rows, in place. models: parameters, first and second moments."""
-        for start, stop, part in parts(work, *models, keep=True):
-            self._settle(part, self.step, self._last.rows(start, stop), readback)
+    def complete(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
+        """Settle all rows, in place."""
+        for start, stop, part in parts(self._rasterizer.work, parameters, first, second, keep=True):
+            self._settle(part, self.step, self._last.rows(start, stop))
 
     def _settle(
         self,
         model: tuple[DeviceGaussians, ...],
         step: int,
         last: DeviceArray,
-        readback: DeviceArray,
         tile_counts: DeviceArray | None = None,
     ) -> None:
         self._table.send(self._tables[step])
+        readback = self._rasterizer.readback
         settle(self._device, self._config, model, step, last, self._table, readback, tile_counts)
 
-    def settled(self, models: tuple[AnyGaussians, ...]) -> AnyGaussians:
+    def completed(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> AnyGaussians:
         """The parameters with all rows settled, a copy if rows have missed steps: a model that is looked at keeps its
         bits."""
-        (parameters, first, second), missed = models, self.step - self._last.get()
+        missed = self.step - self._last.get()
         if not missed.any():
             return parameters
         factors, found = self._tables[self.step][missed], {}
@@ -91,15 +98,15 @@ class LateAdam:
             return replace(parameters, arrays={group: HostArray(values) for group, values in found.items()})
         return replace(parameters, arrays={group: upload(self._device, values) for group, values in found.items()})
 
-    def moved(self, entries: NDArray[np.uint32]) -> None:
-        """Follow rows that density control has moved. entries: as in `DeviceRowList`. Fresh rows have zero moments."""
-        self._last = upload(self._device, self._last.get()[entries & ~np.uint32(FRESH)])
+    def rows_moved(self, listed: DeviceArray) -> None:
+        """Follow rows that have moved. Fresh rows have zero moments."""
+        self._last = upload(self._device, self._last.get()[listed.get() & ~np.uint32(FRESH)])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a checkpoint."""
         return {"late/last": self._last.get(), "late/missed": self._missed.factors.copy()}
 
-    def load(self, named: Callable[[str], dict[str, NDArray[Any]]], step: int, count: int) -> None:
+    def load(self, named: Named, step: int, count: int) -> None:
         """Continue from a checkpoint's arrays, or, without them, as if all rows had taken every step.
 
         Raises ValueError.
@@ -112,3 +119,14 @@ class LateAdam:
         if not np.isfinite(factors).all() or np.any(last > step) or np.any(last + MOST_MISSED < step):
             raise ValueError(f"late/last or late/missed does not belong to step {step}")
         self._begin(last, MissedSteps(self._config, _GROUPS, factors.astype(np.float64)), step)
+
+
+@dataclass(frozen=True, eq=False)
+class _ShownRows(ViewPart):
+    """The rows that a view shows take their missed steps."""
+
+    late: LateAdam
+
+    def before_adam(self, rows: StepRows, step: AdamStep) -> None:
+        """Settle the rows."""
+        self.late.settle_shown(rows, step)

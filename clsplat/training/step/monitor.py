@@ -57,7 +57,7 @@ class StepMonitor(StepProbe):
         key = (*size, *build, *self.inputs.camera.model.defines.items())
         if key not in self.tried:
             with only_tried(step.device), only_tried(step.rasterizer.device), only_tried(rows.device):
-                step.update(rows)
+                step.change(rows, self.inputs)
                 self.add_statistics(self.statistics.rows(0, rows.stop - rows.start), rows)
             self.tried.add(key)
         self.changes()
