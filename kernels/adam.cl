@@ -3,8 +3,7 @@
 //
 // Adam sets the gradients to zero, because project_grad writes only the rows of visible Gaussians.
 //
-// Owner: A work-item owns ABREAST consecutive elements (adam), ABREAST rows (adam_visible), an element (add_view) or a
-//   row (join_view).
+// Owner: A work-item owns ABREAST consecutive elements (adam), ABREAST rows (adam_visible) or an element (add_view).
 // Launch: One work-item for each of these, in groups of 64; work-items past the end do nothing.
 // Buffers: The group's parameters in its own units, their gradients, the moments `first` and `second`; `readback`
 //   (READBACK_SIZE) counts elements that are not updated. The scalars are those of Step. Shapes are above each kernel.
@@ -13,25 +12,38 @@
 #include "shared/lanes.h"
 #include "shared/adam.h"
 
-// Updates the group as a flat array, ABREAST elements per work-item. parameters, gradients, first, second (n).
+// Updates the group as a flat array, ABREAST elements per work-item. parameters, gradients, first, second (n). With
+// SPARSE (OptimiserConfig.sparse) elements whose gradient is zero do not change.
 __kernel void adam(const ulong n, const float rate, const float root, const float beta1, const float beta2,
                    const float epsilon, const float limit2, __global uint *readback, __global float *parameters,
                    __global float *gradients, __global float *first, __global float *second) {
   const Step s = {rate, root, beta1, beta2, epsilon, limit2, readback};
   const Stepped model = {parameters, first, second};
   const ulong i = get_global_id(0) * (ulong)ABREAST;
-  if (i + ABREAST <= n && step_vector(i, LOADA(gradients + i), (intA)(-1), s, model)) {
-    STOREA((floatA)(0.0f), gradients + i);
-    return;
+  if (i + ABREAST <= n) {
+    const floatA g = LOADA(gradients + i);
+#ifdef SPARSE
+    const intA taken = g != 0.0f;
+    if (!ANYA(taken)) return;
+#else
+    const intA taken = (intA)(-1);
+#endif
+    if (step_vector(i, g, taken, s, model)) {
+      STOREA((floatA)(0.0f), gradients + i);
+      return;
+    }
   }
   for (ulong k = i; k < min(i + (ulong)ABREAST, n); ++k) {
+#ifdef SPARSE
+    if (gradients[k] == 0.0f) continue;
+#endif
     step_element(k, gradients[k], s, model);
     gradients[k] = 0.0f;
   }
 }
 
 #ifdef WIDTH
-// Updates only the rows of visible Gaussians (OptimiserConfig.sparse), ABREAST rows per work-item. The gradients of the
+// Updates only the rows of visible Gaussians (OptimiserConfig.late), ABREAST rows per work-item. The gradients of the
 // others are zero. tile_counts (n): 0 if not visible; parameters, gradients, first, second (n, WIDTH).
 __kernel void adam_visible(const uint n, const float rate, const float root, const float beta1, const float beta2,
                            const float epsilon, const float limit2, __global uint *readback,
@@ -75,9 +87,3 @@ __kernel void add_view(const ulong n, __global const uint *tile_counts, __global
   if (i < n && tile_counts[i / WIDTH] > 0) sums[i] += gradients[i];
 }
 #endif
-
-// tile_counts (n) of a view -> shown (n): nonzero if the Gaussian is visible in this view or an earlier one.
-__kernel void join_view(const uint n, __global const uint *tile_counts, __global uint *shown) {
-  const size_t i = get_global_id(0);
-  if (i < n) shown[i] |= tile_counts[i];
-}

@@ -12,7 +12,8 @@
 //   respect to the logs of the focal lengths and, per pixel, to the principal point. project_grad: gradients in the
 //   parameters' shapes, in loss per unit; rows that are not visible do not change. project_step, with ADAM: parameters,
 //   moments `first` and `second`; `readback` (READBACK_SIZE); the scalars of Step, one per group where they differ.
-//   Rows that are not visible have a zero gradient; with SPARSE they do not change. After a stopped pass (duplicate.cl)
+//   Rows that are not visible have a zero gradient. With SPARSE elements whose gradient is zero do not change, with
+//   VISIBLE rows that are not visible. After a stopped pass (duplicate.cl)
 //   nothing changes. PENALTIES adds the gradient of opacity_weight o + scale_weight (s_0 + s_1 + s_2).
 // Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91); (144) and
 //   (145). With RAYS docs/cameras.md, (22) to (29).
@@ -128,27 +129,33 @@ static inline void step_rows(const uint n, const uint first_row, const uint widt
                              const float *gradients, Step s, Stepped model) {
   const size_t begin = (size_t)first_row * width;
   const uint count = min((uint)LANES, n - first_row) * width;
-#ifdef SPARSE
+#if defined(SPARSE) || defined(VISIBLE)
   int some = 0;
   for (uint lane = 0; lane < LANES; ++lane) some |= shown[lane];
   if (!some) return;
+#endif
+#ifdef VISIBLE
   int taken[SH_FLOATS * LANES] ROW_ALIGNED;
   for (uint lane = 0; lane < LANES; ++lane)
     for (uint k = 0; k < width; ++k) taken[lane * width + k] = -shown[lane];
-#define TAKEN(k) *(const intL *)(taken + (k) * LANES)
+#define TAKEN(k, g) *(const intL *)(taken + (k) * LANES)
+#elif defined(SPARSE)
+#define TAKEN(k, g) ((g) != 0.0f)
 #else
-#define TAKEN(k) (intL)(-1)
+#define TAKEN(k, g) (intL)(-1)
 #endif
   ulong left = 0; // bits of vectors that have a refused element or go past the last row
   for (uint k = 0; k < width; ++k) {
     const floatL g = *(const floatL *)(gradients + k * LANES);
-    if ((k + 1) * LANES > count || !step_vector(begin + k * LANES, g, TAKEN(k), s, model)) left |= (ulong)1 << k;
+    if ((k + 1) * LANES > count || !step_vector(begin + k * LANES, g, TAKEN(k, g), s, model)) left |= (ulong)1 << k;
   }
   if (left == 0) return;
   for (uint i = 0; i < count; ++i) {
     if (!(left >> (i / LANES) & 1)) continue;
-#ifdef SPARSE
+#ifdef VISIBLE
     if (!shown[i / width]) continue;
+#elif defined(SPARSE)
+    if (gradients[i] == 0.0f) continue;
 #endif
     step_element(begin + i, gradients[i], s, model);
   }
@@ -229,10 +236,15 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
   __local float by_mean[3 * ROWS] ROW_ALIGNED, by_quaternion[4 * ROWS] ROW_ALIGNED, by_log_scale[3 * ROWS] ROW_ALIGNED;
   __local float by_opacity[ROWS] ROW_ALIGNED, by_sh_dc[3 * ROWS] ROW_ALIGNED, by_sh_rest[SH_FLOATS * ROWS] ROW_ALIGNED;
   __local int in_view[ROWS];
-#ifdef SPARSE
-#define TAKEN(k, width) -in_view[(k) / (width)]
+#if defined(SPARSE) || defined(VISIBLE)
+#define ROW_SHOWN(k, width) -in_view[(k) / (width)]
 #else
-#define TAKEN(k, width) -1
+#define ROW_SHOWN(k, width) -1
+#endif
+#ifdef SPARSE
+#define TAKEN(k, width, gradient) -((gradient) != 0.0f)
+#else
+#define TAKEN(k, width, gradient) ROW_SHOWN(k, width)
 #endif
   __local GroupStep steps[ARRAYS];
   const uint me = get_local_id(0), first_row = get_global_id(0) - me;
@@ -245,14 +257,14 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
     MODEL(GROUP_STEP)
   }
   in_view[me] = me < rows && tile_counts[first_row + me] > 0;
-#ifdef SPARSE
+#if defined(SPARSE) || defined(VISIBLE)
   barrier(CLK_LOCAL_MEM_FENCE);
 #endif
   // Adjacent items read adjacent SH coefficients. If each read its own row, every access would touch a cache line per
   // item.
   __global const float *from = sh_rest + (size_t)sh_width * first_row;
   const uint floats = sh_width * rows, whole_floats = aligned ? floats / ABREAST * ABREAST : 0;
-#define WANTED(k) ((k) < whole_floats && (TAKEN(k, sh_width) | TAKEN((k) + ABREAST - 1, sh_width)))
+#define WANTED(k) ((k) < whole_floats && (ROW_SHOWN(k, sh_width) | ROW_SHOWN((k) + ABREAST - 1, sh_width)))
   for (uint k = own; k < whole_floats; k += 4 * stride) { // four loads, then their stores
     floatA ahead[4];
     UNROLL for (uint i = 0; i < 4; ++i) {
@@ -288,13 +300,14 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
     uint left = 0; // bits of vectors that have a refused element or go past the last row
     ROLLED for (uint k = own, bit = 1; k < count; k += stride, bit += bit) {
       const floatA g = *(__local const floatA *)(step.gradients + k);
-      const intA taken = (intA)(TAKEN(k, width), TAKEN(k + 1, width), TAKEN(k + 2, width), TAKEN(k + 3, width));
+      const intA taken =
+          (intA)(TAKEN(k, width, g.x), TAKEN(k + 1, width, g.y), TAKEN(k + 2, width, g.z), TAKEN(k + 3, width, g.w));
       if (ANYA(taken) && (k + ABREAST > whole || !step_vector(0, g, taken, s, model))) left |= bit;
       model.parameters += stride, model.first += stride, model.second += stride;
     }
     for (uint k = own; left != 0; k += stride, left >>= 1)
       for (uint i = k; (left & 1) && i < min(k + ABREAST, count); ++i)
-        if (TAKEN(i, width)) step_element(begin + i, step.gradients[i], s, step.model);
+        if (TAKEN(i, width, step.gradients[i])) step_element(begin + i, step.gradients[i], s, step.model);
   }
 #endif
 }

@@ -53,7 +53,8 @@ class OptimiserConfig:
     quaternions_rate: float = 1e-3
     """Learning rate of the rotations, as quaternions."""
     sparse: bool = False
-    """Do not update Gaussians that a step's view does not show, nor their Adam moments (approximate)."""
+    """Do not update parameters whose gradient is zero, nor their Adam moments: those of Gaussians that a step's view
+    does not show, hides or masks (approximate)."""
     late: bool = False
     """Leave Gaussians that a step's view does not show, and update them for the missed steps when a view shows them
     again (approximate: that view shows them as they were). Not with batches."""
@@ -92,11 +93,6 @@ class OptimiserConfig:
             )
         if self.means_rate > 0 and self.means_rate_end == 0:  # a log-linear rate would be 0 from the first step
             raise InputError("--optimiser.means-rate-end 0.0: expected more than 0; the rate falls to it log-linearly")
-
-    @property
-    def visible_only(self) -> bool:
-        """True if a step updates only the Gaussians that its view shows."""
-        return self.sparse or self.late
 
 
 @dataclass(frozen=True)

@@ -54,12 +54,12 @@ def adam(
     gradients: DeviceGaussians,
     first: DeviceGaussians,
     second: DeviceGaussians,
-    tile_counts: DeviceArray,
+    tile_counts: DeviceArray | None = None,
     readback: DeviceArray | None = None,
 ) -> None:
     """Update the parameters by Adam, and set the gradients to zero.
 
-    tile_counts: (n,) uint32, 0 for a Gaussian that is not visible in the view; used by `OptimiserConfig.visible_only`.
+    tile_counts: (n,) uint32, 0 for a Gaussian that is not visible in the view; needed for `OptimiserConfig.late`.
     readback: (READBACK_SIZE,) uint32. Its last four entries count the elements that were not updated, by reason
     (`columns.REFUSED`).
     """
@@ -77,29 +77,28 @@ def adam(
         size, rows = parameters[group].size, parameters.count
         if size == 0:
             continue
-        if config.visible_only:
+        if config.late:
+            assert tile_counts is not None, "late is refused in batches"
             kernel = device.kernels("adam", {"WIDTH": size // rows}).adam_visible
             launch_items(device, kernel, -(-rows // abreast), rows, *constants, tile_counts, *arrays)
         else:
-            kernel = device.kernels("adam").adam
+            kernel = device.kernels("adam", {"SPARSE": True} if config.sparse else {}).adam
             # With 95 million Gaussians or more, an index of an SH coefficient needs more than 32 bits.
             launch_items(device, kernel, -(-size // abreast), np.uint64(size), *constants, *arrays)
 
 
-@stage("adam", add_view=1, join_view=1)
+@stage("adam", add_view=1)
 def add_view(
     device: Device,
     tile_counts: DeviceArray,
     gradients: DeviceGaussians,
     sums: DeviceGaussians,
-    shown: DeviceArray | None = None,
     *,
     sh_rest: bool = True,
 ) -> None:
     """Add the gradients of the Gaussians visible in a view to the sums over the earlier views.
 
     tile_counts: (n,) uint32, of the view; 0 for a Gaussian that is not visible.
-    shown: (n,) uint32, optional; set to nonzero for each Gaussian that is visible in the view.
     sh_rest: also add the higher SH bands.
     """
     rows = tile_counts.shape[0]
@@ -108,5 +107,3 @@ def add_view(
         if size and (sh_rest or group != "sh_rest"):
             kernel = device.kernels("adam", {"WIDTH": size // rows}).add_view
             launch_items(device, kernel, size, np.uint64(size), tile_counts, gradients[group], sums[group])
-    if shown is not None:
-        launch_items(device, device.kernels("adam").join_view, rows, rows, tile_counts, shown)

@@ -234,8 +234,10 @@ def project_step(
     """
     parameters, config = model[0], step.config
     defines = {**_defines(parameters, slots, sh_rest=step.updates_sh_rest), "ADAM": True}
-    if config.visible_only:
+    if config.sparse:
         defines["SPARSE"] = True
+    if config.late:
+        defines["VISIBLE"] = True
     numbers = [LaunchParameter(number) for number in step_numbers(step, explore)]
     weights = len(explore.weights)
     if weights:

@@ -90,12 +90,10 @@ class Losses:
 class _AddedView(GradientStep):
     """A view whose gradients are added to the sums over the views. Its model is the parameters and the sums.
 
-    shown: (n,), nonzero for Gaussians that any view shows; None if Adam does not need it.
     own: by each view's place, the gradients with respect to the parameters of its parts.
     noise: noise that the step adds after its last view.
     """
 
-    shown: DeviceArray | None
     own: dict[int, Sequence[DeviceArray | None]]
     noise: Exploration
 
@@ -107,12 +105,11 @@ class _AddedView(GradientStep):
         """Add the rows' gradients to the sums. In a sandbox trial, also try the kernels that follow."""
         assert rows.gradients is not None, "the batch asks for them"
         parameters, sums = rows.model
-        shown = None if self.shown is None else self.shown.rows(rows.start, rows.stop)
         step, counts = self.adam_step, rows.projected.tile_counts
-        add_view(self.device, counts, rows.gradients, sums, shown, sh_rest=step.updates_sh_rest)
+        add_view(self.device, counts, rows.gradients, sums, sh_rest=step.updates_sh_rest)
         if self.device.only_tries:
             models = (parameters, sums, rows.gradients, rows.gradients)
-            adam(self.device, step, *models, counts, self.rasterizer.readback)
+            adam(self.device, step, *models, readback=self.rasterizer.readback)
             noise(self.device, self.noise, parameters, rows.start, self.rasterizer.readback)
 
 
@@ -296,10 +293,10 @@ class Batch:
         batch, work, device = self.config.batch, self.rasterizer.work, step.device
         optimiser, number = scaled(self.config.optimiser, batch), -(-step.step // batch)
         config, rates = replace(self.config, optimiser=optimiser), scaled_rates(step.rates, batch)
-        sums, shown = self._room_for(device, model[0])
+        sums = self._sums_for(device, model[0])
         own: dict[int, Sequence[DeviceArray | None]] = {}
         explore = step.explore.scaled(sqrt(batch))
-        settings = (device, self.rasterizer, config, number, rates, step.fields, shown, own, explore)
+        settings = (device, self.rasterizer, config, number, rates, step.fields, own, explore)
         step_of_view = _AddedView(*settings, explore=step.explore.of_view())
         adam_step = step_of_view.adam_step
         first, *others = shares(len(views), 1 + len(self.replicas))
@@ -321,10 +318,9 @@ class Batch:
         finally:  # no thread may continue after an error
             under_way: list[Future[Any]] = [*transfers, *(future for _, future in pending)]
             wait([future for future in under_way if not future.cancel()])
-        for start, stop, (parameters, moments, squares, gradients) in parts(work, *model, sums, keep=True):
-            counts = self.rasterizer.readback if shown is None else shown.rows(start, stop)
+        for start, _, (parameters, moments, squares, gradients) in parts(work, *model, sums, keep=True):
             models = (parameters, gradients, moments, squares)
-            adam(device, adam_step, *models, counts, self.rasterizer.readback)
+            adam(device, adam_step, *models, readback=self.rasterizer.readback)
             noise(device, explore, parameters, start, self.rasterizer.readback)
         for inputs in views:
             for part, gradient in zip(inputs.parts, own[inputs.place], strict=True):
@@ -332,11 +328,8 @@ class Batch:
         self._sent = None if adam_step.updates_sh_rest else model[0]
         return Losses(tuple(losses))
 
-    def _room_for(self, device: Device, parameters: AnyGaussians) -> tuple[AnyGaussians, DeviceArray | None]:
-        """Arrays for the sums and for the marks of visible Gaussians. The second is None if Adam needs no marks.
-
-        The sums are zero, as `adam` leaves them; the marks are cleared.
-        """
+    def _sums_for(self, device: Device, parameters: AnyGaussians) -> AnyGaussians:
+        """Arrays for the sums, which are zero, as `adam` leaves them."""
         count, coefficients, sums = parameters.count, parameters.coefficients, self._sums
         if sums is None or (sums.count, sums.coefficients) != (count, coefficients):
             del sums
@@ -346,11 +339,7 @@ class Batch:
             else:
                 self._sums = allocate_gaussians(device, count, coefficients, zero=True)
             sums = self._sums
-        if not self.config.optimiser.sparse:
-            return sums, None
-        shown = self.rasterizer.work.array("shown_in_batch", (count,), np.uint32)
-        shown.fill(0)
-        return sums, shown
+        return sums
 
     def _send(self, parameters: AnyGaussians) -> list[Future[None]]:
         """Send the parameters to the further devices, except the higher SH bands if they are unchanged there."""
@@ -397,8 +386,7 @@ class Batch:
                 for group, values in outcome.gradients.items()
             }
             gradients, counts = DeviceGaussians(part.count, part.coefficients, arrays), rows["tile_counts"]
-            shown = None if step.shown is None else step.shown.rows(start, stop)
-            add_view(device, counts, gradients, part, shown, sh_rest="sh_rest" in arrays)
+            add_view(device, counts, gradients, part, sh_rest="sh_rest" in arrays)
             screen = Screen(rows.get("screen", counts), rows.get("contributions"))
             probe.after_rows(ViewRows(start, stop, Projected(rows.get("splats", counts), counts), screen))
         return outcome.loss

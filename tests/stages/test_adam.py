@@ -26,7 +26,7 @@ def test_views_are_added_in_order(shaped_device: Device, count: int) -> None:
     """Rows that a view does not show are not looked at, whatever is there."""
     rng = np.random.default_rng(count)
     sums = allocate_gaussians(shaped_device, count, 4, zero=True)
-    shown, views = upload(shaped_device, np.zeros(count, np.uint32)), []
+    views = []
     for _ in range(3):
         seen = rng.random(count) < 0.6
         gradients, values = allocate_gaussians(shaped_device, count, 4), {}
@@ -35,12 +35,11 @@ def test_views_are_added_in_order(shaped_device: Device, count: int) -> None:
             values[group][~seen] = np.nan
             gradients[group].set(values[group])
         views.append((seen, values))
-        add_view(shaped_device, upload(shaped_device, 5 * seen.astype(np.uint32)), gradients, sums, shown)
+        add_view(shaped_device, upload(shaped_device, 5 * seen.astype(np.uint32)), gradients, sums)
     for group in PARAMETER_GROUPS:
         exact = add_views([values[group].astype(np.float64) for _, values in views], [seen for seen, _ in views])
         # two roundings, of sums that are at most three times as large as their largest term
         assert_close(sums[group].get(), exact, relative=1e-6, absolute=1e-6)
-    np.testing.assert_array_equal(shown.get() > 0, np.any([seen for seen, _ in views], axis=0))
     before = sums["sh_rest"].get()
     add_view(shaped_device, upload(shaped_device, np.ones(count, np.uint32)), sums, sums, sh_rest=False)
     np.testing.assert_array_equal(sums["sh_rest"].get(), before)
@@ -73,12 +72,12 @@ def test_sh_rest_waits_for_its_step(device: Device) -> None:
     assert_close(p["sh_rest"].get(), wanted[0], relative=1e-6, absolute=1e-5)  # as of a step in the case
 
 
-@pytest.mark.parametrize("sparse", [False, True])
+@pytest.mark.parametrize("rows", [{}, {"sparse": True}, {"late": True}], ids=["all", "sparse", "late"])
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 100])
-def test_what_is_not_finite_is_refused_and_marked(shaped_device: Device, count: int, sparse: bool) -> None:
+def test_what_is_not_finite_is_refused_and_marked(shaped_device: Device, count: int, rows: dict[str, bool]) -> None:
     """Element by element, whatever shares its vector; counted by what was wrong."""
     device, rng = shaped_device, np.random.default_rng(count)
-    step = AdamStep(OptimiserConfig(sparse=sparse), 5, dict.fromkeys(PARAMETER_GROUPS, 0.01))
+    step = AdamStep(OptimiserConfig(**rows), 5, dict.fromkeys(PARAMETER_GROUPS, 0.01))
     spoils = {  # array, value, what is then in the first and second moment, place in the counts
         "parameter": ("parameters", np.nan, (0, np.inf), 0),
         "coefficient": ("parameters", -2e7, (0, np.inf), 0),

@@ -27,6 +27,8 @@ from clsplat.stages.project import Screen, Slots, add_slots, project_grad, proje
 
 EVERY_ROW = OptimiserConfig()
 RATES = {group: 10.0**-index for index, group in enumerate(PARAMETER_GROUPS, 1)}
+UNREACHED = 3
+"""The first Gaussian, of every fifth, whose slots are zero, as those of Gaussians behind others are."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,11 @@ def steps(
     rng = np.random.default_rng(count)
     values = rng.normal(0, 1, (pairs, case.fields.floats)).astype(np.float32)
     assert frame.listed.counted.first_slots is not None
+    first_slots = frame.listed.counted.first_slots.get()
+    for index in range(UNREACHED, count, 5):
+        values[first_slots[index] : first_slots[index] + counts[index]] = 0.0
     if spoil == "gradient" and pairs:
-        values[frame.listed.counted.first_slots.get()[np.argmax(counts)]] = np.nan
+        values[first_slots[np.argmax(counts)]] = np.nan
     slots = Slots(upload(device, values), frame.listed.counted.first_slots, case.fields)
     if case.added_up:
         slots = Slots(add_slots(device, work, frame.projected.tile_counts, slots, None), fields=case.fields)
@@ -163,6 +168,8 @@ def test_one_launch_has_the_bits_of_two(shaped_device: Device, name: str) -> Non
     moved = (arrays[0]["means"] != gaussians.means).any(axis=1)
     assert moved[0]
     assert moved[20] != case.optimiser.sparse, "a hidden Gaussian moves by its moments"
+    reached = bool(case.explore.weights)  # penalties have a gradient in each Gaussian in view
+    assert moved[UNREACHED] == (reached or not case.optimiser.sparse), "so does one in view without a gradient"
     waits = not case.adam_step.updates_sh_rest
     assert (arrays[0]["sh_rest"].tobytes() == gaussians.sh[:, 1:].tobytes()) == (waits or case.degree == 0)
 

@@ -4,14 +4,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny import run_steps, short
+from tiny import run_steps, short, write_scene
 
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
+from clsplat.images.reading import read_image
+from clsplat.images.writing import write_image
+from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.scenes.start.initialise import from_points
 from clsplat.stages.device_gaussians import download_gaussians
@@ -42,6 +46,26 @@ def test_sparse_steps_leave_the_hidden(scene: Scene, default_device: Device, spa
     assert np.all(np.any(after.means[:-1] != model.means[:-1], axis=1)), "those in view move"
     assert np.array_equal(after.means[-1], model.means[-1]) == sparse
     assert np.array_equal(trainer.first["means"].get()[-1], moment[-1]) == sparse
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+@pytest.mark.parametrize("sparse", [False, True])
+def test_sparse_steps_leave_what_is_masked(tmp_path: Path, default_device: Device, batch: int, sparse: bool) -> None:
+    """Photographs that a mask leaves out show all Gaussians, but their loss has no gradient."""
+    folder = write_scene(tmp_path / "scene")
+    (folder / "masks").mkdir()
+    for photograph in (folder / "images").iterdir():
+        write_image(folder / "masks" / photograph.name, np.zeros_like(read_image(photograph)))
+    config = replace(
+        short(warmup=(), density={"every": 0}, batch=batch), masks="ignore", optimiser=OptimiserConfig(sparse=sparse)
+    )
+    trainer = Trainer(load_scene(folder, masks=config.mask_use), config, default_device)
+    moment = np.full_like(trainer.first["means"].get(), 0.5)
+    trainer.first["means"].set(moment)
+    before = download_gaussians(trainer.parameters)
+    run_steps(2, trainer)
+    assert np.array_equal(download_gaussians(trainer.parameters).means, before.means) == sparse
+    assert np.array_equal(trainer.first["means"].get(), moment) == sparse
 
 
 @pytest.mark.slow

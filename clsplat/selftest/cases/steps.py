@@ -36,9 +36,10 @@ ADAM_RATES = {name: 2.0**-power for power, name in enumerate(PARAMETER_GROUPS, 3
 
 
 def _random_step(rng: Generator, count: int) -> Inputs:
-    """Gradients of 1e-15 to 1e6, with moments of any magnitude or zero. Adam updates all or only visible Gaussians."""
+    """Gradients of 1e-15 to 1e6, with moments of any magnitude or zero. Adam updates all elements, only those with a
+    gradient (sparse), or only visible Gaussians (late)."""
     step = int(rng.choice([1, 2, 10, 1000, 30_000, 10_000_000]))
-    later, sparse = step > 1, bool(rng.random() < 0.5)
+    later, rows = step > 1, str(rng.choice(["all", "sparse", "late"]))
     visible = (rng.random(count) < 0.5) | (np.arange(count) >= 2 * count // 3)  # some vectors are visible as a whole
     visible[: count // 3] = False
     made: dict[str, Arrays] = {name: {} for name in ADAM_ENDS}
@@ -50,17 +51,18 @@ def _random_step(rng: Generator, count: int) -> Inputs:
             "first": rng.standard_normal(shape) * size * later,
             "second": rng.random(shape) * size**2 * later,
         }
-        if sparse:
+        if rows != "all":
             values["gradients"][~visible] = 0.0
+            values["gradients"][rng.random(shape) < 0.2] = 0.0
         for name, array in values.items():
             made[name][group] = array.astype(np.float32)
-    return Inputs(arrays=made, sparse=sparse, step=step, visible=visible, rates=dict.fromkeys(PARAMETER_GROUPS, 1e-2))
+    return Inputs(arrays=made, rows=rows, step=step, visible=visible, rates=dict.fromkeys(PARAMETER_GROUPS, 1e-2))
 
 
 def _frozen_steps(bench: CaseBench) -> list[Inputs]:
     shapes = group_shapes(bench.model.count, bench.model.coefficients)
     found = []
-    for sparse in (False, True):
+    for rows in ("all", "sparse"):
         made = {
             name: {
                 group: evenly(60 + 8 * i + j, shapes[group], *ADAM_ENDS[name]).astype(np.float32)
@@ -68,10 +70,10 @@ def _frozen_steps(bench: CaseBench) -> list[Inputs]:
             }
             for i, name in enumerate(ADAM_ENDS)
         }
-        if sparse:
+        if rows == "sparse":
             for values in made["gradients"].values():
                 values[~bench.visible] = 0.0  # project_grad leaves zeros there
-        found.append(Inputs(arrays=made, sparse=sparse, step=7, visible=bench.visible, rates=ADAM_RATES))
+        found.append(Inputs(arrays=made, rows=rows, step=7, visible=bench.visible, rates=ADAM_RATES))
     return found
 
 
@@ -87,9 +89,10 @@ def uploaded_groups(device: Device, arrays: Mapping[str, Arrays]) -> list[Device
 
 def _launch_adam(device: Device, _: Workspace, given: Inputs) -> Read:
     models = uploaded_groups(device, given.arrays)
-    config, moving = OptimiserConfig(sparse=given.sparse), upload(device, 3 * given.visible.astype(np.uint32))
+    config = OptimiserConfig(sparse=given.rows == "sparse", late=given.rows == "late")
+    tile_counts = upload(device, 3 * given.visible.astype(np.uint32))
     parameters, gradients, first, second = models
-    adam(device, AdamStep(config, given.step, given.rates), parameters, gradients, first, second, moving)
+    adam(device, AdamStep(config, given.step, given.rates), parameters, gradients, first, second, tile_counts)
     by_name = dict(zip(given.arrays, models, strict=True))
     return lambda: {
         name: np.concatenate([model[group].get().ravel() for group in PARAMETER_GROUPS])
@@ -98,12 +101,14 @@ def _launch_adam(device: Device, _: Workspace, given: Inputs) -> Read:
 
 
 def _twin_of_adam(given: Inputs, got: Arrays) -> dict[str, Expected]:
-    moved = given.visible if given.sparse else np.ones_like(given.visible)
+    moved = given.visible if given.rows == "late" else np.ones_like(given.visible)
     made: dict[str, list[Array]] = {name: [] for name in ("parameters", "first", "second", "steps", "terms", "rows")}
     for group, rate in given.rates.items():
         p, g, m, v = (arrays[group].astype(np.float64) for arrays in given.arrays.values())
         after = reference(p, g, m, v, given.step, rate)
         rows = np.broadcast_to(moved.reshape(-1, *[1] * (p.ndim - 1)), p.shape)
+        if given.rows == "sparse":
+            rows = g != 0
         steps, terms = np.maximum(np.abs(after[0] - p), rate), np.abs(m) + np.abs(g)
         kept = (np.where(rows, new, old) for new, old in zip(after, (p, m, v), strict=True))
         for values, found in zip((*kept, steps, terms, rows), made.values(), strict=True):
@@ -117,8 +122,8 @@ def _twin_of_adam(given: Inputs, got: Arrays) -> dict[str, Expected]:
         "gradients": exactly(np.zeros_like(got["gradients"])),
     }
     for name in ("parameters", "first", "second"):
-        got[f"{name} out of view"] = got[name][~rows]
-        wanted[f"{name} out of view"] = exactly(wanted[name].values[~rows])
+        got[f"{name} left alone"] = got[name][~rows]
+        wanted[f"{name} left alone"] = exactly(wanted[name].values[~rows])
     return wanted
 
 
