@@ -54,7 +54,10 @@ def names_of(mattes: Mapping[str, Matte]) -> tuple[MatteNames, ...]:
 
 
 def _objects(models: JobModels) -> Matte:
-    """A matte with one object per model, and one per volume of a model, which takes precedence over the model's."""
+    """A matte with one object for each model, and one for each volume of a model.
+
+    A Gaussian in a volume belongs to the volume and not to the model; in several volumes, to the first.
+    """
     names, owners = list(models.names), []
     for index, model in enumerate(models.still):
         own = np.full(len(model), index, np.int32)

@@ -96,7 +96,7 @@ class HostPhotographs:
         return made[factor]
 
     def replace(self, index: int, factor: float, image: NDArray[Any]) -> None:
-        """Use other pixels for a view from now on."""
+        """Keep these pixels of view `index` at 1/factor of its size in place of the file's, until they are evicted."""
         with self._lock:
             self._keep((index, factor), image)
 
