@@ -60,7 +60,7 @@ class GradientStep:
     turn: number of the array for the loss's sums (`stages.loss.loss`).
     room: capacity in pairs (`Rasterizer.forward`).
     explore: noise and penalties of the step.
-    late: last steps of the Gaussians, if the optimiser is late.
+    late: with `optimiser.late`, the last step that each Gaussian took, and how to settle the steps since.
     """
 
     device: Device

@@ -21,7 +21,7 @@ Key = tuple[int, float]
 """A view's index, and the divisor of its size."""
 
 
-@cache  # the system takes longer to count than all else of `read_ahead`
+@cache  # the system takes longer to count its processors than `read_ahead` takes for all else
 def reading_threads() -> int:
     """Number of threads that read ahead, which is also the number of views that are read ahead."""
     return min(2 * (os.cpu_count() or 1), MAX_READING_THREADS)
