@@ -71,7 +71,7 @@ def _objects(models: JobModels) -> Matte:
 def _semantic(models: JobModels, ids_from: str) -> Matte:
     """A matte with one object for each value of the property."""
     if not models.files:
-        raise InputError(f"--ids-from {ids_from}: {models.path} is a stage, expected PLY files that have the property")
+        raise InputError(f"--ids-from {ids_from}: {models.path} is a USD stage, expected PLY files with the property")
     columns: list[NDArray[np.int64]] = []
     for file, model in zip(models.files, models.still, strict=True):
         with unpacked(file) as (opened, form):

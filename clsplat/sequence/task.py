@@ -121,7 +121,7 @@ class Task:
     stretch: cameras while the shutter is open, None for a static camera.
     before: state of the file when the job began (`finished_frames.stamp`).
     sampling: shutter and lens of this frame; None means the job's.
-    optics: shutter and lens that a stage sets.
+    optics: shutter and lens that a USD stage sets.
     eye: left or right of a stereo pair.
     right: task of the right eye, if one file holds both.
     lens: the photograph's lens by which the picture is warped.
