@@ -66,8 +66,8 @@ GROUP __kernel void compact_visible(const uint n, const uint chunk, __global con
   const uint begin = group * chunk, end = min(begin + chunk, n);
   uint visible = group_sum(sums, group, scratch);
   ulong pairs = group_sum(sums + groups, group, scratch);
-  // Not the largest ~key: in groups of 2 to 8 items, Intel's CPU runtime inverts it with a vector register that it
-  // never sets.
+  // `least` is a minimum of keys and not a maximum of ~key: in groups of 2 to 8 items, Intel's CPU runtime computes
+  // ~key with a vector register that it never sets.
   uint least = 0xffffffff, largest = 0;
   for (uint first = begin; first < end; first += ITEMS) {
     const uint i = first + get_local_id(0);

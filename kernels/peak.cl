@@ -18,7 +18,7 @@
 #define LIMIT_SPLATS 64
 
 // The arithmetic of blending without branches. Every Gaussian reaches every pixel, sums stay in registers, and splats
-// in the nearest cache. Each item processes rounds * OWNED * LANES pairs.
+// stay in the nearest cache. Each item processes rounds * OWNED * LANES pairs.
 GROUP __kernel void limit_blend(const int rounds, __global const float *splats, __global float *sums) {
   float sum = 0.0f;
   for (int k = 0; k < OWNED; ++k) {

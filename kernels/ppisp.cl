@@ -1,5 +1,5 @@
-// Photographs by several cameras: removes the gains and colour mixes of a photograph and the vignette of its lens, and
-// computes the gradient with respect to these.
+// The colour model ppisp: removes a photograph's gains and colour mixes and its lens's vignette from its pixels, and
+// computes the gradient with respect to these. It is for photographs by cameras that process colours differently.
 //
 // Owner: As in shared/develop.h, which has the kernels.
 // Launch: As there.

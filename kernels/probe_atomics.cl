@@ -3,7 +3,7 @@
 // Owner: A work-item owns an element.
 // Launch: Any number of groups of ITEMS work-items.
 // Buffers: counters (PROBED), zero before -> counters; places (2, items of all groups): what each item got from its
-//   global counter and from its group's local counter. Items have the PROBED counters in turn.
+//   global counter and from its group's local counter. Successive items use the PROBED counters in turn.
 // Equations: none.
 #include "shared/group.h"
 

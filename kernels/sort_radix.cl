@@ -3,8 +3,8 @@
 // all keys, one launch does all passes.
 //
 // Owner: A group owns a chunk; in radix_offsets some digits. In the scatter, a group of one item takes its keys one by
-//   one. A larger group takes tiles of TILE keys, sorts each by digit in local memory, and writes a digit's keys side
-//   by side.
+//   one. A larger group takes tiles, here of TILE keys instead of pixels. It sorts each by digit in local memory, and
+//   writes a digit's keys side by side.
 // Launch: One group of ITEMS work-items for each chunk, or for each `rows` digits.
 // Buffers: keys, values (n), histograms (digits, groups), totals (digits) -> keys_out, values_out (n); counters
 //   (digits) in local memory.

@@ -102,7 +102,7 @@ class BentFisheye(Fisheye):
         return 0.5 * (low + high)
 
     def shows(self, view: Intrinsics, points: Float64) -> Bool:
-        """True for points whose angle from the axis is smaller than that of the fold-over."""
+        """True for points whose angle from the axis is smaller than the largest that the fisheye shows (`fold`)."""
         return np.asarray(np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]) < view.fold[0])
 
 

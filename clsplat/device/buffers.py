@@ -67,7 +67,7 @@ class DeviceArray:
             self.device.calls.writes += 1
             event = self._copied(_WRITING, self.buffer, values, is_blocking=False)
             self._note("write", event)
-            self.device.under_way.append(event)  # keeps the event alive: its deletion would wait
+            self.device.under_way.append(event)  # keeps the event alive: deleting it would wait for the copy
 
     def _check(self, values: NDArray[Any]) -> None:
         if values.shape != self.shape or values.dtype != self.dtype:

@@ -60,16 +60,15 @@ def described(value: Any) -> object:
 class CommandBuffer:
     """Launches, fills and copies to the host, in order.
 
-    entries: functions that put one command each on the queue; with its kernel if the command is a launch.
+    entries: for each command a function that puts it on the queue, and its kernel if it is a launch.
     calls: the number of calls of each kind.
-    anew: setter, argument index and type of each `LaunchParameter`.
-    reads: the entries that copy to the host.
+    anew: setter, argument index and type of each launch parameter, which `set` gives a new value.
+    reads: the functions of `entries` that copy to the host.
+    given: buffers of the recorded launches, in place of which each replay may use others.
 
     Each launch has its own kernel object, whose other arguments stay set. When a command buffer is dropped, its kernel
     objects are kept for later command buffers, because pyopencl takes at least 0.2 ms to make a kernel object. A
     command buffer keeps no array alive: its owner must drop it before one of its arrays is freed.
-
-    given: buffers of the recorded launches that other buffers may take the place of in each replay.
     """
 
     def __init__(self, given: Sequence[cl.Buffer] = ()) -> None:

@@ -116,8 +116,9 @@ def _compiled(context: cl.Context, device: cl.Device, variant: Variant) -> cl.Pr
 class Kernel:
     """A built kernel.
 
-    tried: the kinds of launch (`launch.form_of`) that have been tried. Before the first launch, pyopencl is given the
-    types of the scalar arguments. Without the types, each scalar costs 10 microseconds per launch.
+    cl_kernel: pyopencl's kernel. Before the first launch it is given the types of the scalar arguments. Without the
+        types, each scalar costs 10 microseconds per launch.
+    tried: the kinds of launch (`launch.form_of`) that the sandbox has tried.
     spare: kernel objects of dropped command buffers, for new command buffers.
     """
 

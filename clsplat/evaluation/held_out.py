@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of held-out views with their photographs: the scores in eval.json and the pictures in test/."""
+"""Comparison of held-out views with their photographs: the scores in eval.json and the pictures in test/.
+
+`load_scene` (clsplat/scenes/loading.py) decides which views are held out.
+"""
 
 from __future__ import annotations
 

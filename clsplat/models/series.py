@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models that change over time: interpolation between samples, from a file per frame or a stage's time samples."""
+"""Models that change over time: interpolation between samples, from a file per frame or a USD stage's time samples."""
 
 from __future__ import annotations
 

@@ -14,11 +14,11 @@ from clsplat.arrays import Int64
 
 @dataclass(frozen=True, eq=False)
 class ListsTwin:
-    """Slots and lists.
+    """The lists of all tiles, one after the other, and the first slot of each Gaussian.
 
     first_slots: (N,), the number of pairs of earlier Gaussians.
     ranges: (tiles, 2), begin and end of each tile's list; 0 and 0 if it is empty.
-    gaussian_from_sorted, slot_from_sorted: (pairs), the lists.
+    gaussian_from_sorted, slot_from_sorted: (pairs), Gaussian and slot of each entry of the lists.
     """
 
     first_slots: Int64

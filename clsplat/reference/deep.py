@@ -81,9 +81,11 @@ def sliced(
 ) -> Deep:
     """Cut layers into slices: eqs. (70) to (74).
 
-    colours: (h, w, 3), colour of each layer on its box, times the light that the layer absorbs.
-    depths: (h, w), depth of each layer on its box.
+    taken: the layers, front to back.
+    colours: for each layer, its colour on its box (h, w, 3), times the light that it absorbs.
+    depths: for each layer, its depth on its box (h, w).
     whole: (H, W), the light in front of all layers.
+    bins: maximum number of slices per pixel.
     """
     height, width = whole.shape
     end = whole.copy()

@@ -15,8 +15,9 @@ def developed(photograph: Float64, entries: Float64, lens: Float64, squared: Flo
 
 
 def terms(image: Float64, by_image: Float64, squared: Float64) -> Float64:  # noqa: ARG001
-    """Terms (H, W, 3) of the gradient of a loss of the product image times 2^entries, where entries are 0.
+    """Terms (H, W, 3) of a loss's gradient with respect to the entries, at entries of 0.
 
+    The loss is a function of the product image times 2^entries.
     by_image: (H, W, 3), the gradient of the loss with respect to the product.
     """
     result: Float64 = np.log(2) * image * by_image

@@ -35,7 +35,7 @@ def developed(photograph: Float64, entries: Float64, vignette: Float64, squared:
 
 
 def terms(image: Float64, by_image: Float64, squared: Float64) -> Float64:
-    """Terms (H, W, 12) of the gradient of a loss with respect to the entries and the vignette, where these are 0.
+    """Terms (H, W, 12) of a loss's gradient with respect to the entries and the vignette, at values of 0.
 
     by_image: (H, W, 3), the gradient of the loss with respect to the image after they are applied.
     """

@@ -90,7 +90,8 @@ def plan_step(
         planes = max(planes, pixels + loss.scratch_bytes(device, camera.height, tiles_of(camera)[0] * TILE, step.turns))
     frame = _frame_need(device, gaussians, floats_of(coefficients), planes, config)
     fields = step.fields
-    appends = device.shape.items > 1 and device.memory.limit is None  # lists of both kinds, unless memory is limited
+    # Without a limit of memory, room for the lists by append is added to that for the lists by sort.
+    appends = device.shape.items > 1 and device.memory.limit is None
     screen = project.SCREEN_GRADIENT_BYTES + 4 * fields.contributions
     statistics = density.gaussian_bytes(contributions=fields.contributions)
     need = replace(

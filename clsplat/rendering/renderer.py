@@ -66,7 +66,7 @@ Other channels, if requested: (H, W) or (H, W, floats) float32, as docs/channels
 
 
 def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:
-    """Which SH coefficients of a model the settings keep for rendering, and their storage.
+    """The SH coefficients of a model that the settings keep for rendering, and how they are stored.
 
     Raises InputError if a coefficient is too large for float16.
     """
@@ -362,7 +362,7 @@ def _motion_end(
 
 
 def _pixels_of(planes: Channels, camera: Camera, *, contiguous: bool) -> tuple[NDArray[Any], NDArray[Any]]:
-    """The image's pixels of both arrays of planes on the host, with the plane axis last."""
+    """Both arrays of planes on the host, without padding and with the plane axis last."""
     arrays = (planes.means, planes.whole)
     means, whole = (array.get()[:, : camera.height, : camera.width].transpose(1, 2, 0) for array in arrays)
     return (np.ascontiguousarray(means), np.ascontiguousarray(whole)) if contiguous else (means, whole)

@@ -52,7 +52,11 @@ def needed_degrees(sh: NDArray[np.float32], tolerance: float) -> NDArray[np.uint
 
 
 def coefficients_in_use(degrees: NDArray[np.uint8]) -> tuple[int, bool]:
-    """Largest number of coefficients per channel in use, and True if a degree for each Gaussian saves enough."""
+    """Number of coefficients per channel up to the highest degree in use; and True if each Gaussian should store only
+    its own degree, as that leaves out enough (MIN_DROPPED_SH_FRACTION).
+
+    degrees: (n,), the degree that each Gaussian needs.
+    """
     coefficients = (int(degrees.max(initial=0)) + 1) ** 2
     if coefficients == 1:
         return 1, False

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoints: NumPy arrays in a zip file that is verified before use."""
+"""Checkpoints: NumPy arrays in a zip file that is verified before use.
+
+`Trainer.checkpoint` decides what is in one; docs/architecture.md, "The run folder", lists it.
+"""
 
 from __future__ import annotations
 

@@ -162,7 +162,10 @@ def _views(files: _SceneFiles, path: Path, resolution: int, test_views: tuple[in
 
 
 def _held_out(names: Sequence[str], every: int, most: int) -> Sequence[str]:
-    """Every `every`-th of the sorted names, no name if that is 0. At most `most`, spread evenly; 0 for no maximum."""
+    """Names to hold out: every `every`-th of the sorted names, none if `every` is 0.
+
+    most: maximum number of names, which are then spread evenly; 0 for no maximum.
+    """
     chosen = names[::every] if every > 0 else []
     if not 0 < most < len(chosen):
         return chosen

@@ -38,7 +38,7 @@ class JobModels:
     digest: SHA-256 of their sources; for a single model file, of that file.
     space: the colour space that all models have.
     tracks: placements of the models over time; None for a single model that is not placed.
-    files: files of the models; empty for a stage.
+    files: files of the models; empty for a USD stage.
     volumes: regions with mattes, for each model.
     numbered: files by frame number for each model, empty for a model that does not change.
     """

@@ -54,7 +54,10 @@ def names_of(mattes: Mapping[str, Matte]) -> tuple[MatteNames, ...]:
 
 
 def _objects(models: JobModels) -> Matte:
-    """A matte with one object per model, and one per volume of a model, which takes precedence over the model's."""
+    """A matte with one object for each model, and one for each volume of a model.
+
+    A Gaussian in a volume belongs to the volume and not to the model; in several volumes, to the first.
+    """
     names, owners = list(models.names), []
     for index, model in enumerate(models.still):
         own = np.full(len(model), index, np.int32)
@@ -68,7 +71,7 @@ def _objects(models: JobModels) -> Matte:
 def _semantic(models: JobModels, ids_from: str) -> Matte:
     """A matte with one object for each value of the property."""
     if not models.files:
-        raise InputError(f"--ids-from {ids_from}: {models.path} is a stage, expected PLY files that have the property")
+        raise InputError(f"--ids-from {ids_from}: {models.path} is a USD stage, expected PLY files with the property")
     columns: list[NDArray[np.int64]] = []
     for file, model in zip(models.files, models.still, strict=True):
         with unpacked(file) as (opened, form):

@@ -121,7 +121,7 @@ class Task:
     stretch: cameras while the shutter is open, None for a static camera.
     before: state of the file when the job began (`finished_frames.stamp`).
     sampling: shutter and lens of this frame; None means the job's.
-    optics: shutter and lens that a stage sets.
+    optics: shutter and lens that a USD stage sets.
     eye: left or right of a stereo pair.
     right: task of the right eye, if one file holds both.
     lens: the photograph's lens by which the picture is warped.
@@ -376,7 +376,8 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     used = sampling if sampling.on else None
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
-    made += ("far",) if task.camera.far < inf else ()  # differs from files made before the far plane clipped
+    # Files that were made before the far plane clipped have another digest.
+    made += ("far",) if task.camera.far < inf else ()
     colour = replace(pictures.colour, ocio_config=configuration_digest(pictures.colour.ocio_config))
     if task.holdout is not None:
         made += ("holdout", known_digest(task.holdout), options.holdout)

@@ -68,9 +68,11 @@ def _values(camera: Camera) -> Float64:
 
 
 def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, sampling: SamplingConfig) -> Moments | None:
-    """Cameras while the shutter of the frame `number` is open; None without `moment`, or for a shutter of (0, 0).
+    """Cameras while the shutter of the frame `number` is open. None if the shot has no `moment`, or the shutter is
+    (0, 0).
 
-    They are at the times of the frame's samples, and at the source's own times in between.
+    They are at the shutter's opening, middle and closing, at the times of the frame's samples, and at the source's own
+    times in between.
     """
     if shot.moment is None or sampling.shutter == (0.0, 0.0):
         return None

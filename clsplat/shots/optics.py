@@ -56,7 +56,7 @@ class Optics:
 
 
 def settled(flags: SamplingConfig, optics: Optics | None, camera: Camera) -> SamplingConfig:
-    """Shutter and lens of a frame: the flags' settings, and the stage's settings where no flag is given.
+    """Shutter and lens of a frame: the flags' settings, and the USD stage's settings where no flag is given.
 
     The lens size becomes an aperture radius, unless flags give the sensor width or the metres per unit.
     """
@@ -82,7 +82,7 @@ def settled(flags: SamplingConfig, optics: Optics | None, camera: Camera) -> Sam
 
 
 def headers(camera: Camera, number: int, optics: Optics | None, sampling: SamplingConfig) -> dict[str, tuple[str, Any]]:
-    """OpenEXR standard attributes for a frame of a stage, by name, as (type, value). Empty for other frames.
+    """OpenEXR standard attributes for a frame of a USD stage, by name, as (type, value). Empty for other frames.
 
     camera: camera of the whole frame.
     Lens and sensor attributes are written for perspective cameras only: lengths in millimetres, focus distance in

@@ -94,7 +94,7 @@ class Shot:
         return replace(self, frames=tuple(frame for frame in self.frames if frame.number in asked), warnings=warnings)
 
     def without_optics(self) -> Shot:
-        """The shot without the stage's shutter and lens, whose settings are added to `unapplied`."""
+        """The shot without the USD stage's shutter and lens, whose settings are added to `unapplied`."""
         named = [name for frame in self.frames if frame.optics for name in frame.optics.named()]
         found = {name.partition(" ")[0]: name for name in reversed(named)}  # the first value of each
         frames = tuple(replace(frame, optics=frame.optics.still) if frame.optics else frame for frame in self.frames)

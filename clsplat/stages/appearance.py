@@ -149,10 +149,10 @@ def entry_gradient(
     size: tuple[int, int],
     place: int = 0,
 ) -> DeviceArray:
-    """Column sums (model.sums, stride) of the gradient with respect to the entries, where these are 0.
+    """Column sums (model.sums, stride) of the gradient with respect to entries of 0 that are applied to the render.
 
-    Summed over the columns, and multiplied by ln 2 for logarithms, they are the gradient. place: the view's number in
-    the batch; each has its own array.
+    The sum over the columns, multiplied by ln 2 for logarithms, is the gradient (docs/gradients.md, (184) to (186)).
+    place: the view's number in the batch; each has its own array.
     """
     _, rows, stride = image.shape
     down = rows // TILE
@@ -179,7 +179,7 @@ def step_gains(
 ) -> None:
     """Update the gains by Adam, from their column sums. step: the number of this update, from 1.
 
-    Nothing changes if the step's pass has stopped for lack of capacity (kernels/duplicate.cl).
+    Nothing changes if the step's pass has stopped (kernels/duplicate.cl).
     """
     kernels, (photographs, width) = device.kernels("appearance", {"LANES": 1}), gains.logs.shape
     count = photographs * width

@@ -21,8 +21,11 @@ APPEND_PAIR_BYTES = 12
 """Bytes per pair in addition to the lists: its depth and slot, and the Gaussian of the slot."""
 
 MAX_MEAN_PAIRS, MAX_LIST_PAIRS = 1500, 8192
-"""The largest mean and length of lists that are sorted by a group each. Longer lists leave too few groups for too much
-work, as all steps beyond 2,048 pairs go through global memory: the radix sort is faster."""
+"""The most pairs of a tile, on average and in the longest list, for which lists are made by append.
+
+A group sorts each list, and beyond 2,048 pairs all of its steps go through global memory. Longer lists leave too few
+groups for too much work: the radix sort is faster.
+"""
 
 LOCAL_PAIRS = 2048
 """Pairs that a group sorts in local memory: 16 KiB of them, half of every device's minimum. A power of two."""

@@ -108,7 +108,7 @@ def step_grid(
 ) -> None:
     """Update the photograph's grid by Adam. visit: the number of this update of the grid, from 1.
 
-    Nothing changes if the step's pass has stopped for lack of capacity (kernels/duplicate.cl).
+    Nothing changes if the step's pass has stopped (kernels/duplicate.cl).
     """
     kernel = device.kernels("grid", {"LANES": 1}).move_grid
     constants = (

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches probe_atomics.cl: the probe of a driver's integer atomics, on which lists by append depend. Without them a
-step has the radix sorts.
+"""Launches probe_atomics.cl: the probe of a driver's integer atomics, on which lists by append depend. Where they are
+faulty, a step sorts with sort_radix.cl.
 
 As a program, `python -m clsplat.stages.probe_atomics INDEX`, it prints the fault of a device.
 """

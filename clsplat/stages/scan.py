@@ -24,7 +24,9 @@ counts of all groups before it."""
 
 @dataclass(frozen=True, eq=False)
 class Elements:
-    """The number of elements that a kernel processes: `most`, or if `counts` is given counts[place], at most `most`.
+    """The number of elements that a kernel processes: `most`, or counts[place] if `counts` is given.
+
+    counts[place] is at most `most`.
 
     Launches are sized for `most` (kernels/shared/count.h).
     """

@@ -25,7 +25,9 @@ def settle(
     readback: DeviceArray,
     tile_counts: DeviceArray | None = None,
 ) -> None:
-    """Settle Gaussians up to a step. Nothing changes if `readback` says that the step's pass has stopped.
+    """Settle Gaussians: take all steps that they missed, up to `step`.
+
+    Nothing changes if `readback` says that the step's pass has stopped.
 
     model: parameters, first and second moments.
     last: (n,) uint32, the last step that each Gaussian took.

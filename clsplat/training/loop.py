@@ -143,8 +143,8 @@ class TrainingSession:
     def rescue(self) -> str:
         """Write a checkpoint of the state at the start of the step, if that is intact.
 
-        Called after a failed or interrupted trial of kernels, a failed command of the driver, and for a photograph that
-        cannot be read.
+        Called after a failed or interrupted trial of kernels, after a failed command of the driver (also of a GPU that
+        is lost), and for a photograph that cannot be read.
 
         Returns the end of an error message, which names the checkpoint, or "".
         """

@@ -221,7 +221,7 @@ def _guarded(address: Address) -> Iterator[None]:
 
 
 def _tell(_: Any, context: dict[str, Any]) -> None:
-    """Print a line instead of a traceback. For asyncio, as an exception handler."""
+    """Print a line instead of a traceback. This is asyncio's exception handler."""
     error = context.get("exception")
     words = f"{type(error).__name__}: {error}" if error is not None else str(context.get("message", ""))
     message = plain(" ".join(words.split()))[:200].rstrip(": ")

@@ -1,9 +1,10 @@
 // cells.h for a group of ITEMS work-items that share a tile. A cell is one pixel of a block of 4 x 8 pixels. Each block
-// has 32 items, one per pixel, so that items that run together skip a block together; groups of fewer items have lower
-// blocks. Item i owns pixel i % 32 of OWNED blocks, its cells 0, 1, ...: those of a row of blocks are side by side, so
-// that what depends on y alone is computed once for them. Splats pass through local memory in batches, each with the
-// blocks that its ellipse reaches. Items that own the same blocks are a warp here, whether or not the device runs 32
-// items together.
+// has 32 items, one per pixel, so that items that run together skip a block together. Groups of fewer items have lower
+// blocks. Items that own the same blocks are a warp here, whether or not the device runs 32 items together.
+//
+// Item i owns pixel i % 32 of OWNED blocks; these pixels are its cells 0, 1 and so on. An item's blocks in a row of
+// blocks are side by side, so that it computes once for them what depends on y alone. Splats pass through local memory
+// in batches, each with the blocks that its ellipse reaches.
 #if LANES > 1
 #error "a group of work-items has one pixel a vector"
 #endif
@@ -174,8 +175,8 @@ static inline void mark(__local uint *marks, int j, uint blocks, int sets, int o
 #define SPARSE(own) (ALL_REACHED ? (own) : (own) / 2)
 #define IS_DENSE(entry, own) (SPARSE(own) == 0 || (SPARSE(own) < (own) && ((entry) & DENSE)))
 
-// A bit for each of BLOCK_ITEMS pairs of a batch from `begin` on that are marked; a product's upper byte has the bits
-// of four bytes.
+// The marks of BLOCK_ITEMS pairs of a batch from `begin` on, as bits. The top byte of each product has the marks of
+// four pairs.
 static inline uint marked_from(__local const uint *marks, int begin) {
   uint marked = 0;
   _Pragma("unroll") for (int four = 0; four < BLOCK_ITEMS; four += 4) marked |=
@@ -183,8 +184,8 @@ static inline uint marked_from(__local const uint *marks, int begin) {
   return marked;
 }
 
-// Lists the pairs that are marked for a set of blocks. ENTRY: what the list has of the j-th pair. Defines the number of
-// pairs, `count`.
+// Lists the pairs that are marked for a set of blocks. ENTRY(j): the entry of the j-th pair. Defines `count`, the
+// number of entries.
 #define LIST_MARKED(count, marks, list, ENTRY)                                                                         \
   int count = 0;                                                                                                       \
   _Pragma("unroll") for (int begin_ = 0; begin_ < BATCH; begin_ += BLOCK_ITEMS) {                                      \

@@ -1,5 +1,6 @@
-// The kernels of an appearance model that develops photographs pixel by pixel: appearance.cl updates its entries. A
-// model's file defines, before it includes this header:
+// The kernels of a colour model: they remove a photograph's own colours pixel by pixel, and compute the gradient with
+// respect to the model's entries. appearance.cl updates the entries. A model's file defines, before it includes this
+// header:
 //   ENTRIES, LENS_ENTRIES: numbers of entries of a photograph, of which the first three are gains, and of a lens.
 //   developed: converts LANES pixels of a photograph to the model's colours, in place.
 //   add_terms: adds the terms of LANES pixels to the gradient's ENTRIES + LENS_ENTRIES sums. Those of gains and lenses

@@ -92,8 +92,8 @@ static inline Double scaled2(float a, float a_low, Double b) {
   return multiply2(factor, b);
 }
 
-// s1 - s2, where x is the difference of their logarithms. For close scales this is a series of exp(x) - 1: otherwise
-// rounding in the difference of equal scales would rotate every spherical Gaussian.
+// The difference s1 - s2 of two scales, where x is the difference of their logarithms. For close scales it is a series
+// of exp(x) - 1. Without the series, rounding in the difference of equal scales would rotate every spherical Gaussian.
 static inline floatL scale_difference(floatL x, floatL s1, floatL s2) {
   floatL series = fmaL(x, (floatL)(1.0f / 720.0f), (floatL)(1.0f / 120.0f));
   series = fmaL(x, series, (floatL)(1.0f / 24.0f));

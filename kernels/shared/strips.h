@@ -1,8 +1,10 @@
-// Sums over a tile's pixels for blend_grad.cl, of a group of work-items. Their order is the same whatever the number of
-// items from 32 on. A strip is a row of blocks, half of the tile. Each of its 32 lanes adds its pixels from left to
-// right and applies v, which is the same for all of them; a tree adds the lanes; then come the strips from top to
-// bottom. A team of items owns a strip, or several one after the other, and walks TOGETHER of the strip's pairs at a
-// time: its items leave their sums in rows of local memory, a row a field, and add up a row each.
+// Sums over a tile's pixels for blend_grad.cl, in a group of work-items. From 32 items on, the order of addition does
+// not depend on their number. A strip is a row of blocks, half of the tile. Each of its 32 lanes adds its pixels from
+// left to right, and applies v, which is the same for all of them. A tree then adds the lanes, and the strips are added
+// from top to bottom.
+//
+// A team of items owns a strip, or several one after the other, and walks TOGETHER of the strip's pairs at a time. Its
+// items leave their sums in rows of local memory, one row for each field. Then each item adds up a row.
 #define STRIP_CELLS (OWNED < BLOCK_COLUMNS ? OWNED : BLOCK_COLUMNS) // cells of an item in a strip
 #define OWN_STRIPS (OWNED / STRIP_CELLS)
 #define TEAMS (BLOCK_ROWS / OWN_STRIPS)
@@ -23,7 +25,7 @@
 #define ACROSS_TEAMS (SUBGROUP > BLOCK_ITEMS) // a sub-group has items of two teams, which then go on together
 #define ABREAST (ITEMS < SLOT_STRIDE ? ITEMS : SLOT_STRIDE) // items that write a slot
 
-// Whether a pair reaches all blocks of a strip. It is then quicker to take all of the item's pixels without a branch.
+// True if a pair reaches all blocks of a strip. It is then quicker to take all of the item's pixels without a branch.
 #define IS_WHOLE(reach) (!ALL_REACHED && ((reach) & FIRST_BLOCKS(BLOCK_COLUMNS)) == FIRST_BLOCKS(BLOCK_COLUMNS))
 
 #define FOR_FIELDS(field) _Pragma("unroll") for (int field = 0; field < SLOT_STRIDE; ++field)

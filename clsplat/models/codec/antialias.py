@@ -68,7 +68,7 @@ def _switch(word: str) -> bool | None:
 
 def _meaning(key: str, value: object) -> bool | None:
     """True if a key and its value mean antialiased, False if not antialiased, None if they mean neither."""
-    key = _plain(key.rpartition(".")[2])  # as in pipeline.model.rasterize_mode
+    key = _plain(key.rpartition(".")[2])  # a key may name its sections first: pipeline.model.rasterize_mode
     word = str(value).strip().lower()
     mode = ANTIALIAS_MODE_WORDS.get(_plain(word))
     if key in _AMBIGUOUS_KEYS:

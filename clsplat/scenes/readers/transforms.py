@@ -122,7 +122,10 @@ def _pictures(path: Path, readers: list[Keys], images: Path | None, missing: Mis
 
 
 def _smaller_folders(lost: list[Path], folder: Path) -> dict[Path, Path]:
-    """Folders of missing pictures that have no pictures but a downscaled copy, each with that copy."""
+    """The folders of missing pictures that have no pictures themselves, but a downscaled copy beside them that does.
+
+    Returns the copy of each such folder.
+    """
     names = {parent for file in lost for parent in file.parents if folder in parent.parents}
     found = {name: or_smaller(name) for name in sorted(names)}
     return {name: copy for name, copy in found.items() if copy != name}

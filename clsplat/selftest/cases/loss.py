@@ -64,7 +64,7 @@ def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
     first = _read(loss(device, work, image, photograph, *size, given.weight), size)
 
     def again(source: Array) -> float:
-        """Number of results that are different with this photograph."""
+        """Number of values that change if the kernel reads this form of the photograph in place of its planes."""
         as_loaded = target(device, work, source, background, in_planes=False)
         second = _read(loss(device, work, image, as_loaded, *size, given.weight), size)
         return float(sum(np.count_nonzero(second[name] != first[name]) for name in first))

@@ -130,7 +130,7 @@ class Cameras(Component):
         return 4 * LENS_NUMBERS * self._config.refine_lenses
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:
-        """The views. One whose pose or lens this step refines gets a `CameraSums` for the gradient by its camera."""
+        """The views. If this step refines a view's pose or lens, the view gets a `CameraSums` for that gradient."""
         if self.gate.ended is not None or not self._config.refines:
             return inputs
         return [self._joined(each, step, count) for each in inputs]

@@ -30,22 +30,25 @@ R = TypeVar("R")
 
 
 class StepProbe:
-    """Observer of a step. Its methods are called as the stages are launched, and do nothing by default."""
+    """Observer of a step. The step calls each method after it has launched a stage; the device may still be at work.
+
+    The methods do nothing by default.
+    """
 
     def forward(self, frame: ForwardPass) -> None:
-        """Called when the view is rendered."""
+        """Called after the launch of the view's forward pass."""
 
     def loss(self, result: Loss) -> None:
-        """Called when the loss is computed."""
+        """Called after the launch of the loss."""
 
     def pair_gradients(self, slots: Slots) -> None:
-        """Called when the gradient of blending is computed."""
+        """Called after the launch of the gradient of blending."""
 
     def before_rows(self, rows: StepRows) -> None:
-        """Called before Adam changes these rows."""
+        """Called before Adam on these rows is launched."""
 
     def after_rows(self, rows: ViewRows) -> None:
-        """Called when Adam has changed these rows."""
+        """Called after Adam on these rows was launched."""
 
 
 @dataclass(frozen=True, eq=False)

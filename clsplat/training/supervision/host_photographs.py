@@ -21,7 +21,7 @@ Key = tuple[int, float]
 """A view's index, and the divisor of its size."""
 
 
-@cache  # the system takes longer to count than all else of `read_ahead`
+@cache  # the system takes longer to count its processors than `read_ahead` takes for all else
 def reading_threads() -> int:
     """Number of threads that read ahead, which is also the number of views that are read ahead."""
     return min(2 * (os.cpu_count() or 1), MAX_READING_THREADS)
@@ -96,7 +96,7 @@ class HostPhotographs:
         return made[factor]
 
     def replace(self, index: int, factor: float, image: NDArray[Any]) -> None:
-        """Use other pixels for a view from now on."""
+        """Keep these pixels of view `index` at 1/factor of its size in place of the file's, until they are evicted."""
         with self._lock:
             self._keep((index, factor), image)
 

@@ -19,7 +19,7 @@ class Sizes:
 
     @property
     def factors(self) -> tuple[float, ...]:
-        """All divisors, in the order of the steps."""
+        """Divisors of the photographs' width and height in the course of the training, in order."""
         return (*(factor for _, factor in self.until), 1.0)
 
     def factor(self, step: int) -> float:
