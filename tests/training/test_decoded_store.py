@@ -164,6 +164,30 @@ def test_several_writers_and_readers(store: DecodedStore) -> None:
     assert store.notes() == other.notes() == []
 
 
+def little_memory(scene: Scene) -> int:
+    """A limit in bytes with which most photographs are read again and again."""
+    return HostMemory().photographs(scene, CONFIG).least + len(scene.points) * host_memory.model_bytes(CONFIG)
+
+
+@pytest.mark.slow
+def test_a_training_whose_disk_is_full(
+    scene: Scene, default_device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One line, and the same bytes."""
+    alone = model_bytes(scene, CONFIG, default_device, tmp_path / "alone")
+
+    def full(path: Path, mode: str, **options: Any) -> Any:
+        if "x" in mode:
+            raise OSError(errno.ENOSPC, "full")
+        return open(path, mode, **options)
+
+    monkeypatch.setattr(decoded_store, "open", full, raising=False)
+    limit = little_memory(scene)
+    with pytest.warns(UserWarning, match="no decoded photographs can be written there") as told:
+        assert model_bytes(scene, CONFIG, default_device, tmp_path / "run", max_host_mem=limit) == alone
+    assert len([each for each in told if "can be written there" in str(each.message)]) == 1
+
+
 @pytest.mark.parametrize(
     "other",
     [
@@ -178,12 +202,10 @@ def test_two_trainings_at_once(
 ) -> None:
     """Both have the bytes of a training alone, and neither reads a file that is not whole."""
     configs = {"one": CONFIG, "other": other}
-    gaussians = len(scene.points) * host_memory.model_bytes(CONFIG)
-    limit = HostMemory().photographs(scene, CONFIG).least + gaussians  # most photographs are read again and again
     trainings = []
     for name, config in configs.items():
         Run.create(tmp_path / name, config)
-        words = [ONE_TRAINING, folder, tmp_path / name, tmp_path / "cache", limit]
+        words = [ONE_TRAINING, folder, tmp_path / name, tmp_path / "cache", little_memory(scene)]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         trainings.append(subprocess.Popen([sys.executable, "-c", *map(str, words)], text=True, **pipes))
     for training in trainings:
