@@ -39,10 +39,12 @@ class HostMemory:
 
     limit: maximum number of bytes for photographs and Gaussians; None for no limit.
     cache: folder of the cache of decoded photographs; None for no cache.
+    keeps_cache: True if the user named that folder, which then stays.
     """
 
     limit: int | None = None
     cache: Path | None = None
+    keeps_cache: bool = False
 
     @classmethod
     def chosen(cls, max_host_mem: str | int | None, cache: str | Path | None, run: Run | None) -> HostMemory:
@@ -55,7 +57,7 @@ class HostMemory:
             raise InputError(f"--cache {cache}: expected a folder, or none")
         if cache is None:
             return cls(limit, run.cache_path if run is not None and limit is not None else None)
-        return cls(limit, None if str(cache) == NO_CACHE else Path(cache))
+        return cls(limit) if str(cache) == NO_CACHE else cls(limit, Path(cache), keeps_cache=True)
 
     def photographs(self, scene: Scene, config: TrainConfig) -> HostPhotographs:
         """Training photographs of a scene."""
@@ -95,7 +97,9 @@ class HostMemory:
 
     def end(self, run: Run | None) -> None:
         """Remove the cache in the folder of a run that has finished, unless it was named as the cache's folder."""
-        if run is not None and run.cache_path.is_dir() and (self.cache is None or self.cache == run.cache_path):
+        if run is None or not run.cache_path.is_dir():
+            return
+        if not (self.keeps_cache and self.cache is not None and self.cache.resolve() == run.cache_path.resolve()):
             remove_decoded(run.cache_path)
 
 

@@ -4,10 +4,16 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import struct
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -223,6 +229,45 @@ def test_an_interrupted_town_leaves_nothing(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(KeyboardInterrupt):
         write_town(tmp_path / "town", SMALL, workers=2)
     assert list(tmp_path.iterdir()) == []
+
+
+DEMO = "import sys; from clsplat.cli.main import main; sys.exit(main(sys.argv[1:]))"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends signals as POSIX has them")
+@pytest.mark.parametrize("name", ["SIGINT", "SIGKILL"])
+def test_a_call_after_an_interrupted_one_makes_the_whole_town(tmp_path: Path, name: str) -> None:
+    words = ["demo", "-o", str(tmp_path / "town"), "--town", "1x1", "--town-photos", "300", "--town-size", "64x40"]
+    process = subprocess.Popen([sys.executable, "-c", DEMO, *words], stderr=subprocess.PIPE, text=True)
+    while process.poll() is None and len(list(tmp_path.glob(".town*/result/images/*/*.jpg"))) < 3:
+        time.sleep(0.02)
+    process.send_signal(getattr(signal, name))
+    *_, last = process.communicate(timeout=60)[1].splitlines()
+    if name == "SIGINT":
+        assert process.returncode == 130
+        assert last == (
+            "clsplat: interrupted before the town was complete: no file of it is left, and the same command starts anew"
+        )
+    assert [path.name == "town" for path in tmp_path.iterdir()] == [False] * (name == "SIGKILL")
+    write_town(tmp_path / "town", SMALL)
+    write_town(tmp_path / "alone", SMALL)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["alone", "town"]
+    pictures = {path.name: path.read_bytes() for path in (tmp_path / "alone").rglob("*") if path.is_file()}
+    assert {path.name: path.read_bytes() for path in (tmp_path / "town").rglob("*") if path.is_file()} == pictures
+
+
+def test_files_that_came_while_a_town_was_made_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = writing._write_model
+
+    def write_model(*arguments: Any) -> int:
+        (tmp_path / "town").mkdir()
+        (tmp_path / "town/file").write_text("mine")
+        return plain(*arguments)
+
+    monkeypatch.setattr(writing, "_write_model", write_model)
+    with pytest.raises(InputError, match="is neither empty nor a town"):
+        write_town(tmp_path / "town", replace(SMALL, photos=1, width=16, height=16))
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == ["town", "town/file"]
 
 
 def test_only_a_town_is_replaced_and_only_if_told(tmp_path: Path) -> None:

@@ -5,20 +5,59 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from same_bytes import model_bytes
+from tiny import short
 
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device
 from clsplat.files import mounts
+from clsplat.files.atomic import machine_mark, temporary_name
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene
+from clsplat.training import host_memory
+from clsplat.training.host_memory import HostMemory
 from clsplat.training.supervision import decoded_store
 from clsplat.training.supervision.decoded_store import SUFFIX, DecodedStore, key_of, remove_decoded
 
 KEY, OTHER = key_of(["a"]), key_of(["b"])
 PIXELS = np.random.default_rng(1).integers(0, 256, (6, 5, 4), np.uint8)
+
+CONFIG = short(iterations=24, warmup=(4, 10), report=False, density={"every": 0})
+"""A short training at three sizes."""
+ONE_TRAINING = """
+import io, sys, time
+from pathlib import Path
+from clsplat.api import train
+from clsplat.runs.run import Run
+from clsplat.scenes.loading import load_scene
+from clsplat.training.supervision import decoded_store
+
+class Slow(io.FileIO):
+    def write(self, data):
+        data = memoryview(data).cast("B")
+        for start in range(0, len(data), 1000):
+            time.sleep(0.001)
+            super().write(data[start : start + 1000])
+        return len(data)
+
+decoded_store.open = lambda path, mode, **options: (open if "r" in mode else Slow)(path, mode, **options)
+scene, run, cache, limit = sys.argv[1:]
+scene, run = load_scene(Path(scene)), Run.open(Path(run))
+print("ready", flush=True)
+sys.stdin.readline()
+train(scene, run.config, run=run, cache=cache, max_host_mem=int(limit))
+"""
+"""A training that begins when it is told to. It writes a file of the cache in pieces, a millisecond apart."""
 
 
 @pytest.fixture
@@ -125,12 +164,72 @@ def test_several_writers_and_readers(store: DecodedStore) -> None:
     assert store.notes() == other.notes() == []
 
 
+def little_memory(scene: Scene) -> int:
+    """A limit in bytes with which most photographs are read again and again."""
+    return HostMemory().photographs(scene, CONFIG).least + len(scene.points) * host_memory.model_bytes(CONFIG)
+
+
+@pytest.mark.slow
+def test_a_training_whose_disk_is_full(
+    scene: Scene, default_device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One line, and the same bytes."""
+    alone = model_bytes(scene, CONFIG, default_device, tmp_path / "alone")
+
+    def full(path: Path, mode: str, **options: Any) -> Any:
+        if "x" in mode:
+            raise OSError(errno.ENOSPC, "full")
+        return open(path, mode, **options)
+
+    monkeypatch.setattr(decoded_store, "open", full, raising=False)
+    limit = little_memory(scene)
+    with pytest.warns(UserWarning, match="no decoded photographs can be written there") as told:
+        assert model_bytes(scene, CONFIG, default_device, tmp_path / "run", max_host_mem=limit) == alone
+    assert len([each for each in told if "can be written there" in str(each.message)]) == 1
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        CONFIG,
+        pytest.param(replace(CONFIG, seed=5, warmup=(6,)), marks=pytest.mark.slow),
+        pytest.param(replace(CONFIG, photos="8bit"), marks=pytest.mark.slow),
+    ],
+    ids=["same settings", "other order and sizes", "other precision"],
+)
+def test_two_trainings_at_once(
+    scene: Scene, folder: Path, default_device: Device, tmp_path: Path, other: TrainConfig
+) -> None:
+    """Both have the bytes of a training alone, and neither reads a file that is not whole."""
+    configs = {"one": CONFIG, "other": other}
+    trainings = []
+    for name, config in configs.items():
+        Run.create(tmp_path / name, config)
+        words = [ONE_TRAINING, folder, tmp_path / name, tmp_path / "cache", little_memory(scene)]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        trainings.append(subprocess.Popen([sys.executable, "-c", *map(str, words)], text=True, **pipes))
+    for training in trainings:
+        assert training.stdout.readline() == "ready\n", training.communicate()[1]
+    for training in trainings:
+        training.stdin.write("begin\n")
+        training.stdin.flush()
+    for training in trainings:
+        _, errors = training.communicate(timeout=120)
+        assert training.returncode == 0, errors
+        assert "decoded" not in errors, errors
+    for name, config in configs.items():
+        alone = model_bytes(scene, config, default_device, tmp_path / f"{name} alone")
+        assert (tmp_path / name / "model.ply").read_bytes() == alone
+    store, paths = DecodedStore(tmp_path / "cache"), list((tmp_path / "cache").iterdir())
+    assert len(paths) >= 2 * len(scene.train_views)
+    assert {path.suffix for path in paths} == {SUFFIX}, "no temporary files are left"
+    assert all(store.read(bytes.fromhex(path.stem)) is not None for path in paths)
+
+
 def test_what_a_killed_process_left_is_removed(store: DecodedStore) -> None:
     mark = decoded_store.TEMPORARY_NAME
     with ThreadPoolExecutor(1) as pool:
         pool.submit(store.write, KEY, PIXELS).result()
-    from clsplat.files.atomic import machine_mark
-
     gone = store.folder / f".{store.path(OTHER).name}.{machine_mark()}{2**31 - 2:08x}{'0' * 8}.clsplat-tmp"
     assert mark.fullmatch(gone.name)
     gone.write_bytes(b"half")
@@ -149,6 +248,37 @@ def test_only_its_own_files_are_removed(store: DecodedStore) -> None:
     remove_decoded(store.folder)
     assert not store.folder.exists()
     remove_decoded(store.folder)
+
+
+def test_a_file_that_another_process_is_writing_stays(store: DecodedStore) -> None:
+    """As where a training was told to use the cache in the folder of another one, which ends."""
+    store.write(KEY, PIXELS)
+    being_written = temporary_name(store.path(OTHER))
+    being_written.write_bytes(b"half")
+    remove_decoded(store.folder)
+    assert [path.name for path in store.folder.iterdir()] == [being_written.name]
+    store.write(KEY, PIXELS)
+    assert (store.read(KEY) == PIXELS).all()
+    being_written.unlink()
+    remove_decoded(store.folder)
+    assert not store.folder.exists()
+    store.write(KEY, PIXELS)
+    (note,) = store.notes()
+    assert f"there is no folder {store.folder}" in note
+
+
+@pytest.mark.parametrize("named", ["the run's", "the run's in other words", "another", "none", None])
+def test_a_run_removes_its_own_cache_at_its_end_unless_it_was_named(tmp_path: Path, named: str | None) -> None:
+    run = Run.create(tmp_path / "run", CONFIG)
+    words = {"the run's": run.cache_path, "the run's in other words": tmp_path / "run" / ".." / "run" / "cache"}
+    cache = words.get(named, tmp_path / "another") if named not in {"none", None} else named
+    memory = HostMemory.chosen("1GiB", cache, run)
+    stores = {DecodedStore(folder) for folder in (run.cache_path, memory.cache) if folder is not None}
+    for store in stores:
+        store.write(KEY, PIXELS)
+    memory.end(run)
+    assert run.cache_path.exists() == (named in words)
+    assert (tmp_path / "another").exists() == (named == "another")
 
 
 def test_a_network_disk_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,6 +28,7 @@ from clsplat.device.context import Device
 from clsplat.device.memory_account import Memory
 from clsplat.device.profile import Calls
 from clsplat.errors import InputError
+from clsplat.images.reading import read_image
 from clsplat.images.writing import write_image
 from clsplat.runs.run import Run
 from clsplat.runs.settings import parse_config
@@ -454,6 +455,25 @@ def test_a_damaged_photograph_of_a_large_scene(
     assert str(path) in errors[0]
     again = f"--max-host-mem 1GiB --cache '{tmp_path / 'my cache'}'"
     assert f"clsplat train -o {tmp_path / 'run'} --resume {again}" in errors[0]
+
+
+def test_a_cache_of_other_photographs_gives_none_of_their_pixels(own: Path, scene: Scene, tmp_path: Path) -> None:
+    """Of another scene with the same names, of photographs that were replaced, and of other sizes."""
+    store = DecodedStore(tmp_path / "cache")
+
+    def check(read: Scene) -> None:
+        decoder = Decoder(read.train_views, factors=FACTORS, store=store)
+        for index, image in enumerate(wanted(read, 2.0)):
+            assert_same_bits(decoder.pixels(index, 2.0, keeps=False)[2.0], image, str(index))
+
+    check(scene)
+    for path in (own / "images").iterdir():
+        write_image(path, 1 - read_image(path))
+    check(load_scene(own))
+    replaced(own / "images" / "03.png")
+    check(load_scene(own))
+    check(load_scene(own, resolution=40))
+    assert store.notes() == []
 
 
 def test_keys_follow_what_pixels_depend_on(scene: Scene, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import bench_guards
 import numpy as np
 import pytest
-from calls import Capture, noted, ran, refuses
+from calls import Capture, noted, peak_of, ran, refuses
 from calls import train as command_train
 from compare import assert_same_bits
 from quick import quick
@@ -31,6 +31,7 @@ from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
 from clsplat.spherical_harmonics import sh_basis
 from clsplat.training import repro_bundle
+from clsplat.training.stability import health
 from clsplat.training.stability.health import (
     MAX_CHECKPOINT_RETURNS,
     MAX_TROUBLED_STEPS,
@@ -96,6 +97,18 @@ def test_what_is_broken_and_what_is_refused() -> None:
     assert lost("loss", broken, refused).tolist() == [False, True, True, False, False, False]
     assert lost("adam", broken, refused).tolist() == [False, True, True, False, True, True]
     assert finite_or_zero(first["sh_dc"])[4].tolist() == [first["sh_dc"][4, 0], 0, first["sh_dc"][4, 2]]
+
+
+def test_gaussians_are_examined_a_part_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(health, "EXAMINED_ROWS", 500)
+    parameters, first, second = model(2001), model(2001), model(2001)
+    rows = [0, 499, 500, 1999, 2000]
+    parameters["opacity_logits"][rows] = np.nan
+    second["sh_rest"][rows] = np.inf
+    for found in examine(parameters, first, second):
+        assert np.flatnonzero(found).tolist() == rows
+    most = peak_of(lambda: examine(parameters, first, second))
+    assert most < parameters["sh_rest"].nbytes / 2, "a part is a quarter; all would be all of it, and their marks"
 
 
 def test_patience() -> None:

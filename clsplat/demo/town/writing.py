@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -32,8 +31,9 @@ from clsplat.demo.town.photography import Observations, take
 from clsplat.demo.town.settings import TownConfig
 from clsplat.demo.town.textures import textures
 from clsplat.errors import InputError
-from clsplat.files.atomic import atomic_write, move_into_place
+from clsplat.files.atomic import atomic_write, move_into_place, temporary_name
 from clsplat.files.documents import is_file
+from clsplat.files.locks import abandoned
 from clsplat.images.writing import write_image
 from clsplat.progress import CountedFraction, Progress, no_progress
 from clsplat.scenes.dataset import Lens
@@ -65,15 +65,19 @@ def write_town(
     workers: number of threads, which changes no bytes; None for one per core, up to MAX_TOWN_WORKERS.
     progress: function that is called with a text and the completed fraction.
     Raises InputError for invalid settings and for a folder that must not be replaced, and ClsplatError if a file
-    cannot be written. After KeyboardInterrupt no files remain.
+    cannot be written. After KeyboardInterrupt no files remain. What a killed call left is removed by the next one.
     """
     config.check()
     check_folder(output, overwrite=overwrite)
     output.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(prefix=f".{output.name}-town-", dir=output.parent))
+    for left in abandoned([output]):
+        if left.is_dir():
+            shutil.rmtree(left, ignore_errors=True)
+    place = Path(os.path.realpath(output))
+    work = temporary_name(place)
     try:
         result = work / "result"
-        result.mkdir()
+        result.mkdir(parents=True)
         planned = [
             shot for j in range(config.rows) for i in range(config.columns) for shot in photographs(config, i, j)
         ]
@@ -82,7 +86,11 @@ def write_town(
         points = _write_model(result, config, planned, seen)
         record = {"town": config.record(), "photographs": len(planned), "points": points}
         atomic_write(result / TOWN_RECORD_FILE, (json.dumps(record, indent=2) + "\n").encode())
-        move_into_place(work, output)
+        check_folder(output, overwrite=overwrite)  # again, since others may have written there meanwhile
+        move_into_place(work, place)
+    except KeyboardInterrupt as error:
+        error.args = ("before the town was complete: no file of it is left, and the same command starts anew",)
+        raise
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return record
@@ -116,6 +124,7 @@ def _take_all(
     try:
         for done, observations in enumerate(pool.map(partial(_take_and_write, result, config), planned), 1):
             seen.append(observations)
+            os.utime(result.parent)  # a folder that does not change counts as abandoned (`files.atomic.is_abandoned`)
             progress("taking photographs", CountedFraction(done, len(planned), "taken"))
     finally:
         pool.shutdown(cancel_futures=True)

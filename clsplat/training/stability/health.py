@@ -23,6 +23,8 @@ RETURN_RATE_FACTOR = 0.5
 """Factor on the learning rates at each return, for the rest of the run."""
 MAX_BROKEN_FRACTION = 0.5
 """Fraction of broken Gaussians above which a model is not repaired: training goes back at once."""
+EXAMINED_ROWS = 1 << 16
+"""Number of Gaussians that are examined at a time. All at once would take a copy of their largest parameters."""
 MAX_INCIDENT_GAUSSIANS = 1000
 """Maximum number of Gaussians that are copied for an incident."""
 
@@ -38,12 +40,20 @@ def examine(parameters: Model, first: Model, second: Model) -> tuple[NDArray[np.
     """
     count = len(parameters["means"])
     broken, refused = np.zeros(count, bool), np.zeros(count, bool)
-    for group, values in parameters.items():
-        broken |= ~(np.abs(values) < PARAMETER_GROUPS[group].limit).reshape(count, -1).all(axis=1)
-    for moments in (first, second):
-        for values in moments.values():
-            refused |= ~np.isfinite(values).reshape(count, -1).all(axis=1)
+    for start in range(0, count, EXAMINED_ROWS):
+        rows = slice(start, min(start + EXAMINED_ROWS, count))
+        for group, values in parameters.items():
+            broken[rows] |= _any_in_row(~(np.abs(values[rows]) < PARAMETER_GROUPS[group].limit))
+        for moments in (first, second):
+            for values in moments.values():
+                refused[rows] |= _any_in_row(~np.isfinite(values[rows]))
     return broken, refused
+
+
+def _any_in_row(marks: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Rows (n,) with a mark, of marks (n, ...)."""
+    found: NDArray[np.bool_] = marks.any(axis=tuple(range(1, marks.ndim)))
+    return found
 
 
 def lost(stage: str, broken: NDArray[np.bool_], refused: NDArray[np.bool_]) -> NDArray[np.bool_]:

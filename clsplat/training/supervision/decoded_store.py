@@ -115,11 +115,9 @@ class DecodedStore:
     def _remove_abandoned(self) -> None:
         """Remove the temporary files of processes that have ended."""
         for path in self.folder.iterdir():
-            match = TEMPORARY_NAME.fullmatch(path.name)
-            if match is not None and match[1].endswith(SUFFIX):
-                with suppress(OSError):
-                    if is_abandoned(path, match[2]):
-                        remove(path)
+            with suppress(OSError):
+                if _is_abandoned(path):
+                    remove(path)
 
     def _give_up(self, reason: str) -> None:
         with self._lock:
@@ -156,12 +154,21 @@ class DecodedStore:
 
 
 def remove_decoded(folder: Path) -> None:
-    """Remove the files of decoded photographs in a folder, and the folder if nothing else is in it."""
+    """Remove the files of decoded photographs in a folder, and the folder if nothing else is in it.
+
+    A file that another process is writing stays.
+    """
     with suppress(OSError):
         for path in folder.iterdir():
-            if path.suffix == SUFFIX or TEMPORARY_NAME.fullmatch(path.name):
+            if path.suffix == SUFFIX or _is_abandoned(path):
                 remove(path)
         folder.rmdir()
+
+
+def _is_abandoned(path: Path) -> bool:
+    """True for the temporary file of a process that has ended. Raises OSError."""
+    match = TEMPORARY_NAME.fullmatch(path.name)
+    return match is not None and match[1].endswith(SUFFIX) and is_abandoned(path, match[2])
 
 
 def _read(path: Path, key: bytes) -> NDArray[Any]:
