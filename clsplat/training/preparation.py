@@ -30,22 +30,27 @@ def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None) -> S
     """
     scene.require_training_views()
     check_refinable(config, scene.train_views)
-    unit = _length_unit(scene, resumed)
+    start = config.start_points
+    is_prepared = bool(start) and scene.start == start
+    if not len(scene.points) and not start.sky:  # then photographs look at the points of a file, if there is one
+        scene = with_points(scene, start)
+    unit = _length_unit(scene, resumed, is_prepared=is_prepared)
     if unit != scene.unit:
         scene = replace(scene, unit=unit)
-    return with_depths(with_points(scene, config.start_points), config.depth_use)
+    return with_depths(with_points(scene, start), config.depth_use)
 
 
-def _length_unit(scene: Scene, resumed: Run | None) -> float | None:
+def _length_unit(scene: Scene, resumed: Run | None, *, is_prepared: bool) -> float | None:
     """Length unit in world units; None for the extent, which in some scenes depends on the start points.
 
     A run that has begun keeps its unit, which is the extent if its record is missing.
+    is_prepared: True if the scene has its unit already, and start points that may not count, such as a sky.
     """
     record = None if resumed is None else scene_record.read(resumed)
     if record is not None:
         return scene_record.length_unit_of(record)
     began = resumed is not None and bool(resumed.checkpoints())
-    if scene.unit is not None:
+    if scene.unit is not None or is_prepared:
         return None if began else scene.unit
     unit = length_unit_of(scene)
     if unit == scene.extent:

@@ -235,7 +235,7 @@ DEMO = "import sys; from clsplat.cli.main import main; sys.exit(main(sys.argv[1:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends signals as POSIX has them")
-@pytest.mark.parametrize("name", ["SIGINT", "SIGKILL"])
+@pytest.mark.parametrize("name", ["SIGINT", pytest.param("SIGKILL", marks=pytest.mark.slow)])
 def test_a_call_after_an_interrupted_one_makes_the_whole_town(tmp_path: Path, name: str) -> None:
     words = ["demo", "-o", str(tmp_path / "town"), "--town", "1x1", "--town-photos", "300", "--town-size", "64x40"]
     process = subprocess.Popen([sys.executable, "-c", DEMO, *words], stderr=subprocess.PIPE, text=True)

@@ -12,6 +12,7 @@ import pytest
 from tiny import DISTANCE, short, write_scene
 
 from clsplat.api import train
+from clsplat.arrays import Float64
 from clsplat.device.context import Device
 from clsplat.runs import scene_record
 from clsplat.runs.run import Run
@@ -67,6 +68,32 @@ def test_the_unit_grows_with_the_street_up_to_the_depth(tmp_path: Path) -> None:
 def test_a_scene_without_points_keeps_the_extent(tmp_path: Path) -> None:
     scene = street(tmp_path / "scene")
     assert length_unit_of(replace(scene, points=np.empty((0, 3)), point_colors=np.empty((0, 3)))) == scene.extent
+
+
+def write_cloud(path: Path, points: Float64) -> str:
+    """A PLY of the points without colours. Returns its path."""
+    names = [f"property float {axis}" for axis in "xyz"]
+    head = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *names, "end_header"]
+    path.write_text("\n".join([*head, *(" ".join(map(str, point)) for point in points)]) + "\n")
+    return str(path)
+
+
+def test_a_scene_without_points_takes_those_of_a_file(tmp_path: Path) -> None:
+    scene = street(tmp_path / "scene")
+    config = short(points=write_cloud(tmp_path / "cloud.ply", scene.points))
+    made = prepared(replace(scene, points=np.empty((0, 3)), point_colors=np.empty((0, 3))), config)
+    assert made.length_unit == pytest.approx(length_unit_of(scene))
+    assert prepared(made, config).length_unit == made.length_unit
+
+
+def test_a_prepared_scene_keeps_its_unit(tmp_path: Path) -> None:
+    """As `clsplat train` has it, which hands one to `clsplat.train`. Other points do not count, nearer ones either."""
+    scene = street(tmp_path / "scene", length=0.4)
+    assert length_unit_of(scene) == scene.extent
+    near = np.concatenate([view.camera.position + 0.3 * view.camera.rotation[2:] for view in scene.train_views])
+    made = prepared(scene, config := short(points=write_cloud(tmp_path / "cloud.ply", near)))
+    assert length_unit_of(made) < made.extent
+    assert prepared(made, config).length_unit == made.length_unit == scene.extent
 
 
 def test_tracks_tell_what_a_photograph_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -251,10 +251,12 @@ def test_only_its_own_files_are_removed(store: DecodedStore) -> None:
 
 
 def test_a_file_that_another_process_is_writing_stays(store: DecodedStore) -> None:
-    """As where a training was told to use the cache in the folder of another one, which ends."""
+    """As where a training begins on the same cache, or ends whose own cache this process was told to use."""
     store.write(KEY, PIXELS)
     being_written = temporary_name(store.path(OTHER))
     being_written.write_bytes(b"half")
+    DecodedStore(store.folder)
+    assert being_written.exists()
     remove_decoded(store.folder)
     assert [path.name for path in store.folder.iterdir()] == [being_written.name]
     store.write(KEY, PIXELS)

@@ -52,8 +52,7 @@ def examine(parameters: Model, first: Model, second: Model) -> tuple[NDArray[np.
 
 def _any_in_row(marks: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Rows (n,) with a mark, of marks (n, ...)."""
-    found: NDArray[np.bool_] = marks.any(axis=tuple(range(1, marks.ndim)))
-    return found
+    return np.asarray(marks.any(axis=tuple(range(1, marks.ndim))))
 
 
 def lost(stage: str, broken: NDArray[np.bool_], refused: NDArray[np.bool_]) -> NDArray[np.bool_]:
