@@ -131,7 +131,7 @@ def recorded_camera(camera: Camera) -> RecordedCamera:
 def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
     """Write `folder`/trouble-step-STEP.npz for the incident, and return its path."""
     photograph = trainer.photographs.load(incident.view, trainer.sizes.factor(incident.step))
-    camera = trainer.camera(incident.view, photograph.shape[1], photograph.shape[0])
+    camera = trainer.loader.camera(incident.view, photograph.shape[1], photograph.shape[0])
     device = trainer.device
     record: StepRecord = {
         "step": incident.step,
@@ -166,7 +166,7 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
         models = _unmarked({kind: host_model(incident.gaussians, kind) for kind in _MODEL_KINDS})
         alone = reproduced(models)
     if not alone:
-        models = _unmarked({kind: to_host(model) for kind, model in trainer.models().items()})
+        models = _unmarked({kind: to_host(model) for kind, model in trainer.model.kinds().items()})
     record["of"] = models["parameters"].count, trainer.parameters.count
     record["reproduced"] = alone or reproduced(models)
     arrays = {f"{kind}/{g}": array.values for kind, model in models.items() for g, array in model.arrays.items()}

@@ -17,6 +17,7 @@ from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
 from clsplat.rendering.memory_plan import Plan
+from clsplat.runs.checkpoints import Checkpoint, unusable
 from clsplat.stages.density import (
     DensityStatistics,
     DeviceMarker,
@@ -33,6 +34,7 @@ from clsplat.stages.device_gaussians import (
     HostGaussians,
     allocate_gaussians,
     host_gaussians,
+    host_model,
     host_zeros,
     to_device,
     to_host,
@@ -45,6 +47,7 @@ class TrainedModel:
     """Parameters, first and second moments and statistics, on the device or streamed from the host.
 
     make_plan: function that plans the device's memory for a number of Gaussians.
+    sh_degree: final SH degree.
     counts_contributions: True if the statistics have contributions.
     """
 
@@ -55,10 +58,16 @@ class TrainedModel:
     plan: Plan
 
     def __init__(
-        self, device: Device, work: Workspace, make_plan: Callable[[int], Plan], *, counts_contributions: bool
+        self,
+        device: Device,
+        work: Workspace,
+        make_plan: Callable[[int], Plan],
+        *,
+        sh_degree: int,
+        counts_contributions: bool,
     ) -> None:
         self._device, self._work, self._make_plan = device, work, make_plan
-        self._counts_contributions = counts_contributions
+        self._sh_degree, self._counts_contributions = sh_degree, counts_contributions
 
     def begin(self, initial: Gaussians) -> None:
         """Start from a model on the host."""
@@ -68,10 +77,31 @@ class TrainedModel:
         else:
             self.set(upload_gaussians(self._device, initial))
 
-    def load(self, models: Sequence[HostGaussians]) -> None:
-        """Continue with the parameters, first and second moments of a checkpoint. The statistics start anew."""
+    def saved(self, checkpoint: Checkpoint) -> list[HostGaussians]:
+        """Parameters, first and second moments of a checkpoint. Raises InputError for arrays of another model."""
+        most = (self._sh_degree + 1) ** 2
+        try:
+            models = [host_model(checkpoint.arrays, kind) for kind in self.kinds()]
+            if (n := max(model.coefficients for model in models)) > most:
+                raise ValueError(f"has {n} SH coefficients, more than the {most} of --sh-degree {self._sh_degree}")
+        except ValueError as error:
+            raise unusable(checkpoint, str(error)) from None
+        return models
+
+    def load(self, models: Sequence[HostGaussians], checkpoint: Checkpoint) -> None:
+        """Continue with the models (`saved`) and the statistics of a checkpoint.
+
+        Statistics that the settings did not need before the checkpoint stay unknown.
+        Raises InputError for statistics of another model.
+        """
+        self.free()
         self.plan = self._make_plan(models[0].count)
         self.set(*(self._placed(model) for model in models))
+        statistics = checkpoint.named("statistics/")
+        for name, array in self.statistics.named().items():
+            if name in statistics and (statistics[name].shape, statistics[name].dtype) != (array.shape, array.dtype):
+                raise unusable(checkpoint, f"statistics/{name} has shape {statistics[name].shape}")
+        self.statistics.load(statistics)
 
     def free(self) -> None:
         """Free all arrays."""
@@ -90,6 +120,11 @@ class TrainedModel:
     def kinds(self) -> dict[str, AnyGaussians]:
         """Parameters, first and second moments, by their names in a checkpoint."""
         return {"parameters": self.parameters, "first": self.first, "second": self.second}
+
+    @property
+    def with_moments(self) -> tuple[AnyGaussians, AnyGaussians, AnyGaussians]:
+        """Parameters, first and second moments."""
+        return self.parameters, self.first, self.second
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a checkpoint, without the statistics."""

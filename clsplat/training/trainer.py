@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -12,82 +12,60 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.config.masks import NO_MASKS
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
-from clsplat.errors import warn
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.optimisation.density_rules import FRESH
 from clsplat.optimisation.step_noise import exploration_of
-from clsplat.rendering.memory_needs import MODELS, StepMemory, plan_step
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.rasterizer import PairCapacity, Rasterizer
 from clsplat.rendering.renderer import Renderer, RenderResult
 from clsplat.runs.appearance import held_out_looks
 from clsplat.runs.checkpoints import Checkpoint, unusable
 from clsplat.scenes.start.initialise import from_scene
-from clsplat.stages.density import DensityStatistics, gaussian_bytes
-from clsplat.stages.device_gaussians import (
-    AnyGaussians,
-    DeviceGaussians,
-    HostGaussians,
-    download_gaussians,
-    host_model,
-)
+from clsplat.stages.density import DensityStatistics
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, download_gaussians
 from clsplat.stages.loss import Loss
 from clsplat.training.appearance.choice import appearance_of
-from clsplat.training.batch import OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PER_PARAMETER, Batch, Losses
+from clsplat.training.batch import Batch, Losses
 from clsplat.training.cameras.refinement import Cameras
 from clsplat.training.cameras.validation import ValidationViews, validate
 from clsplat.training.density import ModelState, RowPlan, Strategy
 from clsplat.training.density.choice import strategy_of
 from clsplat.training.host_memory import UNLIMITED, HostMemory
 from clsplat.training.learning_rates import rates_at
+from clsplat.training.memory_planner import MemoryPlanner
 from clsplat.training.mip_filter import MipFilter
-from clsplat.training.stability.health import RetryBudget
 from clsplat.training.stability.non_finite import NonFiniteMonitor, Repair
 from clsplat.training.step.component import Component
 from clsplat.training.step.gradient_step import GradientStep, StepProbe, slot_fields, view_gradients
 from clsplat.training.step.inputs import ViewInputs
 from clsplat.training.step.late_adam import LateAdam
 from clsplat.training.step.monitor import StepMonitor
+from clsplat.training.step.position import Mark, Position
 from clsplat.training.step.speculative_steps import SpeculativeSteps
 from clsplat.training.supervision.depth_targets import DepthTargets
-from clsplat.training.supervision.host_photographs import reading_threads
 from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.supervision.resolution import by_doubling
+from clsplat.training.supervision.view_loader import ViewLoader
 from clsplat.training.trained_model import TrainedModel
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
 
 
-@dataclass(frozen=True)
-class _Mark:
-    """A point in the training at which a checkpoint is possible.
-
-    step: number of steps done.
-    rng: state of the random generator.
-    queue: views that are left in the epoch.
-    controlled: True if the density control before the next step has been done.
-    """
-
-    step: int
-    rng: Mapping[str, Any]
-    queue: list[int]
-    controlled: bool
-
-
 class Trainer:
     """A model in training: parameters, moments, statistics and the random state, which a checkpoint holds.
 
-    step: number of views done.
+    position: step, random state and views left in the epoch.
     monitor: monitor of non-finite values in the model.
     pending: steps that have been launched but may have to be repeated.
     mark: state that `step_back` restores; None once the arrays no longer have that state.
     further: devices in addition to the model's.
-    memory: limit of main memory, and the cache of photographs.
+    planner: planner of the memory.
+    loader: loader of the steps' photographs and cameras.
+    background: background of the last view.
     """
 
     def __init__(
@@ -103,12 +81,12 @@ class Trainer:
         self.scene, self.config, self.device, self._new_strategy = scene, config, device, strategy
         self.views = scene.require_training_views()
         self.rasterizer = Rasterizer(device, config.rasterizer, antialiased=config.antialiased)
-        self.memory, self._begins, self._tight = memory, True, False
         self.photographs = ImageCache(device, memory.photographs(scene, config))
         self.renderer = Renderer(device, self.rasterizer)
         self.validation_views = ValidationViews(scene, device, config)
         self.depths = DepthTargets(config, self.views, scene.length_unit, scene.near, self._pixels)
         self.batch = Batch(self.rasterizer, self.photographs, config, further) if config.batch > 1 else None
+        self.planner = MemoryPlanner(scene, config, self.rasterizer, self.photographs, memory, self.batch)
         self.sizes = by_doubling(config.warmup)
         self.background: NDArray[np.float32] = np.zeros(3, np.float32)
         self.given = initial
@@ -119,87 +97,45 @@ class Trainer:
 
     def _start(self) -> None:
         """Set up the model and the state of step 0."""
-        self.rng = np.random.default_rng(self.config.seed)
-        self.step = 0
-        self.queue: list[int] = []
-        self.controlled, self.last_views = False, 1
-        self.mark: _Mark | None = None
+        self.position = Position(np.random.default_rng(self.config.seed))
+        self.mark: Mark | None = None
         self.tried: set[tuple[object, ...]] = set()
         self.strategy = self._new_strategy(self.config)
         self._looks_at_steps = type(self.strategy).after_gradient is not Strategy.after_gradient
         initial = self.given
         if initial is None:
-            initial = from_scene(self.scene, self.config.random_points, self.rng)
+            initial = from_scene(self.scene, self.config.random_points, self.position.rng)
         self.appearance = appearance_of(self.config, self.device, self.scene)
         self.cameras = Cameras(self.config, self.scene, self.rasterizer.work)
         self.origin, self.near = initial.origin, self.scene.near
         asked = self.config.perspective
         self.by_rays = asked == "rays" or (asked == "auto" and any(view.camera.model.along_rays for view in self.views))
-        self._cameras: dict[int, tuple[Camera, Camera]] = {}
+        self.loader = ViewLoader(self.config, self.views, self.photographs, self.sizes, self.cameras.of, self.local)
         cameras = [self.local(view.camera) for view in self.views]
         mip_filter = MipFilter(self.config, self.device, self.rasterizer.work, cameras)
         late = [LateAdam(self.config.optimiser, self.rasterizer, len(initial))] if self.config.optimiser.late else []
         self.components: tuple[Component, ...] = (*late, mip_filter, self.appearance, self.cameras, self.depths)
-        contributions = self.strategy.needs().contributions
         self.model = TrainedModel(
-            self.device, self.rasterizer.work, self._make_plan, counts_contributions=contributions
+            self.device,
+            self.rasterizer.work,
+            self._make_plan,
+            sh_degree=self.config.sh_degree,
+            counts_contributions=self.strategy.needs().contributions,
         )
         self.model.begin(initial)
 
     def _make_plan(self, count: int) -> Plan:
-        """Plan the device's memory for `count` Gaussians with their final number of SH coefficients."""
-        needs, batch = self.strategy.needs(), self.batch
-        memory = StepMemory(
-            fields=slot_fields(needs, nearness=bool(self.config.depth_use)),
-            photographs=sum(view.camera.width * view.camera.height for view in self.views),
-            turns=self.pending.turns,
-            masks=self.config.mask_use != NO_MASKS,
-            row_bytes=sum(component.row_bytes for component in self.components),
-            pixel_bytes=sum(component.pixel_bytes for component in self.components),
-        )
+        return self.planner.plan(count, self.strategy.needs(), self.components, self.pending.turns)
 
-        def plan(device: Device, models: int) -> Plan:
-            return plan_step(
-                device,
-                count,
-                (self.config.sh_degree + 1) ** 2,
-                [view.camera for view in self.scene.views],
-                self.config.rasterizer,
-                memory,
-                models=models,
-            )
-
-        models = max(component.models for component in self.components)
-        made = plan(self.device, models or (MODELS if batch is None else OWNER_ARRAYS_PER_PARAMETER))
-        self.rasterizer.follow(made)
-        self.photographs.follow(made.photographs)
-        on_host = self.device.shares_memory or made.streamed
-        model = made.need.model + gaussian_bytes(contributions=needs.contributions)
-        enough = self.memory.share(self.photographs.host, count, count * model if on_host else 0, begins=self._begins)
-        if not enough and not self._tight:
-            self._tight = True
-            warn(
-                f"--max-host-mem is exceeded from here on: {count:,} Gaussians leave too little of it for photographs; "
-                "--density.max-gaussians limits the number of Gaussians"
-            )
-        if batch is not None:
-            batch.follow([plan(replica.device, REPLICA_ARRAYS_PER_PARAMETER) for replica in batch.replicas])
-        return made
+    @property
+    def step(self) -> int:
+        """Number of views done."""
+        return self.position.step
 
     @property
     def parameters(self) -> AnyGaussians:
         """Parameters of the model."""
         return self.model.parameters
-
-    @property
-    def first(self) -> AnyGaussians:
-        """First moments of Adam."""
-        return self.model.first
-
-    @property
-    def second(self) -> AnyGaussians:
-        """Second moments of Adam."""
-        return self.model.second
 
     @property
     def statistics(self) -> DensityStatistics:
@@ -224,42 +160,37 @@ class Trainer:
         Kerbl et al. 2023, algorithm 1, but density control comes first instead of last. So a model is rendered, saved
         or finished before its Gaussians are split or made transparent, and not right after.
         """
-        self._begins = False
+        self.planner.begins = False
         if self.mark is None or self._looks_at_steps:
             self._note()
         self.repair()
         self.validate()
-        if not self.controlled:
+        if not self.position.controlled:
             self._control_density()
-            self.controlled = True
+            self.position.controlled = True
         if self.mark is None:
             self._note()
         views = self.views_ahead
-        self.step += views
+        self.position.step += views
         self._raise_sh_degree()
         self._prepare_components(views)
         inputs, step, factor = self._inputs(views), self._gradient_step(), self.sizes.factor(self.step)
-        self.photographs.host.read_ahead(self._next_photographs())
+        self.loader.read_ahead(self.position)
         result: Loss | Losses
         if self.batch is None:
             run = partial(self._run, step, inputs[0], reads_loss)
             result = self.pending.launch(run, self._room(factor), reads_loss=reads_loss)
-            if self.queue:  # upload the next step's photograph, at this resolution
-                self.photographs.ahead(self.queue[-1], factor)
+            if self.position.queue:  # upload the next step's photograph, at this resolution
+                self.photographs.ahead(self.position.queue[-1], factor)
         else:
-            gathers, model = self.strategy.needs(self.step).gradients, (self.parameters, self.first, self.second)
+            gathers, model = self.strategy.needs(self.step).gradients, self.model.with_moments
             result = self.batch.run(step, model, inputs, factor, self._watched_in_batch, statistics=gathers)
             self._after_adam()
-        self.controlled, self.last_views = False, views
+        self.position.controlled, self.position.last_views = False, views
         self._note()
         if self._looks_at_steps:
             self._rearrange(self.strategy.after_gradient(self._state()))
         return result
-
-    def _next_photographs(self) -> list[tuple[int, float]]:
-        """Views of the next steps and their size divisors, in the order of their use, until the end of the epoch."""
-        batch, ahead = self.config.batch, self.queue[: -1 - reading_threads() - self.config.batch : -1]
-        return [(view, self.sizes.factor(self.step + (1 + place // batch) * batch)) for place, view in enumerate(ahead)]
 
     def _prepare_components(self, views: int) -> None:
         """Let the components do the work that is due before a step of `views` views."""
@@ -295,7 +226,7 @@ class Trainer:
     ) -> Loss:
         """Make a step of one view."""
         step = replace(step, turn=turn, room=room)
-        model, probe = (self.parameters, self.first, self.second), self._watched(inputs, step, step.step)
+        model, probe = self.model.with_moments, self._watched(inputs, step, step.step)
         result = step.run(model, inputs, probe, self._view_gradients(inputs), reads_loss=reads_loss)
         self._after_adam()
         return result
@@ -322,7 +253,7 @@ class Trainer:
         """Make all changes to Gaussians that components have postponed, after all launched steps are done."""
         self.settle()
         for component in self.components:
-            component.complete(self.parameters, self.first, self.second)
+            component.complete(*self.model.with_moments)
 
     @property
     def complete_parameters(self) -> AnyGaussians:
@@ -330,7 +261,7 @@ class Trainer:
         self.settle()
         parameters = self.parameters
         for component in self.components:
-            parameters = component.completed(parameters, self.first, self.second)
+            parameters = component.completed(parameters, *self.model.with_moments[1:])
         return parameters
 
     def _pixels(self, view: int) -> NDArray[Any]:
@@ -338,24 +269,11 @@ class Trainer:
         return self.photographs.load(view, self.sizes.factor(self.step))
 
     def _view_inputs(self, place: int) -> ViewInputs:
-        """Inputs of the next view. Without a batch its photograph is on the device."""
-        begins, view, factor = not self.queue, self._next_view(), self.sizes.factor(self.step)
-        bring = self.photographs.bring if self.batch is None else self.photographs.load
-        image = bring(view, factor)
-        self.background = self._background_colour()
-        height, width = image.shape[:2]
-        full = self.views[view].camera
-        return ViewInputs(
-            view,
-            image,
-            self.camera(view, width, height),
-            self.background,
-            begins,
-            self.photographs.kept(view, factor),
-            area=full.width * full.height / (width * height),
-            place=place,
-            name=self.views[view].name,
-        )
+        """Inputs of the next view."""
+        begins, view = not self.position.queue, self._next_view()
+        inputs = self.loader.inputs(view, self.position, place, begins=begins)
+        self.background = inputs.background
+        return inputs
 
     def _view_gradients(self, inputs: ViewInputs) -> DeviceGaussians | None:
         """Arrays for the rows' gradients; None if no component reads them."""
@@ -402,7 +320,7 @@ class Trainer:
 
         begun: True if the step number has already been increased for the current step, which has one view.
         """
-        self.mark = _Mark(self.step - begun, self.rng.bit_generator.state, list(self.queue), self.controlled)
+        self.mark = self.position.mark(begun=begun)
 
     def step_back(self) -> bool:
         """After an error, return to the last point at which a checkpoint was possible.
@@ -410,11 +328,9 @@ class Trainer:
         That point is before the current step, or after the step's density control if that is done. Returns False if the
         state there is lost.
         """
-        mark = self.mark
-        if mark is None:
+        if self.mark is None:
             return False
-        self.step, self.queue, self.controlled = mark.step, list(mark.queue), mark.controlled
-        self.rng.bit_generator.state = mark.rng
+        self.position.go_back(self.mark)
         return True
 
     def repair(self, *, look: bool = False) -> None:
@@ -425,18 +341,14 @@ class Trainer:
         if look:
             self.settle()
             self.monitor.look()
-        self._apply(self.monitor.examine(self.models()))
-
-    def models(self) -> dict[str, AnyGaussians]:
-        """Parameters, first and second moments, by their names in a checkpoint."""
-        return self.model.kinds()
+        self._apply(self.monitor.examine(self.model.kinds()))
 
     def _apply(self, repair: Repair | None) -> None:
         if repair is None:
             return
         for kind, groups in repair.moments.items():
             for group, values in groups.items():
-                self.models()[kind][group].set(values)
+                self.model.kinds()[kind][group].set(values)
         self._rearrange(RowPlan(repair.rows))
 
     def rates(self) -> dict[str, float]:
@@ -444,12 +356,12 @@ class Trainer:
         return rates_at(self.config, self.step, self.scene.length_unit, self.monitor.retries.rate_factor)
 
     def _next_view(self) -> int:
-        if not self.queue:
-            self.queue = [int(index) for index in self.rng.permutation(len(self.views))]
+        if not self.position.queue:
+            self.position.queue = [int(index) for index in self.position.rng.permutation(len(self.views))]
             if self.batch is None:  # a batch may still have to count views of the last epoch
                 self._turn_epoch()
                 self._note(begun=True)
-        return self.queue.pop()
+        return self.position.queue.pop()
 
     def _turn_epoch(self) -> None:
         """Begin a pass through all views."""
@@ -457,11 +369,6 @@ class Trainer:
             self.settle()
         self.mark = None
         self.model.statistics = self.statistics.next_epoch()
-
-    def _background_colour(self) -> NDArray[np.float32]:
-        if self.config.random_background:
-            return self.rng.random(3, dtype=np.float32)
-        return np.array(background_colour(self.config.background), np.float32)
 
     def _raise_sh_degree(self) -> None:
         """Raise the SH degree in use. Higher bands have no arrays yet: their gradients, and so their steps, would be
@@ -475,7 +382,8 @@ class Trainer:
 
     def _control_density(self) -> None:
         """Run the density control that is due after one of the last step's views."""
-        steps = [step for step in range(self.step - self.last_views + 1, self.step + 1) if self.strategy.is_due(step)]
+        last = range(self.step - self.position.last_views + 1, self.step + 1)
+        steps = [step for step in last if self.strategy.is_due(step)]
         for step in steps if self.step > 0 else ():
             self.repair(look=True)
             if step == steps[0]:
@@ -488,7 +396,7 @@ class Trainer:
     def _state(self, step: int | None = None) -> ModelState:
         model, statistics, step = self.parameters, self.statistics.named(), step or self.step
         lengths = self.scene.length_unit, self.scene.extent
-        return ModelState(model.count, step, *lengths, model.arrays, statistics, self.rng, self.model.marker())
+        return ModelState(model.count, step, *lengths, model.arrays, statistics, self.position.rng, self.model.marker())
 
     def _rearrange(self, plan: RowPlan | None) -> None:
         """Carry out a plan of density control, or of a repair, for the rows of all arrays."""
@@ -520,17 +428,6 @@ class Trainer:
         """Camera in the coordinates of the model in training, from a camera in the world: see `Gaussians.local`."""
         return camera.from_origin(self.origin).before(self.near).along_rays(self.by_rays)
 
-    def camera(self, view: int, width: int, height: int) -> Camera:
-        """Camera of a training view at the size of its photograph.
-
-        It returns the same object while the size and the refined camera stay the same.
-        """
-        (of, camera), now = self._cameras.get(view, (None, None)), self.cameras.of(view)
-        if camera is None or of is not now or (camera.width, camera.height) != (width, height):
-            camera = self.local(now.resized(width, height))
-            self._cameras[view] = now, camera
-        return camera
-
     def gaussians(self) -> Gaussians:
         """Model so far, on the host, with room for its final SH degree."""
         model = download_gaussians(self.complete_parameters)
@@ -552,9 +449,7 @@ class Trainer:
         ) is not None:  # finds non-finite values in Gaussians that no step has visited
             self._apply(repair)
             arrays = self._arrays()
-        state = {"rng": self.rng.bit_generator.state, "queue": self.queue, "patience": asdict(self.monitor.retries)}
-        views = {"views": self.last_views} if self.last_views > 1 else {}
-        return arrays, {**state, **views, **({"controlled": True} if self.controlled else {})}
+        return arrays, self.position.state(self.monitor.retries)
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
@@ -573,46 +468,14 @@ class Trainer:
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continue from a checkpoint."""
-        loaded = [self._loaded(checkpoint, kind) for kind in ("parameters", "first", "second")]
-        self.step = checkpoint.step
-        try:
-            self.rng.bit_generator.state = checkpoint.state["rng"]
-            queue = list(checkpoint.state["queue"])
-            if not all(type(index) is int and index >= 0 for index in queue):
-                raise ValueError(f"the queue of views begins with {queue[:3]}")
-            retries = RetryBudget(**checkpoint.state.get("patience", {}))
-            last_views = checkpoint.state.get("views", 1)
-            if type(last_views) is not int or not 1 <= last_views <= max(checkpoint.step, 1):
-                raise ValueError(f"the last step had {last_views!r:.20} views")
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            why = f"{type(error).__name__}: {error}"
-            raise unusable(checkpoint, f"its state is not as this version writes it ({why})") from None
-        self.queue = queue if max(queue, default=0) < len(self.views) else []  # the scene had more views before
-        self.controlled, self.mark = bool(checkpoint.state.get("controlled", False)), None
-        self.last_views = last_views
-        self.monitor.retries = retries
+        models = self.model.saved(checkpoint)
+        self.monitor.retries, self.mark = self.position.load(checkpoint, len(self.views)), None
         self.monitor.forget()
         self.pending.forget()
-        self.model.free()
-        self.model.load(loaded)
-        statistics = checkpoint.named("statistics/")
-        for name, array in self.statistics.named().items():
-            if name in statistics and (statistics[name].shape, statistics[name].dtype) != (array.shape, array.dtype):
-                raise unusable(checkpoint, f"statistics/{name} has shape {statistics[name].shape}")
-        self.statistics.load(statistics)  # statistics that the settings did not need before the checkpoint stay unknown
+        self.model.load(models, checkpoint)
         self.strategy.load(checkpoint.named("strategy/"))
         try:
             for component in self.components:
                 component.load(checkpoint.named, self.step, self.parameters.count)
         except ValueError as error:
             raise unusable(checkpoint, str(error)) from None
-
-    def _loaded(self, checkpoint: Checkpoint, kind: str) -> HostGaussians:
-        most, degree = (self.config.sh_degree + 1) ** 2, self.config.sh_degree
-        try:
-            model = host_model(checkpoint.arrays, kind)
-            if (n := model.coefficients) > most:
-                raise ValueError(f"has {n} SH coefficients, more than the {most} of --sh-degree {degree}")
-        except ValueError as error:
-            raise unusable(checkpoint, str(error)) from None
-        return model

@@ -287,7 +287,7 @@ def test_measuring_leaves_the_model_as_it_is(profiled: Device) -> None:
     after = trainer.gaussians()
     for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
         np.testing.assert_array_equal(getattr(after, name), getattr(subject.gaussians, name))
-    assert trainer.first["means"].get().any(), "there was a gradient"
+    assert trainer.model.first["means"].get().any(), "there was a gradient"
 
 
 def test_synthetic_scene_is_the_same_every_time() -> None:

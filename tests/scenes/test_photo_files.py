@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import unicodedata
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 import pytest
 from calls import only, refuses
-from ring import COUNT, HEIGHT, NAMES, WIDTH, level, write_colmap, write_pictures, write_transforms
+from ring import COUNT, HEIGHT, NAMES, WIDTH, level, matrix_of, poses, write_colmap, write_pictures, write_transforms
 from systems import posix
 
 from clsplat.config.depth import DepthUse
@@ -18,7 +18,7 @@ from clsplat.scenes.depth_sources import with_depths
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.photo_names import match, nearest
 from clsplat.scenes.readers.colmap import read_cameras
-from clsplat.scenes.readers.transforms import read_poses
+from clsplat.scenes.readers.transforms import read_poses, read_transforms
 from clsplat.scenes.scene import Scene
 
 
@@ -262,6 +262,31 @@ def test_those_in_sub_folders_too(tmp_path: Path) -> None:
     scene = load_scene(tmp_path)
     assert_each_has_its_picture(scene)
     assert scene.views[0].name == "images/cam0/00.png"
+
+
+def test_each_folder_has_a_smaller_copy_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twice the folders take twice the work, counted in comparisons of paths: three times leaves room for sorting."""
+    compared = 0
+
+    def counted(one: PurePath, other: object) -> bool:
+        nonlocal compared
+        compared += 1
+        return equal(one, other)
+
+    equal = PurePath.__eq__
+    counts = []
+    for cameras in (20, 40):
+        folder = tmp_path / str(cameras)
+        listed, files = ([f"cam{index:02}{end}/view.png" for index in range(cameras)] for end in ("", "_2"))
+        write_transforms(folder, listed, files, matrices=[matrix_of(poses()[0])] * cameras)
+        compared = 0
+        with monkeypatch.context() as patched:
+            patched.setattr(PurePath, "__eq__", counted)
+            with pytest.warns(UserWarning, match="are read from"):
+                images = read_transforms(folder / "transforms.json").images
+        assert [image.path for image in images] == [folder / file for file in files]
+        counts.append(compared)
+    assert 0 < counts[1] < 3 * counts[0]
 
 
 @pytest.mark.brings("3DGS' convert.py", "`input/` in place of `images/`", "taken where there is no `images/`")

@@ -196,14 +196,14 @@ def test_a_step_is_that_of_the_sum_of_its_views_gradients(scene: Scene, default_
     views = []
     for _ in range(2):
         alone = Trainer(scene, short(), default_device)
-        alone.rng.bit_generator.state, alone.queue = plain.rng.bit_generator.state, plain.queue
+        alone.position.go_back(plain.position.mark())
         inputs, probe = alone._view_inputs(0), _Gradients()
-        plain.rng.bit_generator.state, plain.queue = alone.rng.bit_generator.state, alone.queue
+        plain.position.go_back(alone.position.mark())
         room = allocate_gaussians(default_device, alone.parameters.count, 1, zero=True)
         step = GradientStep(
             default_device, alone.rasterizer, alone.config, 1, alone.rates(), slot_fields(alone.strategy.needs(1))
         )
-        model = (alone.parameters, alone.first, alone.second)
+        model = alone.model.with_moments
         step.run(model, inputs, probe, room)
         views.append(probe)
     batched.train_step()
@@ -216,7 +216,9 @@ def test_a_step_is_that_of_the_sum_of_its_views_gradients(scene: Scene, default_
         wanted, first, _ = reference(before[group], total, zeros, zeros, 1, rate, *constants)
         # one addition and one step in float32, of which beta2's rounding is the most (see test_adam.py)
         assert_close(batched.parameters[group].get(), wanted, relative=1e-6, absolute=1e-4 * rate)
-        assert_close(batched.first[group].get(), first, relative=1e-5, absolute=1e-5 * np.abs(first).max(initial=0))
+        assert_close(
+            batched.model.first[group].get(), first, relative=1e-5, absolute=1e-5 * np.abs(first).max(initial=0)
+        )
 
 
 def test_trouble_on_a_further_device_ends_the_training(
@@ -269,7 +271,7 @@ def test_a_view_without_a_finite_loss_is_named(scene: Scene, default_device: Dev
     for devices in ([default_device], halves(default_device.index)):
         trainer = Trainer(scene, short(batch=2, warmup=()), devices[0], further=devices[1:])
         trainer.train_step()
-        order = [*trainer.queue]
+        order = [*trainer.position.queue]
         bad = order[-2]  # the second view of the next step
         photograph = trainer.photographs.load(bad, 1.0).astype(np.float32)
         photograph[3, 4] = np.nan

@@ -32,7 +32,7 @@ def test_it_is_so_where_the_scene_has_other_lenses(scene: Scene, default_device:
         for each, by_rays in zip((scene, wide, mixed), outcomes, strict=True):
             trainer = Trainer(each, config, default_device)
             kinds = {
-                trainer.camera(index, view.camera.width, view.camera.height).model.along_rays
+                trainer.loader.camera(index, view.camera.width, view.camera.height).model.along_rays
                 for index, view in enumerate(trainer.views)
                 if view.camera.projection == "perspective"
             }

@@ -79,14 +79,14 @@ def trained(scene: Scene, device: Device, steps: int) -> tuple[Trainer, Juggler]
 
 def test_rows_follow_the_plan_of_any_strategy(scene: Scene, default_device: Device) -> None:
     trainer, juggler = trained(scene, default_device, DUE)
-    before = {kind: host(getattr(trainer, kind)) for kind in ("parameters", "first", "second")}
+    before = {kind: host(model) for kind, model in trainer.model.kinds().items()}
     place = np.random.default_rng()
-    place.bit_generator.state = trainer.rng.bit_generator.state
+    place.bit_generator.state = trainer.position.rng.bit_generator.state
     trainer._control_density()
     assert juggler.seen[0] > 0, "it has seen the statistics"
     assert not trainer.statistics.seen.get().any(), "which start again"
     for kind, groups in before.items():
-        after = host(getattr(trainer, kind))
+        after = host(trainer.model.kinds()[kind])
         for group, values in groups.items():
             wanted = np.concatenate([values[1:], values[1:2]])
             if kind == "parameters" and group == "means":
@@ -100,13 +100,13 @@ def test_rows_follow_the_plan_of_any_strategy(scene: Scene, default_device: Devi
 
 def test_a_plan_after_the_gradient_changes_values_alone(scene: Scene, default_device: Device) -> None:
     plain, _ = trained(scene, default_device, 5)
-    before, moments = host(plain.parameters), host(plain.first)
+    before, moments = host(plain.parameters), host(plain.model.first)
     plain._rearrange(plain.strategy.after_gradient(replace(plain._state(), step=6)))
     after = host(plain.parameters)
     before["opacity_logits"][2] -= 1
     for group in PARAMETER_GROUPS:
         assert_same_bits(after[group], before[group], group)
-        assert_same_bits(plain.first[group].get(), moments[group], group)
+        assert_same_bits(plain.model.first[group].get(), moments[group], group)
 
 
 def test_its_state_is_in_the_checkpoint(scene: Scene, default_device: Device) -> None:

@@ -84,14 +84,14 @@ def test_a_pruning_alone_keeps_what_is_not_of_epochs(scene: Scene, default_devic
     )
     trainer = trained_to(26, scene, config, default_device)
     before = {name: array.get() for name, array in trainer.statistics.named().items()}
-    models = {kind: host(getattr(trainer, kind)) for kind in ("parameters", "first", "second")}
+    models = {kind: host(model) for kind, model in trainer.model.kinds().items()}
     gone = np.maximum(before["current_largest"], before["whole_largest"]) < 20.0
     assert 0 < gone.sum() < len(gone)
     trainer._control_density()
     for name, array in trainer.statistics.named().items():
         assert_same_bits(array.get(), before[name][~gone], name)
     for kind, values in models.items():
-        after = host(getattr(trainer, kind))
+        after = host(trainer.model.kinds()[kind])
         for group in PARAMETER_GROUPS:
             assert_same_bits(after[group], values[group][~gone], f"{kind} {group}")
 
@@ -148,7 +148,7 @@ def test_what_crosses_the_bus(
     trainer.statistics.seen.fill(1.0)
     scales = trainer.parameters["log_scales"]
     scales.set(np.where(np.arange(count)[:, None] % 9 == 0, np.float32(3), np.float32(-9)) + 0 * scales.get())
-    trainer.step = 5
+    trainer.position.step = 5
     moved = []
 
     def note(array: DeviceArray, name: str, event: Any, nbytes: int | None = None) -> None:

@@ -49,7 +49,7 @@ def wrong(trainer: Trainer) -> float:
     """Weighted mean difference of nearness over the training views."""
     total = weight = 0.0
     for index, view in enumerate(trainer.views):
-        camera = trainer.camera(index, view.camera.width, view.camera.height)
+        camera = trainer.loader.camera(index, view.camera.width, view.camera.height)
         aims = trainer.depths.aims(index, camera, 1)
         assert aims is not None
         frame = trainer.rasterizer.forward(trainer.parameters, camera, np.zeros(3, np.float32), nearness=True)

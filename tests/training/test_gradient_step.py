@@ -58,11 +58,11 @@ def test_a_trainer_s_step_is_a_gradient_step(scene: Scene, default_device: Devic
     before = by_hand.parameters["means"].get()
     view = int(np.random.default_rng(CONFIG.seed).permutation(len(trainer.views))[-1])
     trainer.train_step()
-    by_hand.step = 1
+    by_hand.position.step = 1
     step = GradientStep(
         default_device, Rasterizer(default_device), CONFIG, 1, by_hand.rates(), slot_fields(by_hand.strategy.needs(1))
     )
-    model = (by_hand.parameters, by_hand.first, by_hand.second)
+    model = by_hand.model.with_moments
     size = (by_hand.parameters.count, by_hand.parameters.coefficients)
     gradients = allocate_gaussians(default_device, *size, zero=True) if looks else None
     photograph, witness = by_hand.photographs.load(view, 1.0), Witness()
@@ -76,7 +76,7 @@ def test_a_trainer_s_step_is_a_gradient_step(scene: Scene, default_device: Devic
     assert np.isfinite(result.read()).all()
     for kind in ("parameters", "first", "second"):
         for group in PARAMETER_GROUPS:
-            got, wanted = getattr(by_hand, kind)[group].get(), getattr(trainer, kind)[group].get()
+            got, wanted = getattr(by_hand.model, kind)[group].get(), getattr(trainer.model, kind)[group].get()
             assert_same_bits(got, wanted, f"{kind} {group}")
     if gradients is not None:
         assert witness.gradients["means"].any()

@@ -26,7 +26,7 @@ def hidden_after(scene: Scene, device: Device, steps: int, optimiser: OptimiserC
     """A training in which no view shows the last Gaussian, which has moments all the same."""
     config = short(iterations=1000, warmup=(), density={"every": 0}, optimiser=optimiser)
     trainer = Trainer(scene, config, device, with_one_behind(scene))
-    for moments, value in ((trainer.first, 0.5), (trainer.second, 0.25)):
+    for moments, value in ((trainer.model.first, 0.5), (trainer.model.second, 0.25)):
         array = moments["means"].get()
         array[-1] = value
         moments["means"].set(array)
@@ -50,10 +50,10 @@ def test_the_hidden_are_where_dense_adam_has_them(scene: Scene, default_device: 
 
 def test_a_look_changes_no_bit(scene: Scene, default_device: Device) -> None:
     trainer = hidden_after(scene, default_device, 3, LATE)
-    before = {f"{kind} {g}": a.get() for kind, model in trainer.models().items() for g, a in model.arrays.items()}
+    before = {f"{kind} {g}": a.get() for kind, model in trainer.model.kinds().items() for g, a in model.arrays.items()}
     trainer.draw(cameras()[1])
     trainer.gaussians()
-    after = {f"{kind} {g}": a.get() for kind, model in trainer.models().items() for g, a in model.arrays.items()}
+    after = {f"{kind} {g}": a.get() for kind, model in trainer.model.kinds().items() for g, a in model.arrays.items()}
     for name, array in before.items():
         np.testing.assert_array_equal(after[name], array)
 

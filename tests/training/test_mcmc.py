@@ -97,7 +97,8 @@ def planned(trainer: Trainer) -> tuple[RowPlan, dict[str, dict[str, Float32]], d
 
     def looked_at() -> dict[str, dict[str, Float32]]:
         return {
-            kind: {group: model[group].get() for group in PARAMETER_GROUPS} for kind, model in trainer.models().items()
+            kind: {group: model[group].get() for group in PARAMETER_GROUPS}
+            for kind, model in trainer.model.kinds().items()
         }
 
     before = looked_at()

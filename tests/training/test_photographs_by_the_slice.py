@@ -394,7 +394,7 @@ def test_a_photograph_that_changes_ends_the_run_with_a_checkpoint(
 
     def between(trainer: Trainer, _stops: Callable[[], bool]) -> None:
         if trainer.step == 3 and not paths:
-            paths.append(trainer.views[trainer.queue[0]].path)
+            paths.append(trainer.views[trainer.position.queue[0]].path)
             shutil.copy2(paths[0], saved)
             change(paths[0])
 

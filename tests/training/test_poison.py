@@ -205,13 +205,13 @@ def test_broken_moments_begin_again(scene: Scene, default_device: Device, which:
         if which == "first" and value == -5.0:
             continue  # that is a moment as good as any
         poisoned, plain = started(scene, default_device), started(scene, default_device)
-        put(getattr(poisoned, which)[group], value)
+        put(poisoned.model.kinds()[which][group], value)
         before = poisoned.parameters[group].get().reshape(40, -1)[ROW, -1]
         poisoned.train_step()
         plain.train_step()
         assert_others_alike(poisoned, plain)
         assert poisoned.parameters[group].get().reshape(40, -1)[ROW, -1] == before
-        for moments in (poisoned.first, poisoned.second):
+        for moments in (poisoned.model.first, poisoned.model.second):
             assert moments[group].get().reshape(40, -1)[ROW, -1] == 0
         poisoned.repair(look=True)
         (incident,) = poisoned.monitor.incidents
@@ -225,7 +225,7 @@ def test_broken_moments_begin_again(scene: Scene, default_device: Device, which:
 def test_garbage_spoils_nothing_else(scene: Scene, default_device: Device, which: str, group: str) -> None:
     for value in GARBAGE:
         poisoned, plain = started(scene, default_device), started(scene, default_device)
-        put(getattr(poisoned, which)[group], value)
+        put(poisoned.model.kinds()[which][group], value)
         assert np.isfinite(poisoned.train_step().read()).all(), value
         plain.train_step()
         if which != "parameters":  # garbage there is drawn, and has its place in the others' gradients

@@ -217,7 +217,7 @@ def test_repeated_trouble_goes_back_with_smaller_steps(scene: Scene, default_dev
     trainer = Trainer(scene, CHECKED, default_device)
     plain = trainer.rates()
     trainer.restore(checkpoint)
-    trainer.step = 0
+    trainer.position.step = 0
     assert trainer.rates() == {group: 0.5 * rate for group, rate in plain.items()}
 
 
@@ -356,9 +356,9 @@ def test_kernels_without_checks_have_the_same_bits_and_no_checks(scene: Scene, d
     for name, array in arrays[0].items():
         assert_same_bits(arrays[1][name], array, name)
     for trainer in trainers:
-        values = trainer.first["means"].get()
+        values = trainer.model.first["means"].get()
         values[3] = np.nan
-        trainer.first["means"].set(values)
+        trainer.model.first["means"].set(values)
         trainer.train_step()
     spoilt = [bool(np.isnan(trainer.parameters["means"].get()).any()) for trainer in trainers]
     assert spoilt == [False, True]
@@ -381,6 +381,6 @@ def test_the_cost_of_the_checks_is_told(scene: Scene, capsys: Capture) -> None:
 
 def test_rates_are_the_settings_where_nothing_happened(scene: Scene, default_device: Device) -> None:
     trainer = Trainer(scene, CONFIG, default_device)
-    trainer.step = 1
+    trainer.position.step = 1
     assert trainer.rates()["sh_dc"] == TrainConfig().optimiser.sh_dc_rate
     assert all(group in trainer.rates() for group in PARAMETER_GROUPS)

@@ -38,14 +38,14 @@ def test_sparse_steps_leave_the_hidden(scene: Scene, default_device: Device, spa
     config = replace(short(warmup=(), density={"every": 0}), optimiser=OptimiserConfig(sparse=sparse))
     model = with_one_behind(scene)
     trainer = Trainer(scene, config, default_device, model)
-    moment = trainer.first["means"].get()
+    moment = trainer.model.first["means"].get()
     moment[-1] = 0.5
-    trainer.first["means"].set(moment)
+    trainer.model.first["means"].set(moment)
     run_steps(3, trainer)
     after = download_gaussians(trainer.parameters)
     assert np.all(np.any(after.means[:-1] != model.means[:-1], axis=1)), "those in view move"
     assert np.array_equal(after.means[-1], model.means[-1]) == sparse
-    assert np.array_equal(trainer.first["means"].get()[-1], moment[-1]) == sparse
+    assert np.array_equal(trainer.model.first["means"].get()[-1], moment[-1]) == sparse
 
 
 @pytest.mark.parametrize("batch", [1, 2])
@@ -60,12 +60,12 @@ def test_sparse_steps_leave_what_is_masked(tmp_path: Path, default_device: Devic
         short(warmup=(), density={"every": 0}, batch=batch), masks="ignore", optimiser=OptimiserConfig(sparse=sparse)
     )
     trainer = Trainer(load_scene(folder, masks=config.mask_use), config, default_device)
-    moment = np.full_like(trainer.first["means"].get(), 0.5)
-    trainer.first["means"].set(moment)
+    moment = np.full_like(trainer.model.first["means"].get(), 0.5)
+    trainer.model.first["means"].set(moment)
     before = download_gaussians(trainer.parameters)
     run_steps(2, trainer)
     assert np.array_equal(download_gaussians(trainer.parameters).means, before.means) == sparse
-    assert np.array_equal(trainer.first["means"].get(), moment) == sparse
+    assert np.array_equal(trainer.model.first["means"].get(), moment) == sparse
 
 
 @pytest.mark.slow

@@ -58,7 +58,7 @@ def test_trouble_is_mended_and_told_as_with_exact_counts(
     def spoil(trainer: Trainer) -> None:
         if trainer.step == 16:
             trainer.settle()
-            array = trainer.models()[kind]["means"]
+            array = trainer.model.kinds()[kind]["means"]
             values = array.get()
             values[5, 0] = np.nan
             array.set(values)

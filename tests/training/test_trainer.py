@@ -315,7 +315,7 @@ def test_the_means_rate_falls_exponentially(scene: Scene, default_device: Device
     trainer = Trainer(scene, replace(CONFIG, optimiser=optimiser), default_device)
     rates = []
     for step in (0, 50, 100, 1000):
-        trainer.step = step
+        trainer.position.step = step
         rates.append(trainer.rates()["means"] / scene.extent)
     np.testing.assert_allclose(rates, [1e-2, 1e-3, 1e-4, 1e-4])
     assert set(trainer.rates()) == set(PARAMETER_GROUPS)
@@ -327,7 +327,7 @@ def test_every_rate_falls_in_the_cooldown(scene: Scene, default_device: Device) 
     trainers = [Trainer(scene, config, default_device) for config in (plain, cooled)]
     for step, wanted in ((1, 1.0), (60, 1.0), (80, 0.1), (100, 0.01), (120, 0.01)):
         for trainer in trainers:
-            trainer.step = step
+            trainer.position.step = step
         full, got = (trainer.rates() for trainer in trainers)
         np.testing.assert_allclose([got[group] / full[group] for group in PARAMETER_GROUPS], wanted)
 
@@ -343,7 +343,7 @@ def test_moments_move_with_their_rows(scene: Scene, default_device: Device, monk
         return made
 
     monkeypatch.setattr(adaptive, "plan", noted)
-    before = {kind: host(getattr(trainer, kind)) for kind in ("parameters", "first", "second")}
+    before = {kind: host(model) for kind, model in trainer.model.kinds().items()}
     trainer._control_density()
     (plan,) = plans
     fresh, rows, split = plan.fresh, plan.rows, split_of(plan)
@@ -351,7 +351,7 @@ def test_moments_move_with_their_rows(scene: Scene, default_device: Device, monk
     assert (fresh & ~split).any()
     assert (~fresh).any()
     for kind in ("first", "second"):
-        after = host(getattr(trainer, kind))
+        after = host(trainer.model.kinds()[kind])
         for group in PARAMETER_GROUPS:
             assert before[kind][group].any(), f"{kind} {group}: nothing to move"
             assert_same_bits(after[group][~fresh], before[kind][group][rows[~fresh]], f"{kind} {group}")
@@ -375,9 +375,9 @@ def test_moments_move_with_their_rows(scene: Scene, default_device: Device, monk
 def test_an_opacity_reset_forgets_the_moments_of_opacity_alone(scene: Scene, default_device: Device) -> None:
     config = short(density={"start": 100})  # no cloning: rows stay
     trainer = trained_to(20, scene, config, default_device)
-    before = {kind: host(getattr(trainer, kind)) for kind in ("parameters", "first", "second")}
+    before = {kind: host(model) for kind, model in trainer.model.kinds().items()}
     trainer._control_density()
-    after = {kind: host(getattr(trainer, kind)) for kind in ("parameters", "first", "second")}
+    after = {kind: host(model) for kind, model in trainer.model.kinds().items()}
     ceiling = np.log(0.1 / 0.9)
     assert before["parameters"]["opacity_logits"].max() > ceiling + 0.1
     # a float32's rounding of the logit
@@ -396,11 +396,11 @@ def test_an_opacity_reset_forgets_the_moments_of_opacity_alone(scene: Scene, def
 
 def test_a_new_degree_keeps_what_there_is(scene: Scene, default_device: Device) -> None:
     trainer = trained_to(23, scene, short(density={"every": 0}), default_device)
-    before = {kind: host(getattr(trainer, kind)) for kind in ("parameters", "first", "second")}
-    trainer.step = 24
+    before = {kind: host(model) for kind, model in trainer.model.kinds().items()}
+    trainer.position.step = 24
     trainer._raise_sh_degree()
     for kind, values in before.items():
-        wide = host(getattr(trainer, kind))["sh_rest"]
+        wide = host(trainer.model.kinds()[kind])["sh_rest"]
         assert wide.shape[1] == 8
         assert values["sh_rest"].any()
         assert_same_bits(np.ascontiguousarray(wide[:, :3]), values["sh_rest"], kind)

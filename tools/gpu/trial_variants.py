@@ -215,7 +215,9 @@ class TrialScene:
             trainer.rasterizer.backward(parameters, frame, frame.blended.image, self._gradients)
             found["blend_grad"] = [self._gradients[group].get() for group in PARAMETER_GROUPS]
         if {"loss", "project_step"} & set(wanted):
-            moments = [model[group] for model in (trainer.first, trainer.second) for group in PARAMETER_GROUPS]
+            moments = [
+                model[group] for model in (trainer.model.first, trainer.model.second) for group in PARAMETER_GROUPS
+            ]
             for array in moments:
                 array.fill(0.0)
             loss = trainer.train_step(reads_loss=True)

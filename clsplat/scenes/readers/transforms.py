@@ -11,7 +11,7 @@ import math
 import os
 import posixpath
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -131,9 +131,9 @@ def _smaller_folders(lost: list[Path], folder: Path) -> dict[Path, Path]:
     return {name: copy for name, copy in found.items() if copy != name}
 
 
-def _moved(file: Path | None, copies: dict[Path, Path]) -> Path | None:
-    """The file in the downscaled copy of its folder, or the file itself if there is no copy."""
-    usual = next((parent for parent in copies if file is not None and parent in file.parents), None)
+def _moved(file: Path | None, copies: Mapping[Path, Path]) -> Path | None:
+    """The file in the downscaled copy of its outermost folder that has one, or the file itself if there is no copy."""
+    usual = next((parent for parent in reversed(file.parents) if parent in copies), None) if file is not None else None
     return file if file is None or usual is None else copies[usual] / file.relative_to(usual)
 
 

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The position of a training in its views, which is the JSON state of a checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from clsplat.runs.checkpoints import Checkpoint, unusable
+from clsplat.training.stability.health import RetryBudget
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A position at which a checkpoint is possible, with the state of the random generator."""
+
+    step: int
+    rng: Mapping[str, Any]
+    queue: list[int]
+    controlled: bool
+
+
+@dataclass
+class Position:
+    """Position of a training in its views.
+
+    rng: random generator.
+    step: number of views done.
+    queue: views that are left in the epoch, the next one last.
+    controlled: True if the density control before the next step has been done.
+    last_views: number of views of the last step.
+    """
+
+    rng: np.random.Generator
+    step: int = 0
+    queue: list[int] = field(default_factory=list)
+    controlled: bool = False
+    last_views: int = 1
+
+    def mark(self, *, begun: bool = False) -> Mark:
+        """Mark this position.
+
+        begun: True if the step number has already been increased for the current step, which has one view.
+        """
+        return Mark(self.step - begun, self.rng.bit_generator.state, list(self.queue), self.controlled)
+
+    def go_back(self, mark: Mark) -> None:
+        """Return to a mark."""
+        self.step, self.queue, self.controlled = mark.step, list(mark.queue), mark.controlled
+        self.rng.bit_generator.state = mark.rng
+
+    def state(self, retries: RetryBudget) -> dict[str, Any]:
+        """JSON state of a checkpoint, with the retries that are left."""
+        state = {"rng": self.rng.bit_generator.state, "queue": self.queue, "patience": asdict(retries)}
+        views = {"views": self.last_views} if self.last_views > 1 else {}
+        return {**state, **views, **({"controlled": True} if self.controlled else {})}
+
+    def load(self, checkpoint: Checkpoint, views: int) -> RetryBudget:
+        """Continue from a checkpoint, in a scene with this number of views. Returns the retries that are left.
+
+        Raises InputError.
+        """
+        try:
+            self.rng.bit_generator.state = checkpoint.state["rng"]
+            queue = list(checkpoint.state["queue"])
+            if not all(type(index) is int and index >= 0 for index in queue):
+                raise ValueError(f"the queue of views begins with {queue[:3]}")
+            retries = RetryBudget(**checkpoint.state.get("patience", {}))
+            last_views = checkpoint.state.get("views", 1)
+            if type(last_views) is not int or not 1 <= last_views <= max(checkpoint.step, 1):
+                raise ValueError(f"the last step had {last_views!r:.20} views")
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            why = f"{type(error).__name__}: {error}"
+            raise unusable(checkpoint, f"its state is not as this version writes it ({why})") from None
+        self.step, self.last_views = checkpoint.step, last_views
+        self.queue = queue if max(queue, default=0) < views else []  # the scene had more views before
+        self.controlled = bool(checkpoint.state.get("controlled", False))
+        return retries

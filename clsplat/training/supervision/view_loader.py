@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Inputs of a step's views: photograph, camera and background."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from clsplat.arrays import Float32
+from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
+from clsplat.images.alpha import background_colour
+from clsplat.scenes.scene import View
+from clsplat.training.step.inputs import ViewInputs
+from clsplat.training.step.position import Position
+from clsplat.training.supervision.host_photographs import reading_threads
+from clsplat.training.supervision.image_cache import ImageCache
+from clsplat.training.supervision.resolution import Sizes
+
+
+class ViewLoader:
+    """Loader of the training views for steps.
+
+    refined: function that returns the current camera of a view.
+    local: function that moves a camera to the coordinates of the model.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        views: Sequence[View],
+        photographs: ImageCache,
+        sizes: Sizes,
+        refined: Callable[[int], Camera],
+        local: Callable[[Camera], Camera],
+    ) -> None:
+        self._config, self._views, self._photographs, self._sizes = config, views, photographs, sizes
+        self._refined, self._local = refined, local
+        self._cameras: dict[int, tuple[Camera, Camera]] = {}
+
+    def camera(self, view: int, width: int, height: int) -> Camera:
+        """Camera of a training view at the size of its photograph.
+
+        It returns the same object while the size and the refined camera stay the same.
+        """
+        (of, camera), now = self._cameras.get(view, (None, None)), self._refined(view)
+        if camera is None or of is not now or (camera.width, camera.height) != (width, height):
+            camera = self._local(now.resized(width, height))
+            self._cameras[view] = now, camera
+        return camera
+
+    def inputs(self, view: int, position: Position, place: int, *, begins: bool) -> ViewInputs:
+        """Inputs of a view. Without a batch its photograph is on the device."""
+        factor = self._sizes.factor(position.step)
+        bring = self._photographs.bring if self._config.batch == 1 else self._photographs.load
+        image = bring(view, factor)
+        background = self._background(position.rng)
+        height, width = image.shape[:2]
+        full = self._views[view].camera
+        return ViewInputs(
+            view,
+            image,
+            self.camera(view, width, height),
+            background,
+            begins,
+            self._photographs.kept(view, factor),
+            area=full.width * full.height / (width * height),
+            place=place,
+            name=self._views[view].name,
+        )
+
+    def read_ahead(self, position: Position) -> None:
+        """Begin to read the photographs of the next steps, in the order of their use, until the end of the epoch."""
+        batch = self._config.batch
+        views = position.queue[: -1 - reading_threads() - batch : -1]
+        factors = [self._sizes.factor(position.step + (1 + place // batch) * batch) for place in range(len(views))]
+        self._photographs.host.read_ahead([*zip(views, factors, strict=True)])
+
+    def _background(self, rng: np.random.Generator) -> Float32:
+        if self._config.random_background:
+            return rng.random(3, dtype=np.float32)
+        return np.array(background_colour(self._config.background), np.float32)
