@@ -21,7 +21,7 @@ from calls import train
 from drivers import KEPT, begin_session, check_some_are_kept, label
 from dying import standing, standing_device  # noqa: F401  # fixtures
 from fakes import folder, model, pipeline  # noqa: F401  # fixtures
-from groups import scheduler
+from groups import begin_apart, in_one_order, scheduler
 from needs import missing
 from passed import leave_out, pytest_addoption, record  # noqa: F401  # a hook
 from pipeline import QUICK_SHAPES, shaped, shapes_of
@@ -42,6 +42,7 @@ os.environ.setdefault("CLSPLAT_BINARIES", str(CACHE / "clsplat" / "binaries"))
 def pytest_configure(config: pytest.Config) -> None:
     check_some_are_kept()
     record(config)
+    begin_apart(config)
 
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist
@@ -59,6 +60,7 @@ def _driver_and_shape(item: pytest.Item) -> tuple[Any, Any]:
 @pytest.hookimpl(tryfirst=True)  # before the slow ones are left out
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """The quick run has two shapes, or with `slow_in_groups` one, as building is slow."""
+    in_one_order(config, items)
     leave_out(config, items, lambda item: _driver_and_shape(item)[0])
     for item in items:
         shape = _driver_and_shape(item)[1]

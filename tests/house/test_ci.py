@@ -70,6 +70,12 @@ def test_a_run_that_is_cut_off_says_in_which_step(tmp_path: Path, command: str, 
     assert rows(result.stdout) == ["environment", "OpenCL drivers", "torch (did not end)", "in all"]
 
 
+def test_its_processes_keep_what_python_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    result = ran(tmp_path, "full", torch="bash -c 'echo kept=${PYTHONDONTWRITEBYTECODE:-yes}'")
+    assert result.returncode == 0 and "kept=yes" in result.stdout.splitlines()
+
+
 @pytest.mark.parametrize("arguments", [["all"], ["quick", "full"], ["--quick"]])
 def test_other_arguments_are_refused(tmp_path: Path, arguments: list[str]) -> None:
     result = ran(tmp_path, *arguments)

@@ -256,7 +256,7 @@ def records(capsys: Capture, *flags: str, status: int = 0) -> list[dict[str, Any
     return found
 
 
-@pytest.mark.slow  # .ci/run has it as a step
+@pytest.mark.slow
 def test_every_driver_here_passes(capsys: Capture) -> None:
     found = records(capsys)
     assert [record["version"] for record in found] == [info.version for info in list_devices()]

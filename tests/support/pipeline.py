@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from compare import assert_close, assert_close_gradient, assert_close_gradients
-from drivers import why_not
+from drivers import KEPT, label, why_not
 from numpy.typing import NDArray
-from quick import quick
 from scenes import Scene
 
 from clsplat.camera import Camera
@@ -35,8 +34,20 @@ QUICK_SHAPES = (8, 1), (1, 64)
 """A CPU's and a GPU's."""
 
 
-EVERY_SHAPE = pytest.mark.parametrize("every", quick([False, True], False))
-"""Of a test of all shapes at once: the quick run has two, as building takes most of the time."""
+EVERY_SHAPE = pytest.mark.parametrize(
+    ("device", "every"),
+    [
+        *(pytest.param(index, False, id=label(index)) for index in KEPT),
+        *(
+            pytest.param(index, True, id=f"{label(index)}-every", marks=pytest.mark.slow)
+            for index in KEPT
+            if open_device(str(index)) is open_device()
+        ),
+    ],
+    indirect=["device"],
+)
+"""Of a test of all shapes at once: each driver in two, as building takes most of the time, and where slow tests run the
+default driver in every one."""
 
 
 def shapes_of(device: Device, *more: tuple[int, int], every: bool = True) -> tuple[tuple[Any, ...], ...]:

@@ -60,7 +60,7 @@ def test_each_machine_has_its_own_drivers(tmp_path: Path) -> None:
     assert environment_of(made["pypi-pocl-haswell"], tmp_path)["CLSPLAT_INTERPRETER"] == str(tmp_path / "python")
 
 
-def test_a_short_table_has_every_machine_and_few_smoke_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_short_table_has_no_driver_twice_and_few_smoke_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     ran: list[Machine] = []
 
     def run(rows: list[Machine], **_: object) -> int:
@@ -71,10 +71,18 @@ def test_a_short_table_has_every_machine_and_few_smoke_tests(monkeypatch: pytest
     monkeypatch.setattr(machines, "run_all", run)
     assert machines.main(["--short"]) == 0
     steps = {row.name: [step.name for step in row.steps] for row in ran}
-    assert steps.keys() == rows().keys()
+    assert steps.keys() == rows().keys() - set(machines.IN_ALL)
     assert {name for name, names in steps.items() if machines.SMOKE in names} == set(machines.SHORT_SMOKE)
-    assert steps["intel"] == ["short self-test"]
+    assert steps["intel-skx"] == steps["all"] == ["short self-test"]
     assert steps["ascii"] == ["short self-test", "scene", "ten steps"]
+    every = rows()
+    for name in machines.IN_ALL:
+        drivers = every[name].drivers
+        assert set(drivers) <= set(every["all"].drivers) and every["all"].pypi
+        assert [row for row in ran if row.drivers == drivers], f"none has the drivers of {name} alone"
+    ran.clear()
+    assert machines.main(["--short", "--only", "intel"]) == 0
+    assert [row.name for row in ran] == ["intel"]
 
 
 def test_nothing_of_ours_gets_into_a_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,11 +9,12 @@ import sys
 from importlib.machinery import SourceFileLoader
 from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import pytest
 from calls import python
-from groups import group_of
+from groups import begin_apart, group_of, in_one_order
 
 ROOT = Path(__file__).resolve().parents[2]
 GROUPS = """
@@ -89,6 +90,13 @@ def test_its_command_line(
     assert commands == [[word.strip("'") for word in wanted.split()]]
 
 
+def test_compiled_tests_are_kept(tool: ModuleType, commands: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["tools/test"])
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    tool.main()
+    assert commands and "PYTHONDONTWRITEBYTECODE" not in os.environ
+
+
 @pytest.mark.parametrize(
     ("cores", "free", "wanted"), [(1, None, 1), (2, None, 2), (64, None, 4), (8, 5 << 30, 2), (8, 1 << 30, 1)]
 )
@@ -140,6 +148,34 @@ def test_a_crash_ends_the_run_and_is_named(tool: ModuleType, tmp_path: Path) -> 
 )
 def test_a_driver_s_tests_are_a_group_and_else_a_file_s(identifier: str, wanted: str) -> None:
     assert group_of(identifier, {0: "fast-1.0", 1: "fast-1.0-new"}) == wanted
+
+
+def collected(folder: Path, source: pytest.Config.ArgsSource, **process: Any) -> list[str]:
+    """Names of the places that a process collects from, in order."""
+    config: Any = SimpleNamespace(rootpath=folder, args=["tests"], args_source=source, **process)
+    begin_apart(config)
+    return [Path(place).name for place in config.args]
+
+
+def test_each_process_begins_to_collect_elsewhere(tmp_path: Path) -> None:
+    for name in ("a/test_it.py", "b/test_it.py", "c/deeper/test_it.py", "support/it.py", "test_it.py", "conftest.py"):
+        (tmp_path / "tests" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "tests" / name).touch()
+    of_all, of_some = pytest.Config.ArgsSource.TESTPATHS, pytest.Config.ArgsSource.ARGS
+    first, second = ({"workerid": f"gw{number}", "workercount": 2} for number in range(2))
+    assert collected(tmp_path, of_all, workerinput=first) == ["a", "b", "c", "test_it.py"]
+    assert collected(tmp_path, of_all, workerinput=second) == ["c", "test_it.py", "a", "b"]
+    assert collected(tmp_path, of_all) == collected(tmp_path, of_some, workerinput=second) == ["tests"]
+
+
+def test_all_processes_have_one_order() -> None:
+    items: Any = [SimpleNamespace(path=Path(file), name=name) for file, name in ("b1", "b0", "a1", "a2")]
+    alone: Any = SimpleNamespace()
+    in_one_order(alone, items)
+    assert [item.name for item in items] == ["1", "0", "1", "2"]
+    process: Any = SimpleNamespace(workerinput={})
+    in_one_order(process, items)
+    assert [f"{item.path}{item.name}" for item in items] == ["a1", "a2", "b1", "b0"]
 
 
 def test_a_group_stays_in_one_process(tool: ModuleType, tmp_path: Path) -> None:

@@ -49,8 +49,8 @@ SAME_ORDER = ("1x32", "1x64", "1x128", "1x256")
 """Shapes with one order of sums: their gradients are the same (decision 0023)."""
 TRAINED = ("8x1", "16x1", "1x1", "1x64")
 """Shapes in which a model is trained, twice. Other work-groups differ from 1x64 only where gradients show it."""
-METHODS = {"loops": ("8x1", "1x64"), "loopvec": ("1x64",), "cbs": ("1x64",)}
-"""Values of POCL_WORK_GROUP_METHOD in addition to PoCL's default, with the shapes to run."""
+METHODS = {"loops": ("8x1", "1x64"), "cbs": ("1x64",)}
+"""Values of POCL_WORK_GROUP_METHOD in addition to PoCL's default, which is loopvec, with the shapes to run."""
 UNKNOWN_METHOD = "Unknown work group generation method"
 """PoCL's error message for an unknown method, at the first kernel that it builds."""
 LIMIT = 600

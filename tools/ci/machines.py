@@ -7,8 +7,8 @@
 
 All machines share this Python environment. They differ in drivers, environment variables, user, and the place of the
 home folder, which is new, so that every driver is used for the first time. --list prints the machines' names, --only
-selects some, --full runs all of tools/test on some, --short runs the smoke tests on few of them, --jobs sets how many
-run at once, and --markdown prints the table for docs/machines.md.
+selects some, --full runs all of tools/test on some, --short leaves out machines whose drivers are in `all` and runs the
+smoke tests on few, --jobs sets how many run at once, and --markdown prints the table for docs/machines.md.
 
 PyPI's PoCL and Intel's runtime are found in this environment, Debian's PoCL through CLSPLAT_DEBIAN_POCL (its
 libpocl.so) or in the system's list, Rusticl through CLSPLAT_RUSTICL (its libRusticlOpenCL.so), and Debian's QEMU
@@ -58,6 +58,9 @@ SMOKE = "smoke tests"
 SHORT_SMOKE = ("pypi-pocl-1-thread", "debian-pocl-sse2", "intel-corei7", "rusticl", "not-root", "odd-paths")
 """Machines with smoke tests in a short table: the least processor of each compiler, another user, odd paths. CI, which
 makes that table, has already run all tests on the drivers of the others."""
+IN_ALL = ("pypi-pocl", "debian-pocl", "intel")
+"""Machines that a short table leaves out: `all` tests their drivers in a new home too, and other machines have each of
+these drivers alone."""
 TAIL = 25
 """Number of last lines of a failed step's output that are printed."""
 
@@ -523,7 +526,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--list", action="store_true", help="print the names and what each is")
     parser.add_argument("--only", default="", metavar="NAME,...", help="these alone")
     parser.add_argument("--full", default="", metavar="NAME,...", help="tools/test too on these")
-    parser.add_argument("--short", action="store_true", help="smoke tests on few of them")
+    parser.add_argument("--short", action="store_true", help="fewer machines, and smoke tests on few of them")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="so many at once")
     parser.add_argument("--markdown", action="store_true", help="print the table as Markdown")
     given = parser.parse_args(arguments)
@@ -537,7 +540,8 @@ def main(arguments: Sequence[str]) -> int:
     rows = [row for row in rows if not wanted or row.name in wanted]
     rows = [replace(row, steps=(*row.steps, full())) if row.name in whole else row for row in rows]
     if given.short:
-        rows = [row if row.name in SHORT_SMOKE else without_smoke(row) for row in rows]
+        left_out = set(IN_ALL) - wanted - whole
+        rows = [row if row.name in SHORT_SMOKE else without_smoke(row) for row in rows if row.name not in left_out]
     if given.list:
         for row in rows:
             print(f"{row.name}: {row.purpose}" + (f" (not run: {row.missing})" if row.missing else ""))
