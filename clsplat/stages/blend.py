@@ -106,8 +106,7 @@ def items_for(tiles: int, units: int, items: int, most: int) -> int:
 
 _GRADIENT_REGISTERS = {64: 96}
 """Maximum registers per work-item of `blend_grad`, by the number of work-items that share a tile, where the driver
-accepts a limit. Without one NVIDIA's assembler keeps to 80, so that loads wait for one another; local memory does not
-let a unit hold more items."""
+accepts a limit. Without one NVIDIA's assembler keeps to 80, as counted, and then loads wait for one another."""
 
 
 def launch_tiles(
