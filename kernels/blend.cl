@@ -172,9 +172,16 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   }
   RECORD(for (; i < end; ++i) cells_from_sorted[i] = 0;)
 #else
+#if OWNED == 1 // a short loop without branches
+#define OF_PAIRS _Pragma("unroll 4")
+#else
+#define OF_PAIRS ROLLED
+#endif
 #define BLEND(cell, power)                                                                                             \
   add_gaussian(pixels + cell, power, i, zero, c_red, c_green, c_blue NEAR_ARGUMENT);                                   \
   COUNT(added += power >= LOG2_ALPHA_MIN && pixels[cell].t > 0.0f;)
+#define FETCH_INDEX(fetch, batch)                                                                                      \
+  gaussian_of[fetch] = gaussian_from_sorted[min((batch) + ITEM + fetch * ITEMS, end - 1)];
   __local Staged staged[BATCH];
   __local uint marks[WARPS * BATCH / 4] __attribute__((aligned(16))), lists[WARPS * LIST];
   __local int open_in[BLOCKS]; // number of open pixels of each block
@@ -182,15 +189,21 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   const int zero = min(pixels[0].stop + 1, 0); // see exp2_by
   for (int block = ITEM; block < BLOCKS; block += ITEMS) open_in[block] = 0;
   BARRIER_LOCAL();
+  uint gaussian_of[FETCHES]; // of the next batch: its splats do not wait for them
+  if (begin < end) {
+    FOR_FETCHES(fetch) { FETCH_INDEX(fetch, begin) }
+  }
   for (int batch = begin; batch < end; batch += BATCH) { // count open pixels, fetch, list; then walk without barriers
     ALL_CELLS(cell) if (GOES_ON(pixels[cell].t > 0.0f)) atomic_inc(open_in + OWN_BLOCK(cell));
     BARRIER_LOCAL();
 
     const uint live = blocks_above(0, open_in);
     if (live == 0) break;
-    for (int j = ITEM; j < BATCH; j += ITEMS) {
-      const uint gaussian = gaussian_from_sorted[min(batch + j, end - 1)];
-      const uint blocks = stage(staged + j, gaussian, 0, batch + j < end ? live : 0, splats, tile_x, tile_y);
+    FOR_FETCHES(fetch) {
+      const int j = ITEM + fetch * ITEMS;
+      const uint gaussian = gaussian_of[fetch], among = batch + j < end ? live : 0;
+      FETCH_INDEX(fetch, batch + BATCH)
+      const uint blocks = stage(staged + j, gaussian, KEPT(gaussian, batch + j), 0, among, splats, tile_x, tile_y);
       mark(marks, j, blocks, WARPS, OWNED);
     }
     BARRIER_LOCAL();
@@ -201,11 +214,12 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     BARRIER_LOCAL();
 
     uint next = list[0];
-    for (int k = 1; k <= count; ++k) {
+    OF_PAIRS for (int k = 1; k <= count; ++k) {
       const uint entry = next;
       next = list[k]; // loaded before its use
-      const int i = batch + PAIR_OF(entry);
-      SPLAT_STAGED(staged[PAIR_OF(entry)])
+      const Staged s = staged[PAIR_OF(entry)];
+      const int i = KEPT(batch + PAIR_OF(entry), (int)s.kept);
+      SPLAT_STAGED(s)
       NEAR_HERE(s.near)
       const uint reach = FROM_OWN(s.blocks);
       COUNT(evaluated += IS_DENSE(entry, OWNED) ? OWNED : popcount(reach & OF_FIRST_WARP);)

@@ -133,35 +133,6 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
 
 #if ITEMS > 1 && !defined(BY_GAUSSIAN)
 #include "shared/strips.h"
-
-// The same for a pixel of a group, without the fields that finish_row computes. Products are rounded before they are
-// added, as items may leave them in local memory first. `begins`: the sums are those of this pixel alone.
-static inline void add_pixel(float *sums, const Pixels *p, uint cell, float g, float weight, float u, float v,
-                             float l11, float l12, float l22, int begins) {
-  float own[SLOT_STRIDE];
-  FOR_FIELDS(field) own[field] = 0.0f;
-  own[SLOT_RED] = weight * p->red[cell];
-  own[SLOT_GREEN] = weight * p->green[cell];
-  own[SLOT_BLUE] = weight * p->blue[cell];
-#ifdef RAYS
-  add_ray_moments(g, u, v, l11, l12, l22, own);
-#else
-  own[SLOT_G] = g;
-  own[SLOT_GU] = g * u;
-  own[SLOT_GUU] = own[SLOT_GU] * u;
-#ifdef ABSOLUTE_GRADIENTS
-  own[SLOT_ABSX] = fabs(g * (l11 * u));
-  own[SLOT_ABSY] = fabs(g * fma1(l12, u, l22 * v));
-#endif
-#endif
-#ifdef CONTRIBUTIONS
-  own[SLOT_WEIGHT] = weight;
-#endif
-#ifdef NEARNESS
-  own[SLOT_NEAR] = weight * p->near[cell];
-#endif
-  FOR_FIELDS(field) if (!OF_ROW(field)) sums[field] = begins ? own[field] : sums[field] + own[field];
-}
 #endif
 
 // ALPHA_IN: alpha of the tile's i-th pair in a cell's pixels.
@@ -188,18 +159,6 @@ static inline void add_pixel(float *sums, const Pixels *p, uint cell, float g, f
   const floatL u = whitened_u(l11, l12, mx - AT_X(cell), dy), v = l22 * dy;                                            \
   const floatL power = log2_alpha(u, v, log2o);                                                                        \
   const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < pixels.stop[cell]);
-#endif
-
-#if ITEMS > 1
-#define TAKE_PIXEL(cell, begins, where)                                                                                \
-  {                                                                                                                    \
-    ALPHA_IN(cell)                                                                                                     \
-    if (where) {                                                                                                       \
-      const float alpha = as_float(as_int(exp2_by(power, zero)) & taken);                                              \
-      const Share share = take_out(&pixels, cell, alpha, c_red, c_green, c_blue NEAR_ARGUMENT);                        \
-      add_pixel(sums, &pixels, cell, share.g, share.weight, u, v, W11, W12, W22, begins);                              \
-    }                                                                                                                  \
-  }
 #endif
 
 // Processes a pair in the cells that it reaches. A work-item with many cells runs three short loops instead of one:
@@ -392,7 +351,7 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
   Walker walker = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, begin - 1, 0, 0};
   for (int turn = last; turn > (last > begin ? begin - ITEMS : begin); turn -= ITEMS) { // the last turn adds no pairs
     const int next = max(turn - 1 - ITEM, begin);
-    stage(staged + ITEM, gaussian_from_sorted[next], slot_from_sorted[next], ALL_BLOCKS, splats, tile_x, tile_y);
+    stage(staged + ITEM, gaussian_from_sorted[next], next, slot_from_sorted[next], ALL_BLOCKS, splats, tile_x, tile_y);
     for (int round = 0; round < ITEMS; ++round) {
       if (round == ITEM) {
         if (walker.i >= begin) {
@@ -426,41 +385,52 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
   const int zero = min(pixels.stop[0] + 1, 0); // see exp2_by
   __local Staged staged[BATCH];
   __local uint marks[BLOCK_ROWS * BATCH / 4] __attribute__((aligned(16)));
-  __local uchar lists[TEAMS * LIST];
+  __local uchar lists[BLOCK_ROWS * LIST];
   __local int counts[BLOCK_ROWS]; // number of a strip's pairs
   __local int lasts[BLOCKS];      // the largest stop of each block
   __local float rows[TEAMS * TOGETHER * PAIR_ROWS * ROW] __attribute__((aligned(16)));
   __local float totals[BLOCK_ROWS * SLOT_STRIDE * TOTALS]; // by strip, field and pair
-  __local uchar *list = lists + TEAM * LIST;
   for (int block = ITEM; block < BLOCKS; block += ITEMS) lasts[block] = begin;
   BARRIER_LOCAL();
   ALL_CELLS(cell) atomic_max(lasts + OWN_BLOCK(cell), pixels.stop[cell]);
   BARRIER_LOCAL();
+  uint gaussian_of[FETCHES], slot_of[FETCHES]; // of the next batch: its splats do not wait for them
+  if (last > begin) {
+    FOR_FETCHES(fetch) { FETCH_INDICES(fetch, last) }
+  }
   for (int batch = last; batch > begin; batch -= BATCH) {
     const int count = min(BATCH, batch - begin); // number of pairs before `batch`, from the last one on
-    for (int j = ITEM; j < BATCH; j += ITEMS) {
-      const int i = max(batch - 1 - j, begin);
-      const uint live = j < count ? blocks_above(i, lasts) : 0;
-      const uint blocks = stage(staged + j, gaussian_from_sorted[i], slot_from_sorted[i], live, splats, tile_x, tile_y);
-      mark(marks, j, blocks, BLOCK_ROWS, BLOCK_COLUMNS);
+    FOR_FETCHES(fetch) {
+      const int j = ITEM + fetch * ITEMS;
+      if (j < BATCH) {
+        const uint above = blocks_above(max(batch - 1 - j, begin), lasts), live = j < count ? above : 0;
+        const uint gaussian = gaussian_of[fetch], slot = slot_of[fetch];
+        FETCH_INDICES(fetch, batch - BATCH)
+        const uint blocks =
+            stage(staged + j, gaussian, KEPT(gaussian, batch - 1 - j), slot, live, splats, tile_x, tile_y);
+        mark(marks, j, blocks, BLOCK_ROWS, BLOCK_COLUMNS);
+      }
     }
     BARRIER_LOCAL();
     UNROLLED for (int k = 0; k < OWN_STRIPS; ++k) {
       const int strip = TEAM * OWN_STRIPS + k;
+      __local uchar *list = lists + strip * LIST;
       if (TEAM_WARP == 0) {
 #define ENTRY(j) (uchar)(j)
         LIST_MARKED(listed, marks + strip * BATCH / 4, list, ENTRY)
         if (LANE == 0) counts[strip] = listed;
+        if (LANE < 2) list[listed + LANE] = 0; // loaded, and not used
       }
       BARRIER_LOCAL();
+      int j = list[0], next = list[1]; // a pair, and the one after it, are loaded before their use
+      Staged s = staged[j];
       const int own = counts[strip], most = max(counts[k], counts[(TEAMS - 1) * OWN_STRIPS + k]);
       for (int first = 0; first < most; first += TOGETHER) { // in step with the other team
         const int stop_at = min(first + TOGETHER, ACROSS_TEAMS ? most : own);
         __local float *pair_rows = rows + TEAM * (TOGETHER * PAIR_ROWS * ROW);
         for (int turn = first; turn < stop_at; ++turn, pair_rows += PAIR_ROWS * ROW) {
-          const int absent = ACROSS_TEAMS && turn >= own, j = absent ? 0 : list[turn];
-          SPLAT_STAGED(staged[j])
-          const int i = batch - 1 - j;
+          const int absent = ACROSS_TEAMS && turn >= own, i = KEPT(batch - 1 - j, (int)s.kept);
+          SPLAT_STAGED(s)
           NEAR_HERE(s.near)
           const uint reach = absent ? 0 : FROM_OWN(s.blocks) >> k * BLOCK_COLUMNS;
           WHITENING_HERE
@@ -472,7 +442,11 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
             FOR_FIELDS(field) sums[field] = 0.0f;
             FOR_STRIP(c) if (reach >> c & 1) { TAKE_PIXEL(k * BLOCK_COLUMNS + c, c == 0, taken); }
           }
-          finish_row(l22 * (my - AT_Y(k * BLOCK_COLUMNS)), sums);
+          const float v = l22 * (my - AT_Y(k * BLOCK_COLUMNS));
+          j = next;
+          s = staged[j];
+          next = list[ACROSS_TEAMS ? min(turn + 2, own) : turn + 2];
+          finish_row(v, sums);
           leave_sums(sums, pair_rows);
 #else
           FOR_STRIP(c) if (reach >> c & 1) {
@@ -480,6 +454,9 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
             TAKE_PIXEL(c, 1, taken);
             leave_block(sums, pair_rows + (TEAM_WARP * STRIP_CELLS + c) * (CELL_FIELDS * ROW));
           }
+          j = next;
+          s = staged[j];
+          next = list[ACROSS_TEAMS ? min(turn + 2, own) : turn + 2];
 #endif
         }
 #if TEAM_WARPS > 1

@@ -60,12 +60,15 @@ GROUP __kernel void values(const int first_tile, const int tiles_x, const int wi
   __local Staged staged[BATCH];
   for (int batch = begin; batch < last; batch += BATCH) {
     const int count = min(BATCH, last - batch);
-    for (int j = ITEM; j < BATCH; j += ITEMS)
-      stage(staged + j, gaussian_from_sorted[min(batch + j, last - 1)], 0, ALL_BLOCKS, splats, tile_x, tile_y);
+    for (int j = ITEM; j < BATCH; j += ITEMS) {
+      const uint gaussian = gaussian_from_sorted[min(batch + j, last - 1)];
+      stage(staged + j, gaussian, gaussian, 0, ALL_BLOCKS, splats, tile_x, tile_y);
+    }
     BARRIER_LOCAL();
     for (int j = 0; j < count; ++j) {
-      SPLAT_STAGED(staged[j])
-      __global const float *own = value_rows + (size_t)depth * s.gaussian + first;
+      const Staged s = staged[j];
+      SPLAT_STAGED(s)
+      __global const float *own = value_rows + (size_t)depth * s.kept + first;
       FOR_CELLS(cell, FROM_OWN(s.blocks))
       add_values(LOG2_ALPHA(splat, cell), stop[cell], batch + j, own, t + cell, sums[cell]);
     }

@@ -182,14 +182,16 @@ GROUP SUBGROUPED __kernel void values_grad(const int first_tile, const int tiles
     const int count = min(BATCH, batch - begin); // of the pairs before `batch`, the last first
     for (int j = ITEM; j < BATCH; j += ITEMS) {
       const int i = max(batch - 1 - j, begin);
-      stage(staged + j, gaussian_from_sorted[i], slot_from_sorted[i], ALL_BLOCKS, splats, tile_x, tile_y);
+      const uint gaussian = gaussian_from_sorted[i];
+      stage(staged + j, gaussian, gaussian, slot_from_sorted[i], ALL_BLOCKS, splats, tile_x, tile_y);
     }
     BARRIER_LOCAL();
     for (int turn = 0; turn < count; turn += TOGETHER) {
       const int together = min(TOGETHER, count - turn);
       for (int j = 0; j < together; ++j) {
-        SPLAT_STAGED(staged[turn + j])
-        __global const float *own = value_rows + (size_t)depth * s.gaussian;
+        const Staged s = staged[turn + j];
+        SPLAT_STAGED(s)
+        __global const float *own = value_rows + (size_t)depth * s.kept;
         float sums[FIELDS];
         for (int field = 0; field < FIELDS; ++field) sums[field] = 0.0f;
         TAKE_PAIR(batch - 1 - turn - j, FROM_OWN(s.blocks), own)

@@ -104,6 +104,11 @@ def items_for(tiles: int, units: int, items: int, most: int) -> int:
     return items
 
 
+_GRADIENT_REGISTERS = {64: 96}
+"""Maximum registers per work-item of `blend_grad`, by the number of work-items that share a tile, where the driver
+accepts a limit. Without one NVIDIA's assembler keeps to 80, as counted, and then loads wait for one another."""
+
+
 def launch_tiles(
     device: Device,
     stem: str,
@@ -113,16 +118,18 @@ def launch_tiles(
     *arguments: Any,
     kernel: str = "",
     items: int | None = None,
+    registers: int = 0,
 ) -> None:
     """Launch a kernel of `stem`.cl, with one group per tile of the lists.
 
     kernel: the kernel's name, if it is not `stem`.
     items: number of work-items that share a tile; None for `tile_items`.
+    registers: maximum registers per work-item, if the driver has an option for it; 0 for no limit.
 
     The kernel's arguments are the first tile, the number of tiles in a row of the image, and `arguments`.
     """
     items = items or tile_items(device)
-    built = getattr(device.kernels(stem, {"ITEMS": items, **defines}), kernel or stem)
+    built = getattr(device.kernels(stem, {"ITEMS": items, **defines}, registers), kernel or stem)
     launch_groups(device, built, lists.band.tiles, items, lists.band.first, tiles_x, *arguments)
 
 
@@ -218,5 +225,6 @@ def blend_grad(
     extra = ([cells] if cells else []) + ([inputs.camera_array] if rays else [])
     extra += [lists.order] if lists.order else []
     arrays = (*listed, inputs.splats, inputs.background, *planes, slots, *extra)
-    launch_tiles(device, "blend_grad", defines, lists, stride // TILE, rows, *arrays)
+    most = _GRADIENT_REGISTERS.get(tile_items(device), 0)
+    launch_tiles(device, "blend_grad", defines, lists, stride // TILE, rows, *arrays, registers=most)
     return slots

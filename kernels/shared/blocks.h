@@ -42,6 +42,7 @@
 #else
 #define UNROLLED
 #endif
+#define ROLLED _Pragma("unroll 1")
 #define ALL_CELLS(cell) UNROLLED for (int cell = 0; cell < OWNED; ++cell)
 
 typedef int Open; // number of the item's cells with an open pixel
@@ -62,7 +63,7 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
 
 #if defined(RAYS) || (defined(NO_ROW_SKIP) && defined(NO_COLUMN_SKIP))
 #define ALL_REACHED 1
-static inline uint blocks_of(__global const float *splat, int tile_x, int tile_y) { return ALL_BLOCKS; }
+static inline uint blocks_of(const float *splat, int tile_x, int tile_y) { return ALL_BLOCKS; }
 #else
 #define ALL_REACHED 0
 // The right edge of an ellipse, relative to its mean, over the offsets [d0, d1] in y (docs/gradients.md, (47)). The
@@ -77,7 +78,7 @@ static inline float block_edge(float d0, float d1, float tangent, float half_w, 
 }
 
 // The blocks that an ellipse reaches, as bits.
-static inline uint blocks_of(__global const float *splat, int tile_x, int tile_y) {
+static inline uint blocks_of(const float *splat, int tile_x, int tile_y) {
   const float mx = (splat[SPLAT_PIXEL_X] - (float)tile_x) + splat[SPLAT_SUB_X];
   const float my = (splat[SPLAT_PIXEL_Y] - (float)tile_y) + splat[SPLAT_SUB_Y];
   const float half_w = splat[SPLAT_HALF_W], half_h = splat[SPLAT_HALF_H];
@@ -115,40 +116,50 @@ static inline uint blocks_of(__global const float *splat, int tile_x, int tile_y
 #ifndef BATCH
 #define BATCH (ITEMS < 64 ? 64 : ITEMS)
 #endif
+#define FETCHES ((BATCH + ITEMS - 1) / ITEMS) // splats of a batch that an item fetches
+#define FOR_FETCHES(fetch) UNROLLED for (int fetch = 0; fetch < FETCHES; ++fetch)
 typedef struct {
   float mx, my, l11, l12; // mx, my: the mean, relative to the tile's first pixel
   float l22, log2o, red, green;
   float blue;
-  uint blocks, gaussian, slot;
+  uint kept, blocks, slot; // kept: the Gaussian, or what a kernel needs instead
 #ifdef NEARNESS
   float near;     // nearness, 1 / depth
   uint unused[3]; // padding to 16 bytes; set, so that copies read no uninitialised memory
 #endif
 } __attribute__((aligned(16))) Staged;
 
-// Copies a splat to local memory. Returns the blocks of `among` that it reaches.
-static inline uint stage(__local Staged *place, uint gaussian, uint slot, uint among, __global const float *splats,
-                         int tile_x, int tile_y) {
-  __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian;
-  Staged s;
-  s.mx = FROM_TILE(splat, X, tile_x);
-  s.my = FROM_TILE(splat, Y, tile_y);
-  s.l11 = splat[SPLAT_L11];
-  s.l12 = splat[SPLAT_L12];
-  s.l22 = splat[SPLAT_L22];
-  s.log2o = splat[SPLAT_LOG2O];
-  s.red = splat[SPLAT_RED];
-  s.green = splat[SPLAT_GREEN];
-  s.blue = splat[SPLAT_BLUE];
-  s.blocks = blocks_of(splat, tile_x, tile_y) & among;
-  s.gaussian = gaussian;
-  s.slot = slot;
-#ifdef NEARNESS
-  s.near = 1.0f / splat[SPLAT_DEPTH];
-  for (int k = 0; k < 3; ++k) s.unused[k] = 0;
+// What blending keeps of a pair: each pixel of RAYS needs the Gaussian.
+#ifdef RAYS
+#define KEPT(gaussian, pair) (gaussian)
+#else
+#define KEPT(gaussian, pair) (pair)
 #endif
-  *place = s;
-  return s.blocks;
+
+// Copies a splat to local memory, in loads that are under way together. Returns the blocks of `among` that it reaches.
+static inline uint stage(__local Staged *place, uint gaussian, uint kept, uint slot, uint among,
+                         __global const float *splats, int tile_x, int tile_y) {
+  __global const float4 *row = (__global const float4 *)splats + (size_t)(SPLAT_SIZE / 4) * gaussian;
+  const float4 a = row[0], b = row[1], c = row[2], d = row[3];
+  const float splat[SPLAT_SIZE] = {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, c.x, c.y, c.z, c.w, d.x, d.y, d.z, d.w};
+  place->mx = FROM_TILE(splat, X, tile_x);
+  place->my = FROM_TILE(splat, Y, tile_y);
+  place->l11 = splat[SPLAT_L11];
+  place->l12 = splat[SPLAT_L12];
+  place->l22 = splat[SPLAT_L22];
+  place->log2o = splat[SPLAT_LOG2O];
+  place->red = splat[SPLAT_RED];
+  place->green = splat[SPLAT_GREEN];
+  place->blue = splat[SPLAT_BLUE];
+  place->kept = kept;
+  place->slot = slot;
+#ifdef NEARNESS
+  place->near = 1.0f / splat[SPLAT_DEPTH];
+  for (int k = 0; k < 3; ++k) place->unused[k] = 0;
+#endif
+  const uint blocks = blocks_of(splat, tile_x, tile_y) & among;
+  place->blocks = blocks;
+  return blocks;
 }
 
 // A bit for each block b of which numbers[b] is above `floor`.
@@ -160,7 +171,7 @@ static inline uint blocks_above(int floor, __local const int *numbers) {
 
 // A warp can walk a list of only the pairs of a batch that reach one of its blocks. First each pair is marked for each
 // set of blocks that has a list, then the marked pairs are listed in order.
-#define LIST (BATCH + 1) // room of a list; the last place is read ahead, and not used
+#define LIST (BATCH + 2) // room of a list; the places after its end are read ahead, and not used
 
 // Marks the j-th pair of a batch for `sets` sets of `own` blocks each: a byte for each pair, 1 or 0.
 static inline void mark(__local uint *marks, int j, uint blocks, int sets, int own) {
@@ -195,8 +206,7 @@ static inline uint marked_from(__local const uint *marks, int begin) {
   }
 
 // Gives a staged splat the names that LOG2_ALPHA and the kernels use for a splat in global memory.
-#define SPLAT_STAGED(place)                                                                                            \
-  const Staged s = place;                                                                                              \
-  __global const float *splat = splats + (size_t)SPLAT_SIZE * s.gaussian;                                              \
+#define SPLAT_STAGED(s)                                                                                                \
+  __global const float *splat = splats + (size_t)SPLAT_SIZE * s.kept;                                                  \
   const float mx = s.mx, my = s.my, l11 = s.l11, l12 = s.l12, l22 = s.l22, log2o = s.log2o;                            \
   const float c_red = s.red, c_green = s.green, c_blue = s.blue;

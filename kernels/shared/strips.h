@@ -29,7 +29,6 @@
 #define IS_WHOLE(reach) (!ALL_REACHED && ((reach) & FIRST_BLOCKS(BLOCK_COLUMNS)) == FIRST_BLOCKS(BLOCK_COLUMNS))
 
 #define FOR_FIELDS(field) _Pragma("unroll") for (int field = 0; field < SLOT_STRIDE; ++field)
-#define ROLLED _Pragma("unroll 1")
 #define FOR_STRIP(c) _Pragma("unroll") for (int c = 0; c < STRIP_CELLS; ++c)
 
 // The fields that finish_row computes; the others have sums over pixels. Each pixel of RAYS has its own v.
@@ -75,3 +74,51 @@ static inline void join_blocks(uint blocks, float v, __local float *pair_rows) {
   finish_row(v, sums);
   FOR_FIELDS(field) pair_rows[field * ROW + LANE] = sums[field];
 }
+
+// Adds the gradients of a pixel to a pair's sums, without the fields that finish_row computes. Products are rounded
+// before they are added, as items may leave them in local memory first. `begins`: the sums are those of this pixel
+// alone.
+static inline void add_pixel(float *sums, const Pixels *p, uint cell, float g, float weight, float u, float v,
+                             float l11, float l12, float l22, int begins) {
+  float own[SLOT_STRIDE];
+  FOR_FIELDS(field) own[field] = 0.0f;
+  own[SLOT_RED] = weight * p->red[cell];
+  own[SLOT_GREEN] = weight * p->green[cell];
+  own[SLOT_BLUE] = weight * p->blue[cell];
+#ifdef RAYS
+  add_ray_moments(g, u, v, l11, l12, l22, own);
+#else
+  own[SLOT_G] = g;
+  own[SLOT_GU] = g * u;
+  own[SLOT_GUU] = own[SLOT_GU] * u;
+#ifdef ABSOLUTE_GRADIENTS
+  own[SLOT_ABSX] = fabs(g * (l11 * u));
+  own[SLOT_ABSY] = fabs(g * fma1(l12, u, l22 * v));
+#endif
+#endif
+#ifdef CONTRIBUTIONS
+  own[SLOT_WEIGHT] = weight;
+#endif
+#ifdef NEARNESS
+  own[SLOT_NEAR] = weight * p->near[cell];
+#endif
+  FOR_FIELDS(field) if (!OF_ROW(field)) sums[field] = begins ? own[field] : sums[field] + own[field];
+}
+
+#define TAKE_PIXEL(cell, begins, where)                                                                                \
+  {                                                                                                                    \
+    ALPHA_IN(cell)                                                                                                     \
+    if (where) {                                                                                                       \
+      const float alpha = as_float(as_int(exp2_by(power, zero)) & taken);                                              \
+      const Share share = take_out(&pixels, cell, alpha, c_red, c_green, c_blue NEAR_ARGUMENT);                        \
+      add_pixel(sums, &pixels, cell, share.g, share.weight, u, v, W11, W12, W22, begins);                              \
+    }                                                                                                                  \
+  }
+
+// The indices of the pairs that an item fetches for a batch, the last of which is at `batch` - 1.
+#define FETCH_INDICES(fetch, batch)                                                                                    \
+  {                                                                                                                    \
+    const int from = max((batch) - 1 - ITEM - fetch * ITEMS, begin);                                                   \
+    gaussian_of[fetch] = gaussian_from_sorted[from];                                                                   \
+    slot_of[fetch] = slot_from_sorted[from];                                                                           \
+  }

@@ -226,8 +226,7 @@ def _of_turn(text: str, share: Rounds) -> Rule:
 BY_PAIR: dict[str, tuple[Rule, ...]] = {
     "blend": (
         Rule("for (int batch = begin", lambda run: run.batches, ends=("if (live == 0) break;",)),
-        Rule("for (int j = ITEM; j < BATCH; j += ITEMS)", lambda run: run.fetches),
-        Rule("for (int k = 1; k <= count; ++k)", lambda run: run.visits),
+        Rule("for (int k = 1; k <= count; ++k)", lambda run: run.visits, mark=("shared", 4)),
         _of_visit("for (int k = 1; k <= count; ++k)", lambda run: run.visits),
         _of_visit("ALL_CELLS(cell) { BLEND(", lambda run: run.dense),
         _of_visit("FOR_CELLS(cell, reach) {", lambda run: run.visits - run.dense),
@@ -243,7 +242,6 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
             ends=("BARRIER_LOCAL();",),
             holding="LIST_MARKED(",
         ),
-        Rule("for (int j = ITEM; j < BATCH; j += ITEMS)", lambda run: run.batches_back * BATCH_BACK / run.items),
         Rule(
             "for (int first = 0; first < most; first += TOGETHER)",
             lambda run: run.rounds_back / run.strips,
@@ -257,10 +255,11 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
             lacking="BARRIER_LOCAL();",
             copies=True,
         ),
-        Rule("SPLAT_STAGED(staged[j])", lambda run: 1, part=True),
+        Rule("SPLAT_STAGED(s)", lambda run: 1, part=True),
         _of_turn("c == 0, 1);", lambda run: run.whole_back / run.strips),
-        _of_turn(
-            "const floatL before = p->t[cell] * inverse;", lambda run: _of_others(run, run.others_taken, run.taken)
+        *(
+            _of_turn(text, lambda run: _of_others(run, run.others_taken, run.taken))
+            for text in ("const floatL t = x + 12582912.0f;", "own[SLOT_RED] = weight", "own[SLOT_G] = g;")
         ),
         _of_turn("l11 * dx);", lambda run: _of_others(run, run.others_reached, run.reached)),
         _of_turn("FOR_STRIP(c) if (reach >> c & 1) {", lambda run: (run.turns_back - run.whole_back) / run.strips),
