@@ -184,7 +184,7 @@ def run_tasks(
 
 
 def _skipped(task: Task, options: RenderOptions) -> Future[Result]:
-    """The result of a frame that an earlier job has finished."""
+    """The result of a frame that another job has finished."""
     outcome: Future[Result] = Future()
     outcome.set_result((record_of(task, options, skipped=True), None))
     return outcome
