@@ -41,7 +41,7 @@ def set_up(extras: tuple[str, ...] = ()) -> Path:
     python = python_of(ENVIRONMENT)
     if not _runs(python):
         print(f"making {ENVIRONMENT}", file=sys.stderr, flush=True)
-        # --clear: an existing environment is broken, as after an interrupted start or an upgrade of Python
+        # --clear: an existing environment is broken, for example by an interruption or an upgrade of Python
         if _call([sys.executable, "-m", "venv", "--clear", str(ENVIRONMENT)]) != 0:
             shutil.rmtree(ENVIRONMENT, ignore_errors=True)
             sys.exit(f"{sys.argv[0]}: {sys.executable} -m venv failed; on Debian and Ubuntu, install python3-venv")
@@ -71,7 +71,7 @@ def run(command: list[str]) -> int:
         try:
             status = process.wait()
         except KeyboardInterrupt:
-            continue  # the terminal has sent Ctrl-C to the command too, which ends in its own way
+            continue  # the terminal has sent Ctrl-C to the command too, which handles it
         return status if status >= 0 else 128 - status
 
 
@@ -91,8 +91,8 @@ def _call(command: list[str], *, quiet: bool = False) -> int:
 
 if __name__ == "__main__":
     if isinstance(sys.stdout, io.TextIOWrapper):
-        encoding, errors = sys.getfilesystemencoding(), sys.getfilesystemencodeerrors()  # those of paths
+        encoding, errors = sys.getfilesystemencoding(), sys.getfilesystemencodeerrors()  # as for paths
         sys.stdout.reconfigure(encoding=encoding, errors=errors)
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
-    parser.add_argument("extras", nargs="*", metavar="EXTRA", help="as pyproject.toml names them: test, dev, docs, ...")
+    parser.add_argument("extras", nargs="*", metavar="EXTRA", help="extras of pyproject.toml: test, dev, docs, ...")
     print(set_up(tuple(parser.parse_args().extras)))

@@ -48,7 +48,7 @@ class RasterizerConfig:
         check_rules(self, "--rasterizer.", rules)
 
     def switches(self) -> BenchSwitches:
-        """This configuration with the switches for measurements at their defaults."""
+        """These settings as BenchSwitches. Switches that this class lacks are at their defaults."""
         return BenchSwitches(**vars(self))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat.jax.spherical_harmonics`."""
+"""Colours from spherical harmonics in JAX programs, with their gradient: `clsplat.jax.spherical_harmonics`."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat.jax.rasterize`."""
+"""Images of Gaussians in JAX programs, with their gradient: `clsplat.jax.rasterize`."""
 
 from __future__ import annotations
 

@@ -139,7 +139,7 @@ class PassSettings:
     alpha_max: the cap of alpha.
     compensated: multiply opacities by the compensation for the low-pass filter.
     absolute: also compute sums over pixels of absolute gradients.
-    differentiable: keep data by which the gradient is faster.
+    differentiable: keep data that speed up the gradient.
     """
 
     mode: str

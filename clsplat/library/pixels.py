@@ -190,7 +190,7 @@ class PixelPass(ListedPixels):
     size: width and height, pixels.
     background: (D,) float32, or None for black.
     alpha_max: the cap of alpha, below 1.
-    backward: True keeps data by which `gradient` is faster.
+    backward: True keeps data that speed up `gradient`.
 
     A Gaussian contributes to a pixel if its alpha there is at least 1/255. Blending ends before the Gaussian that would
     leave a transmittance of 1e-4 or less. A Gaussian is culled if its mean is over 1e9 pixels away, or if a or c of

@@ -208,7 +208,11 @@ class _GivenSplats:
 
 @dataclass(frozen=True, eq=False)
 class _ImageLists:
-    """The tile lists of an image: where each list starts in `gaussians`, its length, and `gaussians`, the rows."""
+    """The tile lists of an image.
+
+    begins, counts: start and length of each list in `gaussians`.
+    gaussians: rows of the listed Gaussians, one list after the other.
+    """
 
     begins: Int64
     counts: Int64
@@ -336,7 +340,7 @@ def _masks(masks: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.bool_]
 
 
 def _own_of(listed: Int64, batch: tuple[int, ...], image: int) -> slice:
-    """The rows of an image's Gaussians; in packed arrays, the range of the rows in the image's lists."""
+    """The rows of an image's Gaussians. In packed arrays, they go from the first to the last row in its lists."""
     if len(batch) > 1:
         return slice(image * batch[-1], (image + 1) * batch[-1])
     return slice(int(listed.min()), int(listed.max()) + 1) if len(listed) else slice(0, 0)

@@ -22,7 +22,7 @@ MASK_STAGES = ("masks",)
 BACKWARD_STAGES = ("append", "loss", "blend_grad", "project_grad", "penalties", "adam", "noise", "statistics")
 """Stages that training needs in addition to FORWARD_STAGES."""
 APPEARANCE_STAGES = (*COLOUR_MODELS, "grid")
-"""Further stages for training with an appearance model, by value of the setting `appearance`."""
+"""Further stages for training with an appearance model, named after the values of the setting `appearance`."""
 DEPTH_STAGES = ("depth",)
 """Further stages for training with known depths."""
 POSE_STAGES = ("pose",)

@@ -62,7 +62,7 @@ def remove_temporaries(tasks: Sequence[Task]) -> None:
 
 
 def _identity(task: Task, options: RenderOptions) -> dict[str, str | int | float]:
-    """Attributes of a frame's file that tell it from frames of other models and settings."""
+    """Attributes that distinguish a frame's file from files of other models and settings."""
     known = {name: value for name, value in options.attributes.items() if name in IDENTITY_ATTRIBUTES}
     return {**known, SETTINGS_DIGEST_ATTRIBUTE: settings_digest(task, options)}
 

@@ -143,7 +143,7 @@ class JobModels:
                     f"{first}-{last}, or cameras of these frames"
                 )
             if missing := sorted({number for number in numbers if number not in files}):
-                warn(f"{path}: has no file of the frame(s) {ranges(missing)}, made from the neighbouring files; {have}")
+                warn(f"{path}: has no file of the frame(s) {ranges(missing)}, so neighbouring files are used; {have}")
 
 
 def load_job_models(path: Path, transform: KeyedTrack | None = None) -> JobModels:

@@ -46,8 +46,8 @@ from clsplat.shots.motion import Moments
 from clsplat.shots.optics import Optics, headers
 
 LATLONG_ATTRIBUTES: dict[str, str | int] = {"textureformat": "LatLong Environment", "openexr:levelmode": 0}
-"""OpenImageIO's attributes for EXR's envmap. The level mode says that no mipmap levels follow, for which OpenImageIO
-would keep the file open."""
+"""OpenImageIO's attributes for EXR's envmap. The level mode says that the file has no mipmap levels. OpenImageIO would
+keep the file open for these."""
 _ENCODING_FIELDS_BY_SUFFIX = {
     ".exr": ("depth", "parts", "compression"),
     **dict.fromkeys((".png", ".tif", ".tiff", ".dpx"), ("bits",)),

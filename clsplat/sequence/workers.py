@@ -131,10 +131,11 @@ def run_tasks(
 ) -> None:
     """Render the frames, and at the same time write them or add them to the video.
 
-    Each renderer has a thread, which takes the next free frame.
+    Each renderer has a thread, which takes the next free frame. The first error of any thread is raised after all
+    threads have ended.
     shared: other jobs may render some of these frames. Frames are then claimed, and those of other jobs awaited.
     on_done: function that is called in this thread for each frame whose file is complete, in any order. For a video it
-    is called in order, when the frame has been encoded. The first error of any thread is raised after all have ended.
+    is called in order, when the frame has been encoded.
     """
     if not tasks:
         return
@@ -183,7 +184,7 @@ def run_tasks(
 
 
 def _skipped(task: Task, options: RenderOptions) -> Future[Result]:
-    """The result of a frame that an earlier job has finished."""
+    """The result of a frame that another job has finished."""
     outcome: Future[Result] = Future()
     outcome.set_result((record_of(task, options, skipped=True), None))
     return outcome

@@ -14,7 +14,7 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 
 COLMAP_UP = (0.0, -1.0, 0.0)
-"""Up direction in the world of a level photograph: COLMAP's y axis points down."""
+"""Up direction of a world with the axes of a level camera. In COLMAP's convention its y axis points down."""
 MAX_AZIMUTH_GAP_RADIANS = np.deg2rad(100.0)
 """Widest azimuth gap between cameras, in radians, that a turntable crosses. At wider gaps it swings back and forth."""
 

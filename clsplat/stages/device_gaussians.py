@@ -31,7 +31,7 @@ class ShStorage:
 
     @property
     def floats(self) -> int:
-        """Floats per Gaussian, including its degree, rounded up."""
+        """Memory per Gaussian, in floats of 4 bytes. An SH degree counts as one; halves count as half, rounded up."""
         rest = 3 * (self.coefficients - 1)
         kept = -(-rest // 2) if self.half else rest
         return floats_of(self.coefficients) - rest + kept + (self.degrees is not None)

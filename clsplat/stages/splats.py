@@ -15,7 +15,7 @@ from clsplat.layouts.columns import SLOT, SPLAT, TILE
 from clsplat.stages.project import Projected, Slots
 
 SPLAT_VALUES = 3
-"""Number of values in a splat, which blend.cl blends."""
+"""Number of values of a splat that blend.cl blends: its columns RED to BLUE."""
 SLOT_MOMENT_FIELDS = SLOT.index("RED")
 """Number of fields in a slot before those for the gradients with respect to values."""
 

@@ -87,7 +87,7 @@ class HeldModel:
 
 
 class LiveModel:
-    """Model in training, which is rendered between two steps, in the trainer's memory. The step's data are kept."""
+    """Model in training. It is rendered between two steps in the trainer's memory, without effect on the training."""
 
     def __init__(self, trainer: Trainer, background: Sequence[float]) -> None:
         self.trainer, self.background = trainer, background

@@ -73,7 +73,10 @@ def path_document(
     if not (1 <= width <= 1 << 15 and 1 <= height <= 1 << 15):
         raise InputError(f"the size is {width}x{height}, expected 1 to {1 << 15} pixels per side")
     if not (math.isfinite(apart) and math.isfinite(fps) and 0 < fps <= 1000 and 0 < apart <= 3600):
-        raise InputError(f"{apart} seconds at {fps} frames per second: expected more than 0, at most 3600 and 1000")
+        raise InputError(
+            f"{apart} seconds between keys, {fps} frames per second: expected more than 0, at most 3600 seconds and "
+            "1000 frames per second"
+        )
     step = max(round(apart * fps), 1)
     head: CameraFileHead = {"clsplat_cameras": 1, "width": width, "height": height, "fps": fps}
     if loop and len(keys) > 1:

@@ -24,7 +24,8 @@ MAX_PAGE_SIDE_PX = MAX_VIDEO_SIDE_PX
 DEFAULT_FOV_Y_RADIANS = math.radians(60)
 """Vertical field of view in radians if no camera of the scene defines it."""
 MAX_START_FOV_Y_RADIANS = math.radians(120)
-"""Maximum vertical field of view in radians at the start of a narrow page. More would only add top and bottom."""
+"""Maximum vertical field of view in radians at the start of a narrow page. More would mainly add space above and below
+the model."""
 
 
 @dataclass(frozen=True, eq=False)

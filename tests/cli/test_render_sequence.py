@@ -139,7 +139,7 @@ def test_motion_blur_is_the_mean_over_the_shutter(folder: Path) -> None:
 
 def test_gaps_are_filled_and_told(folder: Path, capsys: Capture) -> None:
     (folder / "capture.0003.ply").unlink()
-    assert "has no file of the frame(s) 3, made from the neighbouring files; there are the frames 1-2,4-5" in (
+    assert "has no file of the frame(s) 3, so neighbouring files are used; there are the frames 1-2,4-5" in (
         ran(capsys, render, folder, "capture.####.ply", "all", "--channels alpha --exr float").err
     )
     means = (at(2).means.astype(float) + at(4).means) / 2

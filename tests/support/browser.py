@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A headless Chromium for tests of pages: the system's own, driven by Playwright. Skips with the reason without one.
+"""The system's Chromium, headless and driven by Playwright, for tests of pages. Without it such a test is skipped.
 
-`browser` is a fixture (conftest.py). Screenshots go to the folder that CLSPLAT_ARTEFACTS names, or the test's own.
+`browser` is a fixture (conftest.py). Screenshots go to the folder that CLSPLAT_ARTEFACTS names, or to the test's own.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ ARGUMENTS = (
     *("--no-sandbox", "--disable-dev-shm-usage"),
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
 )
-"""Of root in a container, with little shared memory; WebGL without a GPU."""
+"""Chromium's arguments for root in a container with little shared memory, and for WebGL without a GPU."""
 
 
-@pytest.fixture(scope="module")  # while it is open there is an event loop in this thread, which other tests may mind
+@pytest.fixture(scope="module")  # an open browser has an event loop in this thread, which may disturb other tests
 def browser() -> Iterator[Any]:
-    """A Playwright browser. Make a page of it with `browser.new_page()`, and close that."""
+    """A Playwright browser. A test opens a page with `browser.new_page()`, and closes it."""
     for name in ("playwright", "chromium"):
         require(name)
     from playwright.sync_api import sync_playwright
@@ -35,7 +35,10 @@ def browser() -> Iterator[Any]:
 
 
 def watched_page(browser: Any, **options: Any) -> tuple[Any, list[str]]:
-    """A page, and what it said on its console or could not load, of errors alone; options as of `new_page`."""
+    """A new page, and a list of its errors: on its console, in its scripts, and of failed requests.
+
+    options: arguments of `browser.new_page`.
+    """
     page, trouble = browser.new_page(**options), []
     page.on("console", lambda message: trouble.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: trouble.append(str(error)))
@@ -44,7 +47,7 @@ def watched_page(browser: Any, **options: Any) -> tuple[Any, list[str]]:
 
 
 def kept(folder: Path, name: str) -> Path:
-    """Where a screenshot goes; `folder` is the test's own."""
+    """Path of a screenshot. folder: the test's own, used without CLSPLAT_ARTEFACTS."""
     place = Path(os.environ.get("CLSPLAT_ARTEFACTS") or folder)
     place.mkdir(parents=True, exist_ok=True)
     return place / name

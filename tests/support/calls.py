@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calling the command line in tests, and what it says."""
+"""Calls of the command line and of functions in tests, and checks of their output, warnings and errors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Capture = pytest.CaptureFixture[str]
 
 
 def warnings_of(work: Callable[[], object]) -> list[str]:
-    """The user's warnings of a piece of work, and NumPy's."""
+    """Texts of the warnings for users, and of NumPy's, while `work` runs."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         work()
@@ -34,7 +34,7 @@ def warnings_of(work: Callable[[], object]) -> list[str]:
 
 
 def warned(match: str, call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """The result of a call that gives one warning; fails unless the warning matches."""
+    """The result of a call. Fails unless it gives exactly one warning, which matches."""
     with pytest.warns(UserWarning, match=match) as caught:
         found = call(*arguments, **options)
     assert len(caught) == 1, [str(each.message) for each in caught]
@@ -43,20 +43,20 @@ def warned(match: str, call: Callable[..., Any], *arguments: Any, **options: Any
 
 @contextmanager
 def no_warnings() -> Iterator[None]:
-    """Any warning is an error here."""
+    """Make every warning inside the block an error."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
 
 
 def only(items: Iterable[Any]) -> Any:
-    """The one item that there is."""
+    """The only item. Fails if there is none or more than one."""
     (item,) = items
     return item
 
 
 def peak_of(work: Callable[[], object]) -> int:
-    """Bytes that Python and NumPy have at most during a piece of work."""
+    """Peak of the bytes that Python and NumPy allocate while `work` runs."""
     tracemalloc.start()
     try:
         work()
@@ -66,7 +66,7 @@ def peak_of(work: Callable[[], object]) -> int:
 
 
 def flags(config: object, prefix: str = "--") -> list[str]:
-    """Every setting as a user would give it."""
+    """Flags of the command line for all settings except booleans."""
     words: list[str] = []
     for field in fields(config):  # type: ignore[arg-type]
         value, name = getattr(config, field.name), prefix + field.name.replace("_", "-")
@@ -84,12 +84,12 @@ def train(scene: Path, run: Path, config: TrainConfig, *more: str) -> int:
 
 
 def ended(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
-    """The process of this command, once it has ended; options: of subprocess.run."""
+    """Run a command, and return its ended process. options: arguments of subprocess.run."""
     return subprocess.run([*map(str, words)], capture_output=True, text=True, check=False, **options)
 
 
 def python(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
-    """A Python process that is given these words, once it has ended; options: of subprocess.run."""
+    """Run Python with these arguments, and return the ended process. options: arguments of subprocess.run."""
     return ended(sys.executable, *words, **options)
 
 
@@ -100,45 +100,45 @@ def command(*arguments: str) -> subprocess.CompletedProcess[str]:
 def refuses(
     match: str, call: Callable[..., object], *arguments: Any, error: type[Exception] = InputError, **options: Any
 ) -> str:
-    """The message of the error that the call raises, of an InputError one line; fails unless it matches."""
+    """The message of the error that a call raises. Fails unless it matches, and if an InputError has several lines."""
     with pytest.raises(error, match=match) as caught:
         call(*arguments, **options)
     message = str(caught.value)
-    del caught  # else the frames of the call, and the files that they have open, live until garbage is collected
+    del caught  # otherwise the call's frames and their open files live until a garbage collection
     assert error is not InputError or "\n" not in message
     return message
 
 
 def complaint(path: object, call: Callable[..., object], *arguments: Any, **options: Any) -> str:
-    """The words behind the file's name in the InputError that the call raises."""
+    """The message of the InputError that a call raises, without the path at its beginning."""
     start = f"{path}: "
     return refuses(f"^{re.escape(start)}", call, *arguments, **options).removeprefix(start)
 
 
 def ran(capsys: Capture, call: Callable[..., int], *arguments: Any, status: int = 0, **options: Any) -> Any:
-    """Output and errors of a call, which ends with this status."""
+    """Output and errors of a call. Fails unless it returns `status`."""
     assert call(*arguments, **options) == status, arguments
     return capsys.readouterr()
 
 
 def fails(capsys: Capture, call: Callable[..., int], *arguments: Any, status: int = 2, **options: Any) -> str:
-    """The one line of error of a call, which ends with this status."""
+    """The line of error of a call. Fails unless it returns `status`, and prints only that line."""
     assert call(*arguments, **options) == status, arguments
     return error_line(capsys)
 
 
 def printed(capsys: Capture, words: Iterable[object], *, call: Callable[[list[str]], int] = main, **how: Any) -> Any:
-    """Output and errors of a call of the command line; how: its status."""
+    """Output and errors of a call of the command line. how: its expected status, if not 0."""
     return ran(capsys, call, [*map(str, words)], **how)
 
 
 def rejected(capsys: Capture, words: Iterable[object], *, call: Callable[[list[str]], int] = main, **how: Any) -> str:
-    """The one line of error of a call of the command line; how: its status."""
+    """The line of error of a call of the command line. how: its expected status, if not 2."""
     return fails(capsys, call, [*map(str, words)], **how)
 
 
 def raising(error: BaseException) -> Callable[..., Any]:
-    """A function that raises this error, whatever it is called with."""
+    """A function that raises this error for any arguments."""
 
     def call(*_: object, **__: object) -> NoReturn:
         raise error
@@ -147,7 +147,7 @@ def raising(error: BaseException) -> Callable[..., Any]:
 
 
 def noted(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, note: Callable[..., object]) -> None:
-    """Let each call of a function or method go to `note` first, with the same arguments; what `note` raises ends it."""
+    """Let each call of a function or method call `note` first, with the same arguments. Errors of `note` propagate."""
     real = getattr(owner, name)
 
     def call(*arguments: Any, **options: Any) -> Any:
@@ -158,7 +158,7 @@ def noted(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, note: Callable
 
 
 def error_line(capsys: Capture) -> str:
-    """The one line on standard error, and nothing on standard output."""
+    """The line on standard error. Fails if there is another one, or any standard output."""
     captured = capsys.readouterr()
     lines = captured.err.splitlines()
     assert captured.out == "", captured
@@ -168,7 +168,7 @@ def error_line(capsys: Capture) -> str:
 
 
 def one_error(capfd: Capture) -> str:
-    """The last words: nothing on standard output, one line of error, no traceback, nothing from any library."""
+    """The line of error. Fails if there is anything else in the output, such as a traceback or a library's message."""
     captured = capfd.readouterr()
     assert captured.out == ""
     assert captured.err.startswith("clsplat: error: "), captured.err
@@ -177,7 +177,7 @@ def one_error(capfd: Capture) -> str:
 
 
 def left_behind(target: Path) -> str:
-    """Write what one who was killed while writing this file leaves beside it; its name."""
+    """Write the temporary file of a process that was killed while it wrote `target`. Returns the file's name."""
     child = subprocess.Popen([sys.executable, "-c", ""])
     child.wait()
     name = temporary_name(target).name.replace(f"{os.getpid():08x}", f"{child.pid:08x}")

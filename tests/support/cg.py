@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files as other renderers write them: depth EXR, deep EXR, and a sphere for them."""
+"""Depth EXR and deep EXR files as other renderers write them, and depths of a sphere for them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pictures import write_pixels
 from clsplat.camera import Camera
 
 Samples = Sequence[Sequence[Sequence[float]]]
-"""Of each pixel its samples, of each the values of its channels."""
+"""Samples of all pixels: a list for each pixel, with the channels' values of each of its samples."""
 
 
 def write_flat(
@@ -25,7 +25,11 @@ def write_flat(
     size: tuple[int, int] | None = None,
     window: tuple[int, int, int, int] | None = None,
 ) -> Path:
-    """An EXR of channels (H, W) of the data window (x, y, width, height), which is the frame where none is given."""
+    """Write an EXR of channels (H, W).
+
+    size: width and height of the frame; by default those of the channels.
+    window: the data window (x, y, width, height); by default it begins at the frame's corner.
+    """
     pixels = np.stack(list(channels.values()), axis=2).astype(np.float32)
     x, y = (window or (0, 0))[:2]
     width, height = size or (pixels.shape[1], pixels.shape[0])
@@ -34,7 +38,7 @@ def write_flat(
 
 
 def write_samples(path: Path, size: tuple[int, int], samples: Samples, names: Sequence[str] = ("A", "Z")) -> Path:
-    """A deep EXR of a frame of that size (width, height)."""
+    """Write a deep EXR of a frame. size: width and height."""
     spec = oiio.ImageSpec(*size, len(names), oiio.FLOAT)
     spec.channelnames, spec.deep = tuple(names), True
     data = oiio.DeepData()
@@ -52,8 +56,10 @@ def write_samples(path: Path, size: tuple[int, int], samples: Samples, names: Se
 
 
 def sphere(camera: Camera, centre: Sequence[float], radius: float) -> NDArray[np.float64]:
-    """(H, W): depth along the axis of a sphere at a place in the camera's space at each pixel's middle, infinite beside
-    it."""
+    """Depths (H, W) along the camera's axis of a sphere, at the pixels' centres; infinite in pixels that miss it.
+
+    centre: (3,), in the camera's space.
+    """
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
     rays = np.stack(np.broadcast_arrays(x, y[:, None], 1.0), axis=2)
@@ -63,7 +69,10 @@ def sphere(camera: Camera, centre: Sequence[float], radius: float) -> NDArray[np
 
 
 def sphere_samples(camera: Camera, centre: Sequence[float], radius: float, fine: int = 4) -> list[list[list[float]]]:
-    """Of each pixel one deep sample, alpha and depth: the share of fine x fine rays that hit, and their mean depth."""
+    """Deep samples of a sphere, one for each pixel that it covers at least partly.
+
+    A sample's alpha is the fraction of fine x fine rays that hit the sphere, and its depth is their mean.
+    """
     depths = sphere(camera.resized(camera.width * fine, camera.height * fine), centre, radius)
     blocks = depths.reshape(camera.height, fine, camera.width, fine).transpose(0, 2, 1, 3).reshape(-1, fine * fine)
     hits = np.isfinite(blocks)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A few Gaussians before a few cameras, as float64 tensors for `clsplat.torch` and for the dense oracle."""
+"""A few Gaussians in front of a few cameras: float64 tensors for `clsplat.torch` and its reference `dense.py`."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-WIDTH, HEIGHT = 37, 29  # no whole number of tiles
+WIDTH, HEIGHT = 37, 29  # not multiples of a tile's side
 
 
 def cameras(count: int) -> tuple[Tensor, Tensor]:
-    """viewmats (C, 4, 4) and Ks (C, 3, 3), turned and moved a little from each other."""
+    """viewmats (C, 4, 4) and Ks (C, 3, 3) of cameras with slightly different poses and intrinsics."""
     viewmats, Ks = torch.eye(4).double().repeat(count, 1, 1), torch.zeros(count, 3, 3).double()
     for index in range(count):
         angle = torch.tensor(0.2 * index - 0.1).double()
@@ -24,7 +24,7 @@ def cameras(count: int) -> tuple[Tensor, Tensor]:
 
 
 def cloud(count: int, *, width: int = 3, degree: int | None = None, cams: int = 1, seed: int = 0) -> dict[str, Any]:
-    """Arguments of `rasterization`: N Gaussians at depths 2 to 6, `width` channels or SH coefficients of a degree."""
+    """Arguments of `rasterization`: Gaussians at depths 2 to 6, with `width` channels or with SH of a degree."""
     draw = torch.Generator().manual_seed(seed)
 
     def uniform(least: float, most: float, *shape: int) -> Tensor:
@@ -47,16 +47,18 @@ def cloud(count: int, *, width: int = 3, degree: int | None = None, cams: int = 
         "width": WIDTH,
         "height": HEIGHT,
         "sh_degree": degree,
-        # every number is one of float32's: the oracle and the kernels begin with the same
     }
 
 
 def rounded(arguments: dict[str, Any]) -> dict[str, Any]:
-    """The same with each tensor's numbers rounded to float32's, in float64."""
+    """The arguments with all tensors rounded to float32, but stored as float64.
+
+    So the reference and the kernels begin with the same numbers.
+    """
     return {name: value.float().double() if isinstance(value, Tensor) else value for name, value in arguments.items()}
 
 
 def given(count: int = 8, **changes: Any) -> dict[str, Any]:
-    """`cloud` in float32, with these changes."""
+    """Arguments like those of `cloud`, in float32 and with these changes."""
     made = {name: value.float() if isinstance(value, Tensor) else value for name, value in cloud(count).items()}
     return {**made, **changes}

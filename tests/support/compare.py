@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparisons that say what differs, where and by how much. Every test that uses one states why its tolerance."""
+"""Comparisons whose messages say what differs, where and by how much. Tests state the reasons for their tolerances."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _pair(got: ArrayLike, wanted: ArrayLike, name: str) -> tuple[NDArray[np.floa
 def assert_close(
     got: ArrayLike, wanted: ArrayLike, relative: float = 0.0, absolute: float = 0.0, name: str = "array"
 ) -> None:
-    """Every element within absolute + relative * |wanted|."""
+    """Fail unless every element is within absolute + relative * |wanted|."""
     a, b = _pair(got, wanted, name)
     if a.size == 0:
         return
@@ -44,9 +44,12 @@ def assert_close_images(
     ignore: NDArray[np.bool_] | None = None,
     name: str = "image",
 ) -> None:
-    """Images (H, W) or (H, W, C): every channel within `tolerance`, apart from `flips` (a ratio of the pixels, where
-    a threshold decided the other way), which must stay within `flip_tolerance`. `ignore` (H, W) masks pixels out of
-    both, for scenes whose margin band is known: give it or `flips`, not both."""
+    """Fail unless all channels of two images (H, W) or (H, W, C) are within `tolerance`.
+
+    flips: fraction of the pixels that may differ by up to `flip_tolerance`, because a threshold decided differently.
+    ignore: mask (H, W) of pixels that are not compared, for scenes whose pixels near a threshold are known. It excludes
+        `flips`.
+    """
     assert ignore is None or flips == 0.0, "a mask and a flip ratio together would hide errors"
     a, b = _pair(got, wanted, name)
     assert a.ndim in (2, 3), f"{name}: an image has 2 or 3 axes, not {a.ndim}"
@@ -68,7 +71,7 @@ def assert_close_images(
 
 
 def relative_error(got: ArrayLike, wanted: ArrayLike) -> float:
-    """|got - wanted| / |wanted| in the 2-norm over all elements; infinite where wanted is zero and got is not."""
+    """|got - wanted| / |wanted| in the 2-norm of all elements; infinite if `wanted` is zero and `got` is not."""
     a, b = np.asarray(got, np.float64), np.asarray(wanted, np.float64)
     difference, norm = float(np.linalg.norm(a - b)), float(np.linalg.norm(b))
     if norm == 0.0:
@@ -77,8 +80,10 @@ def relative_error(got: ArrayLike, wanted: ArrayLike) -> float:
 
 
 def assert_close_gradient(got: ArrayLike, wanted: ArrayLike, tolerance: float, name: str = "gradient") -> None:
-    """Relative error in norm at most `tolerance`; the wanted gradient must not be zero, or the test would show
-    nothing."""
+    """Fail unless `relative_error` is at most `tolerance`.
+
+    Fails too if the wanted gradient is zero, because the test would then show nothing.
+    """
     a, b = _pair(got, wanted, name)
     assert b.any(), f"{name}: the wanted gradient is zero everywhere"
     error = relative_error(a, b)
@@ -94,7 +99,7 @@ def assert_close_gradient(got: ArrayLike, wanted: ArrayLike, tolerance: float, n
 def assert_close_gradients(
     got: Mapping[str, NDArray[Any]], wanted: Mapping[str, NDArray[Any]], tolerance: float
 ) -> None:
-    """Gradients by name, each as of `assert_close_gradient`."""
+    """Compare gradients by name with `assert_close_gradient`."""
     for name, values in wanted.items():
         assert_close_gradient(got[name], values, tolerance, name=name)
 
@@ -103,8 +108,10 @@ def assert_slopes(
     loss: Callable[[dict[str, Any]], float], arrays: Mapping[str, NDArray[Any]], gradients: Mapping[str, NDArray[Any]],
     *, step: float, tolerance: float,
 ) -> None:  # fmt: skip
-    """Central differences of a loss of arrays along a random direction through each of them, relative to the norm of
-    the gradient by it."""
+    """Fail unless gradients agree with central differences of the loss along a random direction of each array.
+
+    The difference is relative to the norm of the gradient.
+    """
     rng = np.random.default_rng(6)
     for name, gradient in gradients.items():
         direction = rng.standard_normal(gradient.shape)
@@ -116,7 +123,7 @@ def assert_slopes(
 def similarity(
     source: NDArray[np.float64], target: NDArray[np.float64]
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """Scale, rotation and translation that take points (N, 3) to others (Umeyama 1991)."""
+    """Scale, rotation and translation from the points `source` (N, 3) to `target` (N, 3) (Umeyama 1991)."""
     mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
     centred = source - mean_source
     u, s, v = np.linalg.svd((target - mean_target).T @ centred)
@@ -127,14 +134,14 @@ def similarity(
 
 
 def assert_same_arrays(got: Mapping[str, NDArray[Any]], wanted: Mapping[str, NDArray[Any]]) -> None:
-    """Arrays by name, each with the same bits."""
+    """Fail unless there are the same names, and the arrays of each have the same bits."""
     assert got.keys() == wanted.keys()
     for name, values in wanted.items():
         assert_same_bits(got[name], values, name)
 
 
 def assert_same_bits(got: NDArray[Any], wanted: NDArray[Any], name: str = "array") -> None:
-    """Same dtype, shape and bytes; -0.0 and 0.0 differ, NaNs with one payload agree."""
+    """Fail unless dtype, shape and bytes are equal. -0.0 and 0.0 differ; NaNs with the same payload are equal."""
     assert got.dtype == wanted.dtype, f"{name}: got {got.dtype}, wanted {wanted.dtype}"
     assert got.shape == wanted.shape, f"{name}: got shape {got.shape}, wanted {wanted.shape}"
     if got.size == 0:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of the demo's still life."""
+"""Pictures of the demo's still life from a ring of cameras."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from clsplat.demo import ray_caster
 
 
 def photographs(places: range, width: int, height: int) -> tuple[list[NDArray[np.uint8]], list[Camera]]:
-    """Views (height, width, 3) from these places of a ring of forty, and their cameras."""
+    """Pictures (height, width, 3) by these cameras of a ring of forty, and the cameras."""
     surfaces = ray_caster.still_life()
     ray_caster.bake(surfaces, seed=0)
     cameras = ray_caster.cameras(40, width, height, seed=0)[places.start : places.stop]

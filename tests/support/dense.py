@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole of `clsplat.torch.rasterization` in float64 PyTorch, every Gaussian at every pixel: slow.
+"""Slow reference of `clsplat.torch.rasterization` in float64 PyTorch, which evaluates every Gaussian at every pixel.
 
-It shares no code with the package, and none with gsplat.
+It shares no code with gsplat, and with clsplat only constants of spherical harmonics.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from clsplat.spherical_harmonics import SH_C0, SH_C1, SH_C2, SH_C3
 
 ALPHA_LEAST, STOP = 1 / 255, 1e-4
 NEAR_EDGE = 1e-3
-"""A pixel is a threshold pixel where an alpha or a transmittance is within this share of the number that decides:
-float32 has no more than about 1e-4 of an alpha's exponent where that is 10."""
+"""Relative distance of an alpha from a threshold within which a pixel is not steady; ten times that of a transmittance.
+
+At an exponent of about 10, alpha has a relative error of about 1e-4 in float32.
+"""
 
 
 @dataclass
@@ -33,7 +35,10 @@ class Projected:
 
 @dataclass
 class Dense:
-    """images (C, H, W, X), alphas (C, H, W, 1), `steady` (C, H, W): pixels that no threshold is close to."""
+    """Images (C, H, W, X), alphas (C, H, W, 1), and the projected splats.
+
+    steady: (C, H, W), True for pixels where no value is close to a threshold.
+    """
 
     images: Tensor
     alphas: Tensor
@@ -42,7 +47,7 @@ class Dense:
 
 
 def rotations(quats: Tensor) -> Tensor:
-    """(..., 4), w x y z, of any length -> (..., 3, 3)."""
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4), w x y z, of any length."""
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -53,13 +58,13 @@ def rotations(quats: Tensor) -> Tensor:
 
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
-    """(..., 3, 3)."""
+    """Covariances (..., 3, 3)."""
     half = rotations(quats) * scales[..., None, :]
     return half @ half.mT
 
 
 def harmonics(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
-    """directions (..., 3) of any length, coefficients (..., K, 3) -> (..., 3)."""
+    """Colours (..., 3) from directions (..., 3) of any length and coefficients (..., K, 3)."""
     x, y, z = (directions / directions.norm(dim=-1, keepdim=True)).unbind(-1)
     basis = [torch.full_like(x, SH_C0)]
     if degree > 0:
@@ -86,7 +91,7 @@ def harmonics(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
 
 
 def _jacobian(model: str, at: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Pixels (C, N, 2) of points in the camera `at` (C, N, 3), and the projection's derivative (C, N, 2, 3) there."""
+    """Pixels (C, N, 2) of points `at` (C, N, 3) in the camera's space, and the projection's derivative (C, N, 2, 3)."""
     fx, fy, cx, cy = (Ks[:, row, column, None] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
     x, y, z = at.unbind(-1)
     none = torch.zeros_like(z)
@@ -129,7 +134,7 @@ def project(
     camera_model: str = "pinhole",
     antialiased: bool = False,
 ) -> Projected:
-    """means (N, 3), covars (N, 3, 3), opacities (N,), viewmats (C, 4, 4), Ks (C, 3, 3)."""
+    """Project means (N, 3), covars (N, 3, 3) and opacities (N,) by viewmats (C, 4, 4) and Ks (C, 3, 3)."""
     turn = viewmats[:, :3, :3]
     at = means @ turn.mT + viewmats[:, None, :3, 3]
     means2d, jacobian = _jacobian(camera_model, at, Ks, width, height)
@@ -158,7 +163,10 @@ def project(
 def composite(
     splats: Projected, colors: Tensor, opacities: Tensor, width: int, height: int, alpha_max: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """colors (C, N, D), opacities (C, N) -> images without background, transmittances, steady pixels."""
+    """Blend colors (C, N, D) with opacities (C, N).
+
+    Returns images without background, transmittances, and the steady pixels.
+    """
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     pixels = torch.stack([x, y], -1).reshape(-1, 2).double()
     images, left, steady = [], [], []
@@ -209,7 +217,7 @@ def rasterize(
     camera_model: str = "pinhole",
     **limits: float,
 ) -> Dense:
-    """Arguments as `clsplat.torch.rasterization`'s, without batches; covars (N, 3, 3)."""
+    """Render with the arguments of `clsplat.torch.rasterization`, without batches. covars: (N, 3, 3)."""
     antialiased = rasterize_mode == "antialiased"
     if covars is None:
         assert quats is not None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tiny scene with what is known of its depths: tracks of its points, or maps."""
+"""Known depths for the tiny scene: tracks of its points, or depth maps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from clsplat.images.writing import write_image
 
 
 def add_tracks(scene: Path, error: float = 0.5) -> None:
-    """Say in points3D.txt that each point is seen by every second image, by turns."""
+    """Add tracks to points3D.txt: even points are seen by even images, odd points by odd images.
+
+    error: the reprojection error of each point.
+    """
     path = scene / "sparse" / "0" / "points3D.txt"
     rows = []
     for number, line in enumerate(path.read_text().splitlines()):
@@ -25,15 +28,17 @@ def add_tracks(scene: Path, error: float = 0.5) -> None:
 
 
 def depth_of(index: int) -> NDArray[np.float64]:
-    """Depth (H, W) of the plane through the middle of the hidden model that faces camera `index`, with a slope and, on
-    its left quarter, nothing."""
+    """Depth (H, W) of a plane through the middle of the hidden model, which faces camera `index`, with a slope.
+
+    The left quarter has no depth: 0.
+    """
     distance = float(np.linalg.norm(cameras()[index].position - hidden_model().means.mean(axis=0)))
     x = np.arange(WIDTH)[None, :] + 0.5 + np.zeros((HEIGHT, 1))
     return np.where(x < WIDTH / 4, 0.0, distance + 0.5 * (x / WIDTH - 0.5))
 
 
 def add_maps(scene: Path, kind: str = ".png", folder: str = "depths") -> None:
-    """Write a map of each picture: .png in thousandths, .exr and .npy as they are."""
+    """Write a depth map for each picture: in thousandths as .png, in world units as .exr or .npy."""
     target = scene / folder
     target.mkdir()
     for index in range(len(cameras())):

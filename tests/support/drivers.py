@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The OpenCL devices that tests run on, and the kernel shapes that each of them can do.
+"""The OpenCL devices that tests run on, and the kernel shapes that each of them supports.
 
-CLSPLAT_TEST_DRIVERS narrows them down: words with commas between, of which a device's platform, version or name has
-to contain one.
+CLSPLAT_TEST_DRIVERS, words separated by commas, selects the devices whose platform, version or name contains one of
+them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,10 @@ from clsplat.selftest.driver_check import examine
 
 NARROW = "CLSPLAT_TEST_DRIVERS"
 SESSION = "CLSPLAT_TEST_SESSION"
-"""The folder of what all processes of a run share: the first sets it, and it goes with that one."""
+"""Environment variable with the folder of files that all processes of a run share.
+
+The first process sets it, and removes the folder at its end.
+"""
 
 
 def _kept() -> list[DeviceInfo]:
@@ -33,13 +36,13 @@ def _kept() -> list[DeviceInfo]:
 
 
 KEPT = {info.index: info for info in _kept()}
-"""By their index."""
+"""The selected devices, by index."""
 if os.environ.get(NARROW) and KEPT:
-    os.environ["CLSPLAT_DEVICE"] = str(min(KEPT))  # the default driver is one of them, in children too
+    os.environ["CLSPLAT_DEVICE"] = str(min(KEPT))  # also for child processes
 
 
 def check_some_are_kept() -> None:
-    """Raises UsageError where CLSPLAT_TEST_DRIVERS leaves none."""
+    """Raise UsageError if CLSPLAT_TEST_DRIVERS selects no device."""
     if os.environ.get(NARROW) and not KEPT:
         there = "; ".join(f"{info.version}, {info.name}" for info in list_devices()) or "none"
         words = f"{NARROW}={os.environ[NARROW]}"
@@ -47,14 +50,14 @@ def check_some_are_kept() -> None:
 
 
 def label(index: int) -> str:
-    """A driver's name and version, short."""
+    """Short name and version of a driver."""
     words = KEPT[index].version.replace("+", " ").split()
     number = words[words.index("PoCL") + 1] if "PoCL" in words else words[1]
     return f"{KEPT[index].platform.split()[0]}-{number}"
 
 
 def begin_session() -> None:
-    """Make the folder that all processes of this run share, in the first of them."""
+    """Make the folder that all processes of this run share, if this is the first process."""
     if SESSION not in os.environ:
         folder = tempfile.mkdtemp(prefix="clsplat-tests-")
         os.environ[SESSION] = folder
@@ -63,10 +66,10 @@ def begin_session() -> None:
 
 @cache
 def why_not(index: int, lanes: int, items: int) -> str:
-    """Why kernels in this shape cannot run on a device, found out in a process of its own; empty where they can.
+    """Reason why kernels in this shape cannot run on a device, found by a trial in another process; empty if they can.
 
-    PoCL 3.0 aborts at the first launch of a kernel with a square root of 16 lanes where its compiler takes a processor
-    with AVX-512 for one without. A wrong result is no reason: that is for the tests to find.
+    PoCL 3.0 aborts at the first launch of a kernel with a square root of 16 lanes, if its compiler does not recognise
+    that the processor has AVX-512. A wrong result is no reason, because tests are to find it.
     """
     device = all_devices()[index]
     if lanes <= default_shape(device).lanes:
@@ -75,7 +78,7 @@ def why_not(index: int, lanes: int, items: int) -> str:
     if answer.exists():
         return answer.read_text()
     with pytest.MonkeyPatch.context() as patch:
-        # of its own: an aborted build leaves a program without kernels there
+        # a cache of its own, because an aborted build leaves a program without kernels in it
         patch.setenv("POCL_CACHE_DIR", tempfile.mkdtemp(dir=answer.parent))
         report = examine(index, Shape(lanes, items, default_shape(device).chunks), ("arithmetic",), quick=True)
     driver = " ".join(device.platform.version.split("  ")[0].split()[2:])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drivers that misbehave (`stand_in/sitecustomize.py`), and the calls that meet them."""
+"""Drivers that misbehave (`stand_in/sitecustomize.py`), and calls of clsplat with them."""
 
 from __future__ import annotations
 
@@ -21,24 +21,29 @@ from clsplat.device.drivers.quirks import wants_cache
 from clsplat.device.drivers.worker_process import TRUST_DRIVER_VARIABLE
 
 ALWAYS = 10**6
-"""More texts than are ever built."""
+"""A number that is larger than the number of kernel texts in any test."""
 Standing = Callable[..., Path]
 
 
 DRIVER = min((index for index in KEPT if not wants_cache(all_devices()[index])), default=min(KEPT, default=0))
-"""Index of the device that is stood in for: one whose driver has a cache, if there is one, as each test and each of its
-processes builds everything anew on another."""
+"""Index of the device whose driver misbehaves.
+
+It is one whose driver has a cache, if there is one. With another driver, every process would build all kernels again.
+"""
 
 
 @pytest.fixture(scope="session")
 def standing_device() -> Device:
-    """The device that is stood in for, as it is."""
+    """The device DRIVER, without misbehaviour."""
     return open_device(str(DRIVER))
 
 
 @pytest.fixture
 def standing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Standing]:
-    """A driver that is not known yet. Called with HOW, FIRST and LAST it begins to misbehave."""
+    """Function that makes the driver of DRIVER misbehave: its arguments are HOW, FIRST and LAST of `sitecustomize.py`.
+
+    The driver has no record of earlier tests. The function returns the file with the numbered texts.
+    """
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("CLSPLAT_DEVICE", str(DRIVER))
     monkeypatch.delenv(TRUST_DRIVER_VARIABLE)
@@ -56,7 +61,7 @@ def standing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Standi
 
 
 def forget() -> None:
-    """Begin as a new process: no kernels are built, and none are tried by one that has the driver of before."""
+    """Bring clsplat to the state of a new process: without open devices, and without processes that try kernels."""
     for process in sandbox._processes.values():
         process.close()
     context._open.cache_clear()
@@ -82,7 +87,7 @@ def call(verb: str, scene: Path, run: Path, new: Path) -> int:
 
 
 def error_of(capsys: Capture) -> str:
-    """The one line of error."""
+    """The line of error. Fails if there are several or a traceback."""
     said = capsys.readouterr().err
     assert "Traceback" not in said
     (line,) = [line for line in said.splitlines() if line.startswith("clsplat: error: ")]
@@ -93,9 +98,12 @@ def error_of(capsys: Capture) -> str:
 LATE = replace(
     short(iterations=16, checkpoint_every=5), optimiser=OptimiserConfig(means_rate_steps=400, sh_rest_every=3)
 )
-"""Kernels of it are built and launched for the first time after ten steps and more: rows move, SH is left out."""
+"""A training that builds and launches some kernels for the first time after ten steps or more.
+
+These move rows of the model, or leave out the higher SH bands.
+"""
 
 
 def number_of(name: str, numbers: Path) -> int:
-    """Of the first text or kernel of this name."""
+    """Number of the first text or kernel with this name, as listed in the file `numbers`."""
     return next(number for number, line in enumerate(numbers.read_text().splitlines(), 1) if name in line)

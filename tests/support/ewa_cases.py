@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussians and cameras of the EWA projection: its twin, its kernels and the library's calls are tried with them."""
+"""Gaussians and cameras for tests of the EWA projection: of its twin, its kernels and the library's calls."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OUTPUTS = ("means2d", "depths", "conics", "compensations")
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Gaussians in float32 as kernels have them, and a camera whose matrix is no rotation."""
+    """Gaussians in float32, as kernels read them, and a camera whose matrix is not exactly a rotation."""
 
     means: Float32
     quaternions: Float32
@@ -32,12 +32,12 @@ class Case:
 
     @property
     def covariances(self) -> Float32:
-        """(N, 6), rounded."""
+        """Upper triangles (N, 6) of the covariances, rounded to float32."""
         full = twin.covariances_of(self.quaternions.astype(np.float64), self.scales.astype(np.float64))
         return full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]].astype(np.float32)
 
     def full(self, *, rounded: bool) -> Float64:
-        """Covariances (N, 3, 3): of quaternions and scales, or as `covariances` has them."""
+        """Covariances (N, 3, 3) from quaternions and scales. rounded: from the rounded `covariances` instead."""
         if rounded:
             return twin.full_covariances(self.covariances.astype(np.float64))
         return twin.covariances_of(self.quaternions.astype(np.float64), self.scales.astype(np.float64))
@@ -45,7 +45,11 @@ class Case:
     def projected(
         self, *, rounded: bool = False, opacities: bool = False, compensated: bool = False
     ) -> twin.EwaProjectedTwin:
-        """Results of the twin."""
+        """Results of the twin.
+
+        rounded: use the rounded `covariances`.
+        opacities: let the radii depend on the opacities. compensated: multiply these by the compensations first.
+        """
         means, full = self.means.astype(np.float64), self.full(rounded=rounded)
         plain = twin.project(means, full, self.view)
         if not opacities:
@@ -54,15 +58,17 @@ class Case:
         return twin.project(means, full, self.view, seen)
 
     def at(self, **changes: object) -> Case:
-        """The same Gaussians with another view."""
+        """The case with these changes of its view."""
         return replace(self, view=replace(self.view, **changes))  # type: ignore[arg-type]
 
 
 def case(
     count: int, model: str = "pinhole", *, seed: int = 1, thin: float = 1.0, size: tuple[int, int] = (100, 70)
 ) -> Case:
-    """Gaussians around what a camera looks at, some of them beside it, some behind; thin: the standard deviation of the
-    logarithms of their scales."""
+    """Gaussians around the point that a camera looks at. Some are outside its picture, and some behind it.
+
+    thin: standard deviation of the logarithms of their scales.
+    """
     rng = np.random.default_rng(seed)
     viewmat = np.eye(4)
     viewmat[:3, :3] = Rotation.from_rotvec([0.2, 0.3, -0.1]).as_matrix() + 0.02 * rng.normal(size=(3, 3))
@@ -80,7 +86,10 @@ def case(
 
 
 def gradients(projected: twin.EwaProjectedTwin, *names: str, seed: int = 2) -> dict[str, Float32]:
-    """Random gradients by outputs, of one size in a conic's own measure, NaN for what is culled."""
+    """Random gradients with respect to these outputs; NaN for culled Gaussians.
+
+    Gradients of conics are divided by the conic's norm, so that all have similar effects.
+    """
     rng = np.random.default_rng(seed)
     sizes = {"means2d": projected.means2d.shape, "conics": projected.conics.shape}
     result = {}

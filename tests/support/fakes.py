@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands in for scene, device, trainer, renderer and image files where only the command line is tested."""
+"""Fakes of scene, device, trainer, renderer and image files, for tests of the command line alone."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -54,7 +54,13 @@ class FakeDevice:
 
 @dataclass
 class Pipeline:
-    """Calls that the fakes have had, and what they are to do; `main` is the command line on them."""
+    """Fakes for a call of the command line (`main`).
+
+    calls: calls of the fakes, in order.
+    written: pixels of the written files, by path.
+    cameras: cameras that a camera file has, by name.
+    training: called by the fake training with the run and `on_step`.
+    """
 
     calls: list[tuple[Any, ...]] = field(default_factory=list)
     written: dict[str, np.ndarray] = field(default_factory=dict)
@@ -66,14 +72,14 @@ class Pipeline:
         return command_line.main(arguments, self.services)
 
     def write_channels(self, path: Path, made: dict[str, np.ndarray], *_: object) -> None:
-        """In place of the real one."""
+        """Replacement of `frame_files.write_channels`, which keeps the planes in `written`."""
         planes = [plane if plane.ndim == 3 else plane[:, :, None] for plane in made.values()]
         self.written[str(path)] = np.concatenate(planes, axis=2)
 
 
 @pytest.fixture
 def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
-    """Stands in for scene, device, trainer, renderer and image files."""
+    """Fakes of scene, device, trainer, renderer and image files."""
     pipe = Pipeline()
 
     @dataclass
@@ -104,7 +110,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
             return self.train_views
 
         def check_pictures(self) -> None:
-            """Real pictures are cut in test_scene.py."""
+            """Accept the pictures. test_scene.py tests damaged ones."""
 
     @dataclass
     class Result:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Projected Gaussians as arrays, with which the library's pixels are tried."""
+"""Projected Gaussians as arrays, for tests of the library's pixels."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from clsplat.selftest.cases.library import random_splats
 
 @dataclass(frozen=True, eq=False)
 class Flat:
-    """Arrays in the order of `screen_gaussians`, float32 as kernels have them, but for the radii."""
+    """Projected Gaussians: arrays in the order of the arguments of `screen_gaussians`."""
 
     means2d: Float32
     conics: Float32
@@ -29,25 +29,25 @@ class Flat:
 
     @property
     def arrays(self) -> tuple[Float32, Float32, Float32, Float32, Float32, NDArray[np.int32]]:
-        """The arguments of `screen_gaussians`, after the device."""
+        """The arguments of `screen_gaussians` that follow the device."""
         return (self.means2d, self.conics, self.opacities, self.colours, self.depths, self.radii)
 
     @property
     def twin(self) -> twin.FlatGaussians:
-        """The same in float64."""
+        """The Gaussians in float64, for the twin."""
         means2d, conics, opacities, colours, depths = (np.asarray(array, np.float64) for array in self.arrays[:5])
         drawn = np.asarray((self.radii > 0).all(axis=1))
         return twin.FlatGaussians(means2d, conics, opacities, colours, depths, drawn)
 
     def pixels(self, device: Any, width: int, height: int, **how: Any) -> PixelPass:
-        """Their picture."""
+        """The picture of the Gaussians. how: further arguments of `PixelPass`."""
         session = session_of(device)
         with session.lock:
             return PixelPass(session, screen_gaussians(session.device, *self.arrays), (width, height), **how)
 
 
 def cloud(count: int, width: int, height: int, depth: int = 3, *, seed: int = 0, opaque: float = 0.1) -> Flat:
-    """Gaussians all over an image, as in the case of splats."""
+    """Random Gaussians all over an image, by `random_splats` of the self-test."""
     rng = np.random.default_rng(seed)
     given = random_splats(rng, count, width=width, height=height, depth=depth, opaque=opaque)
     return Flat(given.means2d, given.conics, given.opacities, given.values, given.depths, given.radii)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames and gradients of a few tiny scenes, pictures with every channel, and a trained model: checksums for
-`golden/frames.json`, and all of it for `tools/ci/digests.py`."""
+"""Frames and gradients of a few tiny scenes, pictures with every channel, and a trained model.
+
+`golden/frames.json` has checksums of the frames and gradients; `tools/ci/digests.py` uses everything here.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,7 @@ from clsplat.sequence.task import RenderOptions, Task
 Array = NDArray[np.float32]
 
 LANES, ITEMS = 8, 1
-"""The shape of the gradients: their sums, unlike a frame, depend on it."""
+"""Kernel shape of the stored checksums. The sums of gradients depend on the shape, unlike frames."""
 
 SCENES: dict[str, Callable[[], tuple[Gaussians, Camera]]] = {
     "overlap": scenes.NAMED["overlap"],
@@ -38,13 +40,15 @@ SCENES: dict[str, Callable[[], tuple[Gaussians, Camera]]] = {
 
 
 def arrays_of(device: Device) -> dict[str, dict[str, list[Array]]]:
-    """By scene and name, in the device's own shape: all channels of the frame, the gradients of the parameters and of
-    the means on the image."""
+    """Arrays by scene and name, in the device's own shape.
+
+    They are the image, the transmittance, and gradients of the parameters and of the means on the image.
+    """
     return {name: _of(Pipeline.run(device, make())) for name, make in SCENES.items()}
 
 
 def checksums(device: Device) -> dict[str, dict[str, str]]:
-    """By scene and array, in the golden shape."""
+    """Checksums by scene and name of the arrays, in the shape of the stored checksums."""
     found = arrays_of(shaped(device, LANES, ITEMS))
     return {scene: {name: checksum(parts) for name, parts in arrays.items()} for scene, arrays in found.items()}
 
@@ -63,11 +67,11 @@ def _of(run: Pipeline) -> dict[str, list[Array]]:
 
 BINS = 4
 FOCALS = {"perspective": None, "orthographic": 0.2, "equirectangular": 1 / (2 * np.pi), "fisheye": 0.3}
-"""By projection, in widths of the picture; None: the scene's."""
+"""Focal length for each projection, relative to the picture's width; None keeps the scene's."""
 
 
 def pictures_of(device: Device, kinds: Iterable[str] = FOCALS) -> dict[str, dict[str, str]]:
-    """Checksums by kind of camera and channel, and of slices by depth, in the device's own shape."""
+    """Checksums by projection and channel, also of a deep picture (`deep`), in the device's own shape."""
     gaussians, camera = SCENES["cloud"]()
     found = {}
     for kind in kinds:
@@ -89,11 +93,14 @@ def checksum(parts: list[Array]) -> str:
 
 
 TRAINING = short(iterations=60, density={"every": 10, "start": 10, "stop": 55, "opacity_reset_every": 30})
-"""Warm-up, SH degrees, five densifications and an opacity reset."""
+"""A training with rising resolution and SH degree, five densifications and an opacity reset."""
 
 
 def trained(device: Device, folder: Path) -> tuple[Gaussians, float]:
-    """A model trained on the tiny scene, which is written to the folder, and its mean PSNR on the held-out views."""
+    """A model trained on the tiny scene, and its mean PSNR on the held-out views.
+
+    folder: the scene's folder, which is written if it is missing.
+    """
     scene = load_scene(folder if folder.exists() else write_scene(folder))
     model = train(scene, TRAINING, device=device)
     renderer = Renderer(device)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which tests run in one process with `-n 2 --dist loadgroup`: a driver's, so that its kernels are built once, which is
-what most of the time goes to; else a file's, which share its fixtures.
+"""Groups of tests that run in the same process with `-n 2 --dist loadgroup`.
 
-By the identifier, and not by pytest-xdist's marker: of 3.8, with pytest 9.2, that does nothing.
+Tests for the same driver are a group, so that its kernels are built only once, which takes most of the time. Other
+tests of a file are a group, because they share fixtures. Groups follow from the tests' identifiers. The marker of
+pytest-xdist 3.8 has no effect with pytest 9.2.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from xdist.scheduler import LoadScopeScheduling
 
 
 def group_of(identifier: str, drivers: Mapping[int, str]) -> str:
-    """The group of a test. drivers: by their index the words that identifiers name them by."""
+    """The group of a test. drivers: by index, the words that name a driver in the tests' identifiers."""
     file, _, rest = identifier.partition("::")
     named = [index for index, words in drivers.items() if words in rest.partition("[")[2]]
     return f"driver {max(named, key=lambda index: len(drivers[index]))}" if named else PurePath(file).stem
 
 
 class ByDriver(LoadScopeScheduling):  # type: ignore[misc]  # it has no types
-    """pytest-xdist's way to keep the tests of a scope together, for these groups."""
+    """pytest-xdist's scheduler that keeps the tests of a scope together, with these groups as scopes."""
 
     def __init__(self, config: pytest.Config, log: Any, drivers: Mapping[int, str]) -> None:
         super().__init__(config, log)
@@ -34,7 +35,7 @@ class ByDriver(LoadScopeScheduling):  # type: ignore[misc]  # it has no types
 
 
 def scheduler(config: pytest.Config, log: Any, drivers: Mapping[int, str]) -> ByDriver | None:
-    """The scheduler that pytest-xdist distributes the tests by; None where it is not asked for groups."""
+    """The scheduler for pytest-xdist; None without `--dist loadgroup`."""
     return ByDriver(config, log, drivers) if config.getvalue("dist") == "loadgroup" else None
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands in the headers of files, read byte by byte: OpenImageIO translates names on the way out and back in."""
+"""Contents of files' headers, read byte by byte, because OpenImageIO translates names when it writes and reads."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def exr_attributes(path: Path) -> dict[str, tuple[str, bytes]]:
-    """(type, value) of each attribute of the first part (https://openexr.com/en/latest/OpenEXRFileLayout.html)."""
+    """Type and value of each attribute of the first part (https://openexr.com/en/latest/OpenEXRFileLayout.html)."""
     data = path.read_bytes()
     assert data[:4] == b"\x76\x2f\x31\x01"
     at, found = 8, {}
@@ -22,7 +22,7 @@ def exr_attributes(path: Path) -> dict[str, tuple[str, bytes]]:
 
 
 def png_chunks(path: Path) -> dict[str, bytes]:
-    """The chunks by kind, texts as `tEXt` and their keyword; of several of a kind the last."""
+    """Chunks by kind; of several chunks of a kind, the last. The kind of a text is `tEXt` and its keyword."""
     data = path.read_bytes()
     at, found = 8, {}
     while at < len(data):

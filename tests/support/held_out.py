@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs of a training that are changed, and its held-out views, with which refined cameras are validated."""
+"""Changed photographs for a training, and the PSNR of its held-out views, for tests of refined cameras."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from clsplat.training.trainer import Trainer
 
 
 def change_photographs(monkeypatch: pytest.MonkeyPatch, change: Callable[[int, NDArray[Any]], object]) -> None:
-    """Let photographs be float, and what `change` makes of each, by its index."""
+    """Replace each photograph by the result of `change`, which gets its index and its pixels as floats."""
     plain = ImageCache.load
 
     def load(self: ImageCache, index: int, factor: float) -> Float32:
@@ -30,6 +30,6 @@ def change_photographs(monkeypatch: pytest.MonkeyPatch, change: Callable[[int, N
 
 
 def psnr_of(trainer: Trainer, cameras: Sequence[Camera]) -> float:
-    """Mean PSNR of the held-out views through these cameras."""
+    """Mean PSNR of the held-out views with these cameras in place of their own."""
     look = held_out_looks(trainer.appearance.record())
     return trainer.validation_views.psnr(lambda camera: trainer.draw(camera).image, look, cameras)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of .ksplat by its specification, of which clsplat writes none."""
+"""Files in the .ksplat format, which clsplat only reads."""
 
 from __future__ import annotations
 
@@ -13,8 +13,12 @@ from clsplat.spherical_harmonics import SH_C0
 
 
 def ksplat(model: Gaussians, level: int, counts: tuple[int, ...], *, bucket: int = 5) -> tuple[bytes, Gaussians]:
-    """A file with sections of so many Gaussians of the model, in full buckets and two others, and what it should be
-    read as."""
+    """Bytes of a .ksplat file, and the Gaussians that a reader should find in it.
+
+    counts: number of the model's Gaussians in each section. Above level 0 these are in full buckets and two partial
+        ones.
+    bucket: number of Gaussians in a full bucket.
+    """
     degree, block, half = model.sh_degree, 4.0, 32767
     bands = [model.sh[:, b * b : (b + 1) ** 2].transpose(0, 2, 1).reshape(len(model), -1) for b in range(1, degree + 1)]
     rest = np.concatenate([np.zeros((len(model), 0), np.float32), *bands], axis=1)
@@ -59,6 +63,6 @@ def ksplat(model: Gaussians, level: int, counts: tuple[int, ...], *, bucket: int
                 wanted.sh[rows, band**2 : (band + 1) ** 2] = values
                 at += 3 * width
         table = np.concatenate([*parts, rgba[rows].astype("u1"), np.ascontiguousarray(sh).view("u1")], axis=1)
-        bodies += table.tobytes() + bytes(2 * table.shape[1])  # room for two more
+        bodies += table.tobytes() + bytes(2 * table.shape[1])  # unused space for two more Gaussians
         first += count
     return bytes(header) + heads + bodies, wanted

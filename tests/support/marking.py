@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plans of density control on the host, for tests: made by the twin, or brought there from a device."""
+"""Plans of density control on the host, for tests: made by the twin, or copied from a device."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from clsplat.training.density import RowPlan
 
 @dataclass(frozen=True, eq=False)
 class TwinRows:
-    """A list of rows in an array."""
+    """A list of rows on the host, as the twin makes it."""
 
     rows: NDArray[np.uint32]
     halves: int
@@ -29,7 +29,7 @@ class TwinRows:
 
 @dataclass(frozen=True, eq=False)
 class TwinMarker:
-    """Marks by the NumPy twin. Without radii none is over any edge."""
+    """A marker that uses the NumPy twin. Missing statistics count as 0, so that they exceed no edge."""
 
     parameters: Mapping[str, NDArray[Any]]
     statistics: Mapping[str, NDArray[Any]]
@@ -49,8 +49,10 @@ class TwinMarker:
 
 
 def on_host(plan: RowPlan, parameters: Mapping[str, NDArray[Any]]) -> RowPlan:
-    """The same plan in arrays alone: rows, fresh, and the values of halves, which are drawn now. parameters: before
-    it."""
+    """The plan with NumPy arrays: rows, fresh rows, and the values of the halves, which are drawn here.
+
+    parameters: the model's parameters before the plan.
+    """
     listed: Any = plan.listed
     entries = listed.rows if isinstance(listed, TwinRows) else listed.rows.get()
     rows, values = entries & ~FRESH, dict(plan.values)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small models for tests of files, and where the real ones are."""
+"""Small random models for tests of files, and paths of real data."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from clsplat.gaussians import Gaussians
 
 
 def real_file(name: str) -> Path:
-    """A file or folder of the real data; skips the test where it is not there."""
+    """A file or folder of the real data. Skips the test if it is missing."""
     path = SCENES / name
     if not path.exists():
         require("scenes")

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Needed beside the extra `test`: mark a test `needs("name")`, or call `require("name")` in a fixture or a module.
+"""Requirements of tests beyond the extra `test`.
 
-Without it the test is skipped, and the reason is the line that installs it; conftest.py lists them at the end.
+A test has the mark `needs("name")`, or a fixture or module calls `require("name")`. If a requirement is missing, the
+test is skipped. The reason names the command that installs it, and conftest.py lists these reasons at the end.
 """
 
 from __future__ import annotations
@@ -17,16 +18,16 @@ from pathlib import Path
 import pytest
 
 SCENES = Path(os.environ.get("CLSPLAT_SCENES", Path(__file__).parents[3] / "shared" / "scenes"))
-"""The real data."""
+"""Folder of the real scenes and models."""
 NODE_CACHE = Path(__file__).parents[2] / ".pytest_cache" / "node" / "node_modules"
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 PREFIX = "needs "
-"""Beginning of every reason of this kind."""
+"""Beginning of a reason for skipping a test without a requirement."""
 
 
 @dataclass(frozen=True)
 class Need:
-    """A package, a program or data; line: the command that brings it."""
+    """A package, a program or data. line: the command that installs it."""
 
     title: str
     line: str
@@ -34,23 +35,23 @@ class Need:
 
 
 def of_extra(module: str, title: str, extra: str) -> Need:
-    """A package from the index; in `.venv`, where tools/test runs, an extra brings it."""
+    """A Python package that an extra installs into `.venv`, where tools/test runs."""
     return Need(title, f"python3 tools/environment.py {extra}", lambda: find_spec(module) is not None)
 
 
 def chromium_path() -> str | None:
-    """The browser: CLSPLAT_CHROMIUM, or the first that the path has."""
+    """Path of the browser: CLSPLAT_CHROMIUM, or the first of CHROMIUM on the path; None if there is none."""
     named = os.environ.get("CLSPLAT_CHROMIUM")
     return next((found for name in ([named] if named else CHROMIUM) if (found := shutil.which(name))), None)
 
 
 def openjd_path() -> str | None:
-    """The program `openjd`, beside this Python or on the path."""
+    """Path of the program `openjd`, in the folder of this Python or on the path."""
     return shutil.which("openjd", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
 
 
 def node_modules() -> Path | None:
-    """The folder of the readers from npm: CLSPLAT_NODE_MODULES, or where node.py puts them."""
+    """Folder of the packages from npm: CLSPLAT_NODE_MODULES, or the folder into which node.py installs them."""
     given = os.environ.get("CLSPLAT_NODE_MODULES")
     folder = Path(given).resolve() if given else NODE_CACHE
     return folder if shutil.which("node") and folder.is_dir() else None
@@ -82,12 +83,12 @@ NEEDS = {
 
 
 def missing(name: str) -> str:
-    """Why a test that needs this is skipped; empty where it is there."""
+    """Reason for skipping a test with this requirement; empty if it is met."""
     need = NEEDS[name]
     return "" if need.is_there() else f"{PREFIX}{need.title}: {need.line}"
 
 
 def require(name: str) -> None:
-    """Skip the test, or the module that is being imported, where this is not there."""
+    """Skip the test, or the module that is being imported, if this requirement is missing."""
     if reason := missing(name):
         pytest.skip(reason, allow_module_level=True)

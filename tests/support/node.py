@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Independent readers and writers of model files, from npm; tests that need one skip where it is not installed.
+"""Other programs' readers and writers of model files, from npm. Tests that need one are skipped if it is missing.
 
-CLSPLAT_NODE_MODULES names a folder of installed packages. Without it they are those that this file, as a script,
-installs into .pytest_cache; it says where they are or why not.
+CLSPLAT_NODE_MODULES names a folder of installed packages. Without it, the packages in .pytest_cache are used. Run as a
+script, this file installs them there, and prints their folder or the reason of a failure.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import pytest
 from needs import NODE_CACHE, node_modules, require
 
 PACKAGES = ("@playcanvas/splat-transform@2.7.1", "gltf-validator@2.0.0-dev.3.10")
-"""splat-transform 3 asks for Node.js 22."""
+"""Packages with their versions. Version 3 of splat-transform would require Node.js 22."""
 
 VALIDATE = """
 const fs = require("fs"), path = require("path"), file = process.argv[1];
@@ -32,7 +32,7 @@ require("gltf-validator").validateBytes(new Uint8Array(fs.readFileSync(file)), {
 
 
 def install() -> Path | str:
-    """The folder of the packages, or why there is none."""
+    """Install the packages if necessary. Returns their folder, or the reason of a failure as text."""
     if shutil.which("node") is None:
         return "there is no node to run readers from npm with"
     if found := node_modules():
@@ -53,13 +53,13 @@ def install() -> Path | str:
         return f"npm cannot install {' '.join(PACKAGES)}: {done.stderr.strip()[-200:]}"
     try:
         folder.rename(cache)
-    except OSError:  # another process was first
+    except OSError:  # another process has installed them meanwhile
         shutil.rmtree(folder)
     return NODE_CACHE
 
 
 def _node(package: str, *arguments: str) -> str:
-    """What node prints; skips the test where the package is not there."""
+    """Output of node with these arguments. Skips the test if the package is missing."""
     require("node")
     folder = node_modules()
     assert folder is not None
@@ -79,7 +79,7 @@ def _node(package: str, *arguments: str) -> str:
 
 
 def splat_transform(source: Path, target: Path, *options: str) -> None:
-    """Convert a file by the tool of PlayCanvas's."""
+    """Convert a file with PlayCanvas' splat-transform."""
     package = "@playcanvas/splat-transform"
     said = _node(package, f"{package}/bin/cli.mjs", "-q", "-w", "-g", "cpu", *options, str(source), str(target))
     assert target.exists(), said
@@ -95,20 +95,21 @@ const spz = await createModule();
 const cloud = await spz.loadSpzFromBuffer(new Uint8Array(readFileSync(path)), { to: spz.CoordinateSystem.RDF });
 console.log(JSON.stringify({ antialiased: cloud.antialiased, count: cloud.numPoints }));
 """
-"""Prints an SPZ file's flag and number of Gaussians, read by the module that splat-transform reads them with."""
+"""Program that prints the antialiased flag and the number of Gaussians of an SPZ file, read by splat-transform's
+module."""
 
 
 def spz_flag(path: Path) -> tuple[bool, int]:
-    """True if splat-transform's reader has an SPZ file for antialiased; its number of Gaussians."""
+    """Antialiased flag and number of Gaussians of an SPZ file, as splat-transform's reader finds them."""
     package, folder = "@playcanvas/splat-transform", node_modules()
     distribution = f"{folder}/{package}/dist"
     said = _node(package, "--input-type=module", "-e", SPZ, distribution, str(path))
-    found = json.loads(said.splitlines()[-1])  # their module may say more
+    found = json.loads(said.splitlines()[-1])  # the module may print more lines before
     return found["antialiased"], found["count"]
 
 
 def validate_gltf(path: Path) -> list[dict[str, Any]]:
-    """What Khronos's validator finds."""
+    """Messages of Khronos's glTF validator about a file."""
     found: list[dict[str, Any]] = json.loads(_node("gltf-validator", "-e", VALIDATE, str(path)))
     return found
 

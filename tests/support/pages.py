@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading the pages of clsplat.report back in tests."""
+"""Parsing of the pages of `clsplat.report`, for tests of their contents."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Element:
     inside: list[Element] = field(default_factory=list)
 
     def all(self, tag: str, **wanted: str) -> list[Element]:
-        """Every element inside with this tag and these attributes, `class_` being a word of the class."""
+        """All elements inside with this tag and these attributes. class_: one of the words of their class."""
         found = []
         for each in self.inside:
             name = wanted.get("class_")
@@ -42,7 +42,7 @@ class Element:
 
     @property
     def values(self) -> list[str]:
-        """Of the data elements inside."""
+        """Values of the data elements inside."""
         return [each.attributes["value"] for each in self.all("data")]
 
 
@@ -69,7 +69,7 @@ class _Reader(HTMLParser):
 
 
 def parse(html: str) -> Element:
-    """The page; every element is closed where it should be."""
+    """The page as an element. Fails if an element is not closed, or closed in the wrong place."""
     reader = _Reader()
     reader.feed(html)
     reader.close()
@@ -78,7 +78,7 @@ def parse(html: str) -> Element:
 
 
 def figures_of(page: Element) -> dict[str, Any]:
-    """The figures that the page has for programs."""
+    """The numbers that the page holds for programs."""
     found: dict[str, Any] = json.loads(page.one("script", id="figures").text)
     return found
 
@@ -89,7 +89,7 @@ def rows_of(page: Element, table: str) -> list[Element]:
 
 
 def charts_of(page: Element) -> dict[str, dict[str, list[tuple[float, float]]]]:
-    """By title and series the points (x, y) that the charts are drawn by."""
+    """Points (x, y) of each series, by the titles of the charts and the names of the series."""
     found = {}
     for figure in page.all("figure", class_="chart"):
         series = {}
@@ -102,7 +102,7 @@ def charts_of(page: Element) -> dict[str, dict[str, list[tuple[float, float]]]]:
 
 
 def outside_of(html: str) -> list[str]:
-    """Whatever the page would load from elsewhere."""
+    """Addresses outside the page that it would load or lead to. Empty for a page that needs no other files."""
     found = re.findall(r"""(?:src|href|action|data|poster|srcset)\s*=\s*["']([^"']*)""", html)
     found += re.findall(r"url\(([^)]*)\)|@import\s+(\S+)", html)
     return [each for each in found if not str(each).startswith(("data:image/", "#"))]

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two runs of the tests of one checkout, of which the second leaves out what has passed in the first.
+"""Flags for two runs of a checkout's tests, the second of which leaves out the tests that have passed in the first.
 
-pytest --write-passed=FILE    the identifiers of what passed, one a line
-pytest --leave-out=FILE       without those; without the file every test runs
+pytest --write-passed=FILE    writes the identifiers of the tests that passed, one per line
+pytest --leave-out=FILE       leaves out these tests; if the file is missing, all tests run
 
-With the `=`: pytest takes a word of its own for where the tests are if such a file is there, and finds no conftest.py.
-A test for one driver has the driver's name and version in its identifier. One that looks at the list of drivers runs
-again, as the second run may have others.
+Write the `=`: otherwise pytest takes an existing FILE for the place of the tests, and does not find conftest.py. The
+identifier of a test for one driver has the driver's name and version. A test that reads the list of drivers runs again,
+since the second run may have other drivers.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from clsplat.files.atomic import atomic_write
 WRITE, LEAVE_OUT = "--write-passed", "--leave-out"
 PHASES = {"setup", "call", "teardown"}
 OF_ALL_DRIVERS = {"KEPT", "all_devices", "list_devices"}
-"""Names in a module whose tests may depend on which drivers there are."""
+"""Names by which a module's tests may depend on the list of drivers."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -32,16 +32,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def record(config: pytest.Config) -> None:
-    """Where it is asked for, remember what passes; with pytest-xdist in the process that hears of all tests."""
+    """With --write-passed, record the tests that pass. With pytest-xdist, its main process does this for all tests."""
     if not hasattr(config, "workerinput") and config.getoption(WRITE):
         config.pluginmanager.register(Recorder(config.getoption(WRITE)))
 
 
 class Recorder:
-    """The tests that passed in the processes of this run, for a file."""
+    """Plugin that writes the tests that passed in this run to a file."""
 
     def __init__(self, file: Path) -> None:
-        file.unlink(missing_ok=True)  # of a run that is over
+        file.unlink(missing_ok=True)  # of an earlier run
         self._file = file
         self._passed: dict[str, set[str]] = defaultdict(set)
 
@@ -55,8 +55,10 @@ class Recorder:
 
 
 def leave_out(config: pytest.Config, items: list[pytest.Item], driver_of: Callable[[pytest.Item], int | None]) -> None:
-    """Take from `items` those that have passed before. driver_of(item): the index of the driver that a test is for,
-    None where it is for none."""
+    """Remove the tests from `items` that have passed before.
+
+    driver_of(item): index of the driver that a test is for; None if it is for none in particular.
+    """
     file = config.getoption(LEAVE_OUT)
     passed = set(file.read_text("utf-8").splitlines()) if file and file.is_file() else set()
     again = [item for item in items if item.nodeid not in passed or (driver_of(item) is None and _of_all(item))]

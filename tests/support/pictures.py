@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures as any program may have written them, by OpenImageIO."""
+"""Writing of pictures with OpenImageIO, with the types and attributes that other programs may use."""
 
 from __future__ import annotations
 
@@ -15,8 +15,12 @@ from numpy.typing import NDArray
 def write_pixels(
     path: Path, pixels: NDArray[Any], kind: str = "", attributes: Mapping[str, Any] | None = None, **fields: Any
 ) -> Path:
-    """A file of pixels (H, W, C), in the format of its extension. kind: OpenImageIO's name of the channels' type, by
-    default that of the array; attributes: of the file; fields: of OpenImageIO's specification."""
+    """Write pixels (H, W, C) to a file in the format of its extension. Returns the path.
+
+    kind: OpenImageIO's name of the channels' type; by default the array's type.
+    attributes: attributes of the file.
+    fields: fields of OpenImageIO's ImageSpec.
+    """
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, kind or pixels.dtype.name.replace("float32", "float"))
     for name, value in fields.items():

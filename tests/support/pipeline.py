@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pipeline on a tiny scene, every intermediate on the host: what the stage tests look at."""
+"""The pipeline on a tiny scene, with all intermediate results on the host, for tests of the stages."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ BACKGROUND = (0.1, 0.2, 0.3)
 
 
 QUICK_SHAPES = (8, 1), (1, 64)
-"""A CPU's and a GPU's."""
+"""Lanes and items of a shape for CPUs, and of one for GPUs."""
 
 
 EVERY_SHAPE = pytest.mark.parametrize(
@@ -46,22 +46,26 @@ EVERY_SHAPE = pytest.mark.parametrize(
     ],
     indirect=["device"],
 )
-"""Of a test of all shapes at once: each driver in two, as building takes most of the time, and where slow tests run the
-default driver in every one."""
+"""Mark of a test that runs all shapes at once: on each driver in two, since builds take most of the time. Slow tests run the
+default driver in every shape."""
 
 
 def shapes_of(device: Device, *more: tuple[int, int], every: bool = True) -> tuple[tuple[Any, ...], ...]:
-    """(lanes, items), or (lanes, items, True) by Gaussian, that a driver is tested in: a CPU's shape, a GPU's; the
-    default driver also in the scalar loop, in a mixture, by Gaussian, and in `more`, unless not `every` one is wanted.
-    Each driver in each shape: tools/ci/digests.py."""
+    """Shapes in which a driver is tested: (lanes, items), or (lanes, items, True) for a Gaussian per work-item.
+
+    every: for the default driver, also return the shape of one lane and one item, a mixed one, one with a Gaussian per
+        work-item, and `more`. tools/ci/digests.py tests every driver in every shape.
+    """
     every = every and device is open_device()
     return (*QUICK_SHAPES, (1, 1), (8, 16), (1, 32, True), *more) if every else QUICK_SHAPES
 
 
 @cache
 def shaped(device: Device, lanes: int, items: int, by_gaussian: bool = False) -> Device:
-    """The device in another shape; one for the whole session, as each builds its own kernels. Skips a test in a shape
-    in which the driver would take the process down."""
+    """The device in another shape. All tests share it, because each new one builds its kernels again.
+
+    Skips the test if the driver would crash the process in this shape.
+    """
     if reason := why_not(all_devices().index(device.cl_device), lanes, items):
         pytest.skip(reason)
     return device.with_shape(f"{lanes}x{items}{'g' if by_gaussian else ''}")
@@ -85,7 +89,7 @@ class Pipeline:
         config: RasterizerConfig | None = None,
         capacity: int | None = None,
     ) -> Pipeline:
-        """capacity: pairs of a band."""
+        """Render the scene. capacity: maximum number of pairs in a band."""
         gaussians, camera = scene
         rasterizer = Rasterizer(device, config)
         rasterizer.capacity = rasterizer.capacity if capacity is None else capacity
@@ -95,7 +99,7 @@ class Pipeline:
         return cls(rasterizer, on_device, camera, frame)
 
     def crop(self, planes: NDArray[Any]) -> NDArray[Any]:
-        """(..., rows, stride) without its padding, channels last."""
+        """Planes (..., rows, stride) without their padding, with channels last."""
         image = planes[..., : self.camera.height, : self.camera.width]
         return np.ascontiguousarray(image.transpose(1, 2, 0)) if image.ndim == 3 else image
 
@@ -104,7 +108,7 @@ class Pipeline:
         return self.crop(self.frame.blended.image.get())
 
     def splat(self, *names: str) -> NDArray[np.float32]:
-        """Columns of the projected Gaussians."""
+        """Columns of the splats, by their names in SPLAT."""
         columns = [SPLAT.index(name) for name in names]
         values: NDArray[np.float32] = self.frame.projected.splats.get()[:, columns]
         return values
@@ -115,7 +119,7 @@ class Pipeline:
         return shown
 
     def tiles_of(self) -> list[set[int]]:
-        """For each Gaussian the tiles whose lists hold it."""
+        """For each Gaussian, the tiles whose lists contain it."""
         lists = self.frame.listed.lists
         ranges, listed = lists.ranges.get(), lists.gaussian_from_sorted.get()
         found: list[set[int]] = [set() for _ in range(self.gaussians.count)]
@@ -132,7 +136,7 @@ class Pipeline:
         return gradients, screen.gradients.get()
 
     def screened(self, d_image: NDArray[np.float64], fields: SlotFields) -> tuple[Gaussians, Screen]:
-        """As `backward`, with all that density control has of a view."""
+        """Like `backward`, with all results of the view that density control uses."""
         device = self.rasterizer.device
         gradients = allocate_gaussians(device, self.gaussians.count, self.gaussians.coefficients, zero=True)
         by_image = upload(device, planes_of(d_image))
@@ -142,7 +146,7 @@ class Pipeline:
     def slots(
         self, by_image: NDArray[np.float32], fields: SlotFields = PLAIN_SLOTS, blended: Blended | None = None
     ) -> NDArray[np.float32]:
-        """Slots of the frame's pairs from dL/dimage in planes. blended: the frame's, unless given."""
+        """Slots of the frame's pairs, from dL/dimage in planes. blended: used instead of the frame's."""
         device, frame = self.rasterizer.device, self.frame
         how = (frame.listed.lists, frame.inputs, blended or frame.blended, upload(device, by_image))
         values: NDArray[np.float32] = blend_grad(device, self.rasterizer.work, *how, fields=fields).get()
@@ -150,7 +154,7 @@ class Pipeline:
 
 
 def steady(scene: Scene, seed: int = 1) -> NDArray[np.float64]:
-    """Random dL/dimage (H, W, 3) that is 0 where a threshold may fall the other way in float32."""
+    """Random dL/dimage (H, W, 3), which is 0 in pixels where a threshold may decide differently in float32."""
     gaussians, camera = scene
     d_image = np.random.default_rng(seed).standard_normal((camera.height, camera.width, 3))
     d_image[forward(gaussians, camera).blended.margin < 1e-4] = 0
@@ -158,7 +162,7 @@ def steady(scene: Scene, seed: int = 1) -> NDArray[np.float64]:
 
 
 def assert_gradients(run: Pipeline, scene: Scene, fields: SlotFields = PLAIN_SLOTS) -> None:
-    """The gradients of a frame, and its contributions, beside those of the twin, for `steady`."""
+    """Fail unless a frame's gradients for `steady`, and its contributions, agree with the twin's."""
     d_image, shown = steady(scene), run.visible
     got, screen = run.screened(d_image, fields)
     wanted = render_grad(*scene, d_image, BACKGROUND)
@@ -166,7 +170,7 @@ def assert_gradients(run: Pipeline, scene: Scene, fields: SlotFields = PLAIN_SLO
     on_image = wanted.abs_means2d if fields.absolute else wanted.means2d
     assert_close_gradient(screen.gradients.get()[shown], on_image[shown], 1e-4)
     if screen.contributions is not None:
-        # Weights are as good as frames are, 2e-5 a pixel at most; 1e-4 of a Gaussian's own sum, and a few pixels at the
-        # edge of an ellipse, of a weight of 1/255, that are decided the other way.
+        # Weights are as precise as frames, with errors of at most 2e-5 per pixel. The bound is 1e-4 of a Gaussian's
+        # sum, and a few pixels at the ellipse's edge, of weight 1/255, where a threshold may decide differently.
         contributions = screen.contributions.get()[shown]
         assert_close(contributions, wanted.contributions[shown], relative=1e-4, absolute=4 / 255)

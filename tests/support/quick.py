@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of many parameters are tried in the quick run; the others are slow (the marker), and run in CI."""
+"""Choice of the parameters that quick runs test. The others get the marker `slow`, and run in CI."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from _pytest.mark.structures import ParameterSet
 
 
 def quick(values: Iterable[object], *chosen: object) -> list[ParameterSet]:
-    """All of them as parameters, of which only the chosen ones are not slow."""
+    """Parameters for all values; all except the chosen ones are marked slow."""
     every = list(values)
     assert set(chosen) <= set(every), "a chosen one is none of them"
     return [pytest.param(value, marks=() if value in chosen else pytest.mark.slow) for value in every]

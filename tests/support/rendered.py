@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera files for tests of `clsplat render`, and what it has written."""
+"""Camera files for tests of `clsplat render`, and reading of its frames."""
 
 from __future__ import annotations
 
@@ -24,8 +24,12 @@ def camera_file(
     lens: Mapping[str, Any] | None = None,
     **settings: Any,
 ) -> Path:
-    """A clsplat camera file: the camera at these frames is at these places, or x, 4 before the origin. lens: instead of
-    the angle; settings: of the file."""
+    """Write a clsplat camera file of cameras that look along +z. Returns its path.
+
+    places: position by frame; a number x means (x, 0, -4).
+    lens: properties of the lens, in place of `fov_x`.
+    settings: further properties of the file.
+    """
     own = {"world_from_cam": [1, 0, 0, 0], **(lens or {"fov_x": fov_x})}
     positions = {frame: [at, 0, -4] if isinstance(at, int | float) else [*at] for frame, at in places.items()}
     keys = [{"frame": frame, "position": position, **own} for frame, position in positions.items()]
@@ -35,10 +39,10 @@ def camera_file(
 
 
 def pixels_of(path: Path, part: int = 0) -> Float32:
-    """(H, W, C) of a part of a file."""
+    """Pixels (H, W, C) of a part of a file."""
     return np.asarray(oiio.ImageBuf(str(path), part, 0).get_pixels(oiio.FLOAT))
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """The files of a folder by their names."""
+    """Contents of a folder's files, by name."""
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A ring of cameras around a cloud of points, as other programs write it: the pictures, a COLMAP model in text, a
-transforms.json, clouds. Each picture has a colour of its own, so that it is known by its pixels."""
+"""Data sets of a ring of cameras around a cloud of points, as other programs write them.
+
+They have pictures, a COLMAP model in text or a transforms.json, and point files. Each picture has a grey of its own, by
+which tests recognise it.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def poses(count: int = COUNT, radius: float = 4.0) -> list[Pose]:
-    """Around the origin at two heights, looking at it, y down."""
+    """Poses of cameras around the origin, which look at it from two heights, with y down."""
     found = []
     for index in range(count):
         angle = 2 * np.pi * index / count
@@ -38,12 +41,12 @@ def poses(count: int = COUNT, radius: float = 4.0) -> list[Pose]:
 
 
 def centre_of(pose: Pose) -> Float64:
-    """The place of a camera in the world, (3,)."""
+    """Position (3,) of a camera in the world."""
     return np.asarray(-pose[0].T @ pose[1])
 
 
 def moved(pose: Pose, centre: Float64) -> Pose:
-    """The same camera at another place."""
+    """The pose with another position."""
     return pose[0], -pose[0] @ centre
 
 
@@ -54,7 +57,7 @@ def points(count: int = 400, seed: int = 3) -> tuple[Float64, np.ndarray]:
 
 
 def level(index: int) -> float:
-    """The grey of picture number `index`, a whole byte."""
+    """The grey of picture number `index`, from 0 to 1: a whole number of 8-bit levels."""
     return (20 + 9 * index) / 255
 
 
@@ -75,7 +78,11 @@ def write_colmap(
     camera: str = f"PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}",
     cloud: tuple[Float64, np.ndarray] | None = None,
 ) -> Path:
-    """A COLMAP model in text. listed: names in it; files: those on disk, if they differ."""
+    """Write a COLMAP model in text, with pictures. Returns the folder.
+
+    listed: names of the pictures in the model.
+    files: names of the pictures on the disk, if they differ.
+    """
     write_pictures(folder / images, files or listed)
     (folder / model).mkdir(parents=True, exist_ok=True)
     (folder / model / "cameras.txt").write_text(f"1 {camera}\n")
@@ -107,7 +114,11 @@ def write_transforms(
     name: str = "transforms.json",
     **keys: Any,
 ) -> Path:
-    """A transforms.json. keys: of the file; None leaves one out."""
+    """Write a transforms.json with pictures. Returns the folder.
+
+    listed, files: as in `write_colmap`.
+    keys: keys of the file; None leaves a key out.
+    """
     listed = listed or [f"images/{each}" for each in NAMES]
     write_pictures(folder, files or listed)
     matrices = matrices or [matrix_of(pose) for pose in poses()]
@@ -128,7 +139,7 @@ def write_cloud(
     kind: str = "uchar",
     names: Sequence[str] = ("red", "green", "blue"),
 ) -> None:
-    """A binary PLY of points; colours (N, 3) as they are stored, of the PLY's type `kind`."""
+    """Write points to a binary PLY. colours: (N, 3), stored without conversion as the PLY type `kind`."""
     properties = [("x", "float"), ("y", "float"), ("z", "float")]
     columns = [*np.asarray(xyz, float).T]
     if colours is not None:

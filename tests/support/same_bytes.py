@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models of trainings, to the byte: in one go, stopped on the way, and in other memory; for every setting."""
+"""Bytes of trained models, for tests of resumed trainings and of trainings with less memory, with every setting."""
 
 from __future__ import annotations
 
@@ -64,13 +64,13 @@ SETTINGS: dict[str, TrainConfig] = {
         thinning=0.3, appearance="exposure", antialiased=True, masks="ignore",
     ),
 }  # fmt: skip
-"""Each with density control, rising SH degrees and sizes of photographs."""
+"""Trainings by name. Each has density control, a rising SH degree and a rising resolution."""
 
 State = Mapping[str, NDArray[Any]]
 
 
 def write_known_scene(folder: Path) -> Path:
-    """The tiny scene with alpha, a mask of each picture, of as many pixels as no other's, and its depths."""
+    """Write the tiny scene with alpha, masks and known depths. Each mask has another number of pixels."""
     scene = write_scene(folder, alpha=True)
     (scene / "masks").mkdir()
     for index, path in enumerate(sorted((scene / "images").iterdir())):
@@ -83,44 +83,44 @@ def write_known_scene(folder: Path) -> Path:
 
 
 def scene_for(folder: Path, config: TrainConfig) -> Scene:
-    """The known scene as a training with these settings reads it."""
+    """Load the scene of `write_known_scene` with the masks and depths that these settings use."""
     return with_depths(load_scene(folder, masks=config.mask_use), config.depth_use)
 
 
 def trained_run(scene: Scene, config: TrainConfig, device: Device, folder: Path, **options: Any) -> Run:
-    """The run of a training, in this folder."""
+    """Train in this folder, and return the run. options: arguments of `train`."""
     run = Run.create(folder, config, resume=options.get("resume", False))
     train(scene, config, device=device, run=run, **options)
     return run
 
 
 def model_bytes(scene: Scene, config: TrainConfig, device: Device, folder: Path, **options: Any) -> bytes:
-    """model.ply of a training."""
+    """Bytes of model.ply after a training."""
     return trained_run(scene, config, device, folder, **options).model_path.read_bytes()
 
 
 @pytest.fixture(scope="module")
 def undisturbed(request: pytest.FixtureRequest, default_device: Device, tmp_path_factory: Any) -> bytes:
-    """model.ply of the module's CONFIG on its `scene`, trained in one go."""
+    """Bytes of model.ply after an uninterrupted training with the module's CONFIG and fixture `scene`."""
     scene = request.getfixturevalue("scene")
     return model_bytes(scene, request.module.CONFIG, default_device, tmp_path_factory.mktemp("undisturbed"))
 
 
 def outcome(scene: Scene, config: TrainConfig, device: Device, folder: Path, **options: Any) -> State:
-    """The arrays of a training's last checkpoint, and its model.ply."""
+    """Train, and return the arrays of the last checkpoint, and model.ply."""
     model_bytes(scene, config, device, folder, **options)
     return state_of(Run.open(folder))
 
 
 def state_of(run: Run) -> State:
-    """The arrays of a run's last checkpoint, and its model.ply."""
+    """Arrays of a run's last checkpoint, and its model.ply."""
     checkpoint = run.load_latest_checkpoint()
     assert checkpoint is not None
     return {"model.ply": np.frombuffer(run.model_path.read_bytes(), np.uint8), **checkpoint.arrays}
 
 
 def stopped(step: int, scene: Scene, config: TrainConfig, device: Device, folder: Path) -> State:
-    """The outcome of a training that Ctrl-C ended at a step and that went on."""
+    """The outcome of a training that was interrupted by Ctrl-C at a step, and resumed."""
 
     def press(trainer: Trainer, _: object) -> None:
         if trainer.step < step <= trainer.step + config.batch:
@@ -134,13 +134,13 @@ def stopped(step: int, scene: Scene, config: TrainConfig, device: Device, folder
 
 
 def gone_on(scene: Scene, config: TrainConfig, device: Device, run: Run) -> State:
-    """The outcome of a run that goes on where it stopped."""
+    """Resume the training of a run, and return its outcome."""
     train(scene, config, device=device, run=run, resume=True)
     return state_of(run)
 
 
 def make_too_small(monkeypatch: pytest.MonkeyPatch, trainer: Trainer, steps: Collection[int]) -> None:
-    """Give these steps room for 8 pairs, where they have any room, so that they are made again."""
+    """Let passes by capacity of these steps have a capacity of only 8 pairs, so that the steps are repeated."""
     real = trainer.pending.room
     monkeypatch.setattr(
         trainer.pending, "room", lambda *size: (room := real(*size)) and (8 if trainer.step in steps else room)
@@ -160,8 +160,12 @@ def stepped(
     too_small: Collection[int] = (),
     before: Callable[[Trainer], object] = lambda _: None,
 ) -> Stepped:
-    """The arrays of a checkpoint after a training by capacity or with exact counts, the losses that were read, and the
-    trainer. before: called before each step."""
+    """Train, and return the arrays of a checkpoint, the losses that were read, and the trainer.
+
+    capacity: True for passes by capacity, False for exact counts.
+    too_small: steps for `make_too_small`.
+    before: called with the trainer before each step.
+    """
     monkeypatch.setenv(BY_CAPACITY_VARIABLE, "01"[capacity])
     trainer, losses = Trainer(scene, config, device), []
     make_too_small(monkeypatch, trainer, too_small)
@@ -174,12 +178,12 @@ def stepped(
 
 
 def assert_alike(one: Stepped, other: Stepped) -> None:
-    """Arrays, losses and incidents."""
+    """Fail unless arrays, losses and incidents of two trainings are equal."""
     assert_same_arrays(one[0], other[0])
     assert one[1] == other[1]
     assert list(map(str, one[2].monitor.incidents)) == list(map(str, other[2].monitor.incidents))
 
 
 def opened_again(device: Device) -> Device:
-    """The same device with a context, a queue and kernels of its own, as a thread of its own needs them."""
+    """The device with another context, queue and kernels, as another thread needs them."""
     return Device(device.cl_device, device.shape)

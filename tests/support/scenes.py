@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tiny deterministic scenes, each named after what it provokes; every function returns (Gaussians, Camera)."""
+"""Tiny deterministic scenes, named after the conditions that they test. Each is a pair (Gaussians, Camera)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,10 @@ def random_sh(rng: np.random.Generator, count: int, degree: int = 3, rest: float
 
 
 def straight_camera(width: int, height: int, focal: float | None = None) -> Camera:
-    """At the world's origin looking along +z, the principal point in the middle; focal length = width if None."""
+    """A camera at the world's origin that looks along +z, with a central principal point.
+
+    focal: focal length; None means the width.
+    """
     focal = float(width) if focal is None else focal
     return Camera(width, height, focal, focal, width / 2, height / 2, np.eye(3), np.zeros(3))
 
@@ -77,8 +80,10 @@ def one(width: int = 48, height: int = 32) -> Scene:
 
 
 def overlap(count: int = 40, width: int = 40, height: int = 30, seed: int = 4) -> Scene:
-    """Anisotropic overlapping Gaussians, raw quaternions of any length, tilted off-centre camera; a fifth sits
-    outside the image where the Jacobian's ratios are clamped, and reaches in."""
+    """Anisotropic overlapping Gaussians with quaternions of any length, and the tilted camera.
+
+    A fifth has means outside the image, where the Jacobian's ratios are clamped, and reaches into it.
+    """
     rng = np.random.default_rng(seed)
     camera = tilted_camera(width, height)
     size = np.array([width, height])
@@ -109,7 +114,7 @@ def _placed(
 
 
 def many_per_tile(count: int = 500, width: int = 48, height: int = 32) -> Scene:
-    """All means within the 16x16 tile at (16, 0), faint enough that most of them are blended."""
+    """Gaussians with all means in the tile at pixel (16, 0), so faint that most of them are blended."""
     rng = np.random.default_rng(5)
     pixels = np.array([16.0, 0.0]) + rng.uniform(1.0, 15.0, (count, 2))
     depths = rng.uniform(1.0, 9.0, count)
@@ -118,7 +123,7 @@ def many_per_tile(count: int = 500, width: int = 48, height: int = 32) -> Scene:
 
 
 def saturating(count: int = 60, width: int = 40, height: int = 36) -> Scene:
-    """Nearly opaque layers: alpha is clamped at 0.99 and pixels end after a few Gaussians, neighbours later."""
+    """Nearly opaque layers. Alpha is clamped at 0.99, and pixels become opaque after different numbers of Gaussians."""
     rng = np.random.default_rng(6)
     pixels = rng.uniform(0.1, 0.9, (count, 2)) * np.array([width, height])
     axes = rng.uniform(3.0, 9.0, (count, 3))
@@ -126,8 +131,10 @@ def saturating(count: int = 60, width: int = 40, height: int = 36) -> Scene:
 
 
 def off_frustum(count: int = 64, width: int = 40, height: int = 30) -> Scene:
-    """Beside and behind the camera, at and around the near plane, beyond the Jacobian's clamp, partly reaching in;
-    and opacities on both sides of 1/255."""
+    """Gaussians outside the frustum, behind the camera and near the near plane; some reach into the image.
+
+    Many are beyond the clamp of the Jacobian. An eighth has opacities around 1/255.
+    """
     rng = np.random.default_rng(7)
     camera = tilted_camera(width, height)
     angles = rng.uniform(0, 2 * np.pi, count)
@@ -146,7 +153,7 @@ def off_frustum(count: int = 64, width: int = 40, height: int = 30) -> Scene:
 
 
 def needles(count: int = 48, width: int = 64, height: int = 48) -> Scene:
-    """Axis ratios up to 10,000: the 2D covariance is all but singular, the low-pass alone keeps it invertible."""
+    """Needles with axis ratios around 10,000. Only the low-pass filter keeps their 2D covariances invertible."""
     rng = np.random.default_rng(8)
     pixels = rng.uniform(0.0, 1.0, (count, 2)) * np.array([width, height])
     depths = rng.uniform(2.0, 6.0, count)
@@ -155,7 +162,7 @@ def needles(count: int = 48, width: int = 64, height: int = 48) -> Scene:
 
 
 def equal_depth(count: int = 40, width: int = 40, height: int = 32) -> Scene:
-    """All at exactly the same float32 depth, overlapping: only the index orders them."""
+    """Overlapping Gaussians at exactly the same float32 depth, so that only their indices order them."""
     rng = np.random.default_rng(9)
     pixels = rng.uniform(0.2, 0.8, (count, 2)) * np.array([width, height])
     axes = rng.uniform(1.0, 5.0, (count, 3))
@@ -163,8 +170,7 @@ def equal_depth(count: int = 40, width: int = 40, height: int = 32) -> Scene:
 
 
 def random_cloud(count: int, seed: int, width: int, height: int, degree: int = 3) -> Scene:
-    """Like a trained scene: log-normal sizes, opacities over the whole range, means all over the image and a bit
-    around it."""
+    """Gaussians like those of a trained scene: log-normal sizes, all opacities, and means in and around the image."""
     rng = np.random.default_rng(seed)
     camera = tilted_camera(width, height)
     pixels = rng.uniform(-0.1, 1.1, (count, 2)) * np.array([width, height])
@@ -179,18 +185,18 @@ def random_cloud(count: int, seed: int, width: int, height: int, degree: int = 3
 
 
 def in_float64(gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians in float64, so that a step of a difference is not rounded away."""
+    """The Gaussians in float64, so that the step of a difference quotient is not rounded away."""
     arrays: dict[str, Any] = {name: np.asarray(values, np.float64) for name, values in gaussians.arrays().items()}
     return replace(gaussians, **arrays)
 
 
 def antialiased(scene: Scene) -> Scene:
-    """The scene with the antialiased model's low-pass."""
+    """The scene with an antialiased model."""
     return replace(scene[0], antialiased=True), scene[1]
 
 
 def orthographic(scene: Scene, middle: float = 4.0) -> Scene:
-    """The scene through a camera that shows at the depth `middle` what its own did."""
+    """The scene with an orthographic camera, which shows the plane at the depth `middle` at the same size."""
     gaussians, camera = scene
     return gaussians, replace(camera, fx=camera.fx / middle, fy=camera.fy / middle, projection="orthographic")
 
@@ -205,10 +211,10 @@ NAMED: dict[str, Callable[[], Scene]] = {
     "equal_depth": equal_depth,
     "random_cloud": lambda: random_cloud(300, 11, 70, 50),
 }
-"""Every scene without arguments, by name, for `pytest.mark.parametrize`."""
+"""All scenes by name, as functions without arguments, for `pytest.mark.parametrize`."""
 
 ANTIALIASED = {f"antialiased {name}": lambda make=make: antialiased(make()) for name, make in NAMED.items()}
-"""Those scenes with the antialiased model's low-pass."""
+"""The scenes of NAMED with antialiased models, by name."""
 
 SHAPE_MATTERS = ("overlap", "many_per_tile", "saturating")
-"""Of them those that take the branches in which kernels of other shapes differ: several batches, pixels that end."""
+"""Scenes for which kernels differ by shape: their tiles have several batches, or pixels that become opaque."""

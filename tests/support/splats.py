@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models for tests of formats, how far two of them are apart, and what a damaged file must not do."""
+"""Models for tests of formats, their differences, and checks of reading damaged files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from clsplat.spherical_harmonics import sh_basis
 
 
 def lopsided(count: int = 500, degree: int = 3, seed: int = 0) -> Gaussians:
-    """Random Gaussians in a volume that no mirror, turn or exchange of axes leaves as it is; values as models have."""
+    """Random Gaussians with values like a model's, in a volume without symmetry: every change of axes is visible."""
     rng = np.random.default_rng(seed)
 
     def float32(array: np.ndarray) -> np.ndarray:
@@ -40,7 +40,7 @@ def with_origin(gaussians: Gaussians, *origin: float) -> Gaussians:
 
 
 def read_plainly(path: Path) -> Gaussians:
-    """A 3DGS PLY of floats alone, with no more care than NumPy takes; infinite logits become 30."""
+    """Read a 3DGS PLY that has only floats, with NumPy and without checks. Logits are clamped to -30 to 30."""
     data = path.read_bytes()
     end = data.index(b"end_header\n") + 11
     names = [line.split()[2].decode() for line in data[:end].split(b"\n") if line.startswith(b"property float ")]
@@ -70,7 +70,7 @@ def opacity(gaussians: Gaussians) -> np.ndarray:
 
 
 def losses(a: Gaussians, b: Gaussians) -> dict[str, float]:
-    """The largest difference of each attribute; rotations in radians."""
+    """The largest difference between two models for each attribute; rotations in radians."""
     return {
         "means": float(np.abs(a.means + a.origin - (b.means + b.origin)).max()),
         "rotations": float((rotations(a).inv() * rotations(b)).magnitude().max()),
@@ -96,14 +96,14 @@ def covariances(gaussians: Gaussians) -> np.ndarray:
 
 
 def colours(gaussians: Gaussians, directions: np.ndarray) -> np.ndarray:
-    """(n, directions, 3), by the reference's basis."""
+    """Colours (n, directions, 3) of Gaussians in directions, with the reference's SH basis."""
     basis = sh_basis(directions, gaussians.sh_degree)
     found: np.ndarray = np.einsum("dk,nkc->ndc", basis, gaussians.sh.astype(np.float64))
     return found
 
 
 def damaged(data: bytes, *, step: int) -> Iterable[bytes]:
-    """Cut short at every `step`th length, and with a byte changed at as many places."""
+    """Yield the data truncated at every `step`th byte, and with that byte changed."""
     rng = np.random.default_rng(0)
     for at in range(0, len(data), step):
         yield data[:at]
@@ -111,7 +111,7 @@ def damaged(data: bytes, *, step: int) -> Iterable[bytes]:
 
 
 def refused_of(read: Callable[[Path], Gaussians], path: Path, *, step: int) -> int:
-    """How many of the file's damages are refused; what is read of the others is sound."""
+    """Number of damaged versions of a file that `read` refuses. Fails unless it reads sound models from the others."""
     refused = 0
     for data in damaged(path.read_bytes(), step=step):
         path.write_bytes(data)
@@ -120,7 +120,10 @@ def refused_of(read: Callable[[Path], Gaussians], path: Path, *, step: int) -> i
 
 
 def assert_refused_or_sound(read: Callable[[Path], Gaussians], path: Path) -> bool:
-    """Whether the file was refused: by one line that names it; else what was read is whole and finite."""
+    """True if `read` refuses the file, with an error of one line that names it.
+
+    Fails unless the model is complete and finite otherwise.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         message = ""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What tests need of a system that not every one has."""
+"""Requirements of tests that not every operating system meets."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from calls import noted
 
 @cache
 def can_link() -> bool:
-    """Whether this user may make symbolic links: on Windows that takes a right."""
+    """True if this user may make symbolic links, which requires a privilege on Windows."""
     with tempfile.TemporaryDirectory() as folder:
         try:
             (Path(folder) / "link").symlink_to("target")
@@ -25,7 +25,7 @@ def can_link() -> bool:
 
 
 def locked(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-    """Make a folder that this user may not look into, root neither."""
+    """Make a folder that this process cannot list, even as root."""
     folder.mkdir()
 
     def refuse(path: object = ".") -> None:
@@ -35,5 +35,5 @@ def locked(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
     noted(monkeypatch, os, "scandir", refuse)
 
 
-posix = pytest.mark.skipif(os.name != "posix", reason="needs signals, pipes or modes of files as POSIX has them")
+posix = pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals, pipes or file modes")
 links = pytest.mark.skipif(not can_link(), reason="this user may not make symbolic links")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scene small enough to train in seconds: pictures of a hidden model by the float64 twin, in a COLMAP folder."""
+"""A scene that trains in seconds: a COLMAP folder with pictures of a hidden model, rendered by the float64 twin."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from clsplat.training.trainer import Trainer
 
 WIDTH, HEIGHT, FOCAL = 48, 40, 50.0
 VIEWS = 10
-"""Two of them held out by the default split: the first and the ninth."""
+"""Number of views. The default split holds out two of them, the first and the ninth."""
 DISTANCE = 4.0
 
 CONFIG = TrainConfig(
@@ -45,14 +45,14 @@ CONFIG = TrainConfig(
         max_world_fraction=0.08,
     ),
 )
-"""A run in which everything that training does has happened after 40 steps."""
+"""A training of 40 steps with all events: warm-up, SH degrees, density control and opacity reset."""
 
 EVENTS = {"warm-up": 3, "resolution": 4, "densification": 15, "SH degree": 12, "opacity reset": 20, "nothing": 33}
-"""Steps of CONFIG to stop after: what is then due, or has just been done."""
+"""Steps after which tests stop CONFIG, by the event that is then due or has just happened."""
 
 
 def hidden_model(count: int = 40) -> Gaussians:
-    """What the pictures show: coloured blobs in a ball of radius 1 about the origin."""
+    """The model that the pictures show: coloured Gaussians in a ball of radius 1 around the origin."""
     rng = np.random.default_rng(12)
     means = rng.normal(size=(count, 3))
     means *= (rng.uniform(0.1, 1.0, count) ** (1 / 3) / np.linalg.norm(means, axis=1))[:, None]
@@ -63,7 +63,7 @@ def hidden_model(count: int = 40) -> Gaussians:
 
 
 def cameras() -> list[Camera]:
-    """On an arc of 120 degrees about the origin, a little above and below in turn."""
+    """Cameras on an arc of 120 degrees around the origin, in turn slightly above and below it."""
     made = []
     for index, angle in enumerate(np.linspace(-np.pi / 3, np.pi / 3, VIEWS)):
         position = DISTANCE * np.array([np.sin(angle), 0.15 * (-1) ** index, -np.cos(angle)])
@@ -77,13 +77,17 @@ def cameras() -> list[Camera]:
 
 @cache
 def pictures() -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Of every camera the image (H, W, 3) over black and its alpha (H, W)."""
+    """Image (H, W, 3) over black, and alpha (H, W), of every camera."""
     model = hidden_model()
     return [render(model, camera) for camera in cameras()]
 
 
 def write_scene(folder: Path, *, alpha: bool = False, points: bool = True) -> Path:
-    """The scene as a COLMAP folder of text files and 8 bit PNGs; alpha: RGBA pictures; points: whether it has some."""
+    """Write the scene as a COLMAP folder with text files and 8-bit PNGs. Returns the folder.
+
+    alpha: write RGBA pictures.
+    points: False for a model without points.
+    """
     model, sparse, images = hidden_model(), folder / "sparse" / "0", folder / "images"
     sparse.mkdir(parents=True)
     images.mkdir()
@@ -118,7 +122,7 @@ def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def short(**changes: object) -> TrainConfig:
-    """CONFIG with changes; `density` as a dictionary."""
+    """CONFIG with changes. density: a dictionary with changes of CONFIG.density."""
     density = changes.pop("density", {})
     config = replace(CONFIG, **changes)  # type: ignore[arg-type]
     return replace(config, density=replace(config.density, **density))  # type: ignore[arg-type]
@@ -134,18 +138,18 @@ def run_steps(count: int, trainer: Trainer) -> None:
 
 
 def trained_to(step: int, scene: Scene, config: TrainConfig, device: Device, **options: Any) -> Trainer:
-    """A training after so many steps; options: of the trainer."""
+    """The trainer after `step` steps. options: arguments of `Trainer`."""
     trainer = Trainer(scene, config, device, **options)
     run_steps(step, trainer)
     return trainer
 
 
 def loss_curve(scene: Scene, device: Device) -> list[float]:
-    """The losses of 20 steps in which everything happens: `golden/loss_curve.json`.
+    """Losses of 20 steps with all events, for `golden/loss_curve.json`.
 
-    What hangs on the last bit is kept out. Every Gaussian is cloned or split when it is due, as which are over a
-    threshold would; and none starts as a ball, as with those the gradient of a rotation is nothing but rounding,
-    which Adam makes into steps of full length.
+    Nothing in this training depends on the last bits. All Gaussians are cloned or split when this is due, so that none
+    is close to a threshold. None starts as a ball: for a ball the gradient of the rotation is only rounding, which Adam
+    would turn into full steps.
     """
     rng = np.random.default_rng(3)
     start = hidden_model()

@@ -10,7 +10,7 @@ from tiny import HEIGHT, WIDTH
 
 
 def stage_with_camera(path: Path) -> Any:
-    """A new stage of frames 1 to 5, with a camera at z = 5 whose focal length is its picture's width."""
+    """A new stage of frames 1 to 5, with a camera at z = 5. Its focal length equals the aperture's width."""
     from pxr import Gf, Usd, UsdGeom
 
     stage = Usd.Stage.CreateNew(str(path))

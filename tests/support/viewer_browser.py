@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat view` to open in a browser (browser.py), and what the tests do on its page."""
+"""`clsplat view` for tests with a browser (browser.py), and actions on its page."""
 
 from __future__ import annotations
 
@@ -14,12 +14,15 @@ from typing import Any
 from clsplat.errors import ClsplatError
 
 SLOW = 60_000
-"""Milliseconds for what takes one second on a machine that has nothing else to do."""
+"""Time limit in milliseconds of an action that takes one second on an idle machine."""
 
 
 @contextmanager
 def clsplat(*arguments: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """A command that serves a page, with --port 0: its address, and the process, which is ended as by Ctrl-C."""
+    """Run a command that serves a page, with --port 0. Yields the page's address and the process.
+
+    After the block, the process is ended like by Ctrl-C.
+    """
     command = [sys.executable, "-m", "clsplat", *arguments, "--port", "0"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stderr is not None
@@ -44,6 +47,6 @@ def clsplat(*arguments: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
 
 
 def choose(page: Any, label: str, option: str) -> None:
-    """Of one of the page's lists."""
+    """Choose an option of the list with this label on the page."""
     page.get_by_label(label, exact=True).locator("visible=true").first.click(timeout=SLOW)
     page.get_by_role("option", name=option, exact=True).click(timeout=SLOW)

@@ -1,17 +1,17 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""The host's part of a training step by capacity: calls on the queue, and the launching thread's microseconds by cause.
+"""Measure the host's work in a training step by capacity: calls on the queue, and the launching thread's CPU time.
 
     python tools/bench/bench_host.py SCENE [--size 400] [--steps 100] [--shape 1x64] [--repeat 101] [--device DEVICE]
 
-The scene is trained for --steps steps, of photographs whose longer side has --size pixels: the host's part does not
-depend on their size, unless lists are so long that they are sorted by radix. Each measured step is then launched from
-an idle device, onto a queue that waits for a user event until the launch has returned. So no kernel runs meanwhile on
-the same processors, and no call waits for one. Counted is the thread's processor time. Caches are cold, as they are
-after a wait.
+The scene is first trained for --steps steps, with photographs whose longer side has --size pixels. Their size does not
+affect the host's work, unless lists are so long that they are sorted by radix. Each measured step is then launched on
+an idle device, whose queue waits for a user event until the launch has returned. So meanwhile no kernel uses the same
+cores, and no call waits for a kernel. The thread's CPU time is measured. Caches are cold, as after a wait.
 
-A cause has its own time without that of the causes that it calls, and half a microsecond for each of its calls is the
-measuring's own. Printed are medians; the least of all steps is the figure that other load disturbs least.
+The time is divided among CAUSES. The time of a cause excludes that of the causes that it calls. The measurement itself
+adds half a microsecond to each call. Medians are printed, and the least time of all steps, which other load on the
+machine affects least.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ REST = "all else"
 
 
 class Stopwatch:
-    """Microseconds of this thread by cause, each without those of the causes called from it."""
+    """Measures the microseconds of this thread for each cause, without those of the causes that it calls."""
 
     def __init__(self) -> None:
         self.taken: dict[str, float] = {}
@@ -95,7 +95,7 @@ class Stopwatch:
 
 
 def held(device: Device, work: Callable[[], object]) -> float:
-    """Microseconds of this thread in `work`, whose commands begin only after it."""
+    """Microseconds of this thread in `work`. The commands that it queues begin only afterwards."""
     device.finish()
     gate = cl.UserEvent(device.context)
     cl.enqueue_barrier(device.queue, wait_for=[gate])
@@ -109,7 +109,7 @@ def held(device: Device, work: Callable[[], object]) -> float:
 
 
 def measure(trainer: Trainer, steps: int, repeat: int) -> Result:
-    """Calls and microseconds of a step after `steps` steps; by cause in steps of their own."""
+    """Measure steps after `steps` steps: their calls, their time, and in separate steps the time of each cause."""
     device = trainer.device
     for _ in range(steps):
         trainer.train_step()

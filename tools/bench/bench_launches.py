@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""The host's microseconds for a step's launches of an empty kernel, in each way of making them.
+"""Measure the host's microseconds for a step's launches, with an empty kernel and different ways of launching.
 
     python tools/bench/bench_launches.py [--device DEVICE] [--repeat 41] [--json]
 
-By pyopencl, which makes an event for each; by ctypes, without an event; and, if the driver has cl_khr_command_buffer,
-by a command buffer of the driver, which may be on the queue several times at once. A driver that aborts in it ends this
-process. As in bench_host.py the queue waits meanwhile for a user event, and the thread's processor time is counted.
+The ways are: pyopencl, which makes an event for each launch; ctypes, without events; and, if the driver has
+cl_khr_command_buffer, a command buffer of the driver, which may be on the queue several times at once. If the driver
+aborts in it, this process ends. As in bench_host.py, the queue waits for a user event meanwhile, and the thread's CPU
+time is measured.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from clsplat.device.context import Device, open_device
 from clsplat.progress import aligned
 
 LAUNCHES = 11
-"""Launches of a training step by capacity, in groups."""
+"""Number of launches of a training step by capacity, on devices where kernels run in groups."""
 ROUNDS = 8
-"""Steps one after the other, of which the mean counts."""
+"""Number of successive steps, over which the time is averaged."""
 ITEMS = 64
 TEXT = "__kernel void nothing(__global int *x, int n) { if (n == 77) x[0] = 1; }"
 FLAGS_KEY, SIMULTANEOUS_USE = 0x1293, 1
@@ -41,13 +42,13 @@ Launch = Callable[[], object]
 
 
 def checked(status: int, call: str) -> None:
-    """Raise RuntimeError for a status of OpenCL that is an error."""
+    """Raise pyopencl's RuntimeError if an OpenCL call has returned an error status."""
     if status:
         raise cl.RuntimeError(f"{call}: status {status}")
 
 
 class Driver:
-    """OpenCL's functions, as pyopencl has loaded them, for calls that it does not make."""
+    """OpenCL's functions from the library that pyopencl has loaded, for calls that pyopencl does not support."""
 
     def __init__(self, device: Device) -> None:
         self._library = ctypes.CDLL(importlib.import_module("pyopencl._cl").__file__)
@@ -56,7 +57,7 @@ class Driver:
         self.launch.argtypes = [POINTER, POINTER, COUNT, *[POINTER] * 3, COUNT, POINTER, POINTER]
 
     def extension(self, name: str, *types: Any) -> Callable[..., Any]:
-        """The function of an extension. types: of its result and arguments."""
+        """The function of an extension. types: the types of its result and arguments."""
         find = self._library.clGetExtensionFunctionAddressForPlatform
         find.restype, find.argtypes = POINTER, [POINTER, ctypes.c_char_p]
         address = find(self._platform, name.encode())
@@ -86,7 +87,7 @@ class Driver:
 
 
 def ways(device: Device, kernels: Sequence[cl.Kernel]) -> dict[str, Launch]:
-    """Functions that launch all kernels."""
+    """Functions that launch all kernels, by the name of their way."""
     driver, queue, size = Driver(device), device.queue, (ctypes.c_size_t * 1)(ITEMS)
     with_event = [partial(cl.enqueue_nd_range_kernel, queue, kernel, (ITEMS,), (ITEMS,)) for kernel in kernels]
     handles = [(POINTER(queue.int_ptr), POINTER(kernel.int_ptr)) for kernel in kernels]
@@ -107,7 +108,7 @@ def ways(device: Device, kernels: Sequence[cl.Kernel]) -> dict[str, Launch]:
 
 
 def held(device: Device, work: Launch) -> float:
-    """Microseconds of this thread in `work`, the mean of ROUNDS calls, whose kernels run only after them."""
+    """Microseconds of this thread in a call of `work`, as the mean of ROUNDS calls. Kernels run only afterwards."""
     device.finish()
     gate = cl.UserEvent(device.context)
     cl.enqueue_barrier(device.queue, wait_for=[gate])
@@ -122,7 +123,7 @@ def held(device: Device, work: Launch) -> float:
 
 
 def measure(device: Device, repeat: int) -> Result:
-    """Microseconds of LAUNCHES launches by way: the median, and the least."""
+    """Median and least microseconds of LAUNCHES launches, for each way."""
     program = cl.Program(device.context, TEXT).build()
     buffer = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, 64)
     kernels = []

@@ -5,8 +5,9 @@
     python tools/gpu/device_page.py report.json...    adds the reports' devices to docs/gpus/devices.json first
     python tools/gpu/device_page.py
 
-A report has paths and packages of a machine; devices.json keeps only what the page shows. A device's row replaces that
-of the same driver, system and shape. Devices that failed the test, or have no times, are left out, and said.
+Reports contain paths and packages of a machine; devices.json keeps only what the page shows. A new row replaces the row
+of the same device, driver, system and shape. Devices that failed the test, or have no times, are left out with a
+message.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ Row = dict[str, Any]
 
 
 def rows_of(report: Mapping[str, Any]) -> tuple[list[Row], list[str]]:
-    """The rows of a report, and descriptions of devices that are left out. Raises KeyError if it is none."""
+    """The rows of a report, and descriptions of devices that are left out. Raises KeyError if it is not a report."""
     system = next(line["text"] for line in report["installation"] if line["part"] == "system")
     rows, left_out = [], []
     for device in report["devices"]:
@@ -51,7 +52,7 @@ def rows_of(report: Mapping[str, Any]) -> tuple[list[Row], list[str]]:
             "kind": device["kind"],
             "units": device["compute_units"],
             "driver": driver,
-            "system": re.sub(r"(\d+\.\d+)[^\s,]*", r"\1", system),  # of the kernel's version two numbers
+            "system": re.sub(r"(\d+\.\d+)[^\s,]*", r"\1", system),  # only the first two numbers of the system's version
             "date": report["date"],
             "clsplat": report["clsplat"],
             "shape": Shape(**times["shape"], chunks=1).label,
@@ -68,13 +69,13 @@ def rows_of(report: Mapping[str, Any]) -> tuple[list[Row], list[str]]:
 
 
 def bits_of(device: Mapping[str, Any]) -> str:
-    """`same`, or the stages whose bits are not the stored ones."""
+    """`same`, or text with the stages whose bits differ from the stored ones."""
     other = [stage["stage"] for stage in device["stages"] if stage["same_bits"] is False]
     return f"other in {', '.join(other)}" if other else "same"
 
 
 def merged(rows: Sequence[Row], new: Sequence[Row]) -> list[Row]:
-    """All rows, with new ones in place of old ones of the same KEY: GPUs first, the quickest first."""
+    """All rows, where new rows replace old ones with the same KEY. GPUs come first, and the quickest of them."""
     found = {tuple(row[name] for name in KEY): row for row in (*rows, *new)}
     return sorted(found.values(), key=lambda row: (row["kind"] != "gpu", row["step_ms"]))
 

@@ -9,14 +9,26 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 CLASSES = ("fp32", "integer", "shared", "global", "control", "other", "scalar")
-"""fp32: arithmetic and comparisons; integer: these and moves; shared: shared and private memory; control: branches,
-barriers, waits; other: reciprocals, conversions, votes, special registers; scalar: AMD's scalar unit."""
+"""Classes of instructions.
+
+- fp32: arithmetic and comparisons of floats.
+- integer: arithmetic and comparisons of integers, and moves.
+- shared: accesses to shared and private memory. global: accesses to global memory.
+- control: branches, barriers, waits.
+- other: reciprocals, conversions, votes, special registers.
+- scalar: instructions of AMD's scalar unit.
+"""
 
 
 @dataclass(frozen=True)
 class Instruction:
-    """An instruction. target: the label that it may jump to. ends: True if the next instruction never follows it.
-    source: its line in the kernel's text, 0 if unknown. control: NVIDIA's scheduling bits (`gpu_chain.py`), or 0."""
+    """An instruction.
+
+    target: the label that it may jump to.
+    ends: True if the next instruction never follows it.
+    source: its line in the kernel's text, 0 if unknown.
+    control: NVIDIA's scheduling bits (`gpu_chain.py`), or 0.
+    """
 
     name: str
     kind: str

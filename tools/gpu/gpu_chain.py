@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long one warp takes alone, from the scheduling bits in NVIDIA's code.
+"""Compute the time of a single warp from the scheduling bits in NVIDIA's code.
 
-Each instruction says how many cycles pass before the next. One whose time varies (a load, a reciprocal) sets one of six
-scoreboards, and later instructions name the scoreboards for which they wait. So the compiler's own code tells which
-loads are under way together, and how often a warp waits for one after another.
+Each instruction says how many cycles pass before the next one. An instruction of varying time, such as a load or a
+reciprocal, sets one of six scoreboards, and later instructions name the scoreboards for which they wait. So the
+compiler's code shows which loads run at the same time, and how often a warp waits for one load after another.
 """
 
 from __future__ import annotations
@@ -15,10 +15,12 @@ from dataclasses import dataclass
 from gpu_assembly import Block, Instruction
 
 VARIABLE = (("LDS|LDL|LDC|ATOMS", 30), ("LD|ATOM", None), ("", 20))
-"""Cycles until a result of varying time is there, by the first pattern with which the instruction's name begins. None:
-an access to global memory."""
+"""Cycles until the result of an instruction of varying time is ready, by the first pattern that its name begins with.
+
+None stands for an access to global memory.
+"""
 ENDLESS = 1 << 30
-"""Cycles of an access to global memory while counting: so many that all else is done in the meantime."""
+"""Cycles of an access to global memory while waits are counted: longer than everything else together."""
 BARRIER = 30
 """Cycles of a barrier of a group: about the 16 ns of an H100 (docs/gpus/calibration.json)."""
 NEAR = 150
@@ -27,8 +29,12 @@ NEAR = 150
 
 @dataclass(frozen=True)
 class Chain:
-    """A warp's waits in turn: cycles for its own instructions, and accesses to global memory. lines: cache lines of 128
-    bytes that all of its accesses touch, one for each instruction and line."""
+    """The sequence of a warp's waits.
+
+    cycles: cycles of its own instructions.
+    accesses: number of accesses to global memory that it waits for, one after the other.
+    lines: number of cache lines of 128 bytes that its accesses touch, counted for each instruction.
+    """
 
     cycles: float = 0.0
     accesses: float = 0.0
@@ -38,7 +44,7 @@ class Chain:
         return Chain(self.cycles + other.cycles, self.accesses + other.accesses, self.lines + other.lines)
 
     def times(self, rounds: float) -> Chain:
-        """The chain of so many rounds."""
+        """The chain of this number of rounds."""
         return Chain(self.cycles * rounds, self.accesses * rounds, self.lines * rounds)
 
 
@@ -51,7 +57,10 @@ def chain_of(
     rounds: int = 2,
     access: int = ENDLESS,
 ) -> Chain:
-    """The chain of the last of some rounds of a loop: its blocks, each with the fraction of the rounds that run it."""
+    """The chain of the last of some rounds of a loop.
+
+    blocks: blocks of the loop, each with the fraction of the rounds that run it.
+    """
     weighted = [(each, share) for block, share in blocks if share for each in block.body]
     now, ready = 0, [0] * 8
     whole = Chain()

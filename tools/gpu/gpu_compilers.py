@@ -41,8 +41,13 @@ class NoCompilerError(ClsplatError):
 
 @dataclass(frozen=True)
 class Built:
-    """A kernel compiled for a target. registers: per item. spills, stack: bytes per item. shared: bytes per group.
-    whole: the kernel as a loop that runs once."""
+    """A kernel compiled for a target.
+
+    registers: registers per work-item.
+    spills, stack: bytes per work-item.
+    shared: bytes per group.
+    whole: the kernel as a loop that runs once.
+    """
 
     kernel: str
     target: str

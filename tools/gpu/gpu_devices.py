@@ -12,8 +12,10 @@ from gpu_compilers import Built
 class Architecture:
     """The limits of a unit that groups share: NVIDIA's SM, half of AMD's work-group processor or its compute unit.
 
-    wave: items that run in step. waves, groups: maximum at a time. registers: number of 32-bit registers of all waves,
-    allocated in multiples of `grain` per item. shared: bytes of shared memory, of which each group uses `reserved`.
+    wave: items that run in step.
+    waves, groups: maximum number of waves and groups at a time.
+    registers, grain: number of 32-bit registers for all waves, allocated in multiples of `grain` per item.
+    shared, reserved: bytes of shared memory, of which each group needs `reserved` for itself.
     """
 
     name: str
@@ -39,8 +41,13 @@ ARCHITECTURES = {
 
 @dataclass(frozen=True)
 class Gpu:
-    """A device. units: SMs or compute units. issue: wave instructions that a unit starts per cycle. ghz: boost clock.
-    gb: memory bandwidth in GB/s."""
+    """A device.
+
+    units: number of SMs or compute units.
+    issue: number of wave instructions that a unit starts per cycle.
+    ghz: boost clock.
+    gb: memory bandwidth in GB/s.
+    """
 
     name: str
     target: str
@@ -57,7 +64,7 @@ class Gpu:
 
 GPUS = (
     Gpu("RTX 2080 Ti", "sm_75", 68, 4, 1.545, 616),
-    Gpu("RTX 3090", "sm_89", 82, 4, 1.695, 936),  # its target is sm_86, which is not compiled for
+    Gpu("RTX 3090", "sm_89", 82, 4, 1.695, 936),  # its own target would be sm_86
     Gpu("RTX 4090", "sm_89", 128, 4, 2.520, 1008),
     Gpu("H100 SXM", "sm_90", 132, 4, 1.980, 3350),
     Gpu("H200", "sm_90", 132, 4, 1.980, 4800),

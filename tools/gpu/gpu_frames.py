@@ -80,12 +80,15 @@ def count(name: str, subject: Subject) -> dict[str, Any]:
 
 
 WAVE = 32
-"""Neighbouring Gaussians whose items run in step."""
+"""Number of neighbouring Gaussians whose items run in step."""
 
 
 def lists_in(lengths: np.ndarray) -> dict[str, Any]:
-    """Keys of a frame's row, from the lengths of its tiles' lists: the longest; for 1, 2, 4, ... the number of lists up
-    to this length and over half of it; and their pairs."""
+    """Keys of a frame's row, from the lengths of its tiles' lists.
+
+    They are the longest list, and for the lengths 1, 2, 4, ... the number of lists up to this length and over half of
+    it, and their pairs.
+    """
     doublings = np.ceil(np.log2(np.maximum(lengths, 1))).astype(np.int64)
     return {
         "longest_listed": int(lengths.max()),
@@ -95,8 +98,11 @@ def lists_in(lengths: np.ndarray) -> dict[str, Any]:
 
 
 def boxes_in(splats: np.ndarray, pairs: np.ndarray, tiles: tuple[int, int]) -> dict[str, Any]:
-    """Keys of a frame's row: the fields of `gpu_lists.Boxes`; wide: a fraction of all Gaussians. splats, pairs: of each
-    Gaussian. tiles: across and down."""
+    """Keys of a frame's row: the fields of `gpu_lists.Boxes`, where `wide` is a fraction of all Gaussians.
+
+    splats, pairs: splat, and number of pairs, of each Gaussian.
+    tiles: number of tiles across and down.
+    """
     field = dict(zip(SPLAT, splats.T, strict=False))
 
     def side(mean: str, rest: str, half: str, count: int) -> np.ndarray:
@@ -104,7 +110,7 @@ def boxes_in(splats: np.ndarray, pairs: np.ndarray, tiles: tuple[int, int]) -> d
         low, high = ((at + sign * field[half]) / TILE for sign in (-1, 1))
         return np.where(pairs > 0, np.clip(np.floor(high) + 1, 0, count) - np.clip(np.floor(low), 0, count), 0)
 
-    with np.errstate(invalid="ignore", over="ignore"):  # of Gaussians that are culled
+    with np.errstate(invalid="ignore", over="ignore"):  # culled Gaussians have arbitrary values
         columns, rows = side("PIXEL_X", "SUB_X", "HALF_W", tiles[0]), side("PIXEL_Y", "SUB_Y", "HALF_H", tiles[1])
     is_wide = columns * rows > OWN_BOX
     wide = max(int(is_wide.sum()), 1)
@@ -123,14 +129,23 @@ def boxes_in(splats: np.ndarray, pairs: np.ndarray, tiles: tuple[int, int]) -> d
 
 
 WALK = ("walked", "reached", "taken", "halves", "longer_reached", "longer_taken")
-"""Counts of a tile: walked pairs; over these, blocks of 4x8 pixels that the ellipse reaches while one of their pixels
-is not finished, and those with a pixel that takes the pair; halves of the tile (warps of 1x64, which own a row of
-blocks) that it reaches; and the blocks of the half with more of them."""
+"""Counts of a tile.
+
+- walked: walked pairs. The other counts are sums over these.
+- reached: blocks of 4x8 pixels that the ellipse reaches and that have an unfinished pixel.
+- taken: blocks with a pixel that takes the pair.
+- halves: halves of the tile that the ellipse reaches. In 1x64, a warp owns a half, a row of blocks.
+- longer_reached, longer_taken: such blocks in the half that has more of them.
+"""
 
 
 def walk_of(splats: np.ndarray, stops: np.ndarray, corner: np.ndarray) -> list[int]:
-    """WALK of a tile, and VISITS for each of WARPS, of all warps and of the one with most blocks. splats: of its pairs,
-    front to back. stops (16, 16): the first pair that each pixel does not take. corner: x and y of the first pixel."""
+    """WALK of a tile, and VISITS for each of WARPS: of all warps, and of the warp with most blocks.
+
+    splats: splats of the tile's pairs, front to back.
+    stops: (16, 16), the first pair that each pixel does not take.
+    corner: x and y of the tile's first pixel.
+    """
     walked = max(int(stops.max()), 0)
     splats = splats[: -(-walked // LARGEST_BATCH) * LARGEST_BATCH]
     field = dict(zip(SPLAT, splats.T[:, :, None, None], strict=False))
@@ -152,7 +167,7 @@ def walk_of(splats: np.ndarray, stops: np.ndarray, corner: np.ndarray) -> list[i
 
 
 LARGEST_BATCH = 256
-"""BATCH in blocks.h of the largest of WARPS."""
+"""Number of pairs in a batch with the most warps of WARPS: BATCH in blocks.h."""
 
 
 def _blocks(pixels: np.ndarray, over: Callable[..., np.ndarray] = np.any) -> np.ndarray:
@@ -163,9 +178,13 @@ def _blocks(pixels: np.ndarray, over: Callable[..., np.ndarray] = np.any) -> np.
 def visits_of(
     warps: int, ellipse: np.ndarray, ends: np.ndarray, gradient: tuple[np.ndarray, np.ndarray], last: np.ndarray
 ) -> list[int]:
-    """VISITS of a tile, and those of its warp with most blocks. Of pairs and blocks (n, BLOCKS): those that the
-    ellipse reaches, those in which a pixel takes it or is finished by it, and gradient: those that it visits, and those
-    of them with a pixel that takes it. last (1, BLOCKS): the largest stop."""
+    """VISITS of a tile, and of its warp with most blocks.
+
+    ellipse: (n, BLOCKS), blocks that the ellipse of a pair reaches.
+    ends: (n, BLOCKS), blocks with a pixel that takes the pair or is finished by it.
+    gradient: two arrays (n, BLOCKS): blocks that the gradient visits, and blocks with a pixel that takes the pair.
+    last: (1, BLOCKS), the largest stop of a block's pixels.
+    """
     batch, owned = max(64, 32 * warps), BLOCKS // warps
     live = last >= np.arange(len(ellipse))[:, None] // batch * batch
     shape = (-1, warps, owned)
@@ -186,9 +205,15 @@ def visits_of(
 
 
 def back_of(back: np.ndarray, takes: np.ndarray, walked: int, of_round: int) -> list[np.ndarray]:
-    """Of a tile's two strips (strips.h): pairs that the gradient visits there; of these the ones that reach all blocks;
-    blocks of the others that it visits, and those with a pixel that takes the pair; and (2, batches) in how many rounds
-    of so many pairs. back, takes: gradient of `visits_of`. walked: pairs of the tile."""
+    """Counts of the gradient's walk for each of a tile's two strips (strips.h).
+
+    They are: pairs that it visits; those that reach all blocks of the strip; for the other pairs, blocks that it
+    visits, and blocks with a pixel that takes the pair; and rounds (2, batches).
+
+    back, takes: the arrays of `gradient` in `visits_of`.
+    walked: number of the tile's walked pairs.
+    of_round: number of pairs in a round.
+    """
     visited, taken = (each[:walked].reshape(-1, 2, BLOCKS // 2).sum(2)[::-1] for each in (back, takes))
     whole = visited == BLOCKS // 2
     padded = np.pad(visited > 0, ((0, -walked % BATCH_BACK), (0, 0)))
@@ -198,9 +223,11 @@ def back_of(back: np.ndarray, takes: np.ndarray, walked: int, of_round: int) -> 
 
 
 def summary(walks: np.ndarray) -> dict[str, Any]:
-    """Keys of a frame's row, from WALK and VISITS of its tiles (tiles, counts). Of the slowest tile, which has the most
-    pairs and blocks in one half: its pairs, and the counts of its longer half or longest warp. All other counts are per
-    walked pair; those of VISITS are lists over WARPS."""
+    """Keys of a frame's row, from WALK and VISITS of its tiles (tiles, counts).
+
+    The slowest tile is the one with the most pairs and blocks in one half. Its pairs, and the counts of its longer half
+    or longest warp, are among the keys. All other counts are per walked pair. Those of VISITS are lists over WARPS.
+    """
     walked = walks[:, 0]
     slowest = walks[walks[:, (0, 4, 5)].sum(1).argmax()]
     mean, longest = (each / max(each[0], 1) for each in (walks.sum(0), slowest))
@@ -218,8 +245,11 @@ def summary(walks: np.ndarray) -> dict[str, Any]:
 
 
 def as_measured(row: Mapping[str, Any], calibration: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The row of a frame, with the numbers of Gaussians, visible ones and listed pairs of the frame of this name that
-    was measured, if any, and with lists as much longer as it has more pairs. counted: the model's own Gaussians."""
+    """The row of a frame with the numbers of the measured frame of this name, if there is one.
+
+    These are Gaussians, visible Gaussians and listed pairs. The lengths of lists are scaled by the ratio of listed
+    pairs. The key `counted` then has the number of the model's own Gaussians.
+    """
     scenes = (scene for measured in calibration for scene in measured["scenes"])
     scene = next((each for each in scenes if each.get("frame") == row["name"] and "pairs" in each), None)
     if scene is None:
@@ -246,7 +276,7 @@ def main(arguments: Sequence[str]) -> int:
         print(json.dumps(frames[name]))
     rows = sorted(frames.values(), key=lambda row: (row.get("picture", False), row["gaussians"]))
     text = json.dumps({"frames": rows}, indent=2)
-    text = re.sub(r"\[\s+([\d.,\s]+?)\s+\]", lambda match: f"[{' '.join(match[1].split())}]", text)  # a list a line
+    text = re.sub(r"\[\s+([\d.,\s]+?)\s+\]", lambda match: f"[{' '.join(match[1].split())}]", text)  # one line per list
     atomic_write(FRAMES, (text + "\n").encode())
     return 0
 

@@ -25,8 +25,12 @@ INTEL = {"tgllp": "Xe-LP", "dg2-g10": "Arc A770"}
 
 @dataclass(frozen=True)
 class IntelBuilt:
-    """A kernel compiled for a device. step: items that run in step. stack: bytes per item, including spills. shared:
-    bytes per group."""
+    """A kernel compiled for a device.
+
+    step: work-items that run in step.
+    stack: bytes per work-item, including spills.
+    shared: bytes per group.
+    """
 
     source: Source
     kernel: str

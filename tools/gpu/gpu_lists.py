@@ -18,8 +18,13 @@ SIDE = 8
 
 @dataclass(frozen=True)
 class Boxes:
-    """Of Gaussians in tiles. wave_rows, wave_pairs: of 32 neighbours, the most rows and pairs of one whose box is not
-    wide, on average. wide: wide boxes of a group. wide_rows, wide_columns: of a wide box, on average."""
+    """Bounding boxes of Gaussians, in tiles.
+
+    wave_rows, wave_pairs: the largest number of rows, and of pairs, among 32 neighbouring Gaussians without wide boxes,
+        on average.
+    wide: number of wide boxes of a group.
+    wide_rows, wide_columns: mean numbers of rows and columns of a wide box.
+    """
 
     wave_rows: float = 1
     wave_pairs: float = 1
@@ -38,17 +43,23 @@ class Boxes:
 
 
 def boxes_of(frame: Mapping[str, Any], items: int) -> Boxes:
-    """The boxes of a frame, for groups of so many items."""
+    """The boxes of a frame, for groups of `items` items."""
     found = {each.name: frame[each.name] for each in fields(Boxes)}
     return Boxes(**{**found, "wide": found["wide"] * items})
 
 
 @dataclass(frozen=True)
 class Sorting:
-    """Mean rounds of a list's sort. A list of over LOCAL_PAIRS is sorted in parts, which are merged in further stages.
-    stages: in all. parts: over all stages. blocks, steps: of Batcher's network in local memory, over all parts.
-    far_steps: those through global memory. The others are an item's: ordered, ordered_far: comparisons. fetched,
-    stored: pairs copied to local memory and back. listed: pairs written."""
+    """Mean numbers for the sort of a list. Lists of over LOCAL_PAIRS are sorted in parts, and merged in further stages.
+
+    stages: number of stages.
+    parts: number of parts in all stages.
+    blocks, steps: blocks and steps of Batcher's network in local memory, in all parts.
+    far_steps: steps through global memory.
+    ordered, ordered_far: comparisons of an item in local memory, and in global memory.
+    fetched, stored: pairs that an item copies to local memory, and back.
+    listed: pairs that an item writes.
+    """
 
     stages: float = 0
     parts: float = 0
@@ -63,7 +74,7 @@ class Sorting:
 
 
 def sorting_of(lists: Iterable[tuple[float, float]], items: int) -> Sorting:
-    """The mean over lists. lists: numbers of lists, with the mean length of these."""
+    """The mean over lists. lists: numbers of lists, and their mean lengths."""
     each = [(number, _sorting(length, items)) for number, length in lists]
     whole = sum(number for number, _ in each)
     return Sorting(*(sum(number * getattr(one, of.name) for number, one in each) / whole for of in fields(Sorting)))
@@ -92,6 +103,6 @@ def _sorting(length: float, items: int) -> Sorting:
 
 
 def lists_of(frame: Mapping[str, Any]) -> list[tuple[float, float]]:
-    """A frame's lists by length: numbers of lists, with the mean length of these."""
+    """A frame's lists by ranges of lengths: numbers of lists, and their mean lengths."""
     lists = zip(frame["list_tiles"], frame["list_pairs"], strict=True)
     return [(tiles, pairs / tiles) for tiles, pairs in lists if tiles]

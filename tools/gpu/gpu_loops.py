@@ -25,8 +25,12 @@ class UnknownLoopError(ClsplatError):
 
 @dataclass(frozen=True)
 class Cost:
-    """Average number of instructions by class that a wave runs. once: outside of loops. rounds: in loops. rules: the
-    rules that apply to a loop or branch. first, then: the chain of a warp outside of loops, and in them."""
+    """Average numbers of instructions, by class, that a wave runs.
+
+    once, rounds: instructions outside of loops, and in them.
+    rules: the rules that apply to a loop or branch.
+    first, then: the chain of a warp outside of loops, and in them.
+    """
 
     once: Counter[str]
     rounds: Counter[str]

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The measured steps of docs/gpus/calibration.json, beside the model's predictions of them.
+"""The measured steps of docs/gpus/calibration.json, and the model's predictions of them.
 
-A row of the file is a device, its driver, date and commit, and scenes: `frame` is their name in gpu_frames.json,
-`parts_ms` or `kernels_ms` the device's times, `frame_ms` and `step_ms` wall times. `inputs` are what the model takes of
-the step's launches, as the code that was measured has them, so that a row says the same of the model whatever the
-kernels are now. For a new row, `gpu_static.py --inputs` writes them in a checkout of that code. A row without them, or
-of a device that is not in `gpu_devices.py`, is not used.
+A row of the file has a device, its driver, date and commit, and scenes. Of a scene, `frame` is its name in
+gpu_frames.json, `parts_ms` or `kernels_ms` are times on the device, and `frame_ms` and `step_ms` are wall times.
+`inputs` are the model's inputs for the step's launches, from the code that was measured. So a row stays a test of the
+model when kernels change. For a new row, `gpu_static.py --inputs` writes them in a checkout of that code. Rows without
+inputs, or of a device that is not in `gpu_devices.py`, are not used.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from gpu_model import Constants, Stage, Work, fit, stages_of, wall
 
 CALIBRATION = Path(__file__).resolve().parents[2] / "docs/gpus/calibration.json"
 DIGITS = 6
-"""Digits of a row's inputs."""
+"""Number of significant digits of a row's inputs."""
 WITHIN = {"made up, 1 M": 0.25, "fox, step 7000": 0.4}
-"""Most by which a prediction may differ from what was measured, by frame. Others are held out of the fit."""
+"""Maximum relative difference between prediction and measurement, by frame. Other frames are held out of the fit."""
 PARTS = {
     "project": ("project",),
     "lists and sorts": ("duplicate", "ranges", "append"),
@@ -39,20 +39,24 @@ PARTS = {
 }
 """Parts of a step, with the names of their stages."""
 ATOMICS = (1450, 6700)
-"""Counters of the measured atomics in global memory."""
+"""Numbers of global counters for which the time of atomics was measured."""
 OF_FRAME = ("project", "duplicate", "ranges", "blend")
 """Stages of a frame."""
 WALLS = ("frame, wall", "step, wall")
 DRAWN = ", drawn"
-"""After the name of a frame, in the names of the launches that only draw it: lists of a step by capacity are made in
-another way."""
+"""Suffix of a frame's name for the launches that only draw it. They make lists differently from a step by capacity."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A scene of a row. code: its commit and date. ms: what was measured, by part and WALLS. works: of the launches
-    that were measured. now: of those of the present kernels, if the frame has counts. drawn: of those that only draw
-    the frame."""
+    """A scene of a row.
+
+    code: commit and date.
+    ms: measured milliseconds, by part and WALLS.
+    works: the work of the launches that were measured.
+    now: the work of the present kernels' launches, if the frame has counts.
+    drawn: the work of present launches that only draw the frame.
+    """
 
     gpu: Gpu
     frame: str
@@ -63,7 +67,7 @@ class Measured:
     drawn: Sequence[Work | None] = ()
 
     def predicted(self, constants: Constants) -> dict[str, float]:
-        """Milliseconds of all that was measured."""
+        """Predicted milliseconds of everything that was measured."""
         found = milliseconds(self.works, self.gpu, constants)
         return {name: found[name] for name in self.ms}
 
@@ -87,7 +91,7 @@ Works = Mapping[tuple[str, str], Sequence[Work | None]]
 
 
 def with_inputs(rows: Sequence[Mapping[str, Any]], works: Works) -> str:
-    """The file's text, with the inputs of all scenes that have none. works: of the code that was measured."""
+    """The file's text, with inputs added to scenes that have none. works: the work of the code that was measured."""
 
     def told(value: Any) -> Any:
         if isinstance(value, Mapping):
@@ -109,12 +113,12 @@ def with_inputs(rows: Sequence[Mapping[str, Any]], works: Works) -> str:
 
 
 def _work(given: Mapping[str, Any] | None) -> Work | None:
-    """The work of an input."""
+    """The work of a launch from an entry of `inputs`."""
     return None if given is None else Work(**{**given, **{name: Chain(**given[name]) for name in ("chain", "longest")}})
 
 
 def read(rows: Sequence[Mapping[str, Any]], now: Works) -> tuple[list[Measured], list[str]]:
-    """The scenes that can be compared, and descriptions of what is not used.
+    """The scenes that can be compared, and descriptions of rows and scenes that are not used.
 
     now: work of the present kernels, by GPU and frame.
     """
@@ -149,8 +153,10 @@ Fit = tuple[Sequence[Measured], Constants, Sequence[str], Works]
 
 
 def fit_constants(rows: Sequence[Mapping[str, Any]], measured: Sequence[Measured]) -> Constants:
-    """The constants with the least sum of squared logarithms of ratios over all that was measured of frames in WITHIN;
-    those that small kernels measured are taken from the rows."""
+    """The constants that fit the measured frames of WITHIN best: least squares of the logarithms of ratios.
+
+    Constants that small kernels have measured are taken from the rows.
+    """
     limits = next(row["limits"] for row in rows if "limits" in row and "copy float4 x1, 1024" in row["limits"])
     gpu = next(each for row in rows if row.get("limits") is limits for each in GPUS if each.name == row["gpu"])
     few, many = (limits[f"3.4 M atomic_inc on {counters}, ms"] / 3.4 for counters in ATOMICS)  # nanoseconds
@@ -170,7 +176,7 @@ def fit_constants(rows: Sequence[Mapping[str, Any]], measured: Sequence[Measured
 
 
 def beyond(measured: Sequence[Measured], constants: Constants) -> list[str]:
-    """Descriptions of predictions that are further from what was measured than WITHIN."""
+    """Descriptions of predictions that differ from the measurement by more than WITHIN allows."""
     return [
         f"{each.frame}, {each.gpu.name}, {name}: {ms:.3f} ms predicted, {each.ms[name]:.3f} measured, expected within "
         f"{WITHIN[each.frame]:.0%}"

@@ -38,10 +38,16 @@ APPENDING, SORTING = ("count_tiles", "append_pairs"), "sort_lists"
 
 @dataclass(frozen=True)
 class Constants:
-    """efficiency: fraction of a unit's issue slots that are used when it has enough to do. access: nanoseconds of an
-    access to global memory. host: milliseconds in which the host queues a launch. copy: fraction of the data sheet's
-    bandwidth. groups: started per cycle. atomic: nanoseconds of an atomic in global memory, of those of a whole device.
-    counter: nanoseconds between two on one counter."""
+    """Constants of the model, which all stages and GPUs share.
+
+    efficiency: fraction of a unit's issue slots that are used if it has enough work.
+    access: nanoseconds of an access to global memory.
+    host: milliseconds that the host takes to queue a launch.
+    copy: fraction of the data sheet's bandwidth that is reached.
+    groups: number of groups that start per cycle.
+    atomic: mean nanoseconds per atomic in global memory, if the whole device makes them.
+    counter: nanoseconds between two atomics on the same counter.
+    """
 
     efficiency: float = 0.71
     access: float = 600
@@ -58,8 +64,12 @@ FITTED = {"efficiency": (0.5, 1, 0.01), "access": (100, 1000, 10), "host": (0.00
 
 @dataclass(frozen=True)
 class Stage:
-    """Milliseconds of a stage: for instructions, for bytes, of its warps' chains, and in all; its number of launches,
-    including fills."""
+    """Milliseconds of a stage.
+
+    issue, memory, chain: time for instructions, for bytes, and of its warps' chains.
+    ms: time of the whole stage.
+    launches: number of launches, including fills.
+    """
 
     issue: float = 0.0
     memory: float = 0.0
@@ -73,9 +83,15 @@ class Stage:
 
 @dataclass(frozen=True)
 class Work:
-    """The work of a launch. kernel: its name, of a fill `fill`. instructions: of all waves. resident: waves that
-    fit in a unit. chain: of an average wave. longest: of a wave in the slowest tile. atomics: in global memory, spread
-    over so many counters."""
+    """The work of a launch.
+
+    instructions: number of instructions of all waves.
+    resident: number of waves that fit in a unit.
+    chain: chain of an average wave.
+    longest: chain of a wave in the slowest tile.
+    kernel: name of the kernel; `fill` for a fill.
+    atomics, counters: number of atomics in global memory, and of the counters among which they are spread.
+    """
 
     stage: str
     bytes: float
@@ -150,8 +166,10 @@ def run_of(frame: Mapping[str, Any], launch: Mapping[str, Any], items: int, wave
 
 
 def issued(cost: Cost, target: str) -> tuple[float, float]:
-    """Instructions that use a unit's main issue slots, outside of loops and in them. AMD's scalar unit, branches and
-    waits have issue slots of their own."""
+    """Numbers of instructions that use a unit's main issue slots, outside of loops and in them.
+
+    AMD's scalar unit, branches and waits have issue slots of their own.
+    """
     apart = () if target.startswith("sm_") else ("scalar", "control")
     once, rounds = (
         sum(count for kind, count in counts.items() if kind not in apart) for counts in (cost.once, cost.rounds)
@@ -164,8 +182,10 @@ def works_of(
     built: Mapping[tuple[Source, str], Built],
     frame: Mapping[str, Any],
 ) -> list[Work | None]:
-    """The work of a step's launches in order (`gpu_variants.py`), with kernels compiled for one target. None: the host
-    waits for a number, as in a frame; a step does not (decision 0025)."""
+    """The work of a step's launches in order (`gpu_variants.py`), with kernels compiled for one target.
+
+    None stands for a wait of the host for a number. A frame has one; a step has none (decision 0025).
+    """
     works: list[Work | None] = []
     costs = cache(lambda source, name, run: cost_of(built[source, name], source.lines, rules_of(name), run))
     for launch in launches:

@@ -33,14 +33,21 @@ VISITS = (
     *("visits", "dense", "sparse_reached", "sparse_taken"),
     *("turns_back", "whole_back", "others_reached", "others_taken", "rounds_back"),
 )
-"""These counts, of a walked pair: over the pairs of the batches that blending fetches, warps that walk the pair, and
-those for which it is dense (blocks.h); of the others, blocks that it reaches and blocks with a pixel that takes it or
-is finished by it. And of the gradient's walk (strips.h), over all warps: the pairs of a warp's strips, and those that
-reach all blocks of the strip; of the others, blocks that it visits and blocks with a pixel that takes it; and rounds.
+"""Counts per walked pair. Those of blending are over the pairs of the batches that it fetches:
+
+- visits, dense: warps that walk a pair, and those for which it is dense (blocks.h).
+- sparse_reached, sparse_taken: in the other warps, blocks that the pair reaches, and blocks with a pixel that takes it
+  or is finished by it.
+
+Those of the gradient's walk (strips.h) are over all warps:
+
+- turns_back, whole_back: pairs of a warp's strips, and those that reach all blocks of the strip.
+- others_reached, others_taken: for the other pairs, blocks that it visits, and blocks with a pixel that takes the pair.
+- rounds_back: rounds.
 """
 _UNEVEN = 2
-"""Estimated ratio of a wave's rounds, which are those of its longest item, to the rounds of an average item, if
-neighbouring Gaussians have all sizes."""
+"""Estimated ratio of a wave's rounds to those of an average item, if neighbouring Gaussians have all sizes. A wave has
+the rounds of its longest item."""
 
 
 def together(warps: int) -> int:
@@ -50,14 +57,26 @@ def together(warps: int) -> int:
 
 @dataclass(frozen=True)
 class Run:
-    """Numbers on which the rounds of a loop depend. items: per group. wave: items that run in step. subgroup: items
-    that exchange values. addends: pairs per visible Gaussian. listed: pairs per tile. reached, taken: of the blocks of
-    a pair's tile, those that its ellipse reaches, and those with a pixel that takes it; sparse_reached, sparse_taken:
-    only those of warps that walk it and for which it is not dense. visits, dense: fractions of the tile's warps that
-    walk a pair, and for which it is dense. turns_back, whole_back, rounds_back: a warp's pairs, those that reach a
-    whole strip, and rounds in the gradient's walk; others_reached, others_taken: blocks of the tile that it visits for
-    the other pairs (`gpu_frames.py`). coefficients: of SH. groups, elements: of the launch. digits: of a pass of the
-    sort. lists: number of the frame's tiles. boxes, sorting: of lists by append."""
+    """Numbers on which the rounds of a loop depend. `gpu_frames.py` counts those of walked pairs.
+
+    items: work-items per group.
+    wave: items that run in step.
+    subgroup: items that exchange values.
+    addends: pairs per visible Gaussian.
+    listed: pairs per tile.
+    reached, taken: blocks of a pair's tile that its ellipse reaches, and those with a pixel that takes the pair.
+    visits, dense: fractions of the tile's warps that walk a pair, and for which it is dense.
+    sparse_reached, sparse_taken: as reached and taken, only in warps that walk the pair and for which it is not dense.
+    turns_back, whole_back, rounds_back: in the gradient's walk, a warp's pairs, those of them that reach a whole strip,
+        and rounds.
+    others_reached, others_taken: in the gradient's walk, blocks of the tile that it visits for the other pairs, and
+        those with a pixel that takes the pair.
+    coefficients: SH coefficients per channel.
+    groups, elements: numbers of the launch.
+    digits: digits of a pass of the radix sort.
+    lists: number of the frame's tiles.
+    boxes, sorting: numbers for lists by append.
+    """
 
     items: int
     wave: int = 32

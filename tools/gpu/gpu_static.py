@@ -90,9 +90,13 @@ MOST_INSTRUCTIONS = {"gfx1100": {"project_step": 3382}, "gfx90a": {"project_step
 
 @dataclass(frozen=True)
 class Row:
-    """A kernel for a target and shape. pair: instructions per pair by class, or None if it has no pairs. rules: the
-    rules of its loops. unknown: the reason if a loop has no rule. a_wave: instructions that a wave runs of a kernel
-    without pairs."""
+    """A kernel for a target and shape.
+
+    pair: instructions per pair, by class; None if the kernel has no pairs.
+    rules: the rules of its loops.
+    unknown: description of loops without a rule, or "".
+    a_wave: number of instructions that a wave runs, for a kernel without pairs.
+    """
 
     source: Source
     built: Built

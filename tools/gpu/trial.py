@@ -1,21 +1,25 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Measure all that the model of a GPU's step needs to know, in one call of some minutes on a machine with a GPU.
+"""Measure everything that the model of a GPU's step needs, in a call of a few minutes on a machine with a GPU.
 
     python tools/gpu/trial.py [--minutes 6] [--peers FOLDER] [--twins FOLDER] [--out trial.json]
     python tools/gpu/trial.py --complete trial.json
     python tools/gpu/trial.py --write-twins FOLDER [--target sm_90]
     python tools/gpu/trial.py --dry-run
 
-On the GPU it needs no package index and no compiler but the driver's. Its parts, in order: limits of the device by
-small kernels (`trial_limits.py`); stages and steps of the synthetic scene and of one like fox, in the shapes of a GPU;
-variants of the kernels, with their bits (`trial_variants.py`); hardware counters by Nsight Compute
-(`trial_counters.py`); gsplat and Faster-GS on the same Gaussians, imported or built from FOLDER's sources
-(`trial_peers.py`). What is not there, and what no longer fits into the minutes, is listed as left out. Results are
-written after each one: trial.json, and trial.txt with the table beside it.
+On that machine it needs neither a package index nor a compiler other than the driver's. Its parts, in order, are:
 
-The rest needs no GPU. --complete counts the variants' instructions with GPUs' compilers (`trial_counts.py`), adds
-predictions to the table, and a row to docs/gpus/calibration.json; in a checkout of the code that was measured.
+- limits of the device, by small kernels (`trial_limits.py`);
+- stages and steps of the synthetic scene and of a scene like fox, in the shapes of a GPU;
+- variants of the kernels, and comparisons of their bits (`trial_variants.py`);
+- hardware counters, by Nsight Compute (`trial_counters.py`);
+- gsplat and Faster-GS on the same Gaussians, imported or built from the sources in FOLDER (`trial_peers.py`).
+
+Parts that are not possible, or no longer fit into the minutes, are listed as left out. After each result, trial.json
+and trial.txt, which has the table, are written.
+
+The other calls need no GPU. --complete counts the variants' instructions with GPUs' compilers (`trial_counts.py`), and
+adds predictions to the table and a row to docs/gpus/calibration.json, in a checkout of the code that was measured.
 --write-twins writes kernels for the --twins of a later trial. --dry-run runs every part on a CPU with tiny scenes.
 """
 
@@ -74,15 +78,15 @@ TINY_SCENES: dict[str, Callable[[], Subject]] = {
 }
 SHAPES = (USUAL_SHAPE, "1x32", "1x128", "1x256")
 STEPS, MORE_STEPS = 15, 5
-"""Timed steps in the usual shape, and in others; of variants, STEPS."""
+"""Numbers of timed steps in the usual shape, also for variants, and in other shapes."""
 ENDS = {"limits": 0.15, "stages": 0.35, "variants": 0.75, "counters": 0.85, "peers": 1.0}
-"""Part of the minutes at whose end each part stops. A part that needs less leaves its time to the next ones."""
+"""Fraction of the minutes after which each part stops. Time that a part does not need is left to the next ones."""
 NO_PEAKS = Peaks(1.0, 1.0, 1.0, 1, 1)
-"""Instead of the limits that `bench` measures; the trial's own are finer."""
+"""Placeholders for the limits that `bench` would measure, because the trial measures more precise ones."""
 
 
 def digest_of_code() -> str:
-    """Digest of the kernels and the package, by which a trial knows the code that it measured."""
+    """Digest of the kernels and the package, which identifies the code that a trial has measured."""
     found = hashlib.sha256()
     for path in sorted([*kernel_root().rglob("*.[ch]*"), *(ROOT / "clsplat").rglob("*.py")]):
         found.update(path.read_bytes())
@@ -90,7 +94,7 @@ def digest_of_code() -> str:
 
 
 def told(command: Sequence[str]) -> str:
-    """The output of a command, or nothing if it is not there or fails."""
+    """The output of a command; "" if it is missing or fails."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=20, check=True)
     except (OSError, subprocess.SubprocessError):
@@ -99,7 +103,7 @@ def told(command: Sequence[str]) -> str:
 
 
 class Trial:
-    """The results so far, which are on the disk after each one, and the time that is left."""
+    """A running trial: its results, which are written to the disk after each one, and the time that is left."""
 
     def __init__(self, options: Namespace, device: Device, builds: Path) -> None:
         self.options, self.device = options, device
@@ -151,7 +155,7 @@ class Trial:
         self.say(what)
         try:
             work()
-        except Exception as error:  # noqa: BLE001  # a driver may raise anything, and the rest is still wanted
+        except Exception as error:  # noqa: BLE001  # a driver may raise any error, and the other parts must still run
             self.leave_out(what, trial_peers.last_line(str(error), type(error).__name__))
 
     def save(self) -> None:
@@ -235,7 +239,7 @@ def _measure_variant(
 
 
 def count_hardware(trial: Trial) -> None:
-    """Hardware counters of kernels, where Nsight Compute and the kernels for CUDA are at hand."""
+    """Hardware counters of kernels, if Nsight Compute and the kernels for CUDA are available."""
     ncu, twins = shutil.which("ncu"), trial.options.twins
     if why := trial_peers.no_cuda() or ("" if ncu else "ncu is not there"):
         trial.leave_out("hardware counters", why)
@@ -304,12 +308,12 @@ def chosen_device(options: Namespace) -> tuple[Device, list[str]]:
 def main(arguments: Sequence[str]) -> int:
     """Run the parts, and print the table."""
     parser = plain_parser(__doc__, prog="trial")
-    parser.add_argument("--minutes", type=float, default=6, help="after which what remains is left out")
-    parser.add_argument("--device", help="as for `clsplat devices`; the first GPU where not given")
+    parser.add_argument("--minutes", type=float, default=6, help="time limit, after which all else is left out")
+    parser.add_argument("--device", help="a device as listed by `clsplat devices`; by default the first GPU")
     parser.add_argument("--out", type=Path, default=Path("trial.json"), metavar="FILE.json")
     parser.add_argument("--peers", type=Path, metavar="FOLDER", help="sources of gsplat and Faster-GS")
     parser.add_argument("--twins", type=Path, metavar="FOLDER", help="kernels for CUDA")
-    parser.add_argument("--dry-run", action="store_true", help="every part with tiny scenes, on a CPU too")
+    parser.add_argument("--dry-run", action="store_true", help="run every part with tiny scenes, also on a CPU")
     parser.add_argument("--complete", type=Path, metavar="FILE.json", help="add counts and predictions to a trial")
     parser.add_argument("--write-twins", type=Path, metavar="FOLDER", help="write kernels for CUDA")
     parser.add_argument("--target", default="sm_90", help="GPU of these kernels")
@@ -323,7 +327,7 @@ def main(arguments: Sequence[str]) -> int:
     require(options.out.suffix == ".json", f"--out {options.out}: expected a name that ends in .json")
     for name, folder in (("peers", options.peers), ("twins", options.twins)):
         require(folder is None or folder.is_dir(), f"--{name} {folder}: expected a folder")
-    with patch.dict(os.environ, {TRUST_DRIVER_VARIABLE: "1"}):  # a test of the driver would take the trial's time
+    with patch.dict(os.environ, {TRUST_DRIVER_VARIABLE: "1"}):  # a self-test would take the trial's time
         record = run(options)
     print("\n".join(table(record)))
     return 0

@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Hardware counters of a step's kernels by NVIDIA's Nsight Compute, for trial.py.
+"""Read hardware counters of a step's kernels with NVIDIA's Nsight Compute (ncu), for trial.py.
 
     trial_counters.py TWINS DUMPS      launches the kernels in a process that ncu observes
 
-ncu sees no OpenCL. So a kernel's twin runs in CUDA: PTX that clang makes of the same text (`write_twins`, beforehand,
-on a machine with clang), on the arguments of a launch of the step. That is the code that `gpu_static.py` counts, not
-that of NVIDIA's own OpenCL. It needs CuPy, and has not run on a GPU yet.
+ncu does not support OpenCL. So a kernel's twin runs in CUDA, with the arguments of a launch of the step: PTX that clang
+compiles from the same text (`write_twins`, run beforehand on a machine with clang). That is the code in which
+`gpu_static.py` counts instructions, not the code of NVIDIA's OpenCL compiler. This tool needs CuPy, and has not run on
+a GPU yet.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from typing import Any
 import numpy as np
 
 TWINS = ("blend", "blend_grad", "loss_ssim", "loss_grad")
-"""Kernels whose arguments are numbers and arrays in global memory, which CUDA takes as they are."""
+"""Kernels that have only numbers and arrays in global memory as arguments, so that CUDA can launch them."""
 METRICS = {
     "smsp__issue_active.avg.pct_of_peak_sustained_active": "issue slots used, %",
     "sm__warps_active.avg.pct_of_peak_sustained_active": "warps at a time, %",
@@ -36,7 +37,7 @@ METRICS = {
     "dram__bytes.sum": "bytes of memory",
     "gpu__time_duration.sum": "time",
 }
-"""ncu's metrics, in words."""
+"""Descriptions of the metrics, by ncu's names."""
 
 
 def measure(subject: Any, device: Any, twins: Path, seconds: float) -> list[dict[str, Any]]:
@@ -87,7 +88,7 @@ def dump(subject: Any, device: Any, kernels: Sequence[str], folder: Path) -> Non
 
 
 def counters_of(text: str) -> list[dict[str, Any]]:
-    """Rows of ncu's CSV: a kernel, and its counters in words with their units."""
+    """Rows from ncu's CSV: a kernel, and its counters with units, by description."""
     lines = [line for line in text.splitlines() if line.startswith('"')]
     header, units, *rows = csv.reader(lines)
     names = {place: METRICS[name] for place, name in enumerate(header) if name in METRICS}
@@ -119,7 +120,8 @@ def write_twins(folder: Path, target: str) -> list[str]:
 
 
 def arguments_of(path: Path) -> tuple[Mapping[str, Any], Iterator[np.ndarray]]:
-    """The launch that `dump` has written, and its arguments in order: bytes of arrays, and numbers without axes."""
+    """The launch that `dump` has written, and its arguments in order: arrays of bytes, and numbers as arrays without
+    axes."""
     loaded = np.load(path)
     launch = json.loads(str(loaded["launch"]))
     return launch, (loaded[name] for name in launch["order"])

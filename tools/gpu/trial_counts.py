@@ -23,7 +23,8 @@ from clsplat.files.atomic import atomic_write
 
 @contextmanager
 def _text_of(variant: Variant) -> Iterator[None]:
-    """Within the block, compilers get the variant's text. Kernels are compiled anew before and after."""
+    """Let compilers use the variant's kernel text within the block. Clears the cache of compiled kernels before and
+    after it."""
     if not variant.text:
         yield
         return
@@ -65,7 +66,7 @@ def count_variants(record: dict[str, Any]) -> None:
             continue
         try:
             works_of_frames = works_of_variant(variant, gpu.target, frames)
-        except UnknownLoopError as error:  # the gradient by Gaussian is counted for a pair alone
+        except UnknownLoopError as error:  # the rules of blend_grad with a Gaussian per item are per pair
             gpu_static.note(f"{variant.title}: not predicted: {error}")
             continue
         found = {frame["name"]: works for frame, works in zip(frames, works_of_frames, strict=True)}

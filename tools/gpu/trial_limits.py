@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure the limits of a device one by one with small kernels: memory, groups, launches, latencies, atomics.
 
-Each of MEASURED returns figures by name, as in the rows of docs/gpus/calibration.json, which the model's constants come
-from. Times are the device's own, from events, except those of launches.
+Each function of MEASURED returns figures by name, as in the rows of docs/gpus/calibration.json, from which the model's
+constants follow. Times are the device's own, from events, except for launches.
 """
 
 from __future__ import annotations
@@ -25,19 +25,26 @@ from clsplat.device.drivers.capabilities import capabilities_of
 
 SOURCE = Path(__file__).with_suffix(".cl")
 REPEATS = 7
-"""Timed runs of each kernel, of which the median counts."""
+"""Number of timed runs of each kernel, whose median is used."""
 LINE = 128
-"""Bytes between two elements of the pointer chase: one in each cache line."""
+"""Number of bytes between two elements of the pointer chase, so that each cache line has one."""
 ABREAST = 8
-"""Multiply-adds of an item's step."""
+"""Number of independent multiply-adds in a step of an item."""
 RECIPROCALS = 1 << 23
-"""Floats in [1, 2)."""
+"""Number of floats in [1, 2)."""
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """Amounts of work. copied: bytes. groups: of no work. launches: of no work. steps: of loops that wait. chased: KiB
-    of the pointer chases. counted: atomic increments of global counters. items: of the multiply-adds."""
+    """Amounts of work.
+
+    copied: number of copied bytes.
+    groups, launches: number of empty groups, and of empty launches.
+    steps: number of steps in loops that measure a latency.
+    chased: sizes of the pointer chases in KiB.
+    counted: number of atomic increments of global counters.
+    items: number of work-items for multiply-adds.
+    """
 
     copied: int
     groups: int
@@ -50,7 +57,7 @@ class Sizes:
 
 FULL = Sizes(1 << 28, 1 << 20, 1000, 20_000, (64, 4096, 262_144), 3_400_000, 1 << 19)
 TINY = Sizes(1 << 20, 1 << 10, 50, 200, (64, 256), 10_000, 1 << 8)
-"""For a dry run."""
+"""Amounts for a dry run."""
 
 
 class Limits:
@@ -69,7 +76,7 @@ class Limits:
         return cl.Program(self.context, SOURCE.read_text("utf-8")).build(options=[f"-DWIDE={wide}", *exact])
 
     def kernel(self, name: str, *arguments: Any, wide: int = 1) -> cl.Kernel:
-        """A kernel with its arguments, which live until `free`: a kernel does not keep its buffers."""
+        """A kernel with its arguments. They are kept until `free`, because a kernel does not keep its buffers alive."""
         kernel = cl.Kernel(self._program(wide), name)
         kernel.set_args(*arguments)
         self._kept += arguments
@@ -102,12 +109,12 @@ class Limits:
 
     @property
     def group_sizes(self) -> Iterator[int]:
-        """Of 64, 256 and 1024, those that the device has."""
+        """The group sizes of 64, 256 and 1024 that the device supports."""
         return (items for items in (64, 256, 1024) if items <= self.cl_device.max_work_group_size)
 
 
 def clocks(on: Limits) -> dict[str, float]:
-    """Figures of the device by its driver."""
+    """Figures of the device that its driver reports."""
     device = on.cl_device
     return {
         "units": device.max_compute_units,
@@ -118,7 +125,7 @@ def clocks(on: Limits) -> dict[str, float]:
 
 
 def copies(on: Limits) -> dict[str, float]:
-    """GB/s read and written."""
+    """Bandwidth of copies in GB/s, read and written bytes together."""
     nbytes = on.sizes.copied
     source, copy = on.buffer(nbytes), on.buffer(nbytes)
     found = {}
@@ -131,19 +138,19 @@ def copies(on: Limits) -> dict[str, float]:
 
 
 def groups(on: Limits) -> dict[str, float]:
-    """10^9 empty groups a second."""
+    """Number of empty groups per second, in 10^9."""
     kernel, count = on.kernel("nothing", on.buffer(4)), on.sizes.groups
     sizes = (items for items in (32, 64, 128, 256) if items <= on.cl_device.max_work_group_size)
     return {f"groups G/s, {items}": count / on.ns(kernel, count * items, items) for items in sizes}
 
 
 def loader() -> ctypes.CDLL:
-    """OpenCL's loader as pyopencl has loaded it, for calls without an event."""
-    return ctypes.CDLL(importlib.import_module("pyopencl._cl").__file__)  # symbols of what it depends on are found too
+    """OpenCL's loader, by way of pyopencl's library, for calls without an event."""
+    return ctypes.CDLL(importlib.import_module("pyopencl._cl").__file__)  # also has the symbols of its dependencies
 
 
 def launches(on: Limits) -> dict[str, float]:
-    """Microseconds of an empty launch: the host's alone, and until the device has done all."""
+    """Microseconds per empty launch, on the host alone (`host`), and until the device has finished (`wall`)."""
     kernel, count = on.kernel("nothing", on.buffer(4)), on.sizes.launches
     plain = cl.CommandQueue(on.context, on.cl_device)
     enqueue, size = loader().clEnqueueNDRangeKernel, (ctypes.c_size_t * 1)(64)
@@ -161,7 +168,7 @@ def launches(on: Limits) -> dict[str, float]:
     }
     found = {}
     for name, (queue, launch) in ways.items():
-        for _ in range(2):  # the first round is to warm up
+        for _ in range(2):  # the first round is a warm-up
             queue.finish()
             start = time.perf_counter()
             for _ in range(count):
@@ -174,7 +181,7 @@ def launches(on: Limits) -> dict[str, float]:
 
 
 def latencies(on: Limits) -> dict[str, float]:
-    """Nanoseconds of a load that waits for the one before, by the memory that the loads go over."""
+    """Nanoseconds of a load that waits for the load before it, by the size of the memory that is read."""
     steps, found = on.sizes.steps, {}
     for kib in on.sizes.chased:
         lines = kib * 1024 // LINE
@@ -187,32 +194,36 @@ def latencies(on: Limits) -> dict[str, float]:
 
 
 def barriers(on: Limits) -> dict[str, float]:
-    """Nanoseconds of a barrier, in one group."""
+    """Nanoseconds of a barrier in a single group, by group size."""
     steps = on.sizes.steps
     kernel = on.kernel("barriers", np.uint32(steps), on.buffer(4))
     return {f"barrier ns, {items}": on.ns(kernel, items, items) / steps for items in on.group_sizes}
 
 
 def atomics(on: Limits) -> dict[str, float]:
-    """Atomic increments: nanoseconds of a group's in local memory, milliseconds of all in global memory."""
+    """Times of atomic increments: nanoseconds of a group's in local memory, milliseconds of all in global memory."""
     steps, counted = on.sizes.steps, on.sizes.counted // 64 * 64
     kernel = on.kernel("local_atomics", np.uint32(steps), on.buffer(4))
     found = {"local atomic ns a round of 64": on.ns(kernel, 64, 64) / steps}
-    for many in (6700, 1450):  # the tiles of the synthetic scene, and of fox
+    for many in (6700, 1450):  # numbers of tiles of the synthetic scene and of fox
         kernel = on.kernel("global_atomics", np.uint32(many), on.buffer(4 * many))
         found[f"{counted / 1e6:.2g} M atomic_inc on {many}, ms"] = 1e-6 * on.ns(kernel, counted, 64)
     return found
 
 
 def multiply_adds(on: Limits) -> dict[str, float]:
-    """10^12 fused multiply-adds a second."""
+    """Number of fused multiply-adds per second, in 10^12."""
     steps, items = on.sizes.steps // 10, on.sizes.items
     kernel = on.kernel("multiply_adds", np.uint32(steps), on.buffer(4 * items))
     return {"Tfma/s": 1e-3 * ABREAST * steps * items / on.ns(kernel, items, 64)}
 
 
 def reciprocals(on: Limits) -> dict[str, float]:
-    """Of all mantissas: native_recip's wrong ones and its most ulps, and those wrong after two of Newton's steps."""
+    """Accuracy of native_recip over all mantissas.
+
+    Returns the number of wrong results, the largest error in ulp, and the number of results that are still wrong after
+    two of Newton's steps.
+    """
     counters = on.buffer(12)
     kernel = on.kernel("reciprocals", counters)
     cl.enqueue_nd_range_kernel(on.queue, kernel, (RECIPROCALS,), (64,))

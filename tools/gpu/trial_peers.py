@@ -26,19 +26,19 @@ from typing import Any
 import numpy as np
 
 PEERS = {"gsplat": "gsplat", "Faster-GS": "FasterGSFusedCudaBackend", "fused-ssim": "fused_ssim"}
-"""Packages by program; of the carried sources' folders too, which may have the program's or the package's name."""
+"""Names of packages and source folders, by program. A folder may have the program's or the package's name."""
 TIMED = ("gsplat", "Faster-GS")
 DEVICE = "cuda"
 WARM_UP = 5
 JOBS = 8
-"""Compilers at a time, so that the host keeps cores for its own measurements."""
+"""Number of compilers that run at a time, so that cores are left for the host's part of the measurements."""
 WEIGHT = 0.2
-"""Of D-SSIM in the loss, as in clsplat's."""
+"""Weight of D-SSIM in the loss, as in clsplat."""
 Step = Callable[[], object]
 
 
 def last_line(text: str, otherwise: str) -> str:
-    """The last line that says something."""
+    """The last line of a text that is not blank; `otherwise` if there is none."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     return lines[-1] if lines else otherwise
 
@@ -54,7 +54,7 @@ def no_cuda() -> str:
 
 
 class Builds:
-    """Peers' sources under build in the background. folder: has a folder of sources for each."""
+    """Builds of peers' sources in the background. folder: contains a folder of sources for each peer."""
 
     def __init__(self, folder: Path | None, into: Path) -> None:
         self.into, self.failed = into, dict[str, str]()
@@ -89,7 +89,7 @@ class Builds:
 
 
 def save(subject: Any, photograph: np.ndarray, path: Path) -> None:
-    """Write a subject of `clsplat.bench.workload`, and the picture to compare with, for the child."""
+    """Write a subject of `clsplat.bench.workload`, and the photograph for the loss, for the child process."""
     model, camera = subject.gaussians, subject.camera
     arrays = {name: getattr(model, name) for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh")}
     view = np.eye(4)
@@ -99,7 +99,7 @@ def save(subject: Any, photograph: np.ndarray, path: Path) -> None:
 
 
 def measure(peer: str, subject: Path, repeat: int, path: Path, seconds: float) -> dict[str, Any] | str:
-    """Times of a peer on a subject, in a child process; or the reason why there are none. path: of built packages."""
+    """Times of a peer on a subject, in a child process, or the reason why there are none. path: built packages."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (str(path), os.environ.get("PYTHONPATH"))))}
     command = [sys.executable, str(Path(__file__)), peer, str(subject), str(repeat)]
     try:
@@ -113,7 +113,7 @@ def measure(peer: str, subject: Path, repeat: int, path: Path, seconds: float) -
 
 
 def steps_of(peer: str, data: Mapping[str, np.ndarray], torch: Any) -> tuple[Step, Step, str]:
-    """A peer's frame, its training step, and the loss in words."""
+    """Functions for a peer's frame and training step, and a description of its loss."""
     there = {name: torch.tensor(data[name], dtype=torch.float32, device=DEVICE) for name in data}
     photograph = there["photograph"].permute(2, 0, 1)[None].contiguous()
     try:
@@ -135,7 +135,7 @@ def steps_of(peer: str, data: Mapping[str, np.ndarray], torch: Any) -> tuple[Ste
 def gsplat_steps(
     there: Mapping[str, Any], lens: np.ndarray, loss: Callable[[Any], Any], torch: Any
 ) -> tuple[Step, Step]:
-    """gsplat's frame and step."""
+    """Functions for gsplat's frame and training step."""
     from gsplat import rasterization
 
     names = ("means", "quaternions", "log_scales", "opacity_logits")
@@ -167,7 +167,7 @@ def gsplat_steps(
 def faster_gs_steps(
     there: Mapping[str, Any], lens: np.ndarray, loss: Callable[[Any], Any], torch: Any
 ) -> tuple[Step, Step]:
-    """Faster-GS's frame and step. Its backward pass takes Adam's step."""
+    """Functions for Faster-GS's frame and training step. Its backward pass takes Adam's step."""
     from FasterGSFusedCudaBackend.torch_bindings.rasterization import RasterizerSettings, diff_rasterize
 
     model = {

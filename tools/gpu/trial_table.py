@@ -12,8 +12,11 @@ HEADER = ("kernel", "variant", "counted, M", "predicted, ms", "measured, ms", "r
 
 
 def table(record: Mapping[str, Any]) -> list[str]:
-    """The results of a trial in lines: limits, steps, kernels by variant, counters, peers, and what was left out.
-    counted: million instructions of warps, in code that clang and ptxas make. ratio: predicted to measured."""
+    """Lines with the results of a trial: limits, steps, kernels by variant, counters, peers, and parts left out.
+
+    The column counted has millions of warp instructions in the code that clang and ptxas make. The column ratio has
+    predicted by measured time.
+    """
     commit = record["commit"] or "unknown"
     lines = [f"{record['device']}, {record['driver']}, {record['date']}, commit {commit}"]
     lines += record.get("nvidia_smi", [])
@@ -44,12 +47,12 @@ def table(record: Mapping[str, Any]) -> list[str]:
 
 
 def _part(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    """A table of the rows, if there is more than the header."""
+    """Lines of a table of the rows; none if there is only the header."""
     return ["", *aligned(rows, left=range(len(rows[0])))] if len(rows) > 1 else []
 
 
 def _row(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """A kernel's line. Before a trial is completed it has no prediction."""
+    """A kernel's row. It has no prediction until the trial is completed."""
     predicted = row.get("predicted_ms")
     counted = "" if "counted" not in row else f"{row['counted']:.1f}"
     ratio = "" if predicted is None or not row["ms"] else f"{predicted / row['ms']:.2f}"

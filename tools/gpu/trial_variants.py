@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Variants of a step's kernels: other shapes, group sizes, register limits and windows, each timed and compared in its
-bits with the usual form.
+"""Variants of a step's kernels: other shapes, group sizes, register limits and constants.
+
+Each variant is timed, and the bits of its results are compared with those of the usual form.
 
 A variant is a row of VARIANTS. All of a scene's variants run on one model in memory, as `VariedDevice` changes its
 builds while it is open.
@@ -34,11 +35,11 @@ from clsplat.layouts.columns import LOSS_GROUP_ROWS, SPLAT
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
 
 USUAL_SHAPE = "1x64"
-"""Shape of which the variants are changes: the default of GPUs."""
+"""Shape that variants change: the default of GPUs."""
 WARM_UP = 2
-"""Steps before those that are timed."""
+"""Number of steps before the timed ones."""
 COPIES = ("write", "read", "fill")
-"""Names that the recorder gives to what is no kernel."""
+"""Names in the recorder's results that are not kernels."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +47,10 @@ class Variant:
     """A change of a step's kernels.
 
     of: the kernels or stages on which it is measured; empty for all.
-    shape: of all kernels.
-    registers: limit per work-item by kernel file, 0 for none.
-    text: WORDS => WORDS by kernel file, as CLSPLAT_BREAK_KERNEL takes them; at most one.
-    values: values of the package's constants, by their modules' names.
+    shape: shape of all kernels.
+    registers: limit of registers per work-item, by kernel file; 0 for none.
+    text: a change of a kernel file's text, WORDS => WORDS as in CLSPLAT_BREAK_KERNEL; at most one.
+    values: values of the package's constants, by MODULE.NAME.
     """
 
     name: str
@@ -116,9 +117,9 @@ VARIANTS = (
         for items in (32, 128)
     ),
 )
-"""Changes of kernels in the order in which they are measured. A new form of a kernel is a row."""
+"""All variants in the order in which they are measured. To measure a new form of a kernel, add a row."""
 DRY = ("1x64", "1x64g", "blocks of 5 rows", "2048 keys a group", "groups of 32")
-"""Variants of a dry run: one for each way to change kernels that a CPU's driver knows."""
+"""Variants of a dry run: one for each kind of change that a CPU's driver supports."""
 OUTPUTS = {
     "project": "project",
     "duplicate": "lists",
@@ -129,12 +130,14 @@ OUTPUTS = {
     "blend_grad": "blend_grad",
     "project_grad": "project_step",
 }
-"""By stage, the arrays of `TrialScene.outputs` that its kernels make."""
+"""Names of the arrays of `TrialScene.outputs` that a stage's kernels make, by stage."""
 
 
 class VariedDevice(Device):
-    """A device whose shape and builds follow `variant`, which may change while it is open; and so do those of its
-    copies (`with_switches`)."""
+    """A device whose shape and builds are those of a variant, which may change while the device is open.
+
+    Its copies (`with_switches`) change too.
+    """
 
     def __init__(self, device: Any, shape: Shape) -> None:
         self._now: dict[str, Any] = {"shape": shape, "variant": USUAL}  # shared with copies
@@ -166,7 +169,7 @@ class VariedDevice(Device):
                 self._now.update(before)
 
     def kernels(self, stem: str, defines: Mapping[str, object] = {}, registers: int = 0) -> Kernels:
-        """The variant's kernels. Its name is a key of the cache; the kernels' text does not name it."""
+        """The variant's kernels. The variant's name is part of the cache's key, but the kernels do not use it."""
         variant: Variant = self._now["variant"]
         return super().kernels(stem, {**defines, "TRIAL_VARIANT": variant.name}, variant.registers.get(stem, registers))
 

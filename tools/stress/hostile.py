@@ -46,8 +46,14 @@ from clsplat.training import repro_bundle
 
 @dataclass(frozen=True)
 class Reader:
-    """make(folder) writes valid files; read(folder) reads them as the product does; files: those that are spoilt;
-    kinds: how, of SPOILERS; weight: its share of the cases."""
+    """A reader of files, with valid files for it and the ways to spoil them.
+
+    make(folder): writes valid files.
+    read(folder): reads them as clsplat does.
+    files: the files that are spoilt.
+    kinds: the ways to spoil them, keys of SPOILERS or "places".
+    weight: the reader's share of the cases, relative to other readers.
+    """
 
     name: str
     make: Callable[[Path], None]
@@ -61,7 +67,7 @@ class Reader:
 
 
 def make_ply(folder: Path, form: str = "binary_little_endian") -> None:
-    """model.ply, SH degree 1, 7 Gaussians."""
+    """Write model.ply of 7 Gaussians, with SH of degree 1."""
     path = folder / "model.ply"
     ply.write(path, random_gaussians(7, 1))
     head, mark, body = path.read_bytes().partition(b"end_header\n")
@@ -75,7 +81,7 @@ def make_ply(folder: Path, form: str = "binary_little_endian") -> None:
 
 
 def make_cloud(folder: Path, form: str) -> None:
-    """cloud.ply, points with colours."""
+    """Write cloud.ply, points with colours."""
     rows = [(0.1 * i, -0.2 * i, 1.0, 10 * i, 255 - i, 7) for i in range(9)]
     kinds = [("float", name) for name in "xyz"] + [("uchar", name) for name in ("red", "green", "blue")]
     lines = ["ply", f"format {form} 1.0", "element vertex 9"] + [f"property {kind} {name}" for kind, name in kinds]
@@ -87,12 +93,12 @@ def make_cloud(folder: Path, form: str) -> None:
 
 
 def make_model(folder: Path, name: str, **options: Any) -> None:
-    """A model file of another format; options of its writer."""
+    """Write a model file in the format of its name. options: arguments of the format's writer."""
     formats.save(folder / name, random_gaussians(7, 1), **options)
 
 
 def make_zip(folder: Path, name: str) -> None:
-    """model.zip with a model of this name in a folder, compressed as downloads are."""
+    """Write model.zip, which has a model of this name in a folder, compressed like a download."""
     with zipfile.ZipFile(folder / "model.zip", "w", zipfile.ZIP_DEFLATED) as archive, TemporaryDirectory() as made:
         make_model(Path(made), name)
         for file in sorted(Path(made).iterdir()):
@@ -101,7 +107,7 @@ def make_zip(folder: Path, name: str) -> None:
 
 
 def make_ksplat(folder: Path) -> None:
-    """model.ksplat of level 1: one section, a full bucket of 4 and two others, SH of degree 1."""
+    """Write model.ksplat of level 1: one section, a full bucket of 4 and two partial ones, SH of degree 1."""
     (folder / "model.ksplat").write_bytes(ksplat(random_gaussians(7, 1), 1, (7,), bucket=4)[0])
 
 
@@ -114,7 +120,7 @@ def _picture(path: Path, width: int = 12, height: int = 9, channels: int = 3) ->
 
 
 def make_colmap_text(folder: Path) -> None:
-    """A COLMAP model as text beside its pictures."""
+    """Write a COLMAP model as text, with its pictures."""
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True)
     cameras = "# comment\n1 PINHOLE 12 9 11.5 11 6 4.5\n2 OPENCV 12 9 11.5 11 6 4.5 0.01 -0.002 0.001 0.0005\n"
@@ -132,7 +138,7 @@ def make_colmap_text(folder: Path) -> None:
 
 
 def make_colmap_binary(folder: Path) -> None:
-    """The same, binary."""
+    """Write the COLMAP model of `make_colmap_text` in binary files, with its pictures."""
     import pycolmap
 
     make_colmap_text(folder)
@@ -150,7 +156,7 @@ def _frames(names: tuple[str, ...]) -> list[dict[str, Any]]:
 
 
 def make_transforms(folder: Path) -> None:
-    """A transforms.json of nerfstudio's kind, with points and a split, and keys of instant-ngp."""
+    """Write a transforms.json like nerfstudio's, with points, a split and keys of instant-ngp."""
     for name in PICTURES:
         _picture(folder / "images" / name)
     make_cloud(folder, "ascii")
@@ -162,7 +168,7 @@ def make_transforms(folder: Path) -> None:
 
 
 def make_blender(folder: Path) -> None:
-    """transforms_train.json and transforms_test.json."""
+    """Write Blender's transforms_train.json and transforms_test.json, with their pictures."""
     for split, names in (("train", ("a", "b")), ("test", ("c",))):
         for name in names:
             _picture(folder / split / f"{name}.png", channels=4)
@@ -171,7 +177,7 @@ def make_blender(folder: Path) -> None:
 
 
 def make_camera_keys(folder: Path) -> None:
-    """A clsplat camera file of three keys, with all that a key can have."""
+    """Write a clsplat camera file of three keys, which have many of the properties of a key."""
     turn = [0.70710678, -0.70710678, 0, 0]
     keys: list[dict[str, Any]] = [
         {"frame": 1001, "position": [0, -4, 1], "world_from_cam": turn, "fov_x": 40},
@@ -192,7 +198,7 @@ def make_camera_keys(folder: Path) -> None:
 
 
 def make_camera_path(folder: Path) -> None:
-    """nerfstudio's camera_path.json, four frames."""
+    """Write nerfstudio's camera_path.json with four frames."""
     poses = [[1, 0, 0, 0.1 * i, 0, 1, 0, 0.2, 0, 0, 1, 2.0 + i, 0, 0, 0, 1] for i in range(4)]
     frames = [{"camera_to_world": pose, "fov": 50, "aspect": 1.7} for pose in poses]
     document: dict[str, Any] = {"camera_type": "perspective", "render_width": 32, "render_height": 18, "fps": 24}
@@ -201,7 +207,7 @@ def make_camera_path(folder: Path) -> None:
 
 
 def make_cameras_json(folder: Path) -> None:
-    """The cameras that the 3DGS authors' code writes of a training, two of them."""
+    """Write cameras.json with two cameras, as the 3DGS authors' code writes it in a training."""
     rows = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
     lens = {"width": 24, "height": 18, "fy": 20.5, "fx": 20.5}
     cameras = [
@@ -212,24 +218,24 @@ def make_cameras_json(folder: Path) -> None:
 
 
 UNREAD = ("pcx",)
-"""Of `other_pictures.KINDS` what OpenImageIO does not open."""
+"""Kinds of `other_pictures.KINDS` that OpenImageIO does not open."""
 FORMATS = ("png", "jpg", "exr", "tif", "bmp", "hdr", "tga", "ppm", "webp")
 
 
 def make_image(folder: Path, extension: str) -> None:
-    """One picture, with an EXIF orientation where the format has it."""
+    """Write a picture, with an EXIF orientation if the format supports it."""
     pixels = np.random.default_rng(2).random((19, 23, 3)).astype(np.float32)
     kind = "float" if extension in ("exr", "hdr") else "uint8"
     write_pixels(folder / f"picture.{extension}", pixels, kind, {"Orientation": 6})
 
 
 def make_other_image(folder: Path, kind: str) -> None:
-    """A picture of a kind that its name does not say."""
+    """Write picture.png, which is a picture of another kind."""
     (folder / "picture.png").write_bytes(other_picture(kind))
 
 
 def make_run(folder: Path) -> None:
-    """A run with metrics, an evaluation, two checkpoints and no model."""
+    """Write a run with metrics, an evaluation, two checkpoints, and a model.ply of only one line."""
     run = runs_run.Run.create(folder / "run", TrainConfig(iterations=10))
     for step in (1, 2):
         run.append_metrics({"step": step, "loss": 0.1, "seconds": 0.5 * step})
@@ -241,7 +247,7 @@ def make_run(folder: Path) -> None:
 
 
 def make_bundle(folder: Path) -> None:
-    """Write the bundle, of five Gaussians, of a training that gives up."""
+    """Write the bundle of five Gaussians that a training leaves when it gives up."""
     shapes = group_shapes(5, 4)
     arrays: dict[str, Any] = {
         f"{kind}/{g}": np.ones(shapes[g], np.float32) for kind in ("parameters", "first", "second") for g in shapes
@@ -259,14 +265,14 @@ def make_bundle(folder: Path) -> None:
 
 
 def make_photos(folder: Path) -> None:
-    """Photos for structure from motion."""
+    """Write photos for structure from motion."""
     for name in ("a.png", "b.png"):
         _picture(folder / "photos" / name)
     make_image(folder / "photos", "jpg")
 
 
 def make_record(folder: Path) -> None:
-    """A result of structure from motion, as far as it is looked at before it is used again."""
+    """Write a result of structure from motion: the files that are checked before it is used again."""
     make_photos(folder)
     make_colmap_binary(folder)
     (folder / "sfm.json").write_text(json.dumps({"fingerprint": "0", "photos": 3, "unregistered": ["c.png"]}))
@@ -282,7 +288,7 @@ def read_model(path: Path) -> None:
 
 
 def read_scene(folder: Path) -> None:
-    """Everything of a scene that is looked at before training: cameras, points, every picture."""
+    """Read all parts of a scene that are read before training: cameras, points and pictures."""
     scene = load_scene(folder)
     if bad := [warning for warning in scene.warnings if not warning.isprintable()]:
         raise AssertionError(f"a warning that is not a plain line: {bad[0][:300]!r}")
@@ -294,7 +300,7 @@ def read_scene(folder: Path) -> None:
 
 
 def read_cameras(folder: Path, name: str) -> None:
-    """The frames that `clsplat render --cameras` would make of a file, and a path around them."""
+    """Read a file's frames like `clsplat render --cameras`, and make a path around them."""
     path = folder / name
     shot = choose_shot(path, size=(32, 18))
     if all(camera.projection == "perspective" for camera in shot.cameras):
@@ -308,13 +314,16 @@ def read_cameras(folder: Path, name: str) -> None:
 
 
 def inside(folder: Path, path: Path) -> None:
-    """Fails where a scene's picture is not below its folder, by its name: links were made by the folder's owner."""
+    """Raise AssertionError if the path of a scene's picture leads out of its folder.
+
+    Links are not followed, since the folder's owner has made them.
+    """
     if not Path(os.path.normpath(path)).is_relative_to(os.path.normpath(folder)):
         raise AssertionError(f"reads {path}, outside {folder}")
 
 
 def read_picture(path: Path) -> None:
-    """Size and pixels."""
+    """Read a picture's size and pixels."""
     image_size(path)
     image = read_image(path)
     if image.dtype != np.float32 or image.ndim != 3 or image.shape[2] not in (3, 4) or not np.isfinite(image).all():
@@ -322,7 +331,7 @@ def read_picture(path: Path) -> None:
 
 
 def read_run(folder: Path) -> None:
-    """Settings, metrics and evaluation."""
+    """Read settings, metrics and evaluation of a run."""
     run = runs_run.Run.open(folder / "run")
     run.config.check()
     run.read_metrics()
@@ -331,7 +340,7 @@ def read_run(folder: Path) -> None:
 
 
 def read_checkpoint(folder: Path) -> None:
-    """The checkpoint that training goes on from."""
+    """Read the checkpoint from which a training continues."""
     path = folder / "run"
     checkpoint = runs_run.Run(path, TrainConfig(), None, resuming=True).load_latest_checkpoint()
     if checkpoint is not None:
@@ -347,7 +356,7 @@ def read_photos(folder: Path) -> None:
 
 
 def read_record(folder: Path) -> None:
-    """Look if a result of structure from motion can be used again."""
+    """Check if a result of structure from motion can be used again."""
     reconstruct._is_finished(folder, folder / "photos", "0", overwrite=False)  # noqa: SLF001
 
 
@@ -376,7 +385,7 @@ def _one_file(
     kinds: tuple[str, ...],
     weight: float = 1.0,
 ) -> Reader:
-    """A reader that gets the path of a single file."""
+    """A reader that takes the path of a single file."""
     return Reader(name, make, lambda folder: read(folder / file), (file,), kinds, weight)
 
 
@@ -386,7 +395,7 @@ def _saved(name: str, kinds: tuple[str, ...]) -> Reader:
 
 
 def _with_others(name: str, file: str, *others: str) -> Reader:
-    """A reader of a document that clsplat writes with other files beside it."""
+    """A reader of a model's JSON document that clsplat writes together with other files, `others`."""
     one = _one_file(name, file, partial(make_model, name=file), read_model, DOCUMENT, 3)
     return replace(one, files=(file, *others))
 
@@ -455,7 +464,7 @@ READERS = {reader.name: reader for reader in _ALL}
 
 
 def spoil(reader: Reader, folder: Path, rng: random.Random) -> str:
-    """Spoil one or two of the reader's files in one to three ways; says how."""
+    """Spoil files of the reader one to three times, and return a description of it."""
     said = []
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         path = folder / rng.choice(reader.files)

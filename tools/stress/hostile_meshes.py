@@ -14,7 +14,7 @@ SIDES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (
 
 
 def make_obj(folder: Path) -> None:
-    """mesh.obj, a cube with normals, its faces counted from the first point and from the last."""
+    """Write mesh.obj, a cube with normals. Half of its faces count points from the first, the others from the last."""
     lines = ["# a cube", "mtllib none.mtl", "o cube", *(f"v {x} {y} {z}" for x, y, z in CORNERS), "vn 0 0 1"]
     lines += ["f " + " ".join(f"{corner + 1}//1" for corner in side) for side in SIDES[:3]]
     lines += ["f " + " ".join(str(corner - 8) for corner in side) for side in SIDES[3:]]
@@ -22,7 +22,7 @@ def make_obj(folder: Path) -> None:
 
 
 def make_usd_mesh(folder: Path, name: str) -> None:
-    """The same cube as a stage, moved by a transform with values at two times."""
+    """Write the cube of `make_obj` as a USD stage, moved by a transform with values at two times."""
     from pxr import Gf, Usd, UsdGeom
 
     stage = Usd.Stage.CreateNew(str(folder / name))
@@ -38,6 +38,6 @@ def make_usd_mesh(folder: Path, name: str) -> None:
 
 
 def read_volume(path: Path) -> None:
-    """Read a mesh as the volume of a matte, and ask which points are in it."""
+    """Read a mesh like the volume of a matte, and test which points are inside it."""
     mesh = read_mesh(path)
     mesh.holds(np.random.default_rng(4).uniform(-2, 2, (20, 3)))

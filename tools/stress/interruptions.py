@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Ends of every verb where a signal comes, a disk is full, a stream is closed, or another process is there.
+"""How every verb ends after a signal, on a full disk, with a closed stream, or next to another process.
 
     python tools/stress/interruptions.py [--verbs train,eval] [--events SIGINT,2>&-] [--markdown]
 
-Each verb really runs, as a process of its own, on a small scene that is made on the spot; --markdown prints the
-tables that docs/interruptions.md sums up. A full disk is a file system of its own where this user may mount one, else a
-limit of the size of files; a verb that writes none prints to /dev/full. Exit status 1 if a process ends with a
-traceback, by a signal or not at all. Set CLSPLAT_TRUST_DRIVER=1 to be quick.
+Each verb runs in a process of its own, on a small scene that is made beforehand. --markdown prints the tables that
+docs/interruptions.md summarises. A full disk is a small file system, if this user may mount one, or otherwise a limit
+of the size of files. A verb that writes no files prints to /dev/full. The exit status is 1 if a process ends with a
+traceback or by a signal, or does not end. CLSPLAT_TRUST_DRIVER=1 saves the time of self-tests.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ DEADLINE = 300.0
 """Seconds that a process may take to end."""
 MARKER = ".at-work"
 FULL = 48 << 10
-"""Bytes that a full disk still takes."""
+"""Number of bytes that still fit on a full disk."""
 TRAINING = (
     *("--sh-degree", "0", "--density.every", "0", "--warmup", ""),
     *("--checkpoint-every", "0", "--no-report"),
@@ -44,9 +44,13 @@ TRAINING = (
 
 @dataclass(frozen=True)
 class Verb:
-    """A call. words: of the command line, with {scene}, {photos}, {run}, {other}, {model} and {out}, the folder that it
-    may write to; writes: whether it writes files; ready: when it is at work: something is there below {out} (/NAME), a
-    module is imported, or an audit event of Python (!NAME) has come."""
+    """A call of a verb.
+
+    words: its command line, with {scene}, {photos}, {run}, {other}, {model} and {out}, the folder that it writes to.
+    ready: event that shows that it is at work. /PATTERN: a file exists below {out}. !NAME: Python has raised this audit
+        event. A name of a module: the module is imported.
+    writes: True if it writes files.
+    """
 
     name: str
     words: str
@@ -55,7 +59,7 @@ class Verb:
 
     @property
     def in_a_run(self) -> bool:
-        """True if it works with the finished run."""
+        """True if it works in a copy of the finished run."""
         return "{out}/run" in self.words and self.name != "train"
 
 
@@ -90,7 +94,7 @@ sys.addaudithook(hook)
 from clsplat.__main__ import main
 sys.exit(main())
 """
-"""The command line, which says in a file that it is at work."""
+"""Program that runs the command line, and creates a marker file when it is at work."""
 SIGNALS = {"SIGINT": 1, "SIGINT twice": 2, "SIGTERM": 1, "SIGHUP": 1}
 STREAMS = (">&-", "2>&-", "| head -c 0", "2>&1 | head -c 0")
 TITLES = {
@@ -110,7 +114,12 @@ EVENTS = tuple(TITLES)
 
 @dataclass
 class Outcome:
-    """status: of the process, None where it did not end; told: its last line; left: hidden files, which are new."""
+    """How a process has ended.
+
+    status: its exit status, None if it did not end.
+    told: the last line that it printed.
+    left: hidden files that it left behind.
+    """
 
     verb: str
     event: str
@@ -125,7 +134,7 @@ class Outcome:
 
 
 class Bench:
-    """A folder with what the verbs need."""
+    """A folder with the scenes, runs and models that the verbs need."""
 
     def __init__(self, folder: Path, verbs: Sequence[Verb]) -> None:
         self.folder = folder
@@ -140,14 +149,16 @@ class Bench:
             self.call(["train", self.names["scene"], "-o", self.names[name], "--iterations", str(SHORT), *TRAINING])
 
     def call(self, words: Sequence[str]) -> None:
-        """Run to the end, well."""
+        """Run the command line to its end. Raises SystemExit if it fails."""
         done = subprocess.run(command(words), capture_output=True, text=True, timeout=DEADLINE, check=False)
         if done.returncode:
             raise SystemExit(f"{' '.join(words)}: {done.stderr}")
 
     def words(self, verb: Verb, out: Path, *, ends: bool = False) -> list[str]:
-        """The call, with {out}, where the finished run lies for verbs that write into one. ends: a training does so
-        soon, in which it writes most."""
+        """Words of the call. For verbs that write into a run, copies the finished run into `out` first.
+
+        ends: True for a short training that ends by itself, and so also writes the files of its end.
+        """
         if verb.in_a_run:
             shutil.copytree(self.folder / "run", out / "run")
         words = verb.words.format(out=out, **self.names).split(" ")
@@ -155,15 +166,17 @@ class Bench:
 
 
 def command(words: Sequence[str], verb: Verb | None = None, marker: Path | None = None) -> list[str]:
-    """Command line of a process; verb and marker: one that says there when it is at work."""
+    """Command line of a process. With `verb` and `marker`, the process creates the file `marker` when it is at work."""
     if verb is None or verb.ready.startswith("/"):
         return [sys.executable, "-m", "clsplat", *words]
     return [sys.executable, "-c", WATCHED, str(marker), verb.ready, *words]
 
 
 def keep_apart(folder: Path) -> None:
-    """Give children a cache of their own, as `tune` writes there what every later call goes by; what drivers have built
-    stays where it is."""
+    """Give child processes a cache of their own, because `tune` stores shapes in it that later calls would use.
+
+    The caches of built kernels stay where they are.
+    """
     before = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     os.environ.setdefault("POCL_CACHE_DIR", str(before / "pocl" / "kcache"))
     os.environ.setdefault("CLSPLAT_BINARIES", str(before / "clsplat" / "binaries"))
@@ -172,7 +185,7 @@ def keep_apart(folder: Path) -> None:
 
 @contextmanager
 def fresh(folder: Path) -> Iterator[Path]:
-    """A new folder below `folder`."""
+    """A new folder below `folder`, which is removed after the block."""
     out = Path(tempfile.mkdtemp(prefix="out-", dir=folder))
     try:
         yield out
@@ -182,7 +195,11 @@ def fresh(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def full_disk(folder: Path, before: int) -> Iterator[tuple[Path, Callable[[], None] | None]]:
-    """A folder on a disk with room for `before` bytes and FULL; or any, and what limits the files of a child."""
+    """A folder on a disk with room for `before` and FULL bytes.
+
+    If no disk can be mounted, it is an ordinary folder, with a function that limits the size of a child process's
+    files.
+    """
     with fresh(folder) as out:
         size = f"size={before + FULL + (64 << 10)}"
         mounted = subprocess.run(
@@ -204,7 +221,7 @@ def full_disk(folder: Path, before: int) -> Iterator[tuple[Path, Callable[[], No
 
 
 def result_of(verb: Verb, event: str, done: tuple[int | None, str], out: Path, names: dict[str, str]) -> Outcome:
-    """Outcome of a process that has ended: its status and its words."""
+    """Outcome of a process that has ended. done: its exit status and its output."""
     status, text = done
     lines = [line for line in text.splitlines() if line.strip()]
     told = lines[-1] if lines else ""
@@ -216,7 +233,7 @@ def result_of(verb: Verb, event: str, done: tuple[int | None, str], out: Path, n
 
 
 def wait(process: subprocess.Popen[str]) -> tuple[int | None, str]:
-    """Status and words; None where it does not end, and is killed."""
+    """Exit status and output of a process. The status is None if it did not end and was killed."""
     try:
         output, errors = process.communicate(timeout=DEADLINE)
     except subprocess.TimeoutExpired:
@@ -227,7 +244,7 @@ def wait(process: subprocess.Popen[str]) -> tuple[int | None, str]:
 
 
 def wait_until_at_work(verb: Verb, process: subprocess.Popen[str], out: Path) -> bool:
-    """True if it is; False where it has ended before."""
+    """True if the process is at work, False if it has ended before."""
     until = time.monotonic() + DEADLINE
     pattern = verb.ready[1:] if verb.ready.startswith("/") else MARKER
     while process.poll() is None and time.monotonic() < until:
@@ -238,22 +255,22 @@ def wait_until_at_work(verb: Verb, process: subprocess.Popen[str], out: Path) ->
 
 
 def start(verb: Verb, words: Sequence[str], out: Path, **options: object) -> subprocess.Popen[str]:
-    """A process, both of its streams read unless said otherwise."""
+    """Start a process. Its output and errors are read, unless `options` redirect them."""
     streams: dict[str, object] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
     line = command(words, verb, out / MARKER)
     return subprocess.Popen(line, text=True, encoding="utf-8", errors="replace", **streams)  # type: ignore[call-overload, no-any-return]
 
 
 def finish(verb: Verb, process: subprocess.Popen[str], out: Path) -> tuple[int | None, str]:
-    """Wait for the process; a viewer is ended by Ctrl-C, as it says."""
+    """Wait for the process. A viewer is ended by Ctrl-C."""
     if verb.name == "view" and wait_until_at_work(verb, process, out):
-        time.sleep(4.0)  # until its page is there
+        time.sleep(4.0)  # until its page is served
         process.send_signal(signal.SIGINT)
     return wait(process)
 
 
 def signalled(bench: Bench, verb: Verb, event: str) -> Outcome:
-    """A signal in the middle."""
+    """Outcome of the verb if a signal interrupts its work."""
     with fresh(bench.folder) as out:
         process = start(verb, bench.words(verb, out), out)
         if not wait_until_at_work(verb, process, out):
@@ -264,13 +281,13 @@ def signalled(bench: Bench, verb: Verb, event: str) -> Outcome:
             with suppress(ProcessLookupError):
                 process.send_signal(number)
         found = result_of(verb, event, wait(process), out, bench.names)
-    if found.status == -number:  # Python ends so by itself, where a Ctrl-C came while it was ending
+    if found.status == -number:  # Python itself ends like this if Ctrl-C comes during its shutdown
         found.status = 128 + number
     return found
 
 
 def on_a_full_disk(bench: Bench, verb: Verb) -> Outcome:
-    """Files, or standard output."""
+    """Outcome of the verb if its files, or its standard output if it writes none, are on a full disk."""
     if not verb.writes:
         with fresh(bench.folder) as out, open("/dev/full", "w") as full:
             process = start(verb, bench.words(verb, out), out, stdout=full)
@@ -278,7 +295,7 @@ def on_a_full_disk(bench: Bench, verb: Verb) -> Outcome:
     before = sum(path.stat().st_size + 4096 for path in (bench.folder / "run").rglob("*")) if verb.in_a_run else 0
     with full_disk(bench.folder, before) as (out, limit):
         words = bench.words(verb, out, ends=True)
-        left = FULL // 4 if verb.ready.startswith("/") else 0  # of those some find out in the middle of the work
+        left = FULL // 4 if verb.ready.startswith("/") else 0  # these verbs are to fail in the middle of their work
         if limit is None:
             with suppress(OSError), open(out / "filler", "wb", buffering=0) as filler:
                 filler.write(bytes(max(shutil.disk_usage(out).free - left, 0)))
@@ -286,7 +303,7 @@ def on_a_full_disk(bench: Bench, verb: Verb) -> Outcome:
 
 
 def with_a_stream(bench: Bench, verb: Verb, event: str) -> Outcome:
-    """One that is closed, or a pipe whose reader has gone, as by a shell."""
+    """Outcome of the verb with a closed stream, or a pipe whose reader has gone, as from a shell."""
     with fresh(bench.folder) as out:
         words = bench.words(verb, out, ends=True)
         said = out / "said"
@@ -306,7 +323,7 @@ def with_a_stream(bench: Bench, verb: Verb, event: str) -> Outcome:
 
 
 def beside_another(bench: Bench, verb: Verb) -> Outcome:
-    """A training in the run that the verb works with, or the same verb in the same folder."""
+    """Outcome of the verb next to another process: a training in its run, or the same verb in the same folder."""
     with fresh(bench.folder) as out:
         words = bench.words(verb, out)
         first, ready = words, verb
@@ -323,12 +340,12 @@ def beside_another(bench: Bench, verb: Verb) -> Outcome:
             other.wait()
         found = result_of(verb, "second process", done, out, bench.names)
         found.told = found.told.replace(f"process {other.pid}", "process 123")
-        found.left = []  # the other's
+        found.left = []  # these files are the other process's
         return found
 
 
 def outcome(bench: Bench, verb: Verb, event: str) -> Outcome:
-    """Make it happen."""
+    """Run the verb with this event, and return the outcome."""
     if event in SIGNALS:
         return signalled(bench, verb, event)
     if event == "full disk":
@@ -339,7 +356,7 @@ def outcome(bench: Bench, verb: Verb, event: str) -> Outcome:
 
 
 def tables(outcomes: Sequence[Outcome]) -> str:
-    """A table for each event, in Markdown."""
+    """Markdown text with a table of the outcomes for each event."""
     text = []
     for event in dict.fromkeys(each.event for each in outcomes):
         text += [f"### {TITLES[event]}", "", "| verb | exit status | last line | left behind |", "|---|---|---|---|"]
@@ -355,7 +372,7 @@ def tables(outcomes: Sequence[Outcome]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line above."""
+    """Run the verbs with the events. Returns the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--verbs", help="such as train,eval; all if not given")
     parser.add_argument("--events", help=f"some of {', '.join(EVENTS)}; all if not given")
@@ -369,7 +386,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parser.error(f"{unknown[0]}: expected some of {', '.join(of)}")
     verbs = [known[name] for name in names]
     for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
-        signal.signal(number, handler)  # a shell's `&` and nohup have them ignored, and children would go on so
+        signal.signal(number, handler)  # a shell's `&` and nohup ignore them, and child processes would inherit this
     outcomes = []
     with tempfile.TemporaryDirectory(prefix="clsplat-interruptions-") as folder:
         keep_apart(Path(folder))

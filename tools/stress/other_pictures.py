@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of many kinds, made by Pillow, that may stand under the name of another: downloads and renamed files."""
+"""Pictures of many kinds, made by Pillow. They may have another kind's file name, like downloads and renamed files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ HEIGHT, WIDTH = 19, 23
 
 
 def colours() -> Image.Image:
-    """Three ramps, 19 x 23."""
+    """A picture with a ramp in each of its three channels, 19 rows of 23 pixels."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     return Image.fromarray(np.stack([columns * 11, rows * 13, 255 - columns * 5], axis=2).astype(np.uint8))
 
@@ -26,7 +26,7 @@ def _cut_out() -> Image.Image:
 
 
 def _more() -> dict[str, Any]:
-    """A second frame, that is another picture."""
+    """Pillow's settings for a file with a second frame that shows another picture."""
     return {"save_all": True, "append_images": [colours().rotate(180)]}
 
 
@@ -63,11 +63,11 @@ KINDS: dict[str, tuple[str, Callable[[], Image.Image], Callable[[], dict[str, An
     "dds": ("DDS", colours, dict),
     "pcx": ("PCX", colours, dict),
 }
-"""By name: Pillow's format, what makes the picture, and what makes the settings of its file."""
+"""By name of a kind: Pillow's format, a function that makes the picture, and one that makes its file's settings."""
 
 
 def other_picture(kind: str) -> bytes:
-    """A file of one of KINDS."""
+    """The bytes of a file of one of KINDS."""
     form, picture, settings = KINDS[kind]
     file = io.BytesIO()
     picture().save(file, form, **settings())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ways to spoil a file: each takes its bytes and a source of random numbers and gives other bytes; see `hostile.py`."""
+"""Ways to spoil a file (`hostile.py`): functions from its bytes and a random generator to other bytes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 MOST_BYTES = 1 << 24
-"""Larger ones, as some spoilers make them, are not spoilt further."""
+"""Size of a file in bytes above which it is not spoilt further. Some spoilers make such files."""
 
 NUMBERS = (
     *("0", "-1", "-0", "1", "2", "255", "256", "65536", "4294967295", "2147483648", "-2147483649", "1000000000"),
@@ -47,14 +47,14 @@ VALUES: tuple[Any, ...] = (
 def _flip(data: bytes, rng: random.Random) -> bytes:
     spoilt = bytearray(data)
     for _ in range(rng.choice((1, 1, 2, 4, 16)) if spoilt else 0):
-        # headers are short and decide the most
+        # headers are short, but affect the reading most
         at = rng.randrange(min(len(spoilt), 64)) if rng.random() < 0.3 else rng.randrange(len(spoilt))
         spoilt[at] = rng.choice((spoilt[at] ^ (1 << rng.randrange(8)), 0, 255, rng.randrange(256)))
     return bytes(spoilt)
 
 
 def _numbers(data: bytes, rng: random.Random) -> bytes:
-    """A number of 2, 4 or 8 bytes, of either order, becomes one that hurts."""
+    """Overwrite 2, 4 or 8 bytes with a number that may cause errors, in either byte order."""
     order, letter = rng.choice("<>"), rng.choice("hHiIqQfd")
     size = struct.calcsize(letter)
     if letter in "fd":
@@ -110,7 +110,7 @@ def _swap(data: bytes, rng: random.Random) -> bytes:
 
 
 def _words(data: bytes, rng: random.Random) -> bytes:
-    """A number or a word becomes another."""
+    """Replace one or two numbers or words by others."""
     text = data.decode("latin-1")
     found = list(re.finditer(r"-?[0-9][0-9.eE+-]*|[A-Za-z_./][\w./-]*", text))
     if not found:
@@ -122,7 +122,7 @@ def _words(data: bytes, rng: random.Random) -> bytes:
 
 
 def _lines(data: bytes, rng: random.Random) -> bytes:
-    """A line goes, comes twice, changes place or becomes another's."""
+    """Remove, duplicate, exchange, empty or repeat a line."""
     lines = data.split(b"\n")
     at, other = rng.randrange(len(lines)), rng.randrange(len(lines))
     kind = rng.randrange(5)
@@ -140,7 +140,7 @@ def _lines(data: bytes, rng: random.Random) -> bytes:
 
 
 def _text(data: bytes, rng: random.Random) -> bytes:
-    """A text after an editor or a bad transfer, or made deeply nested or very long."""
+    """Change a text like an editor or a bad transfer, or make it deeply nested or very long."""
     at = rng.randrange(len(data) + 1)
     nested = b"[" * 5000 + b"]" * 5000, b"9" * 10_000, b"{a=" * 1000 + b"1" + b"}" * 1000
 
@@ -164,7 +164,7 @@ def _text(data: bytes, rng: random.Random) -> bytes:
 
 
 def _json(data: bytes, rng: random.Random) -> bytes:
-    """A value anywhere in the document becomes another, a key goes, or a list is repeated."""
+    """Replace a value of a JSON document, remove a key, or repeat a list."""
     try:
         first, _, rest = data.partition(b"\n") if data.count(b"\n{") else (data, b"", b"")
         document = json.loads(first)
@@ -200,7 +200,7 @@ def _json(data: bytes, rng: random.Random) -> bytes:
 
 
 class _Mark:
-    """A pickle that calls a function when it is loaded: a reader that loads it is caught."""
+    """An object whose pickle calls a function when it is loaded. So a reader that loads pickles is detected."""
 
     def __reduce__(self) -> tuple[Any, tuple[str]]:
         return (_unpickled, ("a pickle was loaded",))
@@ -211,7 +211,11 @@ def _unpickled(text: str) -> None:
 
 
 def _archive(data: bytes, rng: random.Random) -> bytes:
-    """A member of a checkpoint becomes another: a claim of a huge array, a pickle, a bomb, a state that is none."""
+    """Spoil a member of an archive, such as a checkpoint.
+
+    It may claim a huge array, become a pickle, a decompression bomb or an invalid state, or get another name or number.
+    Or all members are repeated.
+    """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = [(info.filename, archive.read(info)) for info in archive.infolist()]
@@ -258,14 +262,14 @@ def _archive(data: bytes, rng: random.Random) -> bytes:
         members.append((name, content))
     buffer = io.BytesIO()
     with warnings.catch_warnings(), zipfile.ZipFile(buffer, "w", compression) as archive:
-        warnings.simplefilter("ignore")  # names that come twice
+        warnings.simplefilter("ignore")  # about duplicate names
         for each, body in members:
             archive.writestr(each[:65_000] or "empty", body)
     return buffer.getvalue()
 
 
 def npy(array: Any, **options: Any) -> bytes:
-    """An array as a file."""
+    """The bytes of an array's .npy file."""
     buffer = io.BytesIO()
     np.save(buffer, array, **options)
     return buffer.getvalue()
@@ -277,8 +281,9 @@ def _npy_claim(header: str, body: bytes) -> bytes:
 
 
 def spoil_place(path: Path, folder: Path, rng: random.Random) -> None:
-    """The file becomes a link, a folder, a pipe, or what may not be read; its folder a loop of links."""
-    with contextlib.suppress(OSError):  # names that are there already, or are too long
+    """Replace a file by a link, a folder, a pipe or a huge sparse file, or remove it and add links in a loop or a file
+    with an odd name."""
+    with contextlib.suppress(OSError):  # for names that exist already or are too long
         _replace(path, folder, rng)
 
 
@@ -302,7 +307,7 @@ def _replace(path: Path, folder: Path, rng: random.Random) -> None:
         odd = ("a\nb.png", "\x1b[31m.png", "\udcff.png", "e\u0301.png", "x" * 250 + ".png")
         (path.parent / rng.choice(odd)).write_bytes(b"")
     else:
-        with open(path, "wb") as file:  # of no bytes on the disk
+        with open(path, "wb") as file:  # a sparse file, which takes no space on the disk
             file.truncate(rng.choice((1 << 20, 1 << 33)))
 
 

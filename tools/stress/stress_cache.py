@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starts many `clsplat thumbnail` at once on an empty cache of kernels, and interrupts some of them in their first
-build.
+"""Start many `clsplat thumbnail` at once on an empty cache of kernels, and interrupt some of them in their first build.
 
     tools/stress/run cache [--processes 40] [--interrupted 10] [--seed 0] [--device DEVICE]
 
-All share one folder of caches, which is made for it, as the processes of a farm share a home. An interrupted one gets,
-by turns, a Ctrl-C that reaches its whole group, SIGTERM or SIGKILL, at a random moment of the first builds. Each of the
-others has to write the picture that a process alone writes; then one more does, on what is left of the cache. Exit
-status 1 if one of them does not, else 0. The result is JSON.
+All processes share a new folder of caches, like the processes of a farm that share a home folder. Interrupted processes
+get in turn Ctrl-C for their whole process group, SIGTERM and SIGKILL, at random times during the first builds. All
+others must write the same picture as a process that runs alone. Then one more process must write it with the cache that
+is left. The exit status is 1 if a process does not, otherwise 0. The result is printed as JSON.
 """
 
 from __future__ import annotations
@@ -31,16 +30,16 @@ from clsplat.bench.workload import synthetic
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 DEADLINE = 1200.0
-"""Seconds that all of them may take together, however busy the machine is."""
+"""Maximum seconds until all processes have ended, even on a busy machine."""
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run it; prints what it found as JSON."""
+    """Run the processes, and print the result as JSON. Returns the exit status."""
     parser = plain_parser(__doc__)
-    parser.add_argument("--processes", type=int, default=40, help="default 40")
-    parser.add_argument("--interrupted", type=int, default=10, help="of them, default 10")
-    parser.add_argument("--seed", type=int, default=0, help="of the moments, default 0")
-    parser.add_argument("--device", help="as clsplat devices lists them")
+    parser.add_argument("--processes", type=int, default=40, help="number of processes, default 40")
+    parser.add_argument("--interrupted", type=int, default=10, help="number of interrupted processes, default 10")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random times, default 0")
+    parser.add_argument("--device", help="a device as listed by clsplat devices")
     arguments = parser.parse_args(argv)
     with tempfile.TemporaryDirectory(prefix="clsplat-cache-") as folder:
         result = stress(
@@ -51,7 +50,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def environment(cache: Path) -> dict[str, str]:
-    """This one's, with an empty cache of the user's, of drivers and of ours."""
+    """Environment of this process, with empty caches for the user, the drivers and clsplat."""
     cache.mkdir()
     values = {**os.environ, "XDG_CACHE_HOME": str(cache)}
     for name in ("POCL_CACHE_DIR", "CLSPLAT_BINARIES"):
@@ -60,7 +59,7 @@ def environment(cache: Path) -> dict[str, str]:
 
 
 class Started:
-    """A `clsplat thumbnail` that is under way."""
+    """A running `clsplat thumbnail`."""
 
     def __init__(self, model: Path, picture: Path, values: dict[str, str], device: str | None) -> None:
         self.picture, self.said = picture, picture.with_suffix(".txt")
@@ -70,13 +69,16 @@ class Started:
             self.process = subprocess.Popen(line, stdout=said, stderr=said, env=values, start_new_session=True)
 
     def interrupt(self, number: int) -> None:
-        """Send a signal: Ctrl-C to all of its group, as a terminal does."""
+        """Send a signal. Ctrl-C goes to the whole process group, as from a terminal."""
         if self.process.poll() is None:
             send = os.killpg if number == signal.SIGINT else os.kill
             send(self.process.pid, number)
 
     def end(self, wanted: bytes | None, until: float) -> str:
-        """`right`, or what is wrong."""
+        """Wait until the time `until`. Returns `right`, or a description of the fault.
+
+        wanted: bytes of the picture; None accepts any picture.
+        """
         try:
             status = self.process.wait(max(until - time.monotonic(), 1.0))
         except subprocess.TimeoutExpired:
@@ -91,7 +93,7 @@ class Started:
 
 
 def stress(folder: Path, processes: int, interrupted: int, device: str | None, chance: random.Random) -> dict[str, Any]:
-    """Start them all, interrupt some, and wait for the rest; how they ended."""
+    """Start all processes, interrupt some, and wait for the others. Returns how they ended."""
     model = folder / "model.ply"
     synthetic(300, 64, 64).gaussians.save(model)
     alone, start = environment(folder / "alone"), time.monotonic()
@@ -105,7 +107,7 @@ def stress(folder: Path, processes: int, interrupted: int, device: str | None, c
     chosen = chance.sample(range(processes), interrupted)
     while not any(path.is_file() for path in Path(shared["XDG_CACHE_HOME"]).rglob("*")):
         time.sleep(0.01)
-    # all share the processors, so that the builds of each take a good part of as many times those of one
+    # The processes share the cores. Signals come within a fifth of the time that all processes need.
     share = 0.2 * seconds * processes / (os.cpu_count() or 1)
     moments = sorted(chance.uniform(0, share) for _ in chosen)
     begin = time.monotonic()

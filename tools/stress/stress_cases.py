@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stressors of projection and its gradient: each makes Gaussians before one camera, and says how far it went."""
+"""Stressors of projection and its gradient. Each makes extreme Gaussians for one camera, and tells how extreme."""
 
 from __future__ import annotations
 
@@ -15,13 +15,18 @@ from clsplat.gaussians import Gaussians
 
 WIDTH, HEIGHT, FOCAL = 640, 360, 600.0
 DEGREE = 1
-"""Degree of the SH: enough for the gradient by the direction; the bands themselves are tested apart."""
+"""Degree of the SH: enough for the gradient with respect to the direction. Other tests check the bands themselves."""
 
 
 @dataclass
 class Cloud:
-    """Gaussians in float64, to be changed by a stressor: pixels (n, 2), depths (n,), axes (n, 3) as standard
-    deviations in pixels, quaternions (n, 4), logits (n,), sh (n, K, 3)."""
+    """Gaussians in float64, which a stressor changes.
+
+    pixels: (n, 2), the means on the image.
+    axes: (n, 3), standard deviations in pixels.
+    scales: (n, 3), standard deviations in world units, in place of `axes`.
+    spoilt: Gaussians in place of all the other arrays.
+    """
 
     camera: Camera
     pixels: Float64
@@ -34,7 +39,7 @@ class Cloud:
     spoilt: Gaussians | None = None
 
     def gaussians(self) -> Gaussians:
-        """The Gaussians, with the means in the world, as float32; or those that are spoilt."""
+        """The Gaussians in float32, with means in the world; or `spoilt`."""
         if self.spoilt is not None:
             return self.spoilt
         camera = self.camera
@@ -49,7 +54,10 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False)
 class Cases:
-    """A batch: `hurt` (n,) says how far each case goes, in the unit that the stressor names."""
+    """A batch of cases.
+
+    hurt: (n,), how extreme each case is, in the stressor's unit.
+    """
 
     gaussians: Gaussians
     camera: Camera
@@ -57,7 +65,7 @@ class Cases:
 
 
 def camera_of(rng: np.random.Generator) -> Camera:
-    """Turned and placed at random, fx and fy apart, the principal point near the middle."""
+    """A camera with a random pose, different fx and fy, and the principal point near the middle."""
     axis = rng.normal(size=3)
     rotation = Rotation.from_rotvec(rng.uniform(-np.pi, np.pi) * axis / np.linalg.norm(axis)).as_matrix()
     cx, cy = WIDTH * rng.uniform(0.4, 0.6), HEIGHT * rng.uniform(0.4, 0.6)
@@ -66,7 +74,7 @@ def camera_of(rng: np.random.Generator) -> Camera:
 
 
 def cloud(rng: np.random.Generator, count: int) -> Cloud:
-    """Gaussians like those of a trained scene: axes of 0.3 to 30 pixels, opacities all over."""
+    """Gaussians like those of a trained scene: axes of 0.3 to 30 pixels, and all opacities."""
     return Cloud(
         camera=camera_of(rng),
         pixels=rng.uniform(-0.1, 1.1, (count, 2)) * (WIDTH, HEIGHT),
@@ -85,7 +93,10 @@ def scales(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
 
 
 def _elongated(made: Cloud, rng: np.random.Generator, low: float, high: float) -> tuple[Float64, Float64]:
-    """Make needles and discs, with longest axes of 10^low to 10^high pixels; returns these, and longest / shortest."""
+    """Make needles and discs, with longest axes of 10^low to 10^high pixels.
+
+    Returns the longest axes, and their ratios to the shortest ones.
+    """
     count = len(made.depths)
     longest, ratio = 10 ** rng.uniform(low, high, count), 10 ** rng.uniform(0, 8, count)
     middle = np.where(rng.random(count) < 0.5, longest, longest / ratio)
@@ -94,7 +105,7 @@ def _elongated(made: Cloud, rng: np.random.Generator, low: float, high: float) -
 
 
 def edge_on(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
-    """Needles that point at the camera and discs seen from the side, up to an angle."""
+    """Needles that point at the camera, and discs seen from the side, apart from a random angle. Returns the angles."""
     angle = 10 ** rng.uniform(-8, 0, count)
     needle = rng.random(count) < 0.5
     ratio = 10 ** rng.uniform(0, 8, count)
@@ -159,7 +170,7 @@ def quaternions(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
 
 
 def far_world(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
-    """Around a place far from the world's origin; what rounding the means to float32 does is no error of ours."""
+    """Gaussians and a camera far from the world's origin. The rounding of means to float32 is no error here."""
     offset = rng.normal(size=3)
     offset *= 10 ** rng.uniform(3, 6.5) / np.linalg.norm(offset)
     camera = made.camera
@@ -187,7 +198,7 @@ def colours(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
 
 
 def balls(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
-    """All three axes nearly or just alike: a rotation hardly shows, its gradient is a small difference."""
+    """Gaussians with three nearly or exactly equal axes. The gradient of a rotation is then a small difference."""
     apart = 10 ** rng.uniform(-8, 0, count)
     apart[rng.random(count) < 0.05] = 0
     made.axes = made.axes[:, :1] * np.exp(apart[:, None] * rng.uniform(-1, 1, (count, 3)))
@@ -195,7 +206,7 @@ def balls(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
 
 
 def wild(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
-    """Any float32 there is, in one parameter or in all: nothing to compare with, only to survive."""
+    """Gaussians with arbitrary float32 values in one parameter or in all. Only finite results are required."""
     gaussians = made.gaussians()
     everywhere = rng.random(count) < 0.2
     group = rng.integers(0, 5, count)
@@ -221,31 +232,51 @@ PROJECTION: Bounds = {
     "extent": 1e-4,
     "colour": 1e-6,
 }
-"""Largest error of any case. position: two floats carry a mean to 2^-44 of its way, and 6e-8 is lost where the part
-below a pixel is stored; a few roundings of that. shape: 3e-5 is what float32 alone may lose before the rotation is
-refined, and there are three such terms. offset: l12 is stored in float32, so that the end of a needle some 700 pixels
-from its mean and 0.55 wide is off by 700 / 0.55 * 2^-24 = 8e-5 from that alone, and shape times the extent of 3.3 comes
-to it. depth, opacity, colour: two to ten roundings of 6e-8. extent: of a budget log2(255 o) of 0.007 the rounding of
-log2 o, of size 8, leaves four digits."""
+"""Maximum error of a case, by column of `ERRORS`.
+
+- position: two floats store a mean with a relative error of 2^-44, and the fraction of a pixel has one of 6e-8. The
+  bound allows a few such roundings.
+- shape: float32 may cause an error of 3e-5 before the rotation is refined, in each of three terms.
+- offset: l12 is stored in float32. So the end of a needle 0.55 pixels wide and some 700 pixels from its mean is off by
+  700 / 0.55 * 2^-24 = 8e-5. The error of the shape times the extent of 3.3 is added.
+- depth, opacity, colour: two to ten roundings of 6e-8.
+- extent: in a budget log2(255 o) of 0.007, the rounding of log2 o, of size 8, leaves four correct digits.
+"""
 GRADIENT_NORM, GRADIENT_TAIL = 1e-4, 1e-3
-"""Bounds in norm over a batch, and for the 99.9th percentile of Gaussians. The largest may be any: a gradient can
-vanish."""
+"""Bounds of a gradient's relative error: of its norm over all cases, and of the 99.9th percentile of Gaussians.
+
+The largest relative error has no bound, because a gradient may vanish.
+"""
 
 FRAME_TAIL = 5e-3
-"""GRADIENT_TAIL for one kind of frames, of a few thousand Gaussians: there chance has more single numbers near zero,
-and needles have the error of their ends. All kinds together have to be within GRADIENT_TAIL."""
+"""GRADIENT_TAIL for frames of one kind, which have only a few thousand Gaussians.
+
+By chance, more of their gradients are near zero, and needles have the error of their ends. All kinds together must stay
+within GRADIENT_TAIL.
+"""
 FRAME = 2e-5
-"""Bound of a pixel's colour outside the band, relative to the frame's brightest: a few dozen roundings of 6e-8, and the
-ends of needles, which are off as said of "offset", there by 64 / 0.55 * 2^-24 = 7e-6."""
+"""Bound of the error of a pixel's colour outside the band, relative to the frame's brightest colour.
+
+It allows a few dozen roundings of 6e-8. The ends of needles are off by 64 / 0.55 * 2^-24 = 7e-6, as for `offset` in
+PROJECTION.
+"""
 BAND_SHARE = 0.03
-"""Largest share of the pixels with a decision within 1e-4 of its threshold: in "faint" some 100 Gaussians at each pixel
-have alphas spread evenly over about 1 / 255, of which 2e-4 each are in the band; elsewhere there are a few."""
+"""Maximum fraction of pixels in the band: a threshold there decides on a value within 1e-4 of it.
+
+In the scene "faint", about 100 Gaussians at each pixel have alphas spread evenly around 1/255. Of these, a fraction of
+2e-4 is in the band. Other scenes have few such pixels.
+"""
 
 
 @dataclass(frozen=True)
 class Stressor:
-    """change: puts the stress on a cloud of so many, and returns `Cases.hurt`; unit: of that, for the plot; bounds:
-    those that are not PROJECTION's, `why` with the reason; finite: whether nothing but that is asked of the results."""
+    """A way to make extreme Gaussians.
+
+    change(cloud, rng, count): changes a cloud of `count` Gaussians, and returns `Cases.hurt`.
+    unit: unit of `Cases.hurt`, for the plot.
+    bounds, why: bounds that differ from PROJECTION's, and the reason.
+    finite: True if results only have to be finite.
+    """
 
     change: Callable[[Cloud, np.random.Generator, int], Float64]
     unit: str
@@ -254,7 +285,7 @@ class Stressor:
     finite: bool = False
 
     def make(self, rng: np.random.Generator, count: int) -> Cases:
-        """A batch of so many cases."""
+        """A batch of `count` cases."""
         made = cloud(rng, count)
         hurt = self.change(made, rng, count)
         return Cases(made.gaussians(), made.camera, hurt)
@@ -263,7 +294,7 @@ class Stressor:
 STRESSORS: dict[str, Stressor] = {
     "ordinary": Stressor(lambda made, *_: np.asarray(made.axes.max(axis=1)), "longest axis, px"),
     "scales": Stressor(scales, "scale, world units"),
-    # needles and discs, the longest axis as long as the image at most, or far longer
+    # needles and discs: their longest axes are at most as long as the image, or far longer
     "anisotropy": Stressor(lambda made, rng, _: _elongated(made, rng, 0, 2.8)[1], "longest axis / shortest axis"),
     "giants": Stressor(lambda made, rng, _: _elongated(made, rng, 2.8, 6)[0], "longest axis, px"),
     "edge_on": Stressor(edge_on, "angle to the ray (needles) or to its perpendicular (discs), rad"),

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hostile files: valid ones of every kind that is read, spoilt at random, given to their readers.
+"""Spoil valid files of every kind at random, and give them to their readers.
 
     tools/stress/run files [--cases 100000] [--seed 0] [--readers ply,scene,...] [--jobs N] [--keep FOLDER]
     tools/stress/run files --readers ply --first 1234 --cases 1        # a case again, by its number
 
-A case passes where the reader returns, or raises InputError: one line that names a file. Anything else is a failure:
-another exception, a warning of several lines, a crash of the process, more than --seconds of a core, or more than
---memory MiB.
-The spoilt files of failures are kept in --keep. Exit status 1 where there was one.
+A case passes if the reader returns, or raises an InputError of one line that names a file. Everything else is a
+failure: another exception, a warning of several lines, a crash of the process, over --seconds of CPU time, or over
+--memory MiB. The spoilt files of failures are kept in the folder --keep. The exit status is 1 if there was a failure.
 """
 
 from __future__ import annotations
@@ -40,12 +39,17 @@ from clsplat.progress import aligned
 
 MIB = 1 << 20
 SPOILING = 60
-"""Seconds beside --seconds after which a case counts as hung: it has to be made, and the machine may be busy."""
+"""Seconds, in addition to --seconds, after which a case counts as hung. They include the spoiling, and allow for a busy
+machine."""
 
 
 @dataclass
 class Tally:
-    """Count of a reader's cases. slowest: seconds and number; peak: MiB beyond what the process had, and number."""
+    """Counts of a reader's cases.
+
+    slowest: seconds and number of the slowest case.
+    peak: additional MiB and number of the case that took most memory.
+    """
 
     cases: int = 0
     refused: int = 0
@@ -54,7 +58,7 @@ class Tally:
     failures: list[tuple[int, str]] = field(default_factory=list)
 
     def add(self, other: Tally) -> None:
-        """Count the cases of another too."""
+        """Add the counts of another tally."""
         self.cases += other.cases
         self.refused += other.refused
         self.slowest, self.peak = max(self.slowest, other.slowest), max(self.peak, other.peak)
@@ -62,12 +66,12 @@ class Tally:
 
 
 def numbered(seed: int, reader: str, case: int) -> random.Random:
-    """The source of all that is random in a case."""
+    """The random generator of a case."""
     return random.Random(f"{seed} {reader} {case}")
 
 
 def verdict(reader: Reader, folder: Path) -> tuple[bool, str]:
-    """(Whether the reader refused the file, what is wrong with how it did, empty for nothing)."""
+    """Give the files to the reader. Returns True if it raised an error, and a description of the failure or ""."""
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
         try:
@@ -81,7 +85,7 @@ def verdict(reader: Reader, folder: Path) -> tuple[bool, str]:
             if str(folder) not in message:
                 return True, f"an error that names no file: {message[:300]}"
             return True, ""
-        except BaseException as error:  # noqa: BLE001  # whatever it is, it is the finding
+        except BaseException as error:  # noqa: BLE001  # any other exception is a failure
             where = traceback.extract_tb(error.__traceback__)[-1]
             return True, f"{type(error).__name__} at {Path(where.filename).name}:{where.lineno}: {str(error)[:300]}"
     bad = next((str(each.message) for each in heard if not str(each.message).isprintable()), None)
@@ -90,7 +94,7 @@ def verdict(reader: Reader, folder: Path) -> tuple[bool, str]:
 
 @contextlib.contextmanager
 def spoilt(reader: Reader, valid: Path, folder: Path, seed: int, case: int) -> Iterator[str]:
-    """`folder` as a spoilt copy of the reader's valid files, while the block lasts; gives what was done to it."""
+    """Make `folder` a spoilt copy of the reader's valid files within the block. Yields a description of the changes."""
     shutil.copytree(valid, folder, symlinks=True)
     try:
         yield spoil(reader, folder, numbered(seed, reader.name, case))
@@ -99,18 +103,22 @@ def spoilt(reader: Reader, valid: Path, folder: Path, seed: int, case: int) -> I
 
 
 def _status(name: str) -> float:
-    """MiB, of /proc/self/status."""
+    """A value of /proc/self/status in MiB."""
     with open("/proc/self/status", encoding="ascii") as file:
         return next(int(line.split()[1]) / 1024 for line in file if line.startswith(name))
 
 
 def _work(tasks: Connection, names: list[str], seed: int, memory: int, most_seconds: float, scratch: str) -> None:
-    """A worker: gets (reader, first, stop), answers ("case", number), then ("done", seconds, MiB, refused, trouble)."""
+    """Run cases in a worker process, until it receives None.
+
+    tasks: receives (reader, first, stop). Sends ("case", number) and ("done", seconds, MiB, refused, trouble) for each
+    case, then ("end",).
+    """
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     quiet = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(quiet, 1)  # decoders print
+    os.dup2(quiet, 1)  # decoders may print
     os.dup2(quiet, 2)
     root = Path(tempfile.mkdtemp(prefix="worker-", dir=scratch))
     readers = {name: READERS[name] for name in names}
@@ -119,7 +127,7 @@ def _work(tasks: Connection, names: list[str], seed: int, memory: int, most_seco
         valid[name] = root / f"{name}-valid"
         valid[name].mkdir()
         reader.make(valid[name])
-        reader.read(valid[name])  # what it needs is loaded before memory counts
+        reader.read(valid[name])  # loads all modules before memory is measured
     with open("/proc/self/statm", encoding="ascii") as file:
         size = int(file.read().split()[0]) * resource.getpagesize()
     limit = size + memory * MIB
@@ -135,7 +143,7 @@ def _work(tasks: Connection, names: list[str], seed: int, memory: int, most_seco
                     before, start = _status("VmRSS"), time.process_time()
                     refused, trouble = verdict(readers[name], root / "case")
                     seconds, peak = time.process_time() - start, _status("VmHWM") - before
-            except Exception as error:  # noqa: BLE001  # a defect of these tools, to be told as any other
+            except Exception as error:  # noqa: BLE001  # a defect of these tools, reported like a failure
                 seconds, peak, refused, trouble = 0.0, 0.0, False, f"no case: {type(error).__name__}: {error}"
             if peak > memory and not trouble:
                 trouble = f"{peak:.0f} MiB of memory"
@@ -146,7 +154,7 @@ def _work(tasks: Connection, names: list[str], seed: int, memory: int, most_seco
 
 
 class _Worker:
-    """A process that is started again where a case has ended it or taken too long."""
+    """A worker process. It is started again if a case has ended it or has taken too long."""
 
     def __init__(self, names: list[str], seed: int, memory: int, seconds: float, scratch: str) -> None:
         self.arguments, self.seconds = (names, seed, memory, seconds, scratch), seconds
@@ -154,7 +162,7 @@ class _Worker:
 
     def _start(self) -> None:
         self.pipe, other = multiprocessing.Pipe()
-        context = multiprocessing.get_context("spawn")  # what reading starts, threads above all, does not bear forking
+        context = multiprocessing.get_context("spawn")  # readers start threads, which do not survive a fork
         self.process = context.Process(target=_work, args=(other, *self.arguments), daemon=True)
         self.process.start()
         other.close()
@@ -203,7 +211,7 @@ def stress(
     memory: int = 1024,
     seconds: float = 20.0,
 ) -> dict[str, Tally]:
-    """Give `cases` spoilt files to the readers, shared among them by their weights; what each came to."""
+    """Run `cases` cases, divided among the readers by their weights. Returns the tally of each reader."""
     weights = {name: READERS[name].weight for name in names}
     share = {name: max(round(cases * weight / sum(weights.values())), 1) for name, weight in weights.items()}
     chunks = [
@@ -245,7 +253,7 @@ def _sum(parts: list[Tally]) -> Tally:
 
 
 def keep(folder: Path, name: str, case: int, seed: int) -> Path:
-    """The files of a case, made anew, in a folder of their own."""
+    """Make the files of a case again, in a folder of their own, and return it."""
     target = folder / f"{name}-{case}"
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
@@ -256,7 +264,7 @@ def keep(folder: Path, name: str, case: int, seed: int) -> Path:
 
 
 def table(tallies: dict[str, Tally]) -> str:
-    """Text table, a line each."""
+    """Text table with a line for each reader."""
     rows = [("reader", "cases", "refused", "slowest", "most memory", "failures")]
     for name, tally in {**tallies, "all": _sum(list(tallies.values()))}.items():
         most = f"{tally.slowest[0]:.2f} s", f"{tally.peak[0]:.0f} MiB"
@@ -265,15 +273,15 @@ def table(tallies: dict[str, Tally]) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the cases; see the module."""
+    """Run the cases and print the table. Returns the exit status."""
     parser = argparse.ArgumentParser(prog="stress_files", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--cases", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="number of each reader's first case")
-    parser.add_argument("--readers", default=",".join(READERS), help=f"of {', '.join(READERS)}")
+    parser.add_argument("--readers", default=",".join(READERS), help=f"some of {', '.join(READERS)}")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--memory", type=int, default=1024, help="MiB that a case may take")
-    parser.add_argument("--seconds", type=float, default=20.0, help="of a core that a case may take")
+    parser.add_argument("--memory", type=int, default=1024, help="maximum MiB of memory of a case")
+    parser.add_argument("--seconds", type=float, default=20.0, help="maximum CPU seconds of a case")
     parser.add_argument("--keep", type=Path, help="folder for the files of failures")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blending and its gradient: tiny frames, and crops of large ones, pixel by pixel against the twin."""
+"""Stress test of blending and its gradient: compare tiny frames and crops of large ones with the twin, per pixel."""
 
 from __future__ import annotations
 
@@ -24,13 +24,14 @@ Array = NDArray[Any]
 Scene = tuple[Gaussians, Camera]
 GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 BAND = 1e-4
-"""Relative distance of alpha or transmittance to a threshold, within which float32 may decide the other way."""
+"""Relative distance of alpha or transmittance from a threshold within which float32 may decide differently. Pixels with
+such a decision are in the band."""
 
 
 def scene_of(
     rng: np.random.Generator, count: int, width: int, height: int, *, low: float = 0.5, high: float = 6.0
 ) -> tuple[Cloud, Camera]:
-    """Gaussians all over an image of that size, with axes of `low` to `high` pixels."""
+    """Gaussians all over an image of this size, with axes of `low` to `high` pixels."""
     camera = replace(camera_of(rng), width=width, height=height, fx=50.0, fy=55.0)
     camera = replace(camera, cx=width * rng.uniform(0.3, 0.7), cy=height * rng.uniform(0.3, 0.7))
     cloud = Cloud(
@@ -50,33 +51,33 @@ def _made(cloud: Cloud) -> Scene:
 
 
 def counts(rng: np.random.Generator) -> Scene:
-    """0, 1, 2^k - 1, 2^k, 2^k + 1."""
+    """Numbers of Gaussians around powers of two: 0, 1, 2^k - 1, 2^k, 2^k + 1."""
     count = max(0, 2 ** int(rng.integers(0, 10)) + int(rng.integers(-1, 2)))
     return _made(scene_of(rng, count, 40, 24)[0])
 
 
 def sizes(rng: np.random.Generator) -> Scene:
-    """1x1, 1xN, Nx1, and what is no multiple of a tile."""
+    """Image sizes such as 1x1, 1xN and Nx1, most of which are not multiples of a tile."""
     width, height = (int(rng.choice([1, 1, 2, 15, 16, 17, 31, 33, 50])) for _ in range(2))
     return _made(scene_of(rng, 48, width, height)[0])
 
 
 def equal_depth(rng: np.random.Generator) -> Scene:
     cloud, camera = scene_of(rng, 64, 32, 32)
-    cloud.camera = replace(camera, rotation=np.eye(3), translation=np.zeros(3))  # else rounding has depths apart
+    cloud.camera = replace(camera, rotation=np.eye(3), translation=np.zeros(3))  # else rounding makes depths differ
     cloud.depths[:] = rng.choice([1.0, 3.0, 1e4])
     return _made(cloud)
 
 
 def saturated(rng: np.random.Generator) -> Scene:
-    """Alpha at its cap, pixels that end."""
+    """Gaussians with alphas at the cap, so that pixels become opaque before the end of their lists."""
     cloud, _ = scene_of(rng, 64, 32, 24, low=2.0, high=12.0)
     cloud.logits = rng.uniform(2, 30, 64)
     return _made(cloud)
 
 
 def faint(rng: np.random.Generator) -> Scene:
-    """Around 1/255, in many layers."""
+    """Many layers of Gaussians with alphas around 1/255."""
     cloud, _ = scene_of(rng, 400, 24, 24, low=2.0, high=12.0)
     cloud.logits = np.log(rng.uniform(0.8, 3, 400) / 254)
     return _made(cloud)
@@ -89,7 +90,7 @@ def needles(rng: np.random.Generator) -> Scene:
 
 
 def one_pixel(rng: np.random.Generator) -> Scene:
-    """10,000 whose means are on one pixel."""
+    """10,000 Gaussians with means on one pixel."""
     cloud, _ = scene_of(rng, 10_000, 20, 20, low=0.2, high=2.0)
     cloud.pixels = 10 + rng.uniform(0.4, 0.6, (10_000, 2))
     cloud.logits = rng.uniform(-5.5, -3, 10_000)
@@ -97,7 +98,7 @@ def one_pixel(rng: np.random.Generator) -> Scene:
 
 
 def whole_image(rng: np.random.Generator) -> Scene:
-    """One Gaussian over all pixels, and some that are hidden or not."""
+    """Two Gaussians that are larger than the image, one before or behind all the others, and many small ones."""
     cloud, _ = scene_of(rng, 40, 100, 70)
     cloud.axes[:2] = 10 ** rng.uniform(2, 4, (2, 3))
     cloud.depths[0] = rng.choice([0.5, 20.0])
@@ -105,7 +106,7 @@ def whole_image(rng: np.random.Generator) -> Scene:
 
 
 def off_frustum(rng: np.random.Generator) -> Scene:
-    """Means beside the image and behind the camera, that reach in."""
+    """Gaussians with means outside the image or behind the camera, many of which reach into the image."""
     cloud, _ = scene_of(rng, 64, 40, 30, low=5.0, high=60.0)
     angle = rng.uniform(0, 2 * np.pi, 64)
     aside = 0.5 + rng.uniform(0.6, 2.5, (64, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -127,9 +128,15 @@ SCENES = {make.__name__: make for make in _ALL}
 
 @dataclass(frozen=True, eq=False)
 class FrameOutcome:
-    """image: largest difference outside the band, relative to the frame's largest colour; pixels, band: how many, and
-    how many of them in the band; flips: largest relative difference in it; norms: by parameter group
-    (|difference|^2, |wanted|^2); each: by group, every Gaussian's relative error; finite."""
+    """Comparison of a frame with its twin.
+
+    image: largest difference of a pixel outside the band, relative to the frame's largest colour.
+    pixels, band: number of pixels, and of pixels in the band.
+    flips: largest relative difference of a pixel in the band.
+    norms: by parameter group, the sums of |difference|^2 and |wanted|^2.
+    each: by parameter group, the relative error of each Gaussian's gradient.
+    finite: True if image and gradients are finite.
+    """
 
     image: float
     pixels: int
@@ -141,7 +148,7 @@ class FrameOutcome:
 
 
 def compare(device: Device, scene: Scene, rng: np.random.Generator) -> FrameOutcome:
-    """A frame and its gradient for a random gradient of the image, which is 0 in the band."""
+    """Compare a frame with its twin, and its gradient for a random image gradient that is 0 in the band."""
     gaussians, camera = scene
     run = Pipeline.run(device, scene)
     image = run.image
@@ -169,7 +176,7 @@ def compare(device: Device, scene: Scene, rng: np.random.Generator) -> FrameOutc
 
 
 def compare_8k(device: Device, rng: np.random.Generator, *, count: int = 2000, crops: int = 12) -> FrameOutcome:
-    """A frame of 7680 x 4320 on some crops of it; no gradients, which have no dependence on the size."""
+    """Compare crops of a frame of 7680 x 4320 with the twin. Gradients do not depend on the size, and are left out."""
     width, height, side = 7680, 4320, 64
     cloud, _ = scene_of(rng, count, width, height, low=0.5, high=200.0)
     cloud.camera = replace(cloud.camera, fx=6000.0, fy=6100.0)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Projection, blending and their gradients against the float64 twins, under everything that hurts.
+"""Stress test: compare projection, blending and their gradients with the float64 twins on extreme inputs.
 
     tools/stress/run kernels [--cases 1e6] [--seed 0] [--only NAME,NAME] [--device DEVICE] [--json] [--plot FILE]
 
-A case is one Gaussian before one camera under one stressor, forward and backward. Nearly all go through projection
-alone, by the thousand a launch, each held against the twin in 80-bit floats (stress_projection.py); the rest are
-in small frames, compared pixel by pixel and gradient by gradient (stress_frames.py). The bounds, with their
-reasons, are in stress_cases.py. Exit status 1 where one is broken.
+A case is one Gaussian for one camera and one stressor, with forward pass and gradient. Nearly all cases are of
+projection alone: thousands in a launch, each compared with the twin in 80-bit floats (stress_projection.py). The others
+are in small frames, whose pixels and gradients are compared (stress_frames.py). stress_cases.py has the bounds and
+their reasons. The exit status is 1 if an error exceeds its bound.
 """
 
 from __future__ import annotations
@@ -30,23 +30,30 @@ from clsplat.device.context import Device, open_device
 
 Array = NDArray[Any]
 BATCH = 5000
-"""Gaussians before one camera."""
+"""Number of Gaussians for one camera."""
 CASES_A_FRAME = 20_000
-"""Cases in all for each frame of every kind."""
+"""Number of cases of a run for each frame of a kind."""
 CASES_A_LARGE_FRAME = 500_000
-"""Cases in all for each frame that takes seconds: 10,000 Gaussians on a pixel, 7680 x 4320."""
+"""Number of cases of a run for each frame that takes seconds: 10,000 Gaussians on a pixel, or 7680 x 4320 pixels."""
 CASES_A_STAGE = 10_000
-"""Cases in all for each input of a stage by itself; these are not counted."""
+"""Number of cases of a run for each random input of a stage by itself. These inputs do not count as cases."""
 SLOW = ("one_pixel",)
 PLOTTED = {"shape": "whitening, largest", "position": "position (px), largest", "d log_scales": "d scales, 99.9 %"}
 STAGES = "stages"
 FLOOR = 1e-9
-"""Place of no error at all in a plot."""
+"""Smallest error in a plot; smaller errors are drawn there."""
 
 
 @dataclass
 class Tally:
-    """Count of one stressor: cases, those shown, what broke by kind, every error by name, squares of gradients."""
+    """Counts and errors of one stressor.
+
+    shown: number of cases that are visible.
+    broken: number of faults by kind.
+    errors: errors of all cases, by name.
+    norms: sums of squares of the gradients' differences and wanted values, by name.
+    hurt: how extreme each case is (`Cases.hurt`).
+    """
 
     cases: int = 0
     shown: int = 0
@@ -56,18 +63,18 @@ class Tally:
     hurt: list[Array] = field(default_factory=list)
 
     def add_norms(self, norms: Mapping[str, tuple[float, float]]) -> None:
-        """Sum the squares."""
+        """Add the sums of squares."""
         for name, (off, size) in norms.items():
             before = self.norms.get(name, (0.0, 0.0))
             self.norms[name] = (before[0] + off, before[1] + size)
 
     def add_errors(self, errors: Mapping[str, Array]) -> None:
-        """Add errors as float32, which is enough for an error."""
+        """Add errors. float32 is precise enough for them."""
         for name, values in errors.items():
             self.errors.setdefault(name, []).append(np.asarray(values, np.float32))
 
     def joined(self, name: str) -> Array:
-        """All errors of that name, NaN where there was nothing to compare."""
+        """All errors of a name; NaN where there was nothing to compare."""
         return np.concatenate(self.errors[name])
 
     def relative_norm(self, name: str) -> float:
@@ -77,7 +84,7 @@ class Tally:
 
 
 def projections(device: Device, name: str, cases: int, seed: int) -> Tally:
-    """Batches of one stressor."""
+    """Run the cases of one stressor, in batches."""
     stressor, tally = STRESSORS[name], Tally()
     for batch in range(-(-cases // BATCH)):
         rng = np.random.default_rng([seed, batch, *name.encode()])
@@ -105,13 +112,16 @@ def _summary(values: Array) -> Result:
 
 
 def gradient_faults(name: str, row: Result, tail: float) -> list[str]:
-    """Faults of a gradient: its error in norm over GRADIENT_NORM, that of 99.9 % of the Gaussians over `tail`."""
+    """Descriptions of a gradient's errors that exceed their bounds.
+
+    The bound of the norm's error is GRADIENT_NORM, and that of the 99.9th percentile of Gaussians is `tail`.
+    """
     faults = [] if row["norm"] <= GRADIENT_NORM else [f"{name} in norm {row['norm']:.2g} over {GRADIENT_NORM:g}"]
     return faults + ([f"{name} of 99.9 % {row['p999']:.2g} over {tail:g}"] if row["p999"] > tail else [])
 
 
 def judged(name: str, tally: Tally) -> Result:
-    """A stressor's row: every error with its bound, and in words what is over one."""
+    """A stressor's row: errors with their bounds, and descriptions of faults."""
     bounds = {**PROJECTION, **STRESSORS[name].bounds}
     rows, faults = {}, [f"{times} {kind}" for kind, times in tally.broken.items() if times]
     for error in tally.errors:
@@ -128,7 +138,7 @@ def judged(name: str, tally: Tally) -> Result:
 
 
 def frames(device: Device, name: str, many: int, seed: int, every: Tally | None = None) -> Result:
-    """A row of frames of one kind; every: gathers gradients of all kinds."""
+    """The row of `many` frames of one kind. every: tally to which their gradients are added."""
     image = flips = 0.0
     pixels = band = cases = broken = 0
     tally = Tally()
@@ -141,7 +151,7 @@ def frames(device: Device, name: str, many: int, seed: int, every: Tally | None 
             scene = SCENES[name](rng)
             found, count = compare_frame(device, scene, rng), len(scene[0])
         cases += count
-        image, flips = float(np.maximum(image, found.image)), max(flips, found.flips)  # a NaN stays one
+        image, flips = float(np.maximum(image, found.image)), max(flips, found.flips)  # np.maximum keeps a NaN
         pixels, band, broken = pixels + found.pixels, band + found.band, broken + (not found.finite)
         for gathered in (tally, every):
             if gathered is not None:
@@ -169,7 +179,7 @@ def frames(device: Device, name: str, many: int, seed: int, every: Tally | None 
 
 
 def panel(name: str, tally: Tally) -> Panel:
-    """Error against how far the stressor went, in bins."""
+    """Plot of errors over how extreme the cases are (`Cases.hurt`), in bins."""
     hurt = np.concatenate(tally.hurt)
     low, high = hurt[hurt > 0].min(), hurt.max()
     edges = np.geomspace(low, max(high, low * 1.01), 25)
@@ -218,7 +228,7 @@ def table(result: Result) -> list[str]:
 
 
 def stress(device: Device, cases: int, seed: int, names: Sequence[str]) -> tuple[Result, list[Panel]]:
-    """All of it."""
+    """Run all chosen parts. Returns the result and the plots."""
     start = time.perf_counter()
     result: Result = {**machine(device, 1), "seed": seed, "projection": {}, "frames": {}}
     panels = []
@@ -235,7 +245,7 @@ def stress(device: Device, cases: int, seed: int, names: Sequence[str]) -> tuple
         left -= share
         tally = projections(device, name, share, seed)
         result["projection"][name] = judged(name, tally)
-        if tally.hurt and not STRESSORS[name].finite:  # few cases leave some stressors without any
+        if tally.hurt and not STRESSORS[name].finite:  # with few cases, some stressors have none
             panels.append(panel(name, tally))
     rows = [*result["projection"].values(), *result["frames"].values()]
     far = {group: row["p999"] for group, row in result["frame_gradients"].items() if row["p999"] > GRADIENT_TAIL}
@@ -251,7 +261,7 @@ def stress(device: Device, cases: int, seed: int, names: Sequence[str]) -> tuple
 
 @tool("stress")
 def main(arguments: Sequence[str]) -> int:
-    """Run it, tell, plot."""
+    """Run the stress test, and print and plot its result. Returns the exit status."""
     parser = options_parser(__doc__)
     parser.add_argument("--cases", metavar="N", type=number, default=100_000)
     parser.add_argument("--seed", type=int, default=0)

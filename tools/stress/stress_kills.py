@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kills trainings with SIGKILL at random moments, resumes them until they are done, and compares the models' bytes.
+"""Kill trainings with SIGKILL at random times, resume them until they are finished, and compare the models' bytes.
 
     tools/stress/run kills [--kills 100] [--seed 0] [--device DEVICE] [--json]
 
-The scene is the small one of the tests: 40 points, 8 pictures of 48x40 and two held out. Training writes a checkpoint
-every second step, so that many kills come while one is being written. A process is killed after a random time, anywhere
-from its start (imports, building of kernels, reading the checkpoint) to its end. One that gets to its end is compared
-with an undisturbed training: model.ply byte for byte, and the steps in metrics.jsonl. Exit status 1 if one of them
-differs, or a process ends in any other way than by being killed or being done.
+The scene is the small one of the tests: 40 points, 8 pictures of 48x40, and two held out. A training writes a
+checkpoint every second step, so that many kills interrupt the writing. A process is killed after a random time, between
+its start (imports, building of kernels, reading the checkpoint) and its end. A finished training is compared with an
+undisturbed one: the bytes of model.ply, and the steps in metrics.jsonl. The exit status is 1 if these differ, or if a
+process fails.
 """
 
 from __future__ import annotations
@@ -37,15 +37,21 @@ SETTINGS = (
     *("--density.gradient-threshold", "1e-3", "--density.opacity-reset-every", "90"),
 )
 WHILE_WRITING = 0.4
-"""Share of the kills that wait for the next checkpoint to be under way, which is a small part of the time."""
+"""Fraction of the kills that wait until the next checkpoint is being written. Writing takes little of the time."""
 DEADLINE = 300.0
-"""Seconds that a process may take, however busy the machine is."""
+"""Maximum seconds of a process, even on a busy machine."""
 
 
 @dataclass
 class Figures:
-    """kills: processes killed; writing: of them those that left a half-written file; before: those killed before their
-    first step; compared: trainings that were finished; seconds: of it all."""
+    """Figures of all kills.
+
+    kills: number of killed processes.
+    writing: number of those that left a half-written file.
+    before: number of those that were killed before the run had a checkpoint.
+    compared: number of finished trainings.
+    seconds: duration of the whole test.
+    """
 
     kills: int = 0
     writing: int = 0
@@ -55,7 +61,7 @@ class Figures:
 
 
 def half_written(run: Path) -> set[str]:
-    """Checkpoints that are being written, or were when a process died."""
+    """Names of the run's half-written checkpoints."""
     folder = run / "checkpoints"
     return {entry.name for entry in os.scandir(folder) if entry.name.startswith(".")} if folder.is_dir() else set()
 
@@ -68,7 +74,7 @@ class Kills:
         self.more = ("--device", device) if device else ()
         self.scene = write_scene(folder / "scene")
         self.whole = folder / "whole"
-        self.end_of(self.start(folder / "first"))  # which builds the kernels
+        self.end_of(self.start(folder / "first"))  # builds the kernels
         start = time.monotonic()
         self.end_of(self.start(self.whole))
         self.lifetime = time.monotonic() - start
@@ -76,13 +82,13 @@ class Kills:
         self.steps = self.steps_of(self.whole)
 
     def start(self, run: Path) -> subprocess.Popen[str]:
-        """A training, or the rest of one."""
+        """Start a training, or resume it if the run exists."""
         command = [sys.executable, "-m", "clsplat", "train", "-o", str(run), *self.more]
         command += ["--resume"] if (run / "config.toml").exists() else [str(self.scene), *SETTINGS]
         return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
     def end_of(self, process: subprocess.Popen[str]) -> None:
-        """Wait until it is done. Raises ClsplatError with its last words where it fails or hangs."""
+        """Wait until the training is finished. Raises ClsplatError with its last output if it fails or hangs."""
         try:
             _, said = process.communicate(timeout=DEADLINE)
         except subprocess.TimeoutExpired as error:
@@ -96,11 +102,11 @@ class Kills:
         return [json.loads(line)["step"] for line in (run / "metrics.jsonl").read_text().splitlines()]
 
     def kill_once(self, run: Path) -> bool:
-        """Start or go on, and kill at a random moment. Whether there was something to kill."""
+        """Start or resume the run's training, and kill it at a random time. Returns False if it finished before."""
         before = half_written(run)
         process = self.start(run)
         try:
-            # Mostly while it trains, which is the later part; the start is the same every time.
+            # Most kills come at any time; a fifth come in the first quarter, in which the process starts.
             wait = self.lifetime * self.random.uniform(0.0, 0.25 if self.random.random() < 0.2 else 0.9)
             process.wait(timeout=wait)
         except subprocess.TimeoutExpired:
@@ -111,7 +117,7 @@ class Kills:
                 time.sleep(self.random.uniform(0, 1e-3))
             process.kill()
             process.communicate(timeout=DEADLINE)
-            if process.returncode == 0:  # done, while a checkpoint was waited for
+            if process.returncode == 0:  # it finished while this process waited for a checkpoint
                 return False
             self.figures.kills += 1
             self.figures.writing += bool(half_written(run) - before)
@@ -121,7 +127,7 @@ class Kills:
         return False
 
     def compare(self, run: Path) -> None:
-        """Raise ClsplatError where a finished run is not what it would have been."""
+        """Raise ClsplatError if a finished run differs from the undisturbed one."""
         if (run / "model.ply").read_bytes() != self.model:
             raise ClsplatError(f"after {self.figures.kills} kills model.ply differs")
         if (steps := self.steps_of(run)) != self.steps:
@@ -131,7 +137,7 @@ class Kills:
         self.figures.compared += 1
 
     def survive(self, count: int) -> Figures:
-        """So many kills; every training that ends by itself is compared, and at last the one that is left."""
+        """Kill `count` times. Every finished training is compared; the last one is finished at the end."""
         start, run = time.monotonic(), self.folder / "run"
         while self.figures.kills < count:
             if not self.kill_once(run):
@@ -147,7 +153,7 @@ class Kills:
 
 @tool("stress_kills")
 def main(arguments: Sequence[str]) -> int:
-    """The command line above."""
+    """Run the test and print its figures."""
     parser = plain_parser(__doc__)
     parser.add_argument("--kills", metavar="N", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)

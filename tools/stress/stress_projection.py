@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Projection and its gradient on many Gaussians at once, against the twin in 80-bit floats, Gaussian by Gaussian."""
+"""Compare projection and its gradient with the twin in 80-bit floats, for each of many Gaussians."""
 
 from __future__ import annotations
 
@@ -39,9 +39,13 @@ FIELDS = tuple(name for name in SPLAT if name != "UNUSED")
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """errors: by name (n,), NaN where there is nothing to compare; norms: of gradients by parameter group
-    (|difference|^2, |wanted|^2); shown (n,); broken: how many are not finite, or culled wrongly, or shown wrongly, by
-    what it is."""
+    """Comparison of a batch with the twin.
+
+    errors: errors (n,) by name, as in ERRORS; NaN where there is nothing to compare.
+    norms: by parameter group, the sums of |difference|^2 and |wanted|^2 of the gradients.
+    shown: (n,), True for Gaussians that the kernels show.
+    broken: by description, the number of Gaussians that are not finite, wrongly shown or wrongly culled.
+    """
 
     errors: dict[str, Array]
     norms: dict[str, tuple[float, float]]
@@ -50,7 +54,7 @@ class Outcome:
 
 
 def random_sums(rng: np.random.Generator, count: int) -> Array:
-    """Sums as blending's gradient makes them, (n, 9): moments of random weights at points within the ellipse."""
+    """Random sums (n, 9) like those of blending's gradient: moments of random weights at points within the ellipse."""
     points = 6
     radius, angle = 1.5 * np.sqrt(rng.random((count, points))), rng.uniform(0, 2 * np.pi, (count, points))
     u, v = radius * np.cos(angle), radius * np.sin(angle)
@@ -63,8 +67,12 @@ def random_sums(rng: np.random.Generator, count: int) -> Array:
 def there_and_back(
     device: Device, work: Workspace, cases: Cases, sums: Array, *, by_lens: DeviceArray | None = None
 ) -> tuple[stages_project.Projected, DeviceGaussians, DeviceArray]:
-    """Project, and take the sums back: splats, gradients, and those on the screen (n, 2); NaN where nothing was
-    written. by_lens: gets the gradients by the lens."""
+    """Run the kernels of projection and, with the sums as slots, of its gradient.
+
+    by_lens: filled with the gradients with respect to the lens.
+    Returns the splats, the gradients, and the gradients (n, 2) with respect to the means on the image. Values that the
+    kernels have not written are NaN.
+    """
     gaussians = device_gaussians.upload_gaussians(device, cases.gaussians)
     camera = upload(device, device_camera.pack_camera(cases.camera))
     count = len(cases.gaussians)
@@ -93,7 +101,7 @@ def in_order(arrays: Mapping[str, Array]) -> tuple[Array, Array, Array, Array, A
 
 
 def on_image(wanted: ProjectedTwin, sums: Array) -> ProjectedGradients:
-    """Gradients by what is projected, from the sums: eqs. (50), (29)."""
+    """Gradients with respect to the projected Gaussians, from the sums: eqs. (50), (29)."""
     g, gu, gv, uu, uv, vv = sums[:, :6].astype(np.longdouble).T
     l11, l12, l22 = wanted.whitening.T  # the sums are of u' = -k u
     k = np.sqrt(np.longdouble(WHITEN2))
@@ -110,21 +118,21 @@ def on_image(wanted: ProjectedTwin, sums: Array) -> ProjectedGradients:
 def wanted_gradients(
     arrays: Mapping[str, Array], camera: Camera, wanted: ProjectedTwin, sums: Array
 ) -> tuple[dict[str, Array], Array]:
-    """Gradients by the parameters and by the mean on the image, from the sums, by the twin's way back."""
+    """The twin's gradients with respect to the parameters, and to the means on the image, from the sums."""
     image = on_image(wanted, sums)
     g = sums[:, 0].astype(np.longdouble)
     with np.errstate(all="ignore"):
         by = project_grad(arrays, camera, DEGREE, wanted, image)
-        # 1 - o is nothing but rounding where o is next to 1
+        # 1 - o would have only rounding errors where o is close to 1
         rest = 1 / (1 + np.exp(arrays["opacity_logits"]))
     by["opacity_logits"] = np.where(wanted.visible, g * rest, 0)
     logs = arrays["log_scales"]
-    by["quaternions"][(logs == logs[:, :1]).all(axis=1)] = 0  # a ball: what the twin has is its own rounding
+    by["quaternions"][(logs == logs[:, :1]).all(axis=1)] = 0  # a ball: the twin's gradient is only rounding
     return by, image.means2d
 
 
 def least_exponent(wanted: ProjectedTwin, camera: Camera) -> Array:
-    """The least q (n,) over the rectangle of the image's pixel centres: none of them has a larger alpha."""
+    """The least exponent q (n,) over the rectangle of the pixel centres. No pixel has a larger alpha than there."""
     low = 0.5 - wanted.means2d
     high = np.array([camera.width - 0.5, camera.height - 0.5]) - wanted.means2d
     a, b, c = wanted.conics.T
@@ -141,7 +149,8 @@ def least_exponent(wanted: ProjectedTwin, camera: Camera) -> Array:
 
 
 def limits_of_kernels(arrays: Mapping[str, Array], wanted: ProjectedTwin) -> NDArray[np.bool_]:
-    """Gaussians that the kernels cull, or may, in float32, and the twin shows (docs/gradients.md, section 10)."""
+    """Mask (n,) of the Gaussians that the kernels may cull because of float32's range, although the twin shows them
+    (docs/gradients.md, section 10)."""
     norm2 = (arrays["quaternions"] ** 2).sum(axis=1)
     a, b, c = wanted.conics.T
     with np.errstate(all="ignore"):
@@ -152,7 +161,7 @@ def limits_of_kernels(arrays: Mapping[str, Array], wanted: ProjectedTwin) -> NDA
 
 
 def undecided(arrays: Mapping[str, Array], camera: Camera) -> NDArray[np.bool_]:
-    """On a threshold of (13) to within float32: near plane, 1/255."""
+    """Mask (n,) of the Gaussians on a threshold of (13), the near plane or 1/255, within float32's errors."""
     z = (arrays["means"] @ camera.rotation.T + camera.translation)[:, 2]
     reach = np.abs(arrays["means"]).max(axis=1) + np.abs(camera.translation).max()
     with np.errstate(all="ignore"):
@@ -163,7 +172,10 @@ def undecided(arrays: Mapping[str, Array], camera: Camera) -> NDArray[np.bool_]:
 
 
 def compare(device: Device, cases: Cases, rng: np.random.Generator, *, finite_only: bool = False) -> Outcome:
-    """Project and go back; errors as `ERRORS` says."""
+    """Compare projection and gradient of a batch with the twin. ERRORS explains the errors.
+
+    finite_only: only count results that are not finite.
+    """
     count = len(cases.gaussians)
     sums = random_sums(rng, count)
     projected, written, on_screen = there_and_back(device, Workspace(device), cases, sums)
@@ -182,7 +194,7 @@ def compare(device: Device, cases: Cases, rng: np.random.Generator, *, finite_on
     skipped = undecided(arrays, camera)
     with np.errstate(all="ignore"):
         budget = 2 * np.log(wanted.opacities / ALPHA_MIN)
-    # an ellipse that touches the image by this much reaches no pixel that shows it: alpha is within 2 % of 1/255
+    # Ellipses that reach the image by less than this are left out: their alphas are within 2 % of 1/255.
     reaches = wanted.visible & (least_exponent(wanted, camera) < budget - 0.04)
     missing = reaches & ~shown & ~skipped & ~limits_of_kernels(arrays, wanted)
     for i in np.flatnonzero(missing):  # an ellipse may pass between pixel centres
@@ -205,21 +217,21 @@ def compare(device: Device, cases: Cases, rng: np.random.Generator, *, finite_on
         size = np.sqrt((want.reshape(count, -1) ** 2).sum(axis=1))
         off = np.sqrt((difference**2).sum(axis=1))
         with np.errstate(all="ignore"):
-            # where sigmoid ends, at a logit of 87, and under the smallest normal float, there is no relative error
+            # there is no relative error below the smallest normal float, and where the sigmoid ends, at a logit of 87
             errors[f"d {name}"] = np.where(size > TINY, off / size, np.where(off > TINY, np.inf, 0))
         norms[name] = (float((off[both] ** 2).sum()), float((size[both] ** 2).sum()))
     return Outcome({name: np.where(both, e, np.nan).astype(float) for name, e in errors.items()}, norms, shown, broken)
 
 
 ERRORS = {
-    "position": "mean on the image: pixels, beyond 10,000 of them per 10,000",
-    "shape": "whitening: entries on the diagonal of W W_exact^-1 - 1",
-    "offset": "whitened offset (u, v) of the farthest pixel that is in the ellipse: absolute",
+    "position": "mean on the image: in pixels; for means beyond 10,000 pixels, per 10,000 pixels",
+    "shape": "whitening: largest diagonal entry of W W_exact^-1 - 1",
+    "offset": "whitened offset (u, v) of the farthest pixel in the ellipse: absolute",
     "depth": "relative",
     "opacity": "relative",
     "extent": "half sides of the box: relative",
     "colour": "relative to 0.5 + sum |Y_k h_k|",
-    **{f"d {name}": "gradient: relative, in the norm of the Gaussian's own" for name in (*PARAMETER_NAMES, "screen")},
+    **{f"d {name}": "gradient of a Gaussian: its norm's relative error" for name in (*PARAMETER_NAMES, "screen")},
 }
 
 
@@ -248,7 +260,7 @@ def _forward_errors(
             "offset": np.maximum(e11 * reach + e12 * v, e22 * v),
             "depth": np.abs(columns["DEPTH"] / wanted.depths - 1),
             "opacity": np.abs(2 ** columns["LOG2O"] / wanted.opacities - 1),
-            # of a budget next to 0 nothing is left but rounding, and nothing is seen of it
+            # a budget close to 0 has only rounding errors, and the Gaussian is invisible
             "extent": np.where(reach > 0.1, np.abs(half / wanted.half_extents - 1).max(axis=1), 0),
             "colour": (np.abs(colours - wanted.colors) / (0.5 + weights)).max(axis=1),
         }

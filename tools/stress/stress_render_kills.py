@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kills `clsplat render` at random moments, finishes with --skip-existing, and compares with an undisturbed run.
+"""Kill `clsplat render` at random times, finish with --skip-existing, and compare with an undisturbed call.
 
     tools/stress/run render_kills -o OUT --kills 10 -- MODEL --cameras SCENE --path turntable --count 120
 
-What follows -- are arguments of `clsplat render` without -o. OUT/whole and OUT/killed are made and must not exist.
-After every kill each frame that is there has to be whole, and in the end all have to be the same, byte for byte, with
-nothing beside them. Exit status 0 if so, else 1.
+The arguments after -- are those of `clsplat render`, without -o. The folders OUT/whole and OUT/killed are created, and
+must not exist. After every kill, each existing frame must be complete. In the end all frames must have the same bytes
+as undisturbed ones, and there must be no other files. The exit status is 0 if so, otherwise 1.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from rendered import contents
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run it; prints what it found as JSON."""
+    """Run the test, and print its result as JSON. Returns the exit status."""
     parser = plain_parser(__doc__)
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder for the two sequences")
-    parser.add_argument("--kills", type=int, default=10, help="default 10")
-    parser.add_argument("--seed", type=int, default=0, help="of the moments, default 0")
-    parser.add_argument("--extension", default="exr", help="of the files, default exr")
+    parser.add_argument("--kills", type=int, default=10, help="number of kills, default 10")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random times, default 0")
+    parser.add_argument("--extension", default="exr", help="extension of the files, default exr")
     parser.add_argument("render", nargs="+", help="arguments of clsplat render")
     arguments = parser.parse_args(argv)
 
@@ -50,7 +50,7 @@ def main(argv: Sequence[str]) -> int:
     kills, troubles = [], []
     for _ in range(arguments.kills):
         more = chance.randint(0, len(wanted) // (arguments.kills + 1))
-        # a little more than the time of a frame, so that a kill may come at any point of it
+        # up to 1.5 times the time of a frame, so that a kill may come at any point of a frame
         delay = chance.uniform(0, 1.5 * pace)
         kills.append(kill(rest, killed, more, delay))
         troubles += [name for name, data in contents(killed).items() if name[0] != "." and wanted.get(name) != data]
@@ -68,20 +68,22 @@ def main(argv: Sequence[str]) -> int:
 
 
 def command(render: Sequence[str], folder: Path, extension: str) -> list[str]:
-    """The command line for a sequence in the folder."""
+    """The command line that renders the frames into the folder."""
     output = str(folder / f"frame.####.{extension}")
     return [sys.executable, "-m", "clsplat", "render", *render, "-o", output, "--skip-existing"]
 
 
 def kill(line: Sequence[str], folder: Path, more: int, delay: float) -> int:
-    """Start the command, kill it `delay` seconds after `more` further frames are there; returns the number of frames
-    there."""
+    """Start the command, and kill it `delay` seconds after it has completed `more` frames.
+
+    Returns the number of frames in the folder.
+    """
     before = count(folder)
     process = subprocess.Popen(line, stdout=subprocess.DEVNULL, start_new_session=True)
     while process.poll() is None and count(folder) < before + more:
         time.sleep(0.002)
     if more == 0:
-        while process.poll() is None and count(folder, hidden=True) == before:  # until it writes its first
+        while process.poll() is None and count(folder, hidden=True) == before:  # until it begins to write
             time.sleep(0.002)
     time.sleep(delay)
     if process.poll() is None:
@@ -91,5 +93,5 @@ def kill(line: Sequence[str], folder: Path, more: int, delay: float) -> int:
 
 
 def count(folder: Path, *, hidden: bool = False) -> int:
-    """Frames in the folder, with those that are being written if hidden."""
+    """Number of frames in the folder. hidden: also count frames that are being written."""
     return sum(hidden or path.name[0] != "." for path in folder.iterdir())

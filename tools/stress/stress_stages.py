@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stages by themselves: the cases of `clsplat.selftest.cases` with random inputs, and lenses of stressed views."""
+"""Stress test of single stages: cases of `clsplat.selftest.cases` with random inputs, and lenses' gradients."""
 
 from __future__ import annotations
 
@@ -17,12 +17,15 @@ from clsplat.selftest.cases.table import CASES
 from clsplat.stages.pose import LENS_NUMBERS, lens_rows, sum_of, sums_of
 
 LENS_BOUND = 1e-5
-"""Relative to the sum of the terms' magnitudes: a few roundings of partial sums, and of the shape on the screen."""
+"""Bound of a lens gradient's error, relative to the sum of the terms' magnitudes.
+
+It allows a few roundings of partial sums, and of the shape on the image.
+"""
 KINDS = ("ordinary", "anisotropy", "edge_on", "off_centre", "focal_lengths")
 
 
 def worst_errors(device: Device, case: Case, rng: Generator, many: int) -> dict[str, Deviation]:
-    """The largest errors of random inputs, of the case's sizes and of sizes between."""
+    """The largest errors of a case over random inputs, half with the case's own sizes, half with random ones."""
     worst: dict[str, Deviation] = {}
     work = Workspace(device)
     for turn in range(many):
@@ -35,8 +38,10 @@ def worst_errors(device: Device, case: Case, rng: Generator, many: int) -> dict[
 
 
 def lenses(device: Device, rng: Generator, many: int) -> float:
-    """The largest error by lenses of views of needles, discs, off centre, through any lens; from sums as blending
-    makes them."""
+    """The largest relative error of the gradients with respect to a lens, over views of the stressors KINDS.
+
+    The gradients follow from random sums like those of blending's gradient.
+    """
     worst, work = 0.0, Workspace(device)
     for turn in range(many):
         made = STRESSORS[KINDS[turn % len(KINDS)]].make(rng, 300)
@@ -55,7 +60,7 @@ def lenses(device: Device, rng: Generator, many: int) -> float:
 
 
 def stages(device: Device, seed: int, many: int) -> Result:
-    """Errors by name, with their bounds and what is over one."""
+    """Errors by name with their bounds, and descriptions of faults."""
     rng = np.random.default_rng([seed, 77])
     worst = {"lens": Deviation(lenses(device, rng, many), LENS_BOUND)}
     for name, case in CASES.items():

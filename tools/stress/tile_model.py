@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Tiles a model over a grid, to any number of Gaussians, to try large models on.
+"""Make a large model for tests: copies of a model on a grid, with any number of Gaussians.
 
     python tools/stress/tile_model.py MODEL OUTPUT.ply --gaussians N [--sh-degree 3] [--up z] [--box X0,Y0,Z0,X1,Y1,Z1]
 
 The copies lie side by side on the plane across the up axis, row by row in a square. Each has the Gaussians inside a
-box, that of most means by default, and differs a little from the others: places, sizes, opacities, colours. The output
-is the PLY of every tool, written piece by piece: memory is that of the model and of a piece. Equal arguments give equal
-bytes.
+box, which by default holds most of the means. Copies differ slightly in positions, sizes, opacities and colours. The
+output is a 3DGS PLY that is written piece by piece, so that memory is needed only for the model and a piece. Equal
+arguments give equal bytes.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from clsplat.models.edit import take
 from clsplat.shots.viewpoints import extent_of
 
 PIECE_ROWS = 1 << 16
-"""Gaussians that are written at once."""
+"""Number of Gaussians that are written at once."""
 SPREAD = 0.1
-"""Standard deviation of a Gaussian's displacement in a copy, in its own middle sizes, and of its logit."""
+"""Standard deviation of a Gaussian's displacement in a copy, relative to its median scale, and of its logit."""
 INSIDE = 0.8
-"""Fraction of the means, along each axis, in the box if none is given. The others may be far, as those of a sky."""
+"""Fraction of the means along each axis that the default box holds. The others may be far away, such as a sky's."""
 SIZE_SPREAD, TINT_SPREAD = 0.03, 0.06
-"""Standard deviations of logs of scales, and of the colour of a copy."""
+"""Standard deviations of the change of log scales, and of a copy's colour (`sh_dc`)."""
 
 Box = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run it."""
+    """Write the model. Returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", type=Path, help="a model of any format")
     parser.add_argument("output", type=Path, help="the PLY to write")
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--sh-degree", type=int, default=MAX_SH_DEGREE, help="largest degree of SH to keep; default 3")
     parser.add_argument("--up", choices=("x", "y", "z"), default="z", help="axis across the plane; default z")
     parser.add_argument("--box", help="corners of a tile, X0,Y0,Z0,X1,Y1,Z1; by default the box of most means")
-    parser.add_argument("--seed", type=int, default=0, help="of the changes from copy to copy; default 0")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the differences between copies; default 0")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
     given = parser.parse_args(argv)
     try:
@@ -88,10 +88,11 @@ def corners(text: str) -> Box:
 def write_tiled(
     path: Path, model: Gaussians, count: int, *, sh_degree: int, up: int, box: Box | None, seed: int
 ) -> int:
-    """Write `count` Gaussians. Returns the number of copies, the last of which may be a part.
+    """Write `count` Gaussians. Returns the number of copies, the last of which may be incomplete.
 
     up: index of the axis across the plane.
-    box: corners (3,) of a tile, in world units, which is also the distance of the copies; None for that of most means.
+    box: corners (3,) of a tile in world units, whose sides are also the distances between copies. None for the box of
+        most means.
     Raises InputError if the box is empty.
     """
     low, high = extent_of(model.means, INSIDE) if box is None else (corner - model.origin for corner in box)
@@ -124,7 +125,10 @@ def _header(tile: Gaussians, count: int, names: Sequence[str]) -> bytes:
 
 
 def _pieces(tile: Gaussians, count: int, steps: NDArray[np.float64], seed: int) -> Iterator[Float32]:
-    """Rows of the file, at most PIECE_ROWS at a time. steps: (2, 3), to the next copy in a row and in a column."""
+    """Yield rows of the file, at most PIECE_ROWS at a time.
+
+    steps: (2, 3), the displacement of the next copy in a row and in a column.
+    """
     size = len(tile)
     side = math.ceil(math.sqrt(count / size))
     for copy in range(math.ceil(count / size)):
@@ -139,7 +143,7 @@ def _pieces(tile: Gaussians, count: int, steps: NDArray[np.float64], seed: int) 
 def _changed(
     tile: Gaussians, rows: slice, shift: NDArray[np.float64], tint: NDArray[np.float64], generator: np.random.Generator
 ) -> Float32:
-    """Rows of a copy, (n, properties)."""
+    """Rows (n, properties) of a copy, with its random changes."""
     log_scales, sh = tile.log_scales[rows], tile.sh[rows]
     number, rest = len(sh), 3 * (sh.shape[1] - 1)
     middle = np.exp(np.median(log_scales, axis=1, keepdims=True).astype(np.float64))

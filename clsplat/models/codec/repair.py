@@ -44,8 +44,8 @@ Read as logits, such values would mean that no opacity is below 0.5 to 0.58, and
 Trained models reach 0.8 and more, except after short trainings.
 """
 CLIPPED_OPACITY_SHARE = (1e-3, 0.02)
-"""Values are opacities of a neural network, clipped at 1, if at least the second fraction of them is within the first
-distance of 1. Logits do not cluster there."""
+"""A distance from 1, and a fraction. If at least this fraction of the values is within this distance, they are
+opacities, which a neural network has clipped at 1. Logits do not cluster there."""
 PERCENTAGE_MAXIMA = (40.0, 100.0)
 """Whole numbers whose largest is in this range are percentages. As levels from 0 to 255, all would be below 0.4."""
 ZERO_SCALE_LOG_LIMIT = float(np.log(values.MIN_SCALE)) + 1

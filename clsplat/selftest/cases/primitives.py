@@ -135,7 +135,7 @@ SCAN_CASE = Case(
 
 
 _WHOLE_BOX = 16
-"""The largest box, in tiles, of which every tile is listed, whatever the ellipse is (SMALL_BOX of tile.h)."""
+"""Largest number of tiles in a box all of whose tiles are listed, whatever the ellipse is (SMALL_BOX of tile.h)."""
 _EVERYWHERE = 1e6
 """Half an ellipse's width, in pixels, that reaches all tiles of its rows."""
 _COUNTS = ("VISIBLE", "PAIRS", "LONGEST", "STOPPED")

@@ -138,10 +138,11 @@ ADAM_CASE = Case(
 
 
 def _random_missed(rng: Generator, count: int) -> Inputs:
-    """Rows that missed up to MOST_MISSED steps before step `step`, with moments of any magnitude, some of them zero.
+    """Rows that missed at most MOST_MISSED steps up to step `step`, with moments of any magnitude, some of them zero.
 
-    first_step: the last step before which no row missed one. rates: of every step after it, by group. every: steps
-    between updates of the higher SH bands.
+    first_step: the last step that every row has taken.
+    rates: learning rates of each step after `first_step`, by group.
+    every: steps between updates of the higher SH bands.
     """
     span, every = int(rng.choice([1, 7, 40, MOST_MISSED])), int(rng.choice([1, 2]))
     first_step = int(rng.choice([0, 1, 100, 30_000]))

@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An OpenCL driver that misbehaves, in every Python process that has this folder on its PYTHONPATH.
+"""An OpenCL driver that misbehaves in every Python process with this folder on its PYTHONPATH.
 
-CLSPLAT_STAND_IN is HOW FIRST LAST FILE: the texts that are built are numbered from 1, as they are met for the first
-time, in FILE, a line of digest and options each, and those from FIRST to LAST come to a bad end: abort, hang, kill, as
-the system does where memory is short, memory, as Python says it, or empty, a program without kernels. With launch it is
-kernels by name that are numbered, and a launch that aborts.
+CLSPLAT_STAND_IN is HOW FIRST LAST FILE. Kernel texts are numbered from 1 in the order of their first builds; FILE has a
+line with digest and options for each. The build of the texts FIRST to LAST misbehaves, as HOW says:
+
+- abort: the process aborts. once: only at the first build of a text.
+- hang: the build does not return.
+- kill: the process is killed, as by a system without free memory.
+- memory: Python raises MemoryError.
+- empty: the built program has no kernels.
+- launch: kernels are numbered instead of texts, with their names in FILE, and their launches abort.
 """
 
 from __future__ import annotations
@@ -23,7 +28,7 @@ from typing import Any, NoReturn
 
 
 def _numbered(text: str, name: str, file: Path) -> tuple[int, bool]:
-    """The number of a text, and whether it is new. Processes build one after the other, so the file needs no lock."""
+    """The number of a text, and True if it is new. Processes build one after the other, so the file needs no lock."""
     line = f"{hashlib.sha256(text.encode()).hexdigest()} {name}"
     known = file.read_text().splitlines() if file.exists() else []
     if is_new := line not in known:
