@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -48,7 +48,7 @@ from clsplat.training.mip_filter import MipFilter
 from clsplat.training.stability.health import RetryBudget
 from clsplat.training.stability.non_finite import NonFiniteMonitor, Repair
 from clsplat.training.step.component import Component
-from clsplat.training.step.gradient_step import GradientStep, StepProbe, slot_fields, view_gradients
+from clsplat.training.step.gradient_step import GradientStep, StepMaker, StepProbe, slot_fields, view_gradients
 from clsplat.training.step.inputs import ViewInputs
 from clsplat.training.step.late_adam import ROW_BYTES, LateAdam
 from clsplat.training.step.monitor import StepMonitor
@@ -110,7 +110,7 @@ class Trainer:
         self.depths = DepthTargets(config, self.views, scene.length_unit, scene.near, self._pixels)
         self.batch = Batch(self.rasterizer, self.photographs, config, further) if config.batch > 1 else None
         self.sizes = by_doubling(config.warmup)
-        self.background: NDArray[np.float32] = np.zeros(3, np.float32)
+        self.background: NDArray[np.float32] = np.array(background_colour(config.background), np.float32)
         self.given = initial
         self.monitor = NonFiniteMonitor(self.rasterizer.readback)
         self.pending = SpeculativeSteps(device, self.monitor, self._begin_again)
@@ -119,7 +119,7 @@ class Trainer:
 
     def _start(self) -> None:
         """Set up the model and the state of step 0."""
-        self.rng = np.random.default_rng(self.config.seed)
+        self._rng, self._rng_state = np.random.default_rng(self.config.seed), None
         self.step = 0
         self.queue: list[int] = []
         self.controlled, self.last_views = False, 1
@@ -139,6 +139,7 @@ class Trainer:
         cameras = [self.local(view.camera) for view in self.views]
         mip_filter = MipFilter(self.config, self.device, self.rasterizer.work, cameras)
         self.components: tuple[Component, ...] = (mip_filter, self.appearance, self.cameras, self.depths)
+        self._active = [component for component in self.components if component.on]
         contributions = self.strategy.needs().contributions
         self.model = TrainedModel(
             self.device, self.rasterizer.work, self._make_plan, counts_contributions=contributions
@@ -186,6 +187,12 @@ class Trainer:
         if batch is not None:
             batch.follow([plan(replica.device, REPLICA_ARRAYS_PER_PARAMETER) for replica in batch.replicas])
         return made
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """Random generator of the training. Whoever asks for it may draw from it."""
+        self._rng_state = None
+        return self._rng
 
     @property
     def parameters(self) -> AnyGaussians:
@@ -242,7 +249,8 @@ class Trainer:
         self._raise_sh_degree()
         self._prepare_components(views)
         inputs, step, factor = self._inputs(views), self._gradient_step(), self.sizes.factor(self.step)
-        self.photographs.host.read_ahead(self._next_photographs())
+        if not self.photographs.host.has_all(factor):
+            self.photographs.host.read_ahead(self._next_photographs())
         result: Loss | Losses
         if self.batch is None:
             run = partial(self._run, step, inputs[0], reads_loss)
@@ -251,7 +259,7 @@ class Trainer:
                 self.photographs.ahead(self.queue[-1], factor)
         else:
             gathers, model = self.strategy.needs(self.step).gradients, (self.parameters, self.first, self.second)
-            result = self.batch.run(step, model, inputs, factor, self._watched_in_batch, statistics=gathers)
+            result = self.batch.run(step(), model, inputs, factor, self._watched_in_batch, statistics=gathers)
             self._after_adam()
         self.controlled, self.last_views = False, views
         self._note()
@@ -266,7 +274,7 @@ class Trainer:
 
     def _prepare_components(self, views: int) -> None:
         """Let the components do the work that is due before a step of `views` views."""
-        if due := [component for component in self.components if component.is_due(self.step, views)]:
+        if due := [component for component in self._active if component.is_due(self.step, views)]:
             self.catch_up()
             for component in due:
                 component.before_step(self.parameters)
@@ -274,32 +282,23 @@ class Trainer:
     def _inputs(self, views: int) -> Sequence[ViewInputs]:
         """Inputs of the step's views, with the components' parts in them."""
         inputs: Sequence[ViewInputs] = [self._view_inputs(place) for place in range(views)]
-        for component in self.components:
+        for component in self._active:
             inputs = component.join(inputs, self.step, self.parameters.count)
         return inputs
 
-    def _gradient_step(self) -> GradientStep:
-        """The step, with an exact count of pairs."""
-        rates = self.rates()
-        return GradientStep(
-            self.device,
-            self.rasterizer,
-            self.config,
-            self.step,
-            rates,
-            slot_fields(self.strategy.needs(self.step), nearness=bool(self.config.depth_use)),
-            explore=exploration_of(
-                self.config, self.step, rates["means"], self.parameters.count, self.scene.length_unit
-            ),
-            late=self.late,
-        )
+    def _gradient_step(self) -> StepMaker:
+        """Maker of the step; without `turn` and `room` it has an exact count of pairs."""
+        rates, count, unit = self.rates(), self.parameters.count, self.scene.length_unit
+        fields = slot_fields(self.strategy.needs(self.step), nearness=self.depths.on)
+        explore = exploration_of(self.config, self.step, rates["means"], count, unit)
+        of = (self.device, self.rasterizer, self.config, self.step, rates, fields)
+        return partial(GradientStep, *of, explore=explore, late=self.late)
 
-    def _run(
-        self, step: GradientStep, inputs: ViewInputs, reads_loss: bool, turn: int, room: PairCapacity | None
-    ) -> Loss:
+    def _run(self, make: StepMaker, inputs: ViewInputs, reads_loss: bool, turn: int, room: PairCapacity | None) -> Loss:
         """Make a step of one view."""
-        step = replace(step, turn=turn, room=room)
-        model, probe = (self.parameters, self.first, self.second), self._watched(inputs, step, step.step)
+        step = make(turn=turn, room=room)
+        of = self.model
+        model, probe = (of.parameters, of.first, of.second), self._watched(inputs, step, step.step)
         result = step.run(model, inputs, probe, self._view_gradients(inputs), reads_loss=reads_loss)
         self._after_adam()
         return result
@@ -343,7 +342,8 @@ class Trainer:
         begins, view, factor = not self.queue, self._next_view(), self.sizes.factor(self.step)
         bring = self.photographs.bring if self.batch is None else self.photographs.load
         image = bring(view, factor)
-        self.background = self._background_colour()
+        if self.config.random_background:
+            self.background = self.rng.random(3, dtype=np.float32)
         height, width = image.shape[:2]
         full = self.views[view].camera
         return ViewInputs(
@@ -360,12 +360,12 @@ class Trainer:
 
     def _view_gradients(self, inputs: ViewInputs) -> DeviceGaussians | None:
         """Arrays for the rows' gradients; None if no component reads them."""
-        if not any(part.wants_gradients for part in inputs.parts):
+        if not inputs.parts or not any(part.wants_gradients for part in inputs.parts):
             return None
         return view_gradients(self.rasterizer.work, self.parameters, zero=True)
 
     def _after_adam(self) -> None:
-        for component in self.components:
+        for component in self._active:
             component.after_adam(self.parameters)
 
     def _watched(self, inputs: ViewInputs, step: GradientStep, number: int) -> StepMonitor:
@@ -403,7 +403,8 @@ class Trainer:
 
         begun: True if the step number has already been increased for the current step, which has one view.
         """
-        self.mark = _Mark(self.step - begun, self.rng.bit_generator.state, list(self.queue), self.controlled)
+        state = self._rng_state = self._rng_state or self._rng.bit_generator.state
+        self.mark = _Mark(self.step - begun, state, list(self.queue), self.controlled)
 
     def step_back(self) -> bool:
         """After an error, return to the last point at which a checkpoint was possible.
@@ -426,7 +427,8 @@ class Trainer:
         if look:
             self.settle()
             self.monitor.look()
-        self._apply(self.monitor.examine(self.models()))
+        if self.monitor.noticed:
+            self._apply(self.monitor.examine(self.models()))
 
     def models(self) -> dict[str, AnyGaussians]:
         """Parameters, first and second moments, by their names in a checkpoint."""
@@ -458,11 +460,6 @@ class Trainer:
             self.settle()
         self.mark = None
         self.model.statistics = self.statistics.next_epoch()
-
-    def _background_colour(self) -> NDArray[np.float32]:
-        if self.config.random_background:
-            return self.rng.random(3, dtype=np.float32)
-        return np.array(background_colour(self.config.background), np.float32)
 
     def _raise_sh_degree(self) -> None:
         """Raise the SH degree in use. Higher bands have no arrays yet: their gradients, and so their steps, would be

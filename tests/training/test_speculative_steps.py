@@ -88,10 +88,10 @@ def test_a_step_by_capacity_waits_for_no_number(
 def test_a_step_in_groups_is_all_from_command_buffers(
     default_device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch, items: int
 ) -> None:
-    """Whichever photograph it has. Where an item has a tile, the photograph's way to the planes is launched."""
+    """Whichever photograph it has."""
     monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
     device = default_device.with_shape(lanes=1, items=items)
-    trainer = Trainer(scene, short(iterations=200, sh_degree=0, density={"every": 0}), device)
+    trainer = Trainer(scene, short(iterations=200, sh_degree=0, density={"every": 0, "stop": 200}), device)
     run_steps(1 + MAX_COUNTED_PASSES * len(trainer.views), trainer)  # then the most pairs of a view are known
     launched: list[str] = []
     noted(monkeypatch, Device, "enqueue", lambda _, kernel, *arguments, **options: launched.append(kernel.name))
@@ -100,7 +100,7 @@ def test_a_step_in_groups_is_all_from_command_buffers(
         calls = bench_stages.calls_of(device, trainer.train_step)
         assert (calls.launches <= 12) == (items > 1)
         assert (calls.blocking_reads, calls.blocking_writes) == (0, 0)
-        assert launched == ([] if items > 1 else ["target"])
+        assert not launched
 
 
 def test_long_lists_are_sorted_by_radix(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,6 +123,7 @@ def test_long_lists_are_sorted_by_radix(default_device: Device, monkeypatch: pyt
     trainer.pending.room(trainer.rasterizer, None, 0)
     assert appended()[1:] == [True] * 4
     monkeypatch.setattr(rasterizer, "MAX_MEAN_PAIRS", 0)
+    trainer.rasterizer.work.clear()  # command buffers know the limit that they were recorded with
     assert appended() == [False] * 5
 
 
@@ -160,7 +161,7 @@ def test_the_default_is_the_kind_of_the_device(default_device: Device, monkeypat
 
 
 def test_launches_come_from_tapes(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of all of a step but the photograph's planes, as long as the model stays."""
+    """Of all of a step, as long as the model stays."""
     monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
     trainer = bench_stages.trainer_of(bench_subject.synthetic(200, 80, 60), device, RasterizerConfig())
     made: list[str] = []
@@ -171,7 +172,7 @@ def test_launches_come_from_tapes(device: Device, monkeypatch: pytest.MonkeyPatc
         trainer.train_step()
         steps.append(list(made))
     assert len(steps[2]) > 12
-    assert steps[-3:] == [["target"]] * 3
+    assert steps[-3:] == [[]] * 3
     trainer.model.set(upload_gaussians(device, trainer.gaussians()))  # as density control does
     made.clear()
     trainer.train_step()

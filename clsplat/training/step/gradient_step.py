@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from typing import TypeVar
 from weakref import ref
 
@@ -19,9 +20,10 @@ from clsplat.rendering.rasterizer import ForwardPass, PairCapacity, Rasterizer
 from clsplat.stages.adam import AdamStep, adam
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians, parts
 from clsplat.stages.loss import Loss, loss
-from clsplat.stages.noise import noise
-from clsplat.stages.project import Slots, project_grad, project_step, step_numbers
-from clsplat.stages.target import is_photograph, target
+from clsplat.stages.loss_terms import LossTerm
+from clsplat.stages.noise import noise, noise_numbers
+from clsplat.stages.project import Slots, project_grad, project_step, step_numbers, thinning_numbers
+from clsplat.stages.target import is_photograph, on_device, target
 from clsplat.training.density import StatisticsNeeds
 from clsplat.training.step.inputs import StepRows, ViewInputs, ViewRows
 from clsplat.training.step.late_adam import LateAdam
@@ -31,7 +33,21 @@ R = TypeVar("R")
 
 
 class StepProbe:
-    """Observer of a step. Its methods are called as the stages are launched, and do nothing by default."""
+    """Observer of a step. Its methods are called when the stages are launched, and do nothing by default.
+
+    Where launches are replayed from a command buffer, `before_rows` and `after_rows` are not called: the probe's own
+    launches are replayed too.
+    """
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """What the probe's own launches depend on, except `numbers`."""
+        return ()
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """The values that the probe's own launches pass as `LaunchParameter`, in order."""
+        return ()
 
     def forward(self, frame: ForwardPass) -> None:
         """Called when the view is rendered."""
@@ -41,6 +57,9 @@ class StepProbe:
 
     def pair_gradients(self, slots: Slots) -> None:
         """Called when the gradient of blending is computed."""
+
+    def before_replay(self) -> None:
+        """Called before Adam changes the model by launches that are replayed."""
 
     def before_rows(self, rows: StepRows) -> None:
         """Called before Adam changes these rows."""
@@ -92,40 +111,57 @@ class GradientStep:
         them. They are zero before and after. The model has the same bits with and without them.
         reads_loss: True if the loss will be read.
         """
-        rasterizer, work, camera = self.rasterizer, self.rasterizer.work, inputs.camera
-        frame = rasterizer.forward(
-            model[0],
-            camera,
-            inputs.background,
-            room=self.room,
-            thinning=thinning_of(self.config, self.step),
-            nearness=self.fields.nearness,
-        )
-        probe.forward(frame)
-        result = self._compare(model[0], inputs, frame)
-        if reads_loss:
-            result = result.fetched()
-        probe.loss(result)
-        size = (camera.width, camera.height)
-        own = [part.gradient(work, frame.blended.image, result.gradient, size) for part in inputs.parts]
-        slots = self.replayed(
-            model[0],
-            (frame.listed, frame.background, result.gradient, self.fields),
-            lambda: rasterizer.pair_gradients(frame, result.gradient, fields=self.fields),
-        )
-        probe.pair_gradients(slots)
-        for start, stop, part in parts(work, *model, keep=True):
-            self._change(self._rows(start, stop, part, inputs, frame, slots, gradients), inputs, probe)
+        work, camera = self.rasterizer.work, inputs.camera
+        sent = self.rasterizer.send(camera, inputs.background)
+        source = on_device(work, inputs.photograph)
+        thinning, terms = thinning_of(self.config, self.step), loss_terms(self.config, inputs)
+        keys = tuple(term.key for term in terms)
+
+        def gradient(probe: StepProbe) -> tuple[ForwardPass, Loss, Slots, Sequence[DeviceArray | None]]:
+            forward = partial(self.rasterizer.forward, model[0], camera, sent[1], sent=sent)
+            frame = forward(room=self.room, thinning=thinning, nearness=self.fields.nearness)
+            probe.forward(frame)
+            result = self._compare(model[0], inputs, source, frame, terms)
+            if reads_loss:
+                result = result.fetched()
+            probe.loss(result)
+            size = (camera.width, camera.height)
+            own = [part.gradient(work, frame.blended.image, result.gradient, size) for part in inputs.parts]
+            slots = self.replayed(
+                model[0],
+                (frame.listed, frame.background, result.gradient, self.fields),
+                lambda: self.rasterizer.pair_gradients(frame, result.gradient, fields=self.fields),
+            )
+            probe.pair_gradients(slots)
+            return frame, result, slots, own
+
+        if self.room is None or reads_loss or inputs.parts or inputs.kept is not None or None in keys:
+            frame, result, slots, own = gradient(probe)
+        else:
+            on = (self.rasterizer.device_of(camera), sent[1], camera.width, camera.height, source.shape, source.dtype)
+            key = (*on, self.room, self.turn, self.fields, thinning is not None, keys)
+            numbers, given = thinning_numbers(thinning), (source,)
+            frame, result, slots, own = self.replayed(model[0], key, lambda: gradient(StepProbe()), numbers, given)
+            self.device.under_way.append(source.buffer)  # as in `target`
+            frame = frame.by(camera)
+            probe.forward(frame), probe.loss(result), probe.pair_gradients(slots)
+        self._change(model, inputs, frame, slots, gradients, probe)
         self.learn(inputs, own)
         return result
 
-    def _compare(self, of: AnyGaussians, inputs: ViewInputs, frame: ForwardPass) -> Loss:
-        """Loss of a frame."""
-        work, photograph, size = self.rasterizer.work, inputs.photograph, (inputs.camera.width, inputs.camera.height)
-        terms = loss_terms(self.config, inputs)
+    def _compare(
+        self,
+        of: AnyGaussians,
+        inputs: ViewInputs,
+        source: DeviceArray,
+        frame: ForwardPass,
+        terms: Sequence[LossTerm],
+    ) -> Loss:
+        """Loss of a frame, compared with the photograph `source`."""
+        work, size = self.rasterizer.work, (inputs.camera.width, inputs.camera.height)
         alpha = any(term.wants_alpha for term in terms)
         changed = any(part.changes_target for part in inputs.parts)
-        planes = target(self.device, work, photograph, frame.background, frame.blended, alpha=alpha, in_planes=changed)
+        planes = target(self.device, work, source, frame.background, frame.blended, alpha=alpha, in_planes=changed)
         image = frame.blended.image
         for part in inputs.parts:
             image = part.compare(work, image, planes, size)
@@ -152,6 +188,29 @@ class GradientStep:
             return self.replayed(of, (*key, planes.shape, planes.dtype), compared, given=(planes,))
         return self.replayed(of, key, compared)
 
+    def _change(
+        self,
+        model: tuple[AnyGaussians, ...],
+        inputs: ViewInputs,
+        frame: ForwardPass,
+        slots: Slots,
+        gradients: DeviceGaussians | None,
+        probe: StepProbe,
+    ) -> None:
+        """Take Adam's step for the model, part by part."""
+
+        def change() -> None:
+            for start, stop, part in parts(self.rasterizer.work, *model, keep=True):
+                self._change_rows(self._rows(start, stop, part, inputs, frame, slots, gradients), inputs, probe)
+
+        if self.room is None or self.late is not None or gradients is not None:
+            change()
+            return
+        step, explore = self.adam_step, self.explore
+        key = (slots, *map(ref, model[1:]), step.updates_sh_rest, bool(explore.weights), explore.amount != 0)
+        numbers = (*step_numbers(step, explore), *noise_numbers(explore), *probe.numbers)
+        self.replayed(model[0], (*key, *probe.key), change, numbers, before=probe.before_replay)
+
     def _rows(
         self,
         start: int,
@@ -177,7 +236,7 @@ class GradientStep:
             next((room for room in by_lens if room is not None), None),
         )
 
-    def _change(self, rows: StepRows, inputs: ViewInputs, probe: StepProbe) -> None:
+    def _change_rows(self, rows: StepRows, inputs: ViewInputs, probe: StepProbe) -> None:
         """Take Adam's step for some rows."""
         if rows.gradients is not None:
             project_grad(
@@ -205,6 +264,7 @@ class GradientStep:
         make: Callable[[], R],
         numbers: tuple[float, ...] = (),
         given: tuple[DeviceArray, ...] = (),
+        before: Callable[[], None] | None = None,
     ) -> R:
         """The result of `make`, from a command buffer (`Workspace.replayed`) if the step is launched by capacity.
 
@@ -212,7 +272,7 @@ class GradientStep:
         """
         if self.room is None:
             return make()
-        return self.rasterizer.work.replayed(of, key, make, numbers, given)
+        return self.rasterizer.work.replayed(of, key, make, numbers, given, before)
 
     def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
         """Take Adam's step for the view's parts, along the gradients `own`."""
@@ -230,16 +290,12 @@ class GradientStep:
             adam(self.device, step, *models, rows.projected.tile_counts, readback)
         else:
             view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
-            explore = self.explore
-            arrays = (*vars(rows.slots).values(), *vars(rows.screen).values())
-            key = (*map(ref, rows.model), rows.projected, *arrays, step.updates_sh_rest)
-            self.replayed(
-                rows.parameters,
-                (*key, rows.device, rows.camera_array, bool(explore.weights)),
-                lambda: project_step(rows.device, step, rows.model, *view, explore=explore),
-                step_numbers(step, explore),
-            )
+            project_step(rows.device, step, rows.model, *view, explore=self.explore)
         noise(self.device, self.explore, rows.parameters, rows.start, readback)
+
+
+StepMaker = Callable[..., GradientStep]
+"""Makes a step, from `turn` and `room`."""
 
 
 def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = False) -> DeviceGaussians:
