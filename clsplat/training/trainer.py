@@ -119,7 +119,8 @@ class Trainer:
 
     def _start(self) -> None:
         """Set up the model and the state of step 0."""
-        self._rng, self._rng_state = np.random.default_rng(self.config.seed), None
+        self._rng = np.random.default_rng(self.config.seed)
+        self._rng_state: Mapping[str, Any] | None = None
         self.step = 0
         self.queue: list[int] = []
         self.controlled, self.last_views = False, 1

@@ -115,7 +115,7 @@ class GradientStep:
         sent = self.rasterizer.send(camera, inputs.background)
         source = on_device(work, inputs.photograph)
         thinning, terms = thinning_of(self.config, self.step), loss_terms(self.config, inputs)
-        keys = tuple(term.key for term in terms)
+        key = self._key(inputs, source, terms)
 
         def gradient(probe: StepProbe) -> tuple[ForwardPass, Loss, Slots, Sequence[DeviceArray | None]]:
             forward = partial(self.rasterizer.forward, model[0], camera, sent[1], sent=sent)
@@ -135,19 +135,29 @@ class GradientStep:
             probe.pair_gradients(slots)
             return frame, result, slots, own
 
-        if self.room is None or reads_loss or inputs.parts or inputs.kept is not None or None in keys:
+        if key is None or reads_loss:
             frame, result, slots, own = gradient(probe)
         else:
-            on = (self.rasterizer.device_of(camera), sent[1], camera.width, camera.height, source.shape, source.dtype)
-            key = (*on, self.room, self.turn, self.fields, thinning is not None, keys)
             numbers, given = thinning_numbers(thinning), (source,)
             frame, result, slots, own = self.replayed(model[0], key, lambda: gradient(StepProbe()), numbers, given)
             self.device.under_way.append(source.buffer)  # as in `target`
             frame = frame.by(camera)
-            probe.forward(frame), probe.loss(result), probe.pair_gradients(slots)
+            probe.forward(frame)
+            probe.loss(result)
+            probe.pair_gradients(slots)
         self._change(model, inputs, frame, slots, gradients, probe)
         self.learn(inputs, own)
         return result
+
+    def _key(self, inputs: ViewInputs, source: DeviceArray, terms: Sequence[LossTerm]) -> tuple[object, ...] | None:
+        """All that the launches of a view's gradient depend on, except the model; None if they cannot be replayed in
+        one: with exact counts, with parts or depths, or if a mask gives each photograph a divisor of its own."""
+        keys, camera, room, fields = tuple(term.key for term in terms), inputs.camera, self.room, self.fields
+        if room is None or inputs.parts or inputs.kept is not None or None in keys:
+            return None
+        of_view = (self.rasterizer.device_of(camera), camera.width, camera.height, source.shape, source.dtype)
+        of_step = (room.pairs, room.turn, room.appends, fields.absolute, fields.contributions, fields.nearness)
+        return (*of_view, *of_step, self.turn, self.config.thinning > 0, keys)
 
     def _compare(
         self,
