@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from calls import noted, refuses
 from quick import quick
@@ -13,7 +14,9 @@ from tiny import run_steps, short, trained_to
 from clsplat.bench import stages as bench_stages
 from clsplat.bench import workload as bench_subject
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
+from clsplat.device.command_buffer import CommandBuffer
 from clsplat.device.context import Device
+from clsplat.errors import DriverError
 from clsplat.rendering import rasterizer
 from clsplat.rendering.rasterizer import MAX_COUNTED_PASSES, ForwardPass
 from clsplat.scenes.scene import Scene
@@ -125,6 +128,40 @@ def test_long_lists_are_sorted_by_radix(default_device: Device, monkeypatch: pyt
     monkeypatch.setattr(rasterizer, "MAX_MEAN_PAIRS", 0)
     trainer.rasterizer.work.clear()  # command buffers know the limit that they were recorded with
     assert appended() == [False] * 5
+
+
+@pytest.mark.parametrize(("failing", "kept"), [(1, True), (2, False)], ids=["gradient", "change"])
+def test_a_failed_replay_leaves_the_mark_until_the_model_changes(
+    default_device: Device, monkeypatch: pytest.MonkeyPatch, failing: int, kept: bool
+) -> None:
+    monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
+    trainer = bench_stages.trainer_of(bench_subject.synthetic(200, 80, 60), default_device, RasterizerConfig())
+    run_steps(12, trainer)
+    real, calls = Device.replay, []
+
+    def replay(device: Device, commands: CommandBuffer) -> None:
+        calls.append(commands)
+        if len(calls) == failing:
+            raise DriverError("lost")
+        real(device, commands)
+
+    monkeypatch.setattr(Device, "replay", replay)
+    with pytest.raises(DriverError, match="lost"):
+        trainer.train_step()
+    assert trainer.step_back() == kept
+
+
+@pytest.mark.parametrize("capacity", [False, True])
+def test_a_photograph_is_kept_until_its_launches_have_run(
+    default_device: Device, monkeypatch: pytest.MonkeyPatch, capacity: bool
+) -> None:
+    """Its buffer may be the host's memory, and the next size of photographs takes its place."""
+    monkeypatch.setenv(BY_CAPACITY_VARIABLE, str(int(capacity)))
+    trainer = bench_stages.trainer_of(bench_subject.synthetic(200, 80, 60), default_device, RasterizerConfig())
+    run_steps(12, trainer)
+    trainer.train_step()
+    kept = trainer.pending._steps[-1].kept if capacity else default_device.under_way
+    assert any(isinstance(each, cl.Buffer) for each in kept)
 
 
 class _Looks(Adaptive):
