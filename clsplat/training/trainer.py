@@ -236,8 +236,10 @@ class Trainer:
         self._begins = False
         if self.mark is None or self._looks_at_steps:
             self._note()
-        self.repair()
-        self.validate()
+        if self.monitor.noticed:
+            self.repair()
+        if self.cameras.gate.on:
+            self.validate()
         if not self.controlled:
             self._control_density()
             self.controlled = True
@@ -248,7 +250,8 @@ class Trainer:
             self.catch_up()
         self.step += views
         self._raise_sh_degree()
-        self._prepare_components(views)
+        if self._active:
+            self._prepare_components(views)
         inputs, step, factor = self._inputs(views), self._gradient_step(), self.sizes.factor(self.step)
         if not self.photographs.host.has_all(factor):
             self.photographs.host.read_ahead(self._next_photographs())
@@ -428,8 +431,7 @@ class Trainer:
         if look:
             self.settle()
             self.monitor.look()
-        if self.monitor.noticed:
-            self._apply(self.monitor.examine(self.models()))
+        self._apply(self.monitor.examine(self.models()))
 
     def models(self) -> dict[str, AnyGaussians]:
         """Parameters, first and second moments, by their names in a checkpoint."""
