@@ -41,12 +41,12 @@ class StepProbe:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """What the probe's own launches depend on, except `numbers`."""
+        """Everything that the probe's own launches depend on, except `numbers`."""
         return ()
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """The values that the probe's own launches pass as `LaunchParameter`, in order."""
+        """Values that the probe's own launches pass as `LaunchParameter`, in order."""
         return ()
 
     def forward(self, frame: ForwardPass) -> None:
