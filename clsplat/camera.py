@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal, cast
 
 import numpy as np
@@ -178,7 +179,7 @@ class Camera:
     radial: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     by_rays: bool = False
 
-    @property
+    @cached_property
     def model(self) -> CameraModel:
         """The camera model: properties, formulas and kernels."""
         for model in CAMERA_MODELS:

@@ -26,6 +26,15 @@ from clsplat.errors import CapacityError, InputError, amount
 
 R = TypeVar("R")
 
+_inner = getattr(cl, "_cl", None)
+_begin_write = getattr(_inner, "_enqueue_write_buffer", cl.enqueue_copy)
+_begin_read = getattr(
+    _inner, "_enqueue_read_buffer", lambda queue, buffer, host, **how: cl.enqueue_copy(queue, host, buffer, **how)
+)
+_begin_fill = getattr(_inner, "_enqueue_fill_buffer", cl.enqueue_fill_buffer)
+"""pyopencl's functions inside `enqueue_copy` and `enqueue_fill_buffer`. Those themselves, which ask the driver about
+both ends and the queue first, where a version has no such functions."""
+
 
 @dataclass(frozen=True, eq=False)
 class DeviceArray:
@@ -65,7 +74,10 @@ class DeviceArray:
         self._check(values)
         if values.size:
             self.device.calls.writes += 1
-            event = self._copied(_WRITING, self.buffer, values, is_blocking=False)
+            try:
+                event = _begin_write(self.device.queue, self.buffer, values, is_blocking=False)
+            except cl.Error as error:
+                raise self.device.failed(_WRITING, error) from None
             self._note("write", event)
             self.device.under_way.append(event)  # keeps the event alive: deleting it would wait for the copy
 
@@ -78,7 +90,7 @@ class DeviceArray:
         if self.size:
             self.device.calls.fills += 1
             pattern = np.asarray(value, self.dtype)
-            fill = partial(cl.enqueue_fill_buffer, self.device.queue, self.buffer, pattern, 0, self.nbytes)
+            fill = partial(_begin_fill, self.device.queue, self.buffer, pattern, 0, self.nbytes)
             self._note("fill", fill())
             for commands in self.device.command_buffers:
                 commands.add_fill(fill, self.buffer.int_ptr, pattern.tobytes(), self.nbytes)
@@ -103,9 +115,14 @@ class DeviceArray:
         event = copying()
         self._note("read", event)
 
+        queue, buffer = self.device.queue, self.buffer
+
         def again() -> None:
             nonlocal event
-            event = copying()
+            try:
+                event = _begin_read(queue, buffer, host, is_blocking=False)
+            except cl.Error as error:
+                raise self.device.failed(_READING, error) from None
 
         def finish() -> NDArray[Any]:
             try:
@@ -339,6 +356,7 @@ class Workspace:
         make: Callable[[], R],
         numbers: tuple[float, ...] = (),
         given: tuple[DeviceArray, ...] = (),
+        before: Callable[[], None] | None = None,
     ) -> R:
         """Return the result of `make`. From the second call with the same key on, a command buffer replays the commands
         that `make` put on the queue.
@@ -350,17 +368,23 @@ class Workspace:
         key: all other inputs of `make`, except `numbers` and `given`.
         numbers: the values that `make` passes to kernels as `LaunchParameter`, in order.
         given: arrays that `make` passes to kernels; for the same key, they may be others of the same shape and type.
+        before: function that is called before a replay; `make` does the same itself.
+
+        Inside `make`, a further call only makes: its commands belong to the command buffer that is being recorded.
         """
-        if self._poison is not None or self._use == "0" or not self._device.replays:
+        device = self._device
+        if self._poison is not None or self._use == "0" or device.command_buffers or not device.replays:
             return make()
         command_buffers = self._command_buffers.get(of)
         known = None if command_buffers is None else command_buffers.get(key)
         if known is not None and self._use != CHECK_TAPES:
+            if before is not None:
+                before()
             known[1].set(numbers, [array.buffer for array in given])
-            self._device.replay(known[1])
+            device.replay(known[1])
             return known[0]  # type: ignore[no-any-return]  # the result of this key's `make`
         renewed = self._renewed
-        result, commands = self._device.record(make, [array.buffer for array in given])
+        result, commands = device.record(make, [array.buffer for array in given])
         if commands is None or self._renewed != renewed:
             return result
         if known is not None:

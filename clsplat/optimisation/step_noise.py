@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -28,7 +29,7 @@ class Exploration:
     dead: float = 0.005
     key: tuple[int, int] = (0, 0)
 
-    @property
+    @cached_property
     def weights(self) -> tuple[float, ...]:
         """Weights of the penalties, in the order of PENALTY_PARAMETERS (kernels/shared/project_grad.h); empty without
         penalties."""

@@ -93,6 +93,11 @@ class ForwardPass:
     blended: Blended
     refused: tuple[int, ...] = ()
 
+    def by(self, camera: Camera) -> ForwardPass:
+        """The same arrays as the pass of another camera of this model and size."""
+        lists = (self.projected, self.bands, self.listed, self.blended)
+        return self if camera is self.camera else ForwardPass(camera, self.camera_array, self.background, *lists)
+
     @property
     def inputs(self) -> ImageInputs:
         """Input of the stages that compute more from this pass, such as channels and the gradient."""
@@ -120,8 +125,11 @@ class Rasterizer:
         self._antialiased: bool | None = None
         self.antialias(on=antialiased)
         self.work = work or Workspace(device)
-        self._sent: WeakKeyDictionary[Camera, NDArray[np.float32]] = WeakKeyDictionary()  # training has few cameras
-        """A camera and its last background, as `_send` sends them. The device may still read them."""
+        self._sent: WeakKeyDictionary[Camera, tuple[NDArray[np.float32], NDArray[np.float32] | None]] = (
+            WeakKeyDictionary()
+        )
+        """For each camera (training has few): it and a background as `send` sends them, which the device may still be
+        reading, and the background's array."""
         aligned = -(-len(CAMERA) // device.row_alignment) * device.row_alignment
         self._view = allocate(device, (aligned + 3,), np.float32)
         self._camera, self._background = self._view.reshaped(len(CAMERA)), self._view.rows(aligned, aligned + 3)
@@ -154,18 +162,20 @@ class Rasterizer:
         """True if a pass may run by capacity: memory is not tight, and Gaussians, not pairs, are sorted by depth."""
         return not self.work.tight and self._switches.depth_sort != "pairs"
 
-    def _send(self, camera: Camera, background: NDArray[np.float32] | DeviceArray) -> tuple[DeviceArray, DeviceArray]:
+    def send(self, camera: Camera, background: NDArray[np.float32] | DeviceArray) -> tuple[DeviceArray, DeviceArray]:
         """Camera and background on the device. A background on the host is sent with the camera, in one copy."""
-        sent = self._sent.get(camera)
+        sent, of = self._sent.get(camera, (None, None))
         if sent is None:
-            sent = self._sent[camera] = np.zeros(self._view.shape, np.float32)
+            sent = np.zeros(self._view.shape, np.float32)
             sent[: len(CAMERA)] = pack_camera(camera)
+            self._sent[camera] = sent, None
         if isinstance(background, DeviceArray):
             self._camera.send(sent[: len(CAMERA)])
             return self._camera, background
-        if sent[-3:].tobytes() != background.tobytes():
-            sent = self._sent[camera] = sent.copy()
+        if background is not of:
+            sent = sent.copy()
             sent[-3:] = background
+            self._sent[camera] = sent, background
         self._view.send(sent)
         return self._camera, self._background
 
@@ -179,6 +189,7 @@ class Rasterizer:
         room: PairCapacity | None = None,
         thinning: Thinning | None = None,
         nearness: bool = False,
+        sent: tuple[DeviceArray, DeviceArray] | None = None,
     ) -> ForwardPass:
         """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2).
 
@@ -188,9 +199,10 @@ class Rasterizer:
         no effect (docs/decisions/0025-launch-by-capacity.md). None counts the pairs first.
         thinning: random dropout of the model's Gaussians in this pass.
         nearness: like `nearness` of `blend`.
+        sent: result of `send`, if camera and background are already on the device.
         """
         device, work = self.device_of(camera), self.work
-        camera_array, background = self._send(camera, background)
+        camera_array, background = sent or self.send(camera, background)
         by_append = room is not None and self._appends(device, room, tiles_of(camera))
 
         def make() -> tuple[Projected, tuple[Band, ...], ListedBand, Blended, tuple[int, ...]]:

@@ -34,9 +34,12 @@ class AdamStep:
 
     def corrected(self, group: str) -> tuple[float, float]:
         """Return rate / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) of the group's t-th update."""
-        config = self.config
-        updates = self.number // config.sh_rest_every if group == "sh_rest" else self.number
-        return self.rates[group] / (1.0 - config.beta1**updates), (1.0 - config.beta2**updates) ** -0.5
+        shrunk, root = self.corrections(self.number if group != "sh_rest" else self.number // self.config.sh_rest_every)
+        return self.rates[group] / shrunk, root
+
+    def corrections(self, updates: int) -> tuple[float, float]:
+        """1 - beta1^t and 1 / sqrt(1 - beta2^t) of the t-th update."""
+        return 1.0 - self.config.beta1**updates, (1.0 - self.config.beta2**updates) ** -0.5
 
     @property
     def scales(self) -> dict[str, float]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
+from clsplat.device.command_buffer import LaunchParameter
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
@@ -102,6 +103,11 @@ def new_statistics(device: Device, count: int, *, contributions: bool = False) -
     return DensityStatistics(**arrays)
 
 
+def statistics_numbers(camera: Camera) -> tuple[float, ...]:
+    """Arguments of `add_statistics` that differ between cameras of one size."""
+    return (camera.fx,) if camera.model.along_rays else ()
+
+
 @stage("statistics", density_statistics=3)
 def add_statistics(
     device: Device,
@@ -116,7 +122,7 @@ def add_statistics(
     kernels = device.kernels("density", {"RAYS": True} if rays else {})
     to_ndc = (0.5 * camera.width, 0.5 * camera.height)
     view, sums = (projected.tile_counts, screen.gradients), (statistics.gradient_sums, statistics.seen)
-    sizes = (*to_ndc, camera.fx) if rays else to_ndc
+    sizes = (*to_ndc, *(LaunchParameter(number) for number in statistics_numbers(camera)))
     launch_items(device, kernels.density_statistics, n, n, *sizes, *view, projected.splats, *sums, statistics.radii)
 
 
@@ -130,7 +136,9 @@ def add_contributions(
     """
     n = projected.tile_counts.shape[0]
     kernel, view = device.kernels("density").contribution_statistics, (projected.tile_counts, contributions)
-    launch_items(device, kernel, n, n, area, *view, statistics.current_totals, statistics.current_largest)
+    launch_items(
+        device, kernel, n, n, LaunchParameter(area), *view, statistics.current_totals, statistics.current_largest
+    )
 
 
 @dataclass(frozen=True, eq=False)

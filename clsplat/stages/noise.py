@@ -8,6 +8,7 @@ from math import inf, log
 import numpy as np
 
 from clsplat.device.buffers import DeviceArray
+from clsplat.device.command_buffer import LaunchParameter, LaunchParameterWord
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
@@ -23,6 +24,11 @@ def highest_logit(dead: float) -> float:
     """Logit of the opacity above which no noise is added."""
     highest = dead + NOISE_OPACITY_RANGE
     return log(highest / (1 - highest)) if highest < 1 else inf
+
+
+def noise_numbers(explore: Exploration) -> tuple[float, ...]:
+    """Arguments of `noise` that change from step to step: the key's words and the amount; empty without noise."""
+    return () if explore.amount == 0 else (*map(LaunchParameterWord, explore.key), LaunchParameter(explore.amount))
 
 
 def noise(
@@ -41,6 +47,7 @@ def _add_noise(
     device: Device, explore: Exploration, gaussians: DeviceGaussians, first_row: int, readback: DeviceArray
 ) -> None:
     """Launch add_noise. This is a function of its own so that a step without noise records no stage `noise`."""
+    *words, amount = noise_numbers(explore)
     highest, limit2 = min(highest_logit(explore.dead), 1e30), PARAMETER_GROUPS["means"].limit ** 2
     launch_items(
         device,
@@ -48,8 +55,8 @@ def _add_noise(
         gaussians.count,
         gaussians.count,
         np.uint32(first_row),
-        *(np.uint32(word) for word in explore.key),
-        *(explore.amount, explore.dead, highest, limit2),
+        *words,
+        *(amount, explore.dead, highest, limit2),
         readback.buffer,
         *(gaussians[group] for group in ("quaternions", "log_scales", "opacity_logits", "means")),
     )

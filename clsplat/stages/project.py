@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -206,12 +207,12 @@ def project_grad(
 def step_numbers(step: AdamStep, explore: Exploration) -> tuple[float, ...]:
     """Arguments of `project_step` that change with the step: penalty weights, two roots for Adam, and each group's
     learning rate."""
-    by_group = {
-        group: (0.0, 0.0) if group == "sh_rest" and not step.updates_sh_rest else step.corrected(group)
-        for group in PARAMETER_GROUPS
-    }
-    roots = by_group["means"][1], by_group["sh_rest"][1]
-    return (*explore.weights, *roots, *(rate for rate, _ in by_group.values()))
+    rates, number, every = step.rates, step.number, step.config.sh_rest_every
+    shrunk, root = of_rest, root_of_rest = step.corrections(number)
+    if every > 1:
+        of_rest, root_of_rest = (inf, 0.0) if number % every else step.corrections(number // every)
+    by_group = [rates[group] / (of_rest if group == "sh_rest" else shrunk) for group in PARAMETER_GROUPS]
+    return (*explore.weights, root, root_of_rest, *by_group)
 
 
 @stage("project_grad", project_step=18)

@@ -34,6 +34,16 @@ def sample_defines(photograph: DeviceArray) -> dict[str, object]:
     return {"BYTES": True} if photograph.dtype == np.uint8 else {}
 
 
+def on_device(work: Workspace, image: NDArray[Any] | DeviceArray) -> DeviceArray:
+    """A photograph for `target`. An image on the host is uploaded without waiting: it must not change until the host
+    has waited for the device."""
+    if isinstance(image, DeviceArray):
+        return image
+    source = work.array("target_source", image.shape, image.dtype)
+    source.send(np.ascontiguousarray(image))
+    return source
+
+
 @stage("target")
 def target(
     device: Device,
@@ -53,17 +63,10 @@ def target(
     or mask and several items share a tile (`tile_items`).
 
     A fifth channel is a mask, 0 where a pixel does not count. These pixels become zero in the planes, and in the render
-    `blended` too; the gradient of blending skips them. An image on the host is uploaded without waiting: it must not
-    change until the host has waited for the device.
+    `blended` too; the gradient of blending skips them. An image on the host is uploaded as `on_device` does.
     """
-    if isinstance(image, DeviceArray):
-        device.under_way.append(
-            image.buffer
-        )  # the buffer may use the host's memory, which must live until the kernel has run
-        source = image
-    else:
-        source = work.array("target_source", image.shape, image.dtype)
-        source.send(np.ascontiguousarray(image))
+    source = on_device(work, image)
+    device.under_way.append(source.buffer)  # it may use the host's memory, which must live until the kernel has run
     height, width, channels = source.shape
     if not (in_planes or alpha) and is_photograph(source) and tile_items(device) > 1:
         return source

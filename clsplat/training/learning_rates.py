@@ -18,6 +18,6 @@ def rates_at(config: TrainConfig, step: int, length_unit: float, factor: float) 
     cooled = optimiser.cooldown_to ** (into / optimiser.cooldown) if into > 0 else 1.0
     fraction = min(step / optimiser.means_rate_steps, 1.0)
     means_rate = optimiser.means_rate ** (1 - fraction) * optimiser.means_rate_end**fraction
-    rates = {name: getattr(optimiser, group.rate) for name, group in PARAMETER_GROUPS.items()}
-    rates["means"] = means_rate * length_unit
-    return {group: rate * cooled * factor for group, rate in rates.items()}
+    rates = {name: getattr(optimiser, group.rate) * cooled * factor for name, group in PARAMETER_GROUPS.items()}
+    rates["means"] = means_rate * length_unit * cooled * factor
+    return rates

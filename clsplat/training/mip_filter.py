@@ -26,20 +26,25 @@ class MipFilter(Component):
     settings ask for antialiasing."""
 
     def __init__(self, config: TrainConfig, device: Device, work: Workspace, cameras: Sequence[Camera]) -> None:
-        self._device, self._work, self._on = device, work, config.antialiased
+        self._device, self._work, self._antialiased = device, work, config.antialiased
         self._least: DeviceArray | None = None  # (n,), None until computed before the next step
-        if not self._on:
+        if not self.on:
             return
         self._cameras = upload_cameras(device, cameras)
 
     @property
+    def on(self) -> bool:
+        """True for antialiased models."""
+        return self._antialiased
+
+    @property
     def row_bytes(self) -> int:
         """Bytes per Gaussian on the device."""
-        return SAMPLING_GAUSSIAN_BYTES if self._on else 0
+        return SAMPLING_GAUSSIAN_BYTES if self.on else 0
 
     def is_due(self, step: int, views: int) -> bool:
         """True if the limits have to be computed before a step of `views` views that ends with view number `step`."""
-        return self._on and (self._least is None or (step - 1) % SAMPLING_LIMIT_INTERVAL_STEPS < views)
+        return self.on and (self._least is None or (step - 1) % SAMPLING_LIMIT_INTERVAL_STEPS < views)
 
     def before_step(self, gaussians: AnyGaussians) -> None:
         """Compute the limits, and apply them."""
@@ -62,7 +67,7 @@ class MipFilter(Component):
 
     def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002
         """Load the arrays of a checkpoint of `count` Gaussians. Raises ValueError for another number of Gaussians."""
-        least = named("sampling/").get("least") if self._on else None
+        least = named("sampling/").get("least") if self.on else None
         if least is not None and least.shape != (count,):
             raise ValueError(f"sampling/least has shape {least.shape}")
         self._least = None if least is None else upload(self._device, np.ascontiguousarray(least, np.float32))

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -39,7 +38,7 @@ from clsplat.training.memory_planner import MemoryPlanner
 from clsplat.training.mip_filter import MipFilter
 from clsplat.training.stability.non_finite import NonFiniteMonitor, Repair
 from clsplat.training.step.component import Component
-from clsplat.training.step.gradient_step import GradientStep, StepProbe, slot_fields, view_gradients
+from clsplat.training.step.gradient_step import GradientStep, StepMaker, StepProbe, slot_fields, view_gradients
 from clsplat.training.step.inputs import ViewInputs
 from clsplat.training.step.late_adam import LateAdam
 from clsplat.training.step.monitor import StepMonitor
@@ -88,7 +87,7 @@ class Trainer:
         self.batch = Batch(self.rasterizer, self.photographs, config, further) if config.batch > 1 else None
         self.planner = MemoryPlanner(scene, config, self.rasterizer, self.photographs, memory, self.batch)
         self.sizes = by_doubling(config.warmup)
-        self.background: NDArray[np.float32] = np.zeros(3, np.float32)
+        self.background: NDArray[np.float32] = np.array(background_colour(config.background), np.float32)
         self.given = initial
         self.monitor = NonFiniteMonitor(self.rasterizer.readback)
         self.pending = SpeculativeSteps(device, self.monitor, self._begin_again)
@@ -115,6 +114,7 @@ class Trainer:
         mip_filter = MipFilter(self.config, self.device, self.rasterizer.work, cameras)
         late = [LateAdam(self.config.optimiser, self.rasterizer, len(initial))] if self.config.optimiser.late else []
         self.components: tuple[Component, ...] = (*late, mip_filter, self.appearance, self.cameras, self.depths)
+        self._active = [component for component in self.components if component.on]
         self.model = TrainedModel(
             self.device,
             self.rasterizer.work,
@@ -163,8 +163,10 @@ class Trainer:
         self.planner.begins = False
         if self.mark is None or self._looks_at_steps:
             self._note()
-        self.repair()
-        self.validate()
+        if self.monitor.noticed:
+            self.repair()
+        if self.cameras.gate.on:
+            self.validate()
         if not self.position.controlled:
             self._control_density()
             self.position.controlled = True
@@ -173,7 +175,8 @@ class Trainer:
         views = self.views_ahead
         self.position.step += views
         self._raise_sh_degree()
-        self._prepare_components(views)
+        if self._active:
+            self._prepare_components(views)
         inputs, step, factor = self._inputs(views), self._gradient_step(), self.sizes.factor(self.step)
         self.loader.read_ahead(self.position)
         result: Loss | Losses
@@ -184,7 +187,7 @@ class Trainer:
                 self.photographs.ahead(self.position.queue[-1], factor)
         else:
             gathers, model = self.strategy.needs(self.step).gradients, self.model.with_moments
-            result = self.batch.run(step, model, inputs, factor, self._watched_in_batch, statistics=gathers)
+            result = self.batch.run(step(), model, inputs, factor, self._watched_in_batch, statistics=gathers)
             self._after_adam()
         self.position.controlled, self.position.last_views = False, views
         self._note()
@@ -194,7 +197,7 @@ class Trainer:
 
     def _prepare_components(self, views: int) -> None:
         """Let the components do the work that is due before a step of `views` views."""
-        if due := [component for component in self.components if component.is_due(self.step, views)]:
+        if due := [component for component in self._active if component.is_due(self.step, views)]:
             self.catch_up()
             for component in due:
                 component.before_step(self.parameters)
@@ -202,30 +205,21 @@ class Trainer:
     def _inputs(self, views: int) -> Sequence[ViewInputs]:
         """Inputs of the step's views, with the components' parts in them."""
         inputs: Sequence[ViewInputs] = [self._view_inputs(place) for place in range(views)]
-        for component in self.components:
+        for component in self._active:
             inputs = component.join(inputs, self.step, self.parameters.count)
         return inputs
 
-    def _gradient_step(self) -> GradientStep:
-        """The step, with an exact count of pairs."""
-        rates = self.rates()
-        return GradientStep(
-            self.device,
-            self.rasterizer,
-            self.config,
-            self.step,
-            rates,
-            slot_fields(self.strategy.needs(self.step), nearness=bool(self.config.depth_use)),
-            explore=exploration_of(
-                self.config, self.step, rates["means"], self.parameters.count, self.scene.length_unit
-            ),
-        )
+    def _gradient_step(self) -> StepMaker:
+        """Maker of the step; without `turn` and `room` it has an exact count of pairs."""
+        rates, count, unit = self.rates(), self.parameters.count, self.scene.length_unit
+        fields = slot_fields(self.strategy.needs(self.step), nearness=self.depths.on)
+        explore = exploration_of(self.config, self.step, rates["means"], count, unit)
+        of = (self.device, self.rasterizer, self.config, self.step, rates, fields)
+        return partial(GradientStep, *of, explore=explore)
 
-    def _run(
-        self, step: GradientStep, inputs: ViewInputs, reads_loss: bool, turn: int, room: PairCapacity | None
-    ) -> Loss:
+    def _run(self, make: StepMaker, inputs: ViewInputs, reads_loss: bool, turn: int, room: PairCapacity | None) -> Loss:
         """Make a step of one view."""
-        step = replace(step, turn=turn, room=room)
+        step = make(turn=turn, room=room)
         model, probe = self.model.with_moments, self._watched(inputs, step, step.step)
         result = step.run(model, inputs, probe, self._view_gradients(inputs), reads_loss=reads_loss)
         self._after_adam()
@@ -277,12 +271,12 @@ class Trainer:
 
     def _view_gradients(self, inputs: ViewInputs) -> DeviceGaussians | None:
         """Arrays for the rows' gradients; None if no component reads them."""
-        if not any(part.wants_gradients for part in inputs.parts):
+        if not inputs.parts or not any(part.wants_gradients for part in inputs.parts):
             return None
         return view_gradients(self.rasterizer.work, self.parameters, zero=True)
 
     def _after_adam(self) -> None:
-        for component in self.components:
+        for component in self._active:
             component.after_adam(self.parameters)
 
     def _watched(self, inputs: ViewInputs, step: GradientStep, number: int) -> StepMonitor:

@@ -17,6 +17,11 @@ from clsplat.training.step.inputs import ViewInputs, ViewPart
 class Appearance(Component):
     """Appearances of all training views. The base class learns nothing and leaves the model's colours unchanged."""
 
+    @property
+    def on(self) -> bool:
+        """False for the base class."""
+        return type(self) is not Appearance
+
     def of_views(self, views: Sequence[int], step: int) -> Sequence[ViewPart]:  # noqa: ARG002
         """Appearance of each view of a step. The list is empty if the views have the model's own colours.
 

@@ -119,6 +119,11 @@ class Cameras(Component):
         self._config, self._scene, self._views, self._work = config, scene, views, work
 
     @property
+    def on(self) -> bool:
+        """True if cameras are refined."""
+        return self._config.refines
+
+    @property
     def models(self) -> int:
         """Arrays on the device for each parameter: parameter, two moments and a view's gradient if cameras are
         refined."""
@@ -151,7 +156,8 @@ class Cameras(Component):
 
     def of(self, view: int) -> Camera:
         """Camera of a training view; the same object if lenses are not refined and its pose has not moved."""
-        return self.lenses.seen(self._views[view].lens, self.poses.cameras[view])
+        camera = self.poses.cameras[view]
+        return self.lenses.seen(self._views[view].lens, camera) if self._config.refine_lenses else camera
 
     def drift(self) -> Drift | None:
         """Drift of the refined poses from the given ones; None if poses are not refined."""

@@ -67,6 +67,11 @@ class NonFiniteMonitor:
         self.last: LastStep | None = None
         self._noticed: tuple[LastStep, str, int] | None = None
 
+    @property
+    def noticed(self) -> bool:
+        """True if trouble has been noticed that `examine` has not seen yet."""
+        return self._noticed is not None
+
     def forget(self) -> None:
         """Forget the last step and its trouble, because the model has been replaced."""
         self.last = self._noticed = None

@@ -25,6 +25,11 @@ class Component:
     """Component of a training, with state of its own. By default no method does anything."""
 
     @property
+    def on(self) -> bool:
+        """False if the settings do without it: no step asks it for anything."""
+        return True
+
+    @property
     def models(self) -> int:
         """Number of arrays that the device needs for each parameter; 0 if the usual number is enough."""
         return 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from typing import TypeVar
 from weakref import ref
 
@@ -19,9 +20,10 @@ from clsplat.rendering.rasterizer import ForwardPass, PairCapacity, Rasterizer
 from clsplat.stages.adam import AdamStep, adam
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians, parts
 from clsplat.stages.loss import Loss, loss
-from clsplat.stages.noise import noise
-from clsplat.stages.project import Slots, project_grad, project_step, step_numbers
-from clsplat.stages.target import is_photograph, target
+from clsplat.stages.loss_terms import LossTerm
+from clsplat.stages.noise import noise, noise_numbers
+from clsplat.stages.project import Slots, project_grad, project_step, step_numbers, thinning_numbers
+from clsplat.stages.target import is_photograph, on_device, target
 from clsplat.training.density import StatisticsNeeds
 from clsplat.training.step.inputs import StepRows, ViewInputs, ViewRows
 from clsplat.training.step.loss_terms import loss_terms
@@ -32,8 +34,19 @@ R = TypeVar("R")
 class StepProbe:
     """Observer of a step. The step calls each method after it has launched a stage; the device may still be at work.
 
-    The methods do nothing by default.
+    The methods do nothing by default. Where launches are replayed from a command buffer, `before_rows` and `after_rows`
+    are not called: the observer's own launches are replayed too.
     """
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """Everything that the observer's own launches depend on, except `numbers`."""
+        return ()
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """Values that the observer's own launches pass as `LaunchParameter`, in order."""
+        return ()
 
     def forward(self, frame: ForwardPass) -> None:
         """Called after the launch of the view's forward pass."""
@@ -43,6 +56,9 @@ class StepProbe:
 
     def pair_gradients(self, slots: Slots) -> None:
         """Called after the launch of the gradient of blending."""
+
+    def before_replay(self) -> None:
+        """Called before Adam changes the model by launches that are replayed."""
 
     def before_rows(self, rows: StepRows) -> None:
         """Called before Adam on these rows is launched."""
@@ -92,40 +108,67 @@ class GradientStep:
         them. They are zero before and after. The model has the same bits with and without them.
         reads_loss: True if the loss will be read.
         """
-        rasterizer, work, camera = self.rasterizer, self.rasterizer.work, inputs.camera
-        frame = rasterizer.forward(
-            model[0],
-            camera,
-            inputs.background,
-            room=self.room,
-            thinning=thinning_of(self.config, self.step),
-            nearness=self.fields.nearness,
-        )
-        probe.forward(frame)
-        result = self._compare(model[0], inputs, frame)
-        if reads_loss:
-            result = result.fetched()
-        probe.loss(result)
-        size = (camera.width, camera.height)
-        own = [part.gradient(work, frame.blended.image, result.gradient, size) for part in inputs.parts]
-        slots = self.replayed(
-            model[0],
-            (frame.listed, frame.background, result.gradient, self.fields),
-            lambda: rasterizer.pair_gradients(frame, result.gradient, fields=self.fields),
-        )
-        probe.pair_gradients(slots)
-        for start, stop, part in parts(work, *model, keep=True):
-            self._step_rows(self._rows(start, stop, part, inputs, frame, slots, gradients), inputs, probe)
+        work, camera = self.rasterizer.work, inputs.camera
+        sent = self.rasterizer.send(camera, inputs.background)
+        source = on_device(work, inputs.photograph)
+        thinning, terms = thinning_of(self.config, self.step), loss_terms(self.config, inputs)
+        key = self._key(inputs, source, terms)
+
+        def gradient(probe: StepProbe) -> tuple[ForwardPass, Loss, Slots, Sequence[DeviceArray | None]]:
+            forward = partial(self.rasterizer.forward, model[0], camera, sent[1], sent=sent)
+            frame = forward(room=self.room, thinning=thinning, nearness=self.fields.nearness)
+            probe.forward(frame)
+            result = self._compare(model[0], inputs, source, frame, terms)
+            if reads_loss:
+                result = result.fetched()
+            probe.loss(result)
+            size = (camera.width, camera.height)
+            own = [part.gradient(work, frame.blended.image, result.gradient, size) for part in inputs.parts]
+            slots = self.replayed(
+                model[0],
+                (frame.listed, frame.background, result.gradient, self.fields),
+                lambda: self.rasterizer.pair_gradients(frame, result.gradient, fields=self.fields),
+            )
+            probe.pair_gradients(slots)
+            return frame, result, slots, own
+
+        if key is None or reads_loss:
+            frame, result, slots, own = gradient(probe)
+        else:
+            numbers, given = thinning_numbers(thinning), (source,)
+            frame, result, slots, own = self.replayed(model[0], key, lambda: gradient(StepProbe()), numbers, given)
+            self.device.under_way.append(source.buffer)  # as in `target`
+            frame = frame.by(camera)
+            probe.forward(frame)
+            probe.loss(result)
+            probe.pair_gradients(slots)
+        self._change(model, inputs, frame, slots, gradients, probe)
         self.learn(inputs, own)
         return result
 
-    def _compare(self, of: AnyGaussians, inputs: ViewInputs, frame: ForwardPass) -> Loss:
-        """Loss of a frame."""
-        work, photograph, size = self.rasterizer.work, inputs.photograph, (inputs.camera.width, inputs.camera.height)
-        terms = loss_terms(self.config, inputs)
+    def _key(self, inputs: ViewInputs, source: DeviceArray, terms: Sequence[LossTerm]) -> tuple[object, ...] | None:
+        """All that the launches of a view's gradient depend on, except the model; None if they cannot be replayed in
+        one: with exact counts, with parts or depths, or if a mask gives each photograph a divisor of its own."""
+        keys, camera, room, fields = tuple(term.key for term in terms), inputs.camera, self.room, self.fields
+        if room is None or inputs.parts or inputs.kept is not None or None in keys:
+            return None
+        of_view = (self.rasterizer.device_of(camera), camera.width, camera.height, source.shape, source.dtype)
+        of_step = (room.pairs, room.turn, room.appends, fields.absolute, fields.contributions, fields.nearness)
+        return (*of_view, *of_step, self.turn, self.config.thinning > 0, keys)
+
+    def _compare(
+        self,
+        of: AnyGaussians,
+        inputs: ViewInputs,
+        source: DeviceArray,
+        frame: ForwardPass,
+        terms: Sequence[LossTerm],
+    ) -> Loss:
+        """Loss of a frame, compared with the photograph `source`."""
+        work, size = self.rasterizer.work, (inputs.camera.width, inputs.camera.height)
         alpha = any(term.wants_alpha for term in terms)
         changed = any(part.changes_target for part in inputs.parts)
-        planes = target(self.device, work, photograph, frame.background, frame.blended, alpha=alpha, in_planes=changed)
+        planes = target(self.device, work, source, frame.background, frame.blended, alpha=alpha, in_planes=changed)
         image = frame.blended.image
         for part in inputs.parts:
             image = part.compare(work, image, planes, size)
@@ -152,6 +195,29 @@ class GradientStep:
             return self.replayed(of, (*key, planes.shape, planes.dtype), compared, given=(planes,))
         return self.replayed(of, key, compared)
 
+    def _change(
+        self,
+        model: tuple[AnyGaussians, ...],
+        inputs: ViewInputs,
+        frame: ForwardPass,
+        slots: Slots,
+        gradients: DeviceGaussians | None,
+        probe: StepProbe,
+    ) -> None:
+        """Take Adam's step for the model, part by part."""
+
+        def change() -> None:
+            for start, stop, part in parts(self.rasterizer.work, *model, keep=True):
+                self._change_rows(self._rows(start, stop, part, inputs, frame, slots, gradients), inputs, probe)
+
+        if self.room is None or gradients is not None or any(part.changes_rows for part in inputs.parts):
+            change()
+            return
+        step, explore = self.adam_step, self.explore
+        key = (slots, *map(ref, model[1:]), step.updates_sh_rest, bool(explore.weights), explore.amount != 0)
+        numbers = (*step_numbers(step, explore), *noise_numbers(explore), *probe.numbers)
+        self.replayed(model[0], (*key, *probe.key), change, numbers, before=probe.before_replay)
+
     def _rows(
         self,
         start: int,
@@ -177,7 +243,7 @@ class GradientStep:
             next((room for room in by_lens if room is not None), None),
         )
 
-    def _step_rows(self, rows: StepRows, inputs: ViewInputs, probe: StepProbe) -> None:
+    def _change_rows(self, rows: StepRows, inputs: ViewInputs, probe: StepProbe) -> None:
         """Take Adam's step for some rows."""
         if rows.gradients is not None:
             project_grad(
@@ -211,6 +277,7 @@ class GradientStep:
         make: Callable[[], R],
         numbers: tuple[float, ...] = (),
         given: tuple[DeviceArray, ...] = (),
+        before: Callable[[], None] | None = None,
     ) -> R:
         """The result of `make`, from a command buffer (`Workspace.replayed`) if the step is launched by capacity.
 
@@ -218,7 +285,7 @@ class GradientStep:
         """
         if self.room is None:
             return make()
-        return self.rasterizer.work.replayed(of, key, make, numbers, given)
+        return self.rasterizer.work.replayed(of, key, make, numbers, given, before)
 
     def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
         """Take Adam's step for the view's parts, along the gradients `own`."""
@@ -234,16 +301,12 @@ class GradientStep:
             adam(self.device, step, *models, rows.projected.tile_counts, readback)
         else:
             view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
-            explore = self.explore
-            arrays = (*vars(rows.slots).values(), *vars(rows.screen).values())
-            key = (*map(ref, rows.model), rows.projected, *arrays, step.updates_sh_rest)
-            self.replayed(
-                rows.parameters,
-                (*key, rows.device, rows.camera_array, bool(explore.weights)),
-                lambda: project_step(rows.device, step, rows.model, *view, explore=explore),
-                step_numbers(step, explore),
-            )
+            project_step(rows.device, step, rows.model, *view, explore=self.explore)
         noise(self.device, self.explore, rows.parameters, rows.start, readback)
+
+
+StepMaker = Callable[..., GradientStep]
+"""Makes a step, from `turn` and `room`."""
 
 
 def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = False) -> DeviceGaussians:

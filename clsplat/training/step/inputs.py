@@ -90,6 +90,8 @@ class ViewPart:
 
     wants_gradients = False
     """True if `add_rows` reads the rows' gradients."""
+    changes_rows = False
+    """True if `before_adam` changes rows."""
     changes_target = False
     """True if `compare` changes the photograph in `target`."""
 

@@ -127,6 +127,8 @@ class _ShownRows(ViewPart):
 
     late: LateAdam
 
+    changes_rows = True
+
     def before_adam(self, rows: StepRows, step: AdamStep) -> None:
         """Settle the rows."""
         self.late.settle_shown(rows, step)

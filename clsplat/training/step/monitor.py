@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from clsplat.device.launch import only_tried
 from clsplat.rendering.rasterizer import ForwardPass
-from clsplat.stages.density import DensityStatistics, add_contributions, add_statistics
+from clsplat.stages.density import DensityStatistics, add_contributions, add_statistics, statistics_numbers
 from clsplat.stages.loss import Loss
 from clsplat.training.density import StatisticsNeeds
 from clsplat.training.stability.non_finite import LastStep, NonFiniteMonitor
@@ -48,6 +48,23 @@ class StepMonitor(StepProbe):
         inputs = self.inputs
         self.monitor.begin(LastStep(self.number, inputs.view, inputs.name, inputs.background, sums))
 
+    @property
+    def key(self) -> tuple[object, ...]:
+        """Everything that the launches of `add_statistics` depend on, except `numbers`."""
+        camera = self.inputs.camera
+        return (*vars(self.statistics).values(), self.needs.gradients, camera.width, camera.height)
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """Values that the launches of `add_statistics` pass as `LaunchParameter`."""
+        counted = self.step.fields.contributions and self.statistics.current_totals is not None
+        of_view = statistics_numbers(self.inputs.camera) if self.needs.gradients else ()
+        return (*of_view, self.inputs.area) if counted else of_view
+
+    def before_replay(self) -> None:
+        """The model is about to change."""
+        self.changes()
+
     def before_rows(self, rows: StepRows) -> None:
         """Try in the sandbox every kernel that changes the state, before the first row changes: a driver may fail in
         any of them."""
@@ -70,11 +87,6 @@ class StepMonitor(StepProbe):
         """Add the view to the statistics that density control needs of these rows."""
         device, camera, screen = self.step.device, self.inputs.camera, rows.screen
         if self.needs.gradients:
-            size = (camera.width, camera.height, camera.fx)
-            self.step.replayed(
-                statistics,
-                (rows.projected, screen.gradients, *size),
-                lambda: add_statistics(device, statistics, camera, rows.projected, screen),
-            )
+            add_statistics(device, statistics, camera, rows.projected, screen)
         if screen.contributions is not None and statistics.current_totals is not None:
             add_contributions(device, statistics, rows.projected, screen.contributions, self.inputs.area)

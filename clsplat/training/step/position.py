@@ -27,25 +27,32 @@ class Mark:
 class Position:
     """Position of a training in its views.
 
-    rng: random generator.
     step: number of views done.
     queue: views that are left in the epoch, the next one last.
     controlled: True if the density control before the next step has been done.
     last_views: number of views of the last step.
     """
 
-    rng: np.random.Generator
+    _rng: np.random.Generator
     step: int = 0
     queue: list[int] = field(default_factory=list)
     controlled: bool = False
     last_views: int = 1
+    _rng_state: Mapping[str, Any] | None = None
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """Random generator of the training. Whoever asks for it may draw from it."""
+        self._rng_state = None
+        return self._rng
 
     def mark(self, *, begun: bool = False) -> Mark:
         """Mark this position.
 
         begun: True if the step number has already been increased for the current step, which has one view.
         """
-        return Mark(self.step - begun, self.rng.bit_generator.state, list(self.queue), self.controlled)
+        self._rng_state = self._rng_state or self._rng.bit_generator.state
+        return Mark(self.step - begun, self._rng_state, list(self.queue), self.controlled)
 
     def go_back(self, mark: Mark) -> None:
         """Return to a mark."""

@@ -25,6 +25,8 @@ from clsplat.training.stability.non_finite import LastStep, NonFiniteMonitor
 BY_CAPACITY_VARIABLE = "CLSPLAT_BY_CAPACITY"
 """Environment variable that decides if steps are launched by capacity. By default they are, except on CPUs."""
 
+_STOPPED, _PAIRS, _LONGEST = (READBACK.index(name) for name in ("STOPPED", "PAIRS", "LONGEST"))
+
 Run = Callable[[int, PairCapacity | None], Loss]
 """Runs one step. It takes the number of the loss's array of sums, and a capacity, or None to count the pairs first."""
 
@@ -148,12 +150,12 @@ class SpeculativeSteps:
     def _look(self, left: int) -> None:
         """Check all steps except the last `left`."""
         while len(self._steps) > left:
-            counts = self._steps[0].counts()
-            if counts[READBACK.index("STOPPED")]:
+            counts = self._steps[0].counts().tolist()
+            if counts[_STOPPED]:
                 self._again()
                 return
-            self._count(int(counts[READBACK.index("PAIRS")]))
-            self._appends &= bool(counts[READBACK.index("LONGEST")] <= MAX_LIST_PAIRS)
+            self._count(counts[_PAIRS])
+            self._appends &= counts[_LONGEST] <= MAX_LIST_PAIRS
             self._kept = self._steps.pop(
                 0
             ).kept  # the device may still be reading memory for copies launched after the counts
@@ -162,7 +164,7 @@ class SpeculativeSteps:
         """Repeat the steps that the device has skipped, with exact counts."""
         steps, self._steps = self._steps, []
         values = steps[0].readback.get()
-        values[READBACK.index("STOPPED")] = 0
+        values[_STOPPED] = 0
         steps[0].readback.set(values)
         self._monitor.last = steps[0].before
         for step in steps:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,11 @@ class DepthTargets(Component):
             pixels,
         )
         self._held: dict[int, tuple[tuple[int, int], tuple[NDArray[np.int64], Float32, Float32]]] = {}
+
+    @cached_property
+    def on(self) -> bool:
+        """True if the settings ask for depths."""
+        return bool(self._config.depth_use)
 
     @property
     def pixel_bytes(self) -> int:

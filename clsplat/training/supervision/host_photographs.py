@@ -42,7 +42,7 @@ class HostPhotographs:
         self._lock = threading.Lock()
         self._held: OrderedDict[Key, NDArray[Any]] = OrderedDict()
         self._bytes = 0
-        self._factor = 0.0
+        self._factor = self._complete = 0.0
         self._room: int | None = None
         self._ahead = reading_threads()
         self._wanted: set[Key] = set()
@@ -99,6 +99,15 @@ class HostPhotographs:
         """Keep these pixels of view `index` at 1/factor of its size in place of the file's, until they are evicted."""
         with self._lock:
             self._keep((index, factor), image)
+
+    def has_all(self, factor: float) -> bool:
+        """True if all views are held at 1/factor of their size, so that there is nothing to read ahead."""
+        if self._room is not None or factor == self._complete:
+            return self._room is None
+        with self._lock:
+            if sum(size == factor for _, size in self._held) == len(self.decoder.views):
+                self._complete = factor
+        return factor == self._complete
 
     def read_ahead(self, keys: Sequence[Key]) -> None:
         """Begin to read the views of the next steps, in the order of their use. Errors are raised by `get`."""

@@ -24,7 +24,10 @@ class Sizes:
 
     def factor(self, step: int) -> float:
         """Divisor of the photographs' width and height at step number `step`, which counts from 1."""
-        return next((factor for last, factor in self.until if step <= last), 1.0)
+        for last, factor in self.until:
+            if step <= last:
+                return factor
+        return 1.0
 
 
 def by_doubling(warmup: tuple[int, ...]) -> Sizes:

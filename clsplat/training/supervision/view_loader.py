@@ -38,6 +38,7 @@ class ViewLoader:
         self._config, self._views, self._photographs, self._sizes = config, views, photographs, sizes
         self._refined, self._local = refined, local
         self._cameras: dict[int, tuple[Camera, Camera]] = {}
+        self._background: Float32 = np.array(background_colour(config.background), np.float32)
 
     def camera(self, view: int, width: int, height: int) -> Camera:
         """Camera of a training view at the size of its photograph.
@@ -55,7 +56,7 @@ class ViewLoader:
         factor = self._sizes.factor(position.step)
         bring = self._photographs.bring if self._config.batch == 1 else self._photographs.load
         image = bring(view, factor)
-        background = self._background(position.rng)
+        background = position.rng.random(3, dtype=np.float32) if self._config.random_background else self._background
         height, width = image.shape[:2]
         full = self._views[view].camera
         return ViewInputs(
@@ -73,11 +74,8 @@ class ViewLoader:
     def read_ahead(self, position: Position) -> None:
         """Begin to read the photographs of the next steps, in the order of their use, until the end of the epoch."""
         batch = self._config.batch
+        if self._photographs.host.has_all(self._sizes.factor(position.step)):
+            return
         views = position.queue[: -1 - reading_threads() - batch : -1]
         factors = [self._sizes.factor(position.step + (1 + place // batch) * batch) for place in range(len(views))]
         self._photographs.host.read_ahead([*zip(views, factors, strict=True)])
-
-    def _background(self, rng: np.random.Generator) -> Float32:
-        if self._config.random_background:
-            return rng.random(3, dtype=np.float32)
-        return np.array(background_colour(self._config.background), np.float32)
