@@ -243,7 +243,7 @@ PROJECTION: Bounds = {
 - extent: in a budget log2(255 o) of 0.007, the rounding of log2 o, of size 8, leaves four correct digits.
 """
 GRADIENT_NORM, GRADIENT_TAIL = 1e-4, 1e-3
-"""Bounds of a gradient's relative error: of its norm over all cases, and of the 99.9th percentile of Gaussians.
+"""Bounds of a gradient's relative error: in norm over all cases, and for the 99.9th percentile of Gaussians.
 
 The largest relative error has no bound, because a gradient may vanish.
 """

@@ -114,7 +114,7 @@ def _summary(values: Array) -> Result:
 def gradient_faults(name: str, row: Result, tail: float) -> list[str]:
     """Descriptions of a gradient's errors that exceed their bounds.
 
-    The bound of the norm's error is GRADIENT_NORM, and that of the 99.9th percentile of Gaussians is `tail`.
+    The bound of the error in norm over all cases is GRADIENT_NORM, that of the 99.9th percentile of Gaussians `tail`.
     """
     faults = [] if row["norm"] <= GRADIENT_NORM else [f"{name} in norm {row['norm']:.2g} over {GRADIENT_NORM:g}"]
     return faults + ([f"{name} of 99.9 % {row['p999']:.2g} over {tail:g}"] if row["p999"] > tail else [])

@@ -231,7 +231,7 @@ ERRORS = {
     "opacity": "relative",
     "extent": "half sides of the box: relative",
     "colour": "relative to 0.5 + sum |Y_k h_k|",
-    **{f"d {name}": "gradient of a Gaussian: its norm's relative error" for name in (*PARAMETER_NAMES, "screen")},
+    **{f"d {name}": "gradient of a Gaussian: relative error in norm" for name in (*PARAMETER_NAMES, "screen")},
 }
 
 
