@@ -46,8 +46,8 @@ EVERY_SHAPE = pytest.mark.parametrize(
     ],
     indirect=["device"],
 )
-"""Mark of a test that runs all shapes at once: on each driver in two, since builds take most of the time, and where slow
-tests run on the default driver in all."""
+"""Mark of a test that runs all shapes at once. On each driver it has two, since builds take most of the time; among
+slow tests the default driver has all."""
 
 
 def shapes_of(device: Device, *more: tuple[int, int], every: bool = True) -> tuple[tuple[Any, ...], ...]:
