@@ -12,6 +12,8 @@ from clsplat.stages.append import LOCAL_PAIRS
 
 OWN_BOX = 32
 """Tiles of the largest box that an item processes alone: OWN_BOX in append.cl."""
+AHEAD = 4
+"""Pairs that an item loads at once: AHEAD in append.cl."""
 SIDE = 8
 """Items that share a row of tiles of a wide box: SIDE in append.cl."""
 
@@ -46,9 +48,10 @@ def boxes_of(frame: Mapping[str, Any], items: int) -> Boxes:
 @dataclass(frozen=True)
 class Sorting:
     """Mean rounds of a list's sort. A list of over LOCAL_PAIRS is sorted in parts, which are merged in further stages.
-    stages: in all. parts: over all stages. blocks, steps: of Batcher's network in local memory, over all parts.
-    far_steps: those through global memory. The others are an item's: ordered, ordered_far: comparisons. fetched,
-    stored: pairs copied to local memory and back. listed: pairs written."""
+    stages: in all. parts: over all stages. blocks, steps: of Batcher's network in local memory, two by two, over all
+    parts. far_steps: those through global memory. The others are an item's: ordered: four pairs in two steps;
+    ordered_far: comparisons. fetched: AHEAD pairs copied to local memory; stored: a pair copied back. listed: AHEAD
+    pairs written."""
 
     stages: float = 0
     parts: float = 0
@@ -70,25 +73,33 @@ def sorting_of(lists: Iterable[tuple[float, float]], items: int) -> Sorting:
 
 
 def _sorting(length: float, items: int) -> Sorting:
-    parts, doublings = math.ceil(length / LOCAL_PAIRS), math.ceil(math.log2(max(min(length, LOCAL_PAIRS), 1)))
     merges = math.ceil(math.log2(max(length / LOCAL_PAIRS, 1)))
-    of_merge = math.ceil(math.log2(LOCAL_PAIRS))
-    a_part = length / max(parts, 1)
-    steps = parts * (doublings * (doublings + 1) / 2 + of_merge * merges)
+    parts = [min(length - first, LOCAL_PAIRS) for first in range(0, math.ceil(length), LOCAL_PAIRS)]
+    doublings = [math.ceil(math.log2(max(part, 1))) for part in parts]
+    # Of each block of each part: the part's length, and the logarithm of half the block.
+    blocks = [(part, block) for part, number in zip(parts, doublings, strict=True) for block in range(number)]
+    blocks += [(part, LOCAL_PAIRS.bit_length() - 2) for part in parts] * merges
+    steps = [(part, max(1 << (block - 2 * turn) >> 1, 1)) for part, block in blocks for turn in range(block // 2 + 1)]
+    filled = [*(1 << number for number in doublings), *([LOCAL_PAIRS] * len(parts) * merges)]
     far_steps = merges * (merges + 1) / 2
-    copied = (1 + merges) * parts * math.ceil(a_part / items)
     return Sorting(
         stages=1 + merges,
-        parts=(1 + merges) * parts,
-        blocks=parts * (doublings + merges),
-        steps=steps,
+        parts=(1 + merges) * len(parts),
+        blocks=len(blocks),
+        steps=len(steps),
         far_steps=far_steps,
-        ordered=steps * math.ceil(a_part / 2 / items),
+        ordered=sum(math.ceil(_fours(part, apart) / items) for part, apart in steps),
         ordered_far=far_steps * math.ceil(length / 2 / items),
-        fetched=copied,
-        stored=copied if merges else 0,
-        listed=math.ceil(length / items),
+        fetched=sum(math.ceil(whole / items / AHEAD) for whole in filled),
+        stored=(1 + merges) * sum(math.ceil(part / items) for part in parts) if merges else 0,
+        listed=math.ceil(length / items / AHEAD),
     )
+
+
+def _fours(length: float, apart: int) -> float:
+    """Number of fours of pairs, `apart` from each other, of which the first is in the list."""
+    whole = length // (4 * apart)
+    return whole * apart + min(length - 4 * apart * whole, apart)
 
 
 def lists_of(frame: Mapping[str, Any]) -> list[tuple[float, float]]:
