@@ -16,66 +16,84 @@
 
 // Number of tiles in the largest box that an item processes alone.
 #define OWN_BOX 32
+// Number of loads that an item starts before it waits for the first.
+#define AHEAD 4
+#define EACH_AHEAD(i) _Pragma("unroll") for (uint i = 0; i < AHEAD; ++i)
 // Number of items that share a row of tiles of a wide box.
 #define SIDE (ITEMS < 8 ? ITEMS : 8)
 
-// True if pair a comes after pair b: (depth, slot).
-static inline int is_after(uint2 a, uint2 b) { return a.x > b.x || (a.x == b.x && a.y > b.y); }
+// A pair: its slot, then its depth's bits. The lists are in the order of depth, then slot.
+typedef uint2 Pair;
+// Fills up a list in local memory. It comes after every pair.
+#define NO_PAIR ((Pair)(0xffffffff))
 
-// The place of the first pair of the k-th comparison, and of the second: `step` apart, or in a mirrored step at equal
-// distances from the ends of a block of 2 step. All comparisons leave the lesser pair first, so that places past the
-// end of a list need no pairs: none would move.
-static inline uint first_of(uint k, uint step) { return 2 * k - (k & (step - 1)); }
-static inline uint second_of(uint first, uint step, int mirrored) {
-  return mirrored ? (first | (2 * step - 1)) - (first & (step - 1)) : first + step;
+// Swaps two pairs if the first comes after the second. One comparison of 64 bits and four selections.
+static inline void order_two(Pair *one, Pair *other) {
+  const Pair a = *one, b = *other;
+  const int after = ((ulong)a.y << 32 | a.x) > ((ulong)b.y << 32 | b.x);
+  *one = (Pair)(after ? b.x : a.x, after ? b.y : a.y);
+  *other = (Pair)(after ? a.x : b.x, after ? a.y : b.y);
 }
 
-// One step over pairs (count) in local memory.
-static inline void order_step(__local uint *depths, __local uint *slots, uint count, uint step, int mirrored) {
-  for (uint k = get_local_id(0); first_of(k, step) + 1 < count; k += ITEMS) {
-    const uint a = first_of(k, step), b = second_of(a, step, mirrored);
-    if (b < count) {
-      const uint2 one = (uint2)(depths[a], slots[a]), other = (uint2)(depths[b], slots[b]);
-      if (is_after(one, other)) {
-        depths[a] = other.x;
-        slots[a] = other.y;
-        depths[b] = one.x;
-        slots[b] = one.y;
-      }
-    }
+// Where local memory keeps the pair with this number: within 16, so that neighbouring items use different banks of it,
+// whatever the step. PLACE(a ^ b) is PLACE(a) ^ PLACE(b).
+#define PLACE(number) ((number) ^ ((number) >> 4 & 3) ^ ((number) >> 2 & 12))
+
+// Two steps of the network over pairs (count) in local memory: pairs `step` apart, or in a mirrored step at equal
+// distances from the ends of a block of 2 step, then pairs step / 2 apart. An item does both for four pairs in
+// registers, which may go past `count`, up to the next power of two. If step is 1, the first is one that has been done,
+// or comes before all others and may do anything.
+static inline void order_steps(__local Pair *pairs, uint count, uint step, int mirrored) {
+  const uint apart = max(step / 2, 1u), within = apart - 1;
+  const uint near = PLACE(apart), far = PLACE(mirrored ? 3 * apart - 1 : 2 * apart), turned = mirrored ? near : 0;
+  for (uint k = get_local_id(0); 4 * k - 3 * (k & within) < count; k += ITEMS) {
+    const uint number = 4 * k - 3 * (k & within), place = PLACE(number);
+    Pair one = pairs[place], two = pairs[place ^ near];
+    Pair three = pairs[place ^ far ^ turned], four = pairs[place ^ far ^ near ^ turned];
+    order_two(&one, &three);
+    order_two(&two, &four);
+    order_two(&one, &two);
+    order_two(&three, &four);
+    pairs[place] = one;
+    pairs[place ^ near] = two;
+    pairs[place ^ far] = three;
+    pairs[place ^ far ^ near] = four;
   }
   BARRIER_LOCAL();
 }
 
-// The same step over pairs in global memory.
-static inline void order_step_far(__global uint2 *list, uint count, uint step, int mirrored) {
-  for (uint k = get_local_id(0); first_of(k, step) + 1 < count; k += ITEMS) {
-    const uint a = first_of(k, step), b = second_of(a, step, mirrored);
+// One step over pairs (count) in global memory. All comparisons leave the lesser pair first, so that places past the
+// end of a list need no pairs: none would move.
+static inline void order_step_far(__global Pair *list, uint count, uint step, int mirrored) {
+  for (uint k = get_local_id(0); 2 * k - (k & (step - 1)) + 1 < count; k += ITEMS) {
+    const uint a = 2 * k - (k & (step - 1));
+    const uint b = mirrored ? (a | (2 * step - 1)) - (a & (step - 1)) : a + step;
     if (b < count) {
-      const uint2 one = list[a], other = list[b];
-      if (is_after(one, other)) {
-        list[a] = other;
-        list[b] = one;
-      }
+      Pair one = list[a], other = list[b];
+      order_two(&one, &other);
+      list[a] = one;
+      list[b] = other;
     }
   }
   BARRIER_GLOBAL();
 }
 
-// Copies pairs (count) to local memory.
-static inline void fetch_pairs(__global const uint2 *list, uint count, __local uint *depths, __local uint *slots) {
-  for (uint k = get_local_id(0); k < count; k += ITEMS) {
-    const uint2 pair = list[k];
-    depths[k] = pair.x;
-    slots[k] = pair.y;
+// Copies pairs (count) to local memory, and fills it up to `whole`.
+static inline void fetch_pairs(__global const Pair *list, uint count, uint whole, __local Pair *pairs) {
+  for (uint k = get_local_id(0); k < whole; k += AHEAD * ITEMS) {
+    Pair ahead[AHEAD];
+    EACH_AHEAD(i) ahead[i] = list[min(k + i * ITEMS, count - 1)];
+    EACH_AHEAD(i) {
+      const uint place = k + i * ITEMS;
+      if (place < whole) pairs[PLACE(place)] = place < count ? ahead[i] : NO_PAIR;
+    }
   }
   BARRIER_LOCAL();
 }
 
 // Writes pairs (count) back from local memory.
-static inline void store_pairs(__global uint2 *list, uint count, __local const uint *depths,
-                               __local const uint *slots) {
-  for (uint k = get_local_id(0); k < count; k += ITEMS) list[k] = (uint2)(depths[k], slots[k]);
+static inline void store_pairs(__global Pair *list, uint count, __local const Pair *pairs) {
+  for (uint k = get_local_id(0); k < count; k += ITEMS) list[k] = pairs[PLACE(k)];
   BARRIER_GLOBAL();
   BARRIER_LOCAL();
 }
@@ -190,7 +208,7 @@ GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint
 // Appends a pair to a tile's list.
 #define APPEND(tile, slot, gaussian)                                                                                   \
   {                                                                                                                    \
-    pairs[atomic_inc(cursors + (tile))] = (uint2)(depth, slot);                                                        \
+    pairs[atomic_inc(cursors + (tile))] = (Pair)(slot, depth);                                                         \
     gaussian_from_slot[slot] = gaussian;                                                                               \
   }
 
@@ -199,7 +217,7 @@ GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint
 // stopped, tile_counts (n) become zero, so that it adds nothing to statistics.
 GROUP __kernel void append_pairs(const uint n, const int tiles_x, const int tiles_y, __global const float *splats,
                                  __global const uint *sums, __global const uint *readback, __global uint *cursors,
-                                 __global uint *tile_counts, __global uint *slots, __global uint2 *pairs,
+                                 __global uint *tile_counts, __global uint *slots, __global Pair *pairs,
                                  __global uint *gaussian_from_slot) {
   __local uint wide[ITEMS], wide_slots[ITEMS], wides;
   const uint i = get_global_id(0), item = get_local_id(0), stopped = readback[READBACK_STOPPED];
@@ -251,31 +269,42 @@ GROUP __kernel void append_pairs(const uint n, const int tiles_x, const int tile
 }
 
 // order and ranges, which list_offsets writes; pairs and gaussian_from_slot (pairs), which append_pairs writes ->
-// gaussian_from_sorted, slot_from_sorted (pairs). fit, a power of two: the number of pairs that depths and slots, in
-// local memory, hold. A longer list is sorted in parts, then merged in ever larger blocks, in `pairs`.
+// gaussian_from_sorted, slot_from_sorted (pairs). fit, a power of two from 16 on: the number of pairs that `near`, in
+// local memory, holds. A longer list is sorted in parts, then merged in ever larger blocks, in `pairs`.
 GROUP __kernel void sort_lists(const uint fit, __global const uint *order, __global const uint *ranges,
-                               __global const uint *gaussian_from_slot, __global uint2 *pairs,
+                               __global const uint *gaussian_from_slot, __global Pair *pairs,
                                __global uint *gaussian_from_sorted, __global uint *slot_from_sorted,
-                               __local uint *depths, __local uint *slots) {
+                               __local Pair *near) {
   const uint tile = order[get_group_id(0)], begin = ranges[2 * tile], count = ranges[2 * tile + 1] - begin;
-  __global uint2 *list = pairs + begin;
+  __global Pair *list = pairs + begin;
   // PoCL makes wrong code of two loops, one for the parts and one for the blocks, that both have barriers inside.
   for (uint stage = fit / 2; stage == fit / 2 || stage < count; stage *= 2) {
     for (uint step = stage; step >= fit; step /= 2) order_step_far(list, count, step, step == stage);
     for (uint first = 0; first < count; first += fit) {
       const uint here = min(fit, count - first), sorts = stage < fit;
-      fetch_pairs(list + first, here, depths, slots);
+      const uint whole = sorts && here < fit ? max(4u, 1u << (32 - clz(here - 1))) : fit;
+      fetch_pairs(list + first, here, whole, near);
       for (uint half_block = sorts ? 1 : fit / 2; half_block < (sorts ? here : fit); half_block *= 2) {
-        for (uint step = half_block; step > 0; step /= 2) {
-          order_step(depths, slots, here, step, sorts && step == half_block);
+        for (uint step = half_block; step > 0; step /= 4) {
+          order_steps(near, here, step, sorts && step == half_block);
         }
       }
-      store_pairs(list + first, count > fit ? here : 0, depths, slots);
+      store_pairs(list + first, count > fit ? here : 0, near);
     }
   }
-  for (uint k = get_local_id(0); k < count; k += ITEMS) {
-    const uint slot = count > fit ? list[k].y : slots[k];
-    gaussian_from_sorted[begin + k] = gaussian_from_slot[slot];
-    slot_from_sorted[begin + k] = slot;
+  for (uint k = get_local_id(0); k < count; k += AHEAD * ITEMS) {
+    uint slot[AHEAD], gaussian[AHEAD];
+    EACH_AHEAD(i) {
+      const uint place = min(k + i * ITEMS, count - 1);
+      slot[i] = count > fit ? list[place].x : near[PLACE(place)].x;
+    }
+    EACH_AHEAD(i) gaussian[i] = gaussian_from_slot[slot[i]];
+    EACH_AHEAD(i) {
+      const uint place = k + i * ITEMS;
+      if (place < count) {
+        gaussian_from_sorted[begin + place] = gaussian[i];
+        slot_from_sorted[begin + place] = slot[i];
+      }
+    }
   }
 }

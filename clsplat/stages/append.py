@@ -28,7 +28,8 @@ groups for too much work: the radix sort is faster.
 """
 
 LOCAL_PAIRS = 2048
-"""Pairs that a group sorts in local memory: 16 KiB of them, half of every device's minimum. A power of two."""
+"""Pairs that a group sorts in local memory: 16 KiB of them, half of every device's minimum. A power of two from 16
+on."""
 
 _OFFSET_ITEMS = 1024
 """Work-items of each group of `list_offsets`, which has all tiles or all groups of `count_tiles`."""
@@ -77,8 +78,8 @@ def append(
     gaussian_from_sorted = work.array("gaussian_from_sorted", (capacity,), np.uint32)
     slot_from_sorted = work.array("slot_from_sorted", (capacity,), np.uint32)
     arrays = (order, ranges, gaussian_from_slot, pairs, gaussian_from_sorted, slot_from_sorted)
-    local, sharing = cl.LocalMemory(4 * LOCAL_PAIRS), frame_items(device, number)
+    local, sharing = cl.LocalMemory(8 * LOCAL_PAIRS), frame_items(device, number)
     sort = device.kernels("append", {"ITEMS": sharing}).sort_lists
-    launch_groups(device, sort, number, sharing, LOCAL_PAIRS, *arrays, local, local)
+    launch_groups(device, sort, number, sharing, LOCAL_PAIRS, *arrays, local)
     lists = TileLists(Band(0, number), ranges, gaussian_from_sorted, slot_from_sorted, order)
     return Totals(tile_counts, slots, n, capacity, on_device=readback, arriving=arriving), lists

@@ -108,7 +108,7 @@ def test_lists_longer_than_local_memory(device: Device, items: int) -> None:
         assert_same_lists(lists.appended(), wanted)
 
 
-@pytest.mark.parametrize("local", [2, 8, 64])
+@pytest.mark.parametrize("local", [16, 32, 64])
 def test_every_number_of_merges(device: Device, monkeypatch: pytest.MonkeyPatch, local: int) -> None:
     """As many as a list of any length needs, with less local memory."""
     monkeypatch.setattr(stages_append, "LOCAL_PAIRS", local)

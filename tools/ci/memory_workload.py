@@ -300,9 +300,9 @@ def sorts(device: Device) -> None:
 
 def lists(device: Device) -> None:
     """Lists by append that local memory does not hold, and boxes that a group shares; the probe of its atomics."""
-    fits, stages_append.LOCAL_PAIRS = stages_append.LOCAL_PAIRS, 4
+    fits, stages_append.LOCAL_PAIRS = stages_append.LOCAL_PAIRS, 16
     rng = np.random.default_rng(2)
-    check("lists by append", CASES["append"], device, CASES["append"].random(rng, 70))
+    check("lists by append", CASES["append"], device, CASES["append"].random(rng, 120))
     stages_append.LOCAL_PAIRS = fits
     if found := atomics_fault(device):
         raise SystemExit(found)

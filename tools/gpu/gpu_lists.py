@@ -12,6 +12,8 @@ from clsplat.stages.append import LOCAL_PAIRS
 
 OWN_BOX = 32
 """Tiles of the largest box that an item processes alone: OWN_BOX in append.cl."""
+AHEAD = 4
+"""Pairs that an item loads at once: AHEAD in append.cl."""
 SIDE = 8
 """Items that share a row of tiles of a wide box: SIDE in append.cl."""
 
@@ -54,11 +56,13 @@ class Sorting:
 
     stages: number of stages.
     parts: number of parts in all stages.
-    blocks, steps: blocks and steps of Batcher's network in local memory, in all parts.
+    blocks, steps: blocks of Batcher's network in local memory, and its steps, two at a time, in all parts.
     far_steps: steps through global memory.
-    ordered, ordered_far: comparisons of an item in local memory, and in global memory.
-    fetched, stored: pairs that an item copies to local memory, and back.
-    listed: pairs that an item writes.
+    ordered: an item's fours of pairs that it orders in two steps, in local memory.
+    ordered_far: comparisons of an item in global memory.
+    fetched: copies of AHEAD pairs to local memory by an item.
+    stored: pairs that an item copies back.
+    listed: lists of AHEAD pairs that an item writes.
     """
 
     stages: float = 0
@@ -81,25 +85,33 @@ def sorting_of(lists: Iterable[tuple[float, float]], items: int) -> Sorting:
 
 
 def _sorting(length: float, items: int) -> Sorting:
-    parts, doublings = math.ceil(length / LOCAL_PAIRS), math.ceil(math.log2(max(min(length, LOCAL_PAIRS), 1)))
     merges = math.ceil(math.log2(max(length / LOCAL_PAIRS, 1)))
-    of_merge = math.ceil(math.log2(LOCAL_PAIRS))
-    a_part = length / max(parts, 1)
-    steps = parts * (doublings * (doublings + 1) / 2 + of_merge * merges)
+    parts = [min(length - first, LOCAL_PAIRS) for first in range(0, math.ceil(length), LOCAL_PAIRS)]
+    doublings = [math.ceil(math.log2(max(part, 1))) for part in parts]
+    # Of each block of each part: the part's length, and the logarithm of half the block.
+    blocks = [(part, block) for part, number in zip(parts, doublings, strict=True) for block in range(number)]
+    blocks += [(part, LOCAL_PAIRS.bit_length() - 2) for part in parts] * merges
+    steps = [(part, max(1 << (block - 2 * turn) >> 1, 1)) for part, block in blocks for turn in range(block // 2 + 1)]
+    filled = [*(1 << number for number in doublings), *([LOCAL_PAIRS] * len(parts) * merges)]
     far_steps = merges * (merges + 1) / 2
-    copied = (1 + merges) * parts * math.ceil(a_part / items)
     return Sorting(
         stages=1 + merges,
-        parts=(1 + merges) * parts,
-        blocks=parts * (doublings + merges),
-        steps=steps,
+        parts=(1 + merges) * len(parts),
+        blocks=len(blocks),
+        steps=len(steps),
         far_steps=far_steps,
-        ordered=steps * math.ceil(a_part / 2 / items),
+        ordered=sum(math.ceil(_fours(part, apart) / items) for part, apart in steps),
         ordered_far=far_steps * math.ceil(length / 2 / items),
-        fetched=copied,
-        stored=copied if merges else 0,
-        listed=math.ceil(length / items),
+        fetched=sum(math.ceil(whole / items / AHEAD) for whole in filled),
+        stored=(1 + merges) * sum(math.ceil(part / items) for part in parts) if merges else 0,
+        listed=math.ceil(length / items / AHEAD),
     )
+
+
+def _fours(length: float, apart: int) -> float:
+    """Number of fours of pairs, `apart` from each other, of which the first is in the list."""
+    whole = length // (4 * apart)
+    return whole * apart + min(length - 4 * apart * whole, apart)
 
 
 def lists_of(frame: Mapping[str, Any]) -> list[tuple[float, float]]:

@@ -356,8 +356,6 @@ def _over_list(function: str, rounds: Rounds, text: str = "k < count; k += ITEMS
     return Rule(f"for (uint k = get_local_id(0); {text}", rounds, function=function)
 
 
-_OF_COMPARISONS = "first_of(k, step) + 1 < count; k += ITEMS"
-
 BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "project": (
         Rule("for (int ty = e->tile_y0; ty < e->tile_y1; ++ty)", _side, ends=("count += x1 - x0;",), mark=("fp32", 60)),
@@ -400,18 +398,18 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "sort_lists": (
         Rule("for (uint stage = fit / 2;", lambda run: run.sorting.stages),
         Rule("for (uint step = stage; step >= fit; step /= 2)", lambda run: run.sorting.far_steps),
-        _over_list(" order_step_far(", lambda run: run.sorting.ordered_far, _OF_COMPARISONS),
+        _over_list(" order_step_far(", lambda run: run.sorting.ordered_far, "2 * k - (k & (step - 1)) + 1 < count;"),
         Rule(
             "for (uint first = 0; first < count; first += fit) {",
             lambda run: run.sorting.parts,
             ends=("BARRIER_LOCAL();",),
         ),
-        _over_list(" fetch_pairs(", lambda run: run.sorting.fetched),
+        _over_list(" fetch_pairs(", lambda run: run.sorting.fetched, "k < whole; k += AHEAD * ITEMS"),
         Rule("for (uint half_block = sorts", lambda run: run.sorting.blocks),
-        Rule("for (uint step = half_block; step > 0; step /= 2) {", lambda run: run.sorting.steps),
-        _over_list(" order_step(", lambda run: run.sorting.ordered, _OF_COMPARISONS),
+        Rule("for (uint step = half_block; step > 0; step /= 4) {", lambda run: run.sorting.steps),
+        _over_list(" order_steps(", lambda run: run.sorting.ordered, "4 * k - 3 * (k & within) < count; k += ITEMS"),
         _over_list(" store_pairs(", lambda run: run.sorting.stored),
-        _over_list(" sort_lists(", lambda run: run.sorting.listed),
+        _over_list(" sort_lists(", lambda run: run.sorting.listed, "k < count; k += AHEAD * ITEMS"),
     ),
     "order_counts": (),
     "duplicate": (
