@@ -42,6 +42,7 @@ from clsplat.training.step.gradient_step import GradientStep
 from clsplat.training.step.monitor import StepMonitor
 from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE, SpeculativeSteps
 from clsplat.training.supervision.host_photographs import HostPhotographs
+from clsplat.training.supervision.view_loader import ViewLoader
 from clsplat.training.trainer import Trainer
 
 CAUSES: dict[str, Sequence[tuple[type, str]]] = {
@@ -55,7 +56,7 @@ CAUSES: dict[str, Sequence[tuple[type, str]]] = {
     "monitor and statistics": [(StepMonitor, name) for name in ("forward", "loss", "before_rows", "after_rows")],
     "counts of the step before": [(SpeculativeSteps, "_look")],
     "view, rates and settings": [(Trainer, "_inputs"), (Trainer, "_gradient_step")],
-    "reading ahead": [(Trainer, "_next_photographs"), (HostPhotographs, "read_ahead")],
+    "reading ahead": [(ViewLoader, "read_ahead"), (HostPhotographs, "read_ahead")],
     "mark to step back to": [(Trainer, "_note")],
 }
 REST = "all else"
