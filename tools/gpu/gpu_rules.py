@@ -274,11 +274,10 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
             lacking="BARRIER_LOCAL();",
             copies=True,
         ),
-        Rule("SPLAT_STAGED(s)", lambda run: 1, part=True),
         _of_turn("c == 0, 1);", lambda run: run.whole_back / run.strips),
         *(
             _of_turn(text, lambda run: _of_others(run, run.others_taken, run.taken))
-            for text in ("const floatL t = x + 12582912.0f;", "own[SLOT_RED] = weight", "own[SLOT_G] = g;")
+            for text in ("const floatL t = x + 12582912.0f;", "own[SLOT_RED] = weight")
         ),
         _of_turn("l11 * dx);", lambda run: _of_others(run, run.others_reached, run.reached)),
         _of_turn("FOR_STRIP(c) if (reach >> c & 1) {", lambda run: (run.turns_back - run.whole_back) / run.strips),
