@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Literal, cast
 
@@ -178,6 +178,10 @@ class Camera:
     window: Window | None = None
     radial: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     by_rays: bool = False
+
+    def __getstate__(self) -> dict[str, object]:
+        """The fields alone: a copy in another process finds its model in that process's table."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @cached_property
     def model(self) -> CameraModel:

@@ -139,6 +139,14 @@ def test_a_run_that_is_there_is_not_trained_into_and_knows_its_settings(
     assert len(again) == len(clsplat.Gaussians.load(run.model_path))
 
 
+def test_a_background_that_is_changed_in_place_counts(loaded: Scene, default_device: Device) -> None:
+    gaussians, camera = hidden_model(), loaded.views[0].camera
+    renderer, background = Renderer(default_device), np.zeros(3, np.float32)
+    dark = renderer.render(gaussians, camera, background).image
+    background[:] = 1
+    assert renderer.render(gaussians, camera, background).image.sum() > dark.sum()
+
+
 def test_arrays_of_different_lengths_are_not_rendered(loaded: Scene, default_device: Device) -> None:
     model = hidden_model()
     model.quaternions = model.quaternions[:5]

@@ -125,11 +125,8 @@ class Rasterizer:
         self._antialiased: bool | None = None
         self.antialias(on=antialiased)
         self.work = work or Workspace(device)
-        self._sent: WeakKeyDictionary[Camera, tuple[NDArray[np.float32], NDArray[np.float32] | None]] = (
-            WeakKeyDictionary()
-        )
-        """For each camera (training has few): it and a background as `send` sends them, which the device may still be
-        reading, and the background's array."""
+        self._sent: WeakKeyDictionary[Camera, NDArray[np.float32]] = WeakKeyDictionary()  # training has few cameras
+        """A camera and its last background, as `send` sends them. The device may still read them."""
         aligned = -(-len(CAMERA) // device.row_alignment) * device.row_alignment
         self._view = allocate(device, (aligned + 3,), np.float32)
         self._camera, self._background = self._view.reshaped(len(CAMERA)), self._view.rows(aligned, aligned + 3)
@@ -164,18 +161,16 @@ class Rasterizer:
 
     def send(self, camera: Camera, background: NDArray[np.float32] | DeviceArray) -> tuple[DeviceArray, DeviceArray]:
         """Camera and background on the device. A background on the host is sent with the camera, in one copy."""
-        sent, of = self._sent.get(camera, (None, None))
+        sent = self._sent.get(camera)
         if sent is None:
-            sent = np.zeros(self._view.shape, np.float32)
+            sent = self._sent[camera] = np.zeros(self._view.shape, np.float32)
             sent[: len(CAMERA)] = pack_camera(camera)
-            self._sent[camera] = sent, None
         if isinstance(background, DeviceArray):
             self._camera.send(sent[: len(CAMERA)])
             return self._camera, background
-        if background is not of:
-            sent = sent.copy()
+        if sent[-3:].tobytes() != background.tobytes():
+            sent = self._sent[camera] = sent.copy()
             sent[-3:] = background
-            self._sent[camera] = sent, background
         self._view.send(sent)
         return self._camera, self._background
 

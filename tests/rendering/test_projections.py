@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -72,7 +73,9 @@ def test_an_option_selects_its_model() -> None:
     camera = scenes.straight_camera(8, 8)
     for model in CAMERA_MODELS:
         chosen = {"": {}, "radial": {"radial": (0.1, 0.0, 0.0, 0.0)}, "by_rays": {"by_rays": True}}[model.option]
-        assert replace(camera.through(model), **chosen).model is model
+        made = replace(camera.through(model), **chosen)
+        assert made.model is model
+        assert pickle.loads(pickle.dumps(made)).model is model, "as it goes to another process"
 
 
 def test_blending_reads_splats_and_rays_alike() -> None:
