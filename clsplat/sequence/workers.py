@@ -131,8 +131,7 @@ def run_tasks(
 ) -> None:
     """Render the frames, and at the same time write them or add them to the video.
 
-    Each renderer has a thread, which takes the next free frame. The first error of any thread is raised after all
-    threads have ended.
+    A thread for each renderer takes the next free frame. The first error of a thread is raised when all have ended.
     shared: other jobs may render some of these frames. Frames are then claimed, and those of other jobs awaited.
     on_done: function that is called in this thread for each frame whose file is complete, in any order. For a video it
     is called in order, when the frame has been encoded.
