@@ -28,8 +28,8 @@ from clsplat.gaussians import Gaussians
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.selftest import driver_check
-from clsplat.training import loop as training
 from clsplat.training.step import monitor
+from clsplat.training.supervision.view_loader import ViewLoader
 
 WITHOUT = replace(LATE, checkpoint_every=0, optimiser=replace(LATE.optimiser, sparse=True), report=False)
 """Adam has a kernel for each number of floats in a row: that of SH is built in step 12, behind the others."""
@@ -121,13 +121,15 @@ def test_an_epoch_that_has_just_begun(
     run = Run.create(tmp_path / "run", config, scene=scene)
     first = 1 + len(loaded.train_views)
 
-    def fails(trainer):
-        if trainer.step == first:
+    load = ViewLoader.inputs
+
+    def fails(loader, view, position, *arguments, **options):
+        if position.step == first:
             raise DriverError("it failed")
-        return np.zeros(3, np.float32)
+        return load(loader, view, position, *arguments, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(training.Trainer, "_background_colour", fails)
+        patch.setattr(ViewLoader, "inputs", fails)
         with pytest.raises(DriverError):
             train_on(loaded, config, device=default_device, run=run)
     assert [number for number, _ in run.checkpoints()] == [first - 1]

@@ -129,11 +129,11 @@ def test_a_crash_and_a_loop_are_failures(tmp_path: Path, monkeypatch: pytest.Mon
     )
     monkeypatch.setitem(READERS, "fake", broken(name="fake", read=lambda _: None))
     monkeypatch.setattr(stress_files, "SPOILING", 0)
-    tally = stress(["fake"], 4, seed=1, seconds=0.5)["fake"]
+    tally = stress(["fake"], 4, seed=1, seconds=3)["fake"]  # a child that begins beside others is not late
     assert tally.cases == 4
     troubles = " ".join(trouble for _, trouble in tally.failures)
     assert "the process ended, status -6" in troubles
-    assert "not done after 0.5 s" in troubles
+    assert "not done after 3 s" in troubles
 
 
 def test_a_bomb_is_not_repeated_two_hundred_times() -> None:
