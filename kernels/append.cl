@@ -78,11 +78,12 @@ static inline void order_step_far(__global Pair *list, uint count, uint step, in
   BARRIER_GLOBAL();
 }
 
-// Copies pairs (count) to local memory, and fills it up to `whole`.
+// Copies pairs (count) to local memory, and fills it up to `whole`. An item reads only pairs that it writes in
+// store_pairs, as the barriers between do not order global memory.
 static inline void fetch_pairs(__global const Pair *list, uint count, uint whole, __local Pair *pairs) {
   for (uint k = get_local_id(0); k < whole; k += AHEAD * ITEMS) {
     Pair ahead[AHEAD];
-    EACH_AHEAD(i) ahead[i] = list[min(k + i * ITEMS, count - 1)];
+    EACH_AHEAD(i) if (k + i * ITEMS < count) ahead[i] = list[k + i * ITEMS];
     EACH_AHEAD(i) {
       const uint place = k + i * ITEMS;
       if (place < whole) pairs[PLACE(place)] = place < count ? ahead[i] : NO_PAIR;
