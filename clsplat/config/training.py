@@ -53,8 +53,8 @@ class OptimiserConfig:
     quaternions_rate: float = 1e-3
     """Learning rate of the rotations, as quaternions."""
     sparse: bool = False
-    """Do not update parameters whose gradient is zero, nor their Adam moments: those of Gaussians that a step's view
-    does not show, hides or masks (approximate)."""
+    """Do not update parameters whose gradient is zero, nor their Adam moments (approximate). Gaussians out of view,
+    masked, or behind others have such gradients."""
     late: bool = False
     """Leave Gaussians that a step's view does not show, and update them for the missed steps when a view shows them
     again (approximate: that view shows them as they were). Not with batches."""
