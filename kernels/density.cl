@@ -4,9 +4,11 @@
 // Launch: One work-item for each Gaussian or row, in groups of 64; work-items past the end do nothing.
 // Buffers: tile_counts (n): 0 if not visible; screen (n, 2): gradient with respect to the mean's image position, per
 //   pixel; splats (n, SPLAT_SIZE) in pixels. Statistics (n) are updated in place. Other shapes are above each kernel.
+//   The statistics of a view have CHUNKS as in chunks.h.
 // Equations: docs/gradients.md, (43) and (55); Kerbl et al. 2023, section 5.
 #include "shared/math.h"
 #include "shared/splat.h"
+#include "shared/chunks.h"
 #ifdef RAYS
 #include "shared/lanes.h"
 #include "shared/rays.h"
@@ -27,9 +29,10 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
 #endif
                                  __global const uint *tile_counts, __global const float *screen,
                                  __global const float *splats, __global float *gradient_sums, __global float *seen,
-                                 __global float *radii) {
+                                 __global float *radii CHUNK_PARAMETERS) {
   const size_t i = get_global_id(0);
   if (i >= n || tile_counts[i] == 0) return;
+  const size_t row = ROW_OF_MODEL(i);
   const float norm = ndc_norm(screen, i, x_scale, y_scale);
   __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
 #ifdef RAYS
@@ -41,22 +44,23 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
   const float radius = ceil(3.0f * sqrt(larger_eigenvalue(l11, l12, l22)));
 #endif
   if (!(norm < INFINITY && radius < INFINITY)) return;
-  gradient_sums[i] += norm;
-  seen[i] += 1.0f;
-  radii[i] = radii[i] > radius ? radii[i] : radius;
+  gradient_sums[row] += norm;
+  seen[row] += 1.0f;
+  radii[row] = radii[row] > radius ? radii[row] : radius;
 }
 
 // contributions (n) of the Gaussians with tiles to this view, in pixels; area: number of full-size pixels in a pixel of
 // this view -> totals, largest (n): sum and maximum over the views.
 __kernel void contribution_statistics(const uint n, const float area, __global const uint *tile_counts,
                                       __global const float *contributions, __global float *totals,
-                                      __global float *largest) {
+                                      __global float *largest CHUNK_PARAMETERS) {
   const size_t i = get_global_id(0);
   if (i >= n || tile_counts[i] == 0) return;
+  const size_t row = ROW_OF_MODEL(i);
   const float contribution = area * contributions[i];
   if (!(contribution < INFINITY)) return;
-  totals[i] += contribution;
-  largest[i] = largest[i] > contribution ? largest[i] : contribution;
+  totals[row] += contribution;
+  largest[row] = largest[row] > contribution ? largest[row] : contribution;
 }
 
 // Scores of the Gaussians for densification. seen (n): numbers of views -> scores (n): the mean gradient norm if it is

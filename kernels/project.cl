@@ -7,7 +7,8 @@
 //   visible; tile_counts (n): 0 where culled. With NO_FRUSTUM_CULL shown (n): 1 where a splat is written, including
 //   Gaussians without a tile. With SH_DEGREES sh_degrees (n): the highest SH degree that each Gaussian uses. With
 //   THINNED a Gaussian is left out if its random word is under `threshold`, and `factor` multiplies the others'
-//   opacities; model_row: the model's row of the first Gaussian; key0, key1: the step's key.
+//   opacities; model_row: the model's row of the first Gaussian; key0, key1: the step's key. With CHUNKS as in
+//   chunks.h.
 // Equations: docs/gradients.md, (1) to (13), (44) to (47) and (53) to (57); orthographic docs/cameras.md, (15) to (17);
 //   Kerbl et al. 2023, section 4.
 #include "shared/math.h"
@@ -17,6 +18,7 @@
 #include "shared/tile.h"
 #include "shared/gaussian.h"
 #include "shared/sh.h"
+#include "shared/chunks.h"
 #ifdef THINNED
 #include "shared/random.h"
 #endif
@@ -36,10 +38,21 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
 #endif
 #ifdef THINNED
                       ,
-                      const uint model_row, const uint key0, const uint key1, const uint threshold, const float factor
+                      const uint model_row, const uint key0, const uint key1, const uint threshold,
+                      const float factor
 #endif
-) {
-  ROWS_OF_ITEM(n)
+                          CHUNK_PARAMETERS) {
+#ifdef CHUNKS
+  const uint first = get_global_id(0) * LANES;
+  if (first >= n) return;
+  for (uint lane = 0; lane < LANES; ++lane) tile_counts[first + lane] = 0; // whole chunks, so whole vectors
+  const size_t ahead = rows_ahead(chunks, first);
+  const uint end = end_of_rows(first, n, ahead, model_rows);
+  MOVE_ROWS(ahead, )
+#else
+  const uint end = n;
+#endif
+  ROWS_OF_ITEM(end)
   for (uint lane = 0; lane < lanes_used; ++lane) tile_counts[first_row + lane] = 0;
 #ifdef NO_FRUSTUM_CULL
   for (uint lane = 0; lane < lanes_used; ++lane) shown[first_row + lane] = 0;
@@ -54,7 +67,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
 #ifdef THINNED
   Lanes left;
   for (uint lane = 0; lane < LANES; ++lane)
-    left.lane[lane] = thinning((uint)first_row + lane + model_row, key0, key1, threshold, factor);
+    left.lane[lane] = thinning((uint)ROW_OF_MODEL(first_row + lane) + model_row, key0, key1, threshold, factor);
   opacity *= left.all;
 #endif
   floatL dx = FROM_CAMERA(means, X, 0), dy = FROM_CAMERA(means, Y, 1), dz = FROM_CAMERA(means, Z, 2);

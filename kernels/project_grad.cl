@@ -14,7 +14,8 @@
 //   moments `first` and `second`; `readback` (READBACK_SIZE); the scalars of Step, one per group where they differ.
 //   Rows that are not visible have a zero gradient. With SPARSE elements whose gradient is zero do not change, with
 //   VISIBLE rows that are not visible. After a stopped pass (duplicate.cl)
-//   nothing changes. PENALTIES adds the gradient of opacity_weight o + scale_weight (s_0 + s_1 + s_2).
+//   nothing changes. PENALTIES adds the gradient of opacity_weight o + scale_weight (s_0 + s_1 + s_2). project_step has
+//   CHUNKS as in chunks.h.
 // Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91); (144) and
 //   (145). With RAYS docs/cameras.md, (22) to (29).
 #include "shared/math.h"
@@ -28,6 +29,7 @@
 #include "shared/splat.h"
 #include "shared/gaussian.h"
 #include "shared/sh.h"
+#include "shared/chunks.h"
 #ifdef RAYS
 #include "shared/rays.h"
 #include "shared/tangent.h"
@@ -172,24 +174,33 @@ typedef struct {
 } GroupStep;
 #endif
 
-__kernel void
-project_step(const uint n, const int coefficients, __constant float *camera, __global const uint *tile_counts,
-             __global const uint *first_slots, __global const float *slots, __global const float *splats,
-             __global float *screen
+__kernel void project_step(
+    const uint n, const int coefficients, __constant float *camera, __global const uint *tile_counts,
+    __global const uint *first_slots, __global const float *slots, __global const float *splats, __global float *screen
 #ifdef CONTRIBUTIONS
-             ,
-             __global float *contributions
+    ,
+    __global float *contributions
 #endif
-                 PENALTY_PARAMETERS,
-             const float beta1, const float beta2, const float epsilon, const float root, const float root_sh_rest,
-             const float rate_means, const float rate_quaternions, const float rate_log_scales,
-             const float rate_opacity_logits, const float rate_sh_dc, const float rate_sh_rest, const float limit2,
-             const float limit2_sh, __global uint *readback, __global float *means, __global float *quaternions,
-             __global float *log_scales, __global float *opacity_logits, __global float *sh_dc, __global float *sh_rest,
-             __global float *first_means, __global float *first_quaternions, __global float *first_log_scales,
-             __global float *first_opacity_logits, __global float *first_sh_dc, __global float *first_sh_rest,
-             __global float *second_means, __global float *second_quaternions, __global float *second_log_scales,
-             __global float *second_opacity_logits, __global float *second_sh_dc, __global float *second_sh_rest) {
+        PENALTY_PARAMETERS,
+    const float beta1, const float beta2, const float epsilon, const float root, const float root_sh_rest,
+    const float rate_means, const float rate_quaternions, const float rate_log_scales, const float rate_opacity_logits,
+    const float rate_sh_dc, const float rate_sh_rest, const float limit2, const float limit2_sh,
+    __global uint *readback, __global float *means, __global float *quaternions, __global float *log_scales,
+    __global float *opacity_logits, __global float *sh_dc, __global float *sh_rest, __global float *first_means,
+    __global float *first_quaternions, __global float *first_log_scales, __global float *first_opacity_logits,
+    __global float *first_sh_dc, __global float *first_sh_rest, __global float *second_means,
+    __global float *second_quaternions, __global float *second_log_scales, __global float *second_opacity_logits,
+    __global float *second_sh_dc, __global float *second_sh_rest CHUNK_PARAMETERS) {
+#ifdef CHUNKS // the end of the rows from `row` on, and the model's arrays at them
+#define MODEL_ROWS(row)                                                                                                \
+  const size_t ahead = (row) < n ? rows_ahead(chunks, row) : 0;                                                        \
+  const uint end = (row) < n ? end_of_rows(row, n, ahead, model_rows) : 0;                                             \
+  MOVE_ROWS(ahead, )                                                                                                   \
+  MOVE_ROWS(ahead, first_)                                                                                             \
+  MOVE_ROWS(ahead, second_)
+#else
+#define MODEL_ROWS(row) const uint end = n;
+#endif
 #define STEP_OF(group, root, limit2)                                                                                   \
   const Stepped model = {group, first_##group, second_##group};                                                        \
   const Step s = {rate_##group, root, beta1, beta2, epsilon, limit2, readback};
@@ -199,8 +210,10 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
   // Updates one array of the model after another, so that runs are long enough for the processor's prefetcher.
   const uint begin = get_global_id(0) * BLOCKS * LANES;
   if (begin >= n || readback[READBACK_STOPPED]) return;
+  MODEL_ROWS(begin)
+  if (begin >= end) return;
   int shown[ROWS];
-  const uint blocks = min((n - begin - 1) / LANES + 1, (uint)BLOCKS);
+  const uint blocks = min((end - begin - 1) / LANES + 1, (uint)BLOCKS);
   float by_mean[3 * ROWS] ROW_ALIGNED, by_quaternion[4 * ROWS] ROW_ALIGNED, by_log_scale[3 * ROWS] ROW_ALIGNED;
   float by_opacity[ROWS] ROW_ALIGNED, by_sh_dc[3 * ROWS] ROW_ALIGNED, by_sh_rest[SH_FLOATS * ROWS] ROW_ALIGNED;
 #ifndef NO_SH_REST
@@ -208,7 +221,7 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
 #endif
   for (uint block = 0; block < blocks; ++block) {
     int *seen = shown + block * LANES;
-    const int any = gradients_of(n, begin + block * LANES, coefficients, camera, tile_counts, first_slots, slots,
+    const int any = gradients_of(end, begin + block * LANES, coefficients, camera, tile_counts, first_slots, slots,
                                  splats, means, quaternions, log_scales, opacity_logits, sh_rest, VIEW_ARRAYS,
                                  by_sh_rest + block * LANES * sh_width, seen, &d PENALTY_WEIGHTS);
     for (uint lane = 0; lane < LANES; ++lane) {
@@ -225,7 +238,7 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
   {                                                                                                                    \
     STEP_OF(group, root, limit2)                                                                                       \
     for (uint block = 0; block < blocks; ++block)                                                                      \
-      step_rows(n, begin + block * LANES, width, shown + block * LANES, gradients + block * LANES * (width), s,        \
+      step_rows(end, begin + block * LANES, width, shown + block * LANES, gradients + block * LANES * (width), s,      \
                 model);                                                                                                \
   }
   MODEL(STEP_ARRAY)
@@ -248,7 +261,8 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
 #endif
   __local GroupStep steps[ARRAYS];
   const uint me = get_local_id(0), first_row = get_global_id(0) - me;
-  const uint rows = first_row < n && !readback[READBACK_STOPPED] ? min((uint)get_local_size(0), n - first_row) : 0;
+  MODEL_ROWS(first_row)
+  const uint rows = first_row < end && !readback[READBACK_STOPPED] ? min((uint)get_local_size(0), end - first_row) : 0;
   const uint own = ABREAST * me, stride = ABREAST * get_local_size(0);
   const int aligned = first_row % ABREAST == 0; // false only if a driver allows less than ABREAST items in a group
 #define GROUP_STEP(number, group, columns, by, root, limit2)                                                           \
@@ -279,7 +293,7 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
   __local float *own_sh_rest = by_sh_rest + sh_width * me; // gradients replace the coefficients
   int any = 0, shown[1] = {0};
   if (me < rows)
-    any = gradients_of(n, first_row + me, coefficients, camera, tile_counts, first_slots, slots, splats, means,
+    any = gradients_of(end, first_row + me, coefficients, camera, tile_counts, first_slots, slots, splats, means,
                        quaternions, log_scales, opacity_logits, sh_rest, VIEW_ARRAYS, own_sh_rest, shown,
                        &d PENALTY_WEIGHTS);
   UNROLL for (int k = 0; k < 3; ++k) by_mean[3 * me + k] = any ? d.mean[k].all : 0.0f;

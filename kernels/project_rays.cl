@@ -4,7 +4,7 @@
 // Owner: A work-item owns a Gaussian. Built with one lane; LANES and ITEMS do not change its bits.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
 // Buffers: The inputs of project.cl; NO_FRUSTUM_CULL is not supported -> splats (n, RAY_SIZE), directions in the
-//   camera's axes and distance in world units; tile_counts (n).
+//   camera's axes and distance in world units; tile_counts (n). With CHUNKS as in chunks.h.
 // Equations: docs/cameras.md, (8) to (14), (18), (19), (30), (32); colour docs/gradients.md, (12).
 #include "shared/math.h"
 #define NEEDS_TANGENTS
@@ -16,6 +16,7 @@
 #include "shared/sh.h"
 #include "shared/rays.h"
 #include "shared/tangent.h"
+#include "shared/chunks.h"
 #ifdef THINNED
 #include "shared/random.h"
 #endif
@@ -69,13 +70,18 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
                            const uint model_row, const uint key0, const uint key1, const uint threshold,
                            const float factor
 #endif
-) {
+                               CHUNK_PARAMETERS) {
   const size_t i = get_global_id(0);
   if (i >= n) return;
   tile_counts[i] = 0;
+#ifdef CHUNKS
+  const size_t ahead = rows_ahead(chunks, i);
+  if (i + ahead >= model_rows) return;
+  MOVE_ROWS(ahead, )
+#endif
   float opacity = sigmoidL(opacity_logits[i]);
 #ifdef THINNED
-  opacity *= thinning((uint)i + model_row, key0, key1, threshold, factor);
+  opacity *= thinning((uint)ROW_OF_MODEL(i) + model_row, key0, key1, threshold, factor);
 #endif
   if (!(opacity > ALPHA_MIN)) return;
   RayProjection p;

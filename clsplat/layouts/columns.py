@@ -90,6 +90,12 @@ EWA_GRADIENT = _TRANSFORM
 SUM_ROWS = 64
 """Number of adjacent numbers that a work-item of `kernels/sums.cl` adds."""
 
+CHUNK_ROWS = 1024
+"""Number of rows of a model in a chunk; its last chunk may have fewer."""
+
+NO_CHUNK = 0x3FFFFF
+"""Entry of a list of chunks that stands for no chunk. All its rows are past the end of every model."""
+
 _SEEN = ("LOG2O", "RED", "GREEN", "BLUE", "DEPTH")
 """Fields that have the same meaning and position in SPLAT and RAY, so that blending can read both."""
 
@@ -200,6 +206,7 @@ def header() -> str:
     lines += [f"#define LOSS_GROUP_ROWS {LOSS_GROUP_ROWS}", f"#define LOSS_GROUP_COLUMNS {LOSS_GROUP_COLUMNS}"]
     lines.append(f"#define LOSS_PARTS {LOSS_PARTS}")
     lines += [f"#define POSE_ROWS {POSE_ROWS}u", f"#define SUM_ROWS {SUM_ROWS}u"]
+    lines.append(f"#define CHUNK_ROWS {CHUNK_ROWS}u")
     lines += [f"#define FRESH {FRESH:#x}u", f"#define UNWANTED {UNWANTED}f", f"#define USELESS {USELESS}f"]
     layouts = {"CAMERA": CAMERA, "SPLAT": SPLAT, "RAY": RAY, "SLOT": SLOT, "READBACK": READBACK}
     layouts |= {"DEEP": DEEP_SLICE, "HELD": HOLDOUT_SURFACE_FIELDS, "EWA": EWA_CAMERA, "BY_CAMERA": EWA_GRADIENT}

@@ -21,6 +21,7 @@ from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.memory_plan import Plan
 from clsplat.stages.append import MAX_MEAN_PAIRS, append, appends
 from clsplat.stages.blend import Blended, ImageInputs, blend, blend_grad
+from clsplat.stages.bounds import ChunkList
 from clsplat.stages.channels import Channels, Features, Floats, Motion, channels, features
 from clsplat.stages.deep import deep
 from clsplat.stages.device_camera import pack_camera, tiles_of
@@ -185,6 +186,7 @@ class Rasterizer:
         thinning: Thinning | None = None,
         nearness: bool = False,
         sent: tuple[DeviceArray, DeviceArray] | None = None,
+        chunks: ChunkList | None = None,
     ) -> ForwardPass:
         """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2).
 
@@ -195,13 +197,14 @@ class Rasterizer:
         thinning: random dropout of the model's Gaussians in this pass.
         nearness: like `nearness` of `blend`.
         sent: result of `send`, if camera and background are already on the device.
+        chunks: the only chunks of the model that may be in view; None takes the whole model.
         """
         device, work = self.device_of(camera), self.work
         camera_array, background = sent or self.send(camera, background)
         by_append = room is not None and self._appends(device, room, tiles_of(camera))
 
         def make() -> tuple[Projected, tuple[Band, ...], ListedBand, Blended, tuple[int, ...]]:
-            projected = project(device, work, gaussians, camera, camera_array, thinning)
+            projected = project(device, work, gaussians, camera, camera_array, thinning, chunks)
             inputs = ImageInputs(projected.splats, background, camera.width, camera.height, camera_array)
             if by_append:
                 assert room is not None
@@ -227,7 +230,8 @@ class Rasterizer:
         if room is None:
             return ForwardPass(camera, camera_array, background, *make())
         size, how = (camera.width, camera.height), (backward, thinning is not None, nearness)
-        key = (self.readback, device, background, *size, *how, room.pairs, room.turn, by_append)
+        rows = None if chunks is None else chunks.key
+        key = (self.readback, device, background, *size, *how, room.pairs, room.turn, by_append, rows)
         return ForwardPass(
             camera, camera_array, background, *work.replayed(gaussians, key, make, thinning_numbers(thinning))
         )

@@ -20,6 +20,7 @@ from clsplat.layouts.columns import PLAIN_SLOTS, SPLAT, SlotFields
 from clsplat.optimisation.dropout import Thinning
 from clsplat.optimisation.step_noise import NO_EXPLORATION, Exploration
 from clsplat.stages.adam import AdamStep
+from clsplat.stages.bounds import CHUNKS_DEFINE, ChunkList
 from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
 
@@ -76,16 +77,20 @@ def project(
     camera: Camera,
     camera_array: DeviceArray,
     thinning: Thinning | None = None,
+    chunks: ChunkList | None = None,
 ) -> Projected:
-    """Project all Gaussians that thinning does not drop, and count their tiles (Kerbl et al. 2023, section 4)."""
-    n = gaussians.count
+    """Project all Gaussians that thinning does not drop, and count their tiles (Kerbl et al. 2023, section 4).
+
+    chunks: the chunks whose Gaussians are projected; the result has their rows. None projects the whole model.
+    """
+    n = gaussians.count if chunks is None else chunks.rows
     splats = work.array("splats", (n, len(SPLAT)))
     tile_counts = work.array("tile_counts", (n,), np.uint32)
     rays = device.switched("RAYS")
     keeps_culled = not rays and device.switched("NO_FRUSTUM_CULL")
     projected = Projected(splats, tile_counts, work.array("shown", (n,), np.uint32) if keeps_culled else None)
     for start, stop, (part,) in parts(work, gaussians):
-        out = projected.rows(start, stop)
+        out = projected if chunks is not None else projected.rows(start, stop)
         defines: dict[str, object] = {"SH_DEGREES": True} if "sh_degrees" in part.arrays else {}
         if part["sh_rest"].dtype == np.float16:
             defines["SH_HALF"] = True
@@ -93,6 +98,9 @@ def project(
         if thinning is not None:
             defines["THINNED"] = True
             thinned = (start, *thinning_numbers(thinning))
+        if chunks is not None:
+            defines |= CHUNKS_DEFINE
+        rows = out.tile_counts.shape[0]
         if rays:
             kernel, lanes = device.kernels("project_rays", {"LANES": 1, **defines}).project_rays, 1
         else:
@@ -100,8 +108,8 @@ def project(
         launch_items(
             device,
             kernel,
-            -(-part.count // lanes),
-            part.count,
+            -(-rows // lanes),
+            rows,
             part.coefficients,
             *((camera.width, camera.height) if rays else tiles_of(camera)),
             camera_array,
@@ -111,6 +119,7 @@ def project(
             *(() if out.shown is None else (out.shown,)),
             *([part["sh_degrees"]] if "sh_degrees" in part.arrays else []),
             *thinned,
+            *(() if chunks is None else chunks.arguments),
         )
     return projected
 
@@ -195,6 +204,7 @@ def project_grad(
         device,
         device.kernels("project_grad", defines).project_grad,
         -(-n // build.lanes) if slots.values.shape[0] else 0,
+        n,
         *_inputs(gaussians, camera_array, projected, slots),
         *(model[group] for model in (gaussians, gradients) for group in PARAMETER_GROUPS),
         screen.gradients,
@@ -227,13 +237,16 @@ def project_step(
     readback: DeviceArray,
     *,
     explore: Exploration = NO_EXPLORATION,
+    chunks: ChunkList | None = None,
 ) -> None:
     """`project_grad` and `stages.adam.adam` in one kernel, which keeps no gradients in memory.
 
     model: parameters, first and second moments.
+    chunks: the chunks that were projected; no other Gaussian takes the step.
     The other arguments are passed on to the two functions.
     """
     parameters, config = model[0], step.config
+    n = parameters.count if chunks is None else chunks.rows
     defines = {**_defines(parameters, slots, sh_rest=step.updates_sh_rest), "ADAM": True}
     if config.sparse:
         defines["SPARSE"] = True
@@ -244,6 +257,7 @@ def project_step(
     if weights:
         defines["PENALTIES"] = True
     arguments = (
+        n,
         *_inputs(parameters, camera_array, projected, slots),
         screen.gradients,
         *([screen.contributions] if slots.fields.contributions else []),
@@ -253,15 +267,16 @@ def project_step(
         *(PARAMETER_GROUPS["means"].limit ** 2, PARAMETER_GROUPS["sh_dc"].limit ** 2),
         readback.buffer,  # a buffer, so that the profile counts no traffic: it is written only on a fault
         *(arrays[group] for arrays in model for group in PARAMETER_GROUPS),
+        *(() if chunks is None else chunks.arguments),
     )
     build = _build(device)
-    defines |= build.defines
+    defines |= {**build.defines, **({} if chunks is None else CHUNKS_DEFINE)}
     if build.lanes > 1:
         kernel = device.kernels("project_grad", {"ROWS": CPU_STEP_ROWS, **defines}).project_step
-        launch_groups(device, kernel, -(-parameters.count // CPU_STEP_ROWS), 1, *arguments)
+        launch_groups(device, kernel, -(-n // CPU_STEP_ROWS), 1, *arguments)
     else:
         kernel = device.kernels("project_grad", {"ROWS": DEFAULT_GROUP_ITEMS, **defines}, STEP_REGISTERS).project_step
-        launch_items(device, kernel, parameters.count, *arguments)
+        launch_items(device, kernel, n, *arguments)
 
 
 class _Build(NamedTuple):
@@ -284,9 +299,9 @@ def _defines(gaussians: DeviceGaussians, slots: Slots, *, sh_rest: bool) -> dict
 def _inputs(
     gaussians: DeviceGaussians, camera_array: DeviceArray, projected: Projected, slots: Slots
 ) -> tuple[object, ...]:
-    """The first arguments of both kernels."""
+    """The arguments of both kernels after the number of rows."""
     first_slots = (
         slots.first_slots or projected.tile_counts
     )  # the kernel does not read it if the slots are already summed
     counts = (projected.tile_counts, first_slots, slots.values, projected.splats)
-    return (gaussians.count, gaussians.coefficients, camera_array, *counts)
+    return (gaussians.coefficients, camera_array, *counts)

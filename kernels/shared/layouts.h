@@ -10,6 +10,7 @@
 #define LOSS_PARTS 64
 #define POSE_ROWS 64u
 #define SUM_ROWS 64u
+#define CHUNK_ROWS 1024u
 #define FRESH 0x80000000u
 #define UNWANTED -1.0f
 #define USELESS -2.0f

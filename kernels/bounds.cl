@@ -1,0 +1,42 @@
+// Bounds of a model's chunks: the box of a chunk's means, and its largest scale.
+//
+// Owner: A group owns a chunk. Each item takes every ITEMS-th row; the first item then combines their bounds.
+// Launch: Groups of ITEMS items, one for each entry of `chunks`.
+// Buffers: `chunks`: numbers of chunks; means, log_scales (model_rows, 3) -> bounds, 8 floats for each entry: the least
+//   and the greatest coordinates of the means, the greatest log scale, and 0. NaN counts as no value, because no view
+//   shows a Gaussian that has one. A chunk without values has an empty box, from INFINITY to -INFINITY.
+#include "shared/math.h"
+
+#define BOUNDS 7
+__kernel void bounds(__global const uint *chunks, const uint model_rows, __global const float *means,
+                     __global const float *log_scales, __global float *bounds) {
+  const uint place = get_group_id(0), me = get_local_id(0);
+  const size_t first = (size_t)CHUNK_ROWS * chunks[place];
+  const uint rows = first < model_rows ? (uint)min((size_t)CHUNK_ROWS, model_rows - first) : 0;
+  float found[BOUNDS];
+  for (int k = 0; k < 3; ++k) found[k] = INFINITY, found[3 + k] = -INFINITY;
+  found[6] = -INFINITY;
+  for (uint i = me; i < rows; i += ITEMS) {
+    for (int k = 0; k < 3; ++k) {
+      const float mean = means[3 * (first + i) + k];
+      found[k] = fmin(found[k], mean);
+      found[3 + k] = fmax(found[3 + k], mean);
+      found[6] = fmax(found[6], log_scales[3 * (first + i) + k]);
+    }
+  }
+#if ITEMS > 1
+  __local float by_item[BOUNDS * ITEMS];
+  for (int k = 0; k < BOUNDS; ++k) by_item[k * ITEMS + me] = found[k];
+  barrier(CLK_LOCAL_MEM_FENCE);
+  if (me < BOUNDS) {
+    float one = by_item[me * ITEMS];
+    for (uint i = 1; i < ITEMS; ++i)
+      one = me < 3 ? fmin(one, by_item[me * ITEMS + i]) : fmax(one, by_item[me * ITEMS + i]);
+    bounds[8 * (size_t)place + me] = one;
+  }
+  if (me == BOUNDS) bounds[8 * (size_t)place + BOUNDS] = 0.0f;
+#else
+  for (int k = 0; k < BOUNDS; ++k) bounds[8 * (size_t)place + k] = found[k];
+  bounds[8 * (size_t)place + BOUNDS] = 0.0f;
+#endif
+}
