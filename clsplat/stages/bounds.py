@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.device.buffers import DeviceArray, Workspace
@@ -50,16 +51,20 @@ CHUNKS_DEFINE: dict[str, object] = {"CHUNKS": True}
 """Define of kernels that run over a `ChunkList`."""
 
 
-def padded_chunks(numbers: np.ndarray[tuple[int], np.dtype[np.uint32]]) -> np.ndarray[tuple[int], np.dtype[np.uint32]]:
-    """The numbers of chunks, then NO_CHUNK, in one of few lengths, so that arrays and command buffers are reused.
+def send_chunks(work: Workspace, name: str, numbers: NDArray[np.uint32], model_rows: int) -> ChunkList:
+    """Send a list of chunks to the workspace's array `name`.
 
-    The length is at most an eighth more than needed, or 1.
+    The list has one of few lengths, at most an eighth more than needed, so that arrays and command buffers are reused.
+
+    numbers: in rising order.
     """
     wanted = max(len(numbers), 1)
     unit = 1 << max(wanted.bit_length() - 4, 0)
     padded = np.full(-(-wanted // unit) * unit, NO_CHUNK, np.uint32)
     padded[: len(numbers)] = numbers
-    return padded
+    array = work.array(name, padded.shape, np.uint32)
+    array.send(padded)
+    return ChunkList(array, model_rows)
 
 
 @stage("bounds")

@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Twin of kernels/bounds.cl."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clsplat.arrays import Float32, Float64
+from clsplat.layouts.columns import CHUNK_ROWS
+
+
+def bounds(means: Float32, log_scales: Float32) -> Float64:
+    """Bounds (chunks, 7) of means and log scales (n, 3): least and greatest coordinates, greatest log scale.
+
+    NaN counts as no value.
+    """
+    starts = np.arange(0, len(means), CHUNK_ROWS)
+    least = np.fmin.reduceat(means, starts)
+    found = np.hstack([least, np.fmax.reduceat(means, starts), np.fmax.reduceat(log_scales, starts).max(1)[:, None]])
+    empty = np.array([*3 * [np.inf], *4 * [-np.inf]])
+    return np.where(np.isnan(found), empty, found)
