@@ -76,6 +76,12 @@ RARE void step_element(size_t i, float g, Step s, Stepped model) {
   model.parameters[i] = p;
 }
 
+// How far a step moves parameters, from the moments after it.
+__attribute__((always_inline)) static inline floatA movement(float rate, float root, float epsilon, floatA m,
+                                                             floatA v) {
+  return rate * m / fmaA(sqrt(v), (floatA)(root), (floatA)(epsilon));
+}
+
 // Updates those of ABREAST elements from i on that are `taken`; i is a multiple of 4 unless LANES > 1. Returns 0 and
 // stores nothing if one must be refused. The second moment and p * p are not negative, so a test of their sum checks
 // both. Always inlined, because AMD's compiler would otherwise keep Step in memory.
@@ -84,7 +90,7 @@ __attribute__((always_inline)) static inline int step_vector(size_t i, floatA g,
   const floatA v_before = LOADA(model.second + i);
   const floatA m = fmaA((floatA)(s.beta1), m_before, (1.0f - s.beta1) * g);
   const floatA v = fmaA((floatA)(s.beta2), v_before, (1.0f - s.beta2) * (g * g));
-  const floatA by = s.rate * m / fmaA(sqrt(v), (floatA)(s.root), (floatA)(s.epsilon));
+  const floatA by = movement(s.rate, s.root, s.epsilon, m, v);
   const floatA p = before - (taken ? by : (floatA)(0.0f));
 #ifndef UNGUARDED
   if (ANYA(~(fmaA(p, p, v) < s.limit2) & taken)) return 0;

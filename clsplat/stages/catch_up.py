@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches catch_up.cl: the steps of Adam that chunks of a model missed while no view showed them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import prod
+
+import numpy as np
+
+from clsplat.arrays import Float32
+from clsplat.config.training import OptimiserConfig
+from clsplat.device.buffers import DeviceArray
+from clsplat.device.context import Device
+from clsplat.device.launch import DEFAULT_GROUP_ITEMS, launch_groups
+from clsplat.device.profile import stage
+from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
+from clsplat.layouts.columns import CHUNK_ROWS
+from clsplat.optimisation.step_noise import NO_EXPLORATION
+from clsplat.stages.adam import AdamStep
+from clsplat.stages.bounds import ChunkList
+from clsplat.stages.device_gaussians import DeviceGaussians
+from clsplat.stages.project import CPU_STEP_ROWS, step_numbers
+
+_TABLE_NUMBERS = 2 + len(PARAMETER_GROUPS)
+"""Numbers of a step in the table: two roots for Adam, and each group's learning rate."""
+_ABREAST = 4
+"""Elements that an item updates at once in kernel shapes of one lane (`kernels/shared/adam.h`)."""
+
+
+def step_table(steps: Iterable[AdamStep]) -> Float32:
+    """The table (steps, numbers) of `catch_up`, for steps in sequence."""
+    return np.array([step_numbers(step, NO_EXPLORATION) for step in steps], np.float32).reshape(-1, _TABLE_NUMBERS)
+
+
+@stage("catch_up", catch_up=18)
+def catch_up(
+    device: Device,
+    config: OptimiserConfig,
+    model: tuple[DeviceGaussians, ...],
+    chunks: ChunkList,
+    last: DeviceArray,
+    step: int,
+    table: DeviceArray,
+    first_step: int,
+    readback: DeviceArray,
+) -> None:
+    """Take the missed steps of these chunks up to step `step`, with gradient zero, to the bits of steps over all rows.
+
+    Nothing changes if `readback` says that the step's pass has stopped.
+
+    model: parameters, first and second moments of the whole model.
+    last: (entries of chunks,) uint32, the last step that each chunk has taken.
+    table: (steps, numbers), `step_table` of step number `first_step` and those after it. It has all missed steps.
+    readback: (READBACK_SIZE,) uint32. Its last four entries count refused updates of elements, one for each step.
+    """
+    if step >= first_step + table.shape[0]:
+        raise ValueError(f"table: has steps {first_step} to {first_step + table.shape[0] - 1}, expected up to {step}")
+    entries, coefficients = chunks.numbers.shape[0], model[0].coefficients
+    sh_width = 3 * (coefficients - 1)
+    if device.shape.lanes > 1:
+        items, pieces = 1, CHUNK_ROWS // CPU_STEP_ROWS
+        defines: dict[str, object] = {"ROWS": CPU_STEP_ROWS}
+    else:
+        items = DEFAULT_GROUP_ITEMS if device.max_group >= DEFAULT_GROUP_ITEMS else 1
+        floats = sum(prod(shape) for shape in group_shapes(1, coefficients).values())
+        pieces = CHUNK_ROWS // _ABREAST // items * floats
+        defines = {"ITEMS": items}
+    launch_groups(
+        device,
+        device.kernels("catch_up", defines).catch_up,
+        entries * pieces,
+        items,
+        *chunks.arguments,
+        last,
+        np.uint32(step),
+        table,
+        np.uint32(first_step),
+        np.uint32(sh_width),
+        *(config.beta1, config.beta2, config.epsilon),
+        *(PARAMETER_GROUPS["means"].limit ** 2, PARAMETER_GROUPS["sh_dc"].limit ** 2),
+        readback.buffer,  # a buffer, so that the profile counts no traffic: it is written only on a fault
+        *(arrays[group] for arrays in model for group in PARAMETER_GROUPS),
+    )

@@ -1,0 +1,175 @@
+// Catches up chunks of a model that earlier steps did not show: their missed steps of Adam, in which all gradients are
+// zero. The bits are those of steps over all rows.
+//
+// Owner: A group owns ROWS rows of a chunk if LANES > 1; otherwise, ITEMS vectors of a chunk's array at a time.
+// Launch: LANES > 1: groups of one item, CHUNK_ROWS / ROWS for each entry of `chunks`. Otherwise groups of ITEMS items,
+//   PIECES for each float of a row, for each entry of `chunks`.
+// Buffers: chunks (entries), last (entries): numbers of chunks, or NO_CHUNK, and the last step that each has taken;
+//   table (steps, TABLE_NUMBERS): for each step from number `first_step` on the two roots of Step and the rates of the
+//   six parameter groups, root 0 where a step leaves `sh_rest` alone; parameters and both moments of the model's
+//   model_rows rows, updated up to step `step`; readback (READBACK_SIZE) counts refusals. Other scalars are those of
+//   Step. After a stopped pass (duplicate.cl) nothing changes.
+// Equations: docs/gradients.md, (42), and (193) for the steps that only the moments take.
+#include "shared/math.h"
+#include "shared/lanes.h"
+#include "shared/adam.h"
+
+#define TABLE_NUMBERS 8
+#define TABLE_ROOT 0
+#define TABLE_ROOT_SH_REST 1
+#define TABLE_RATES 2
+
+#if LANES > 1
+#define AS_INTA AS_INTL
+#else
+#define AS_INTA as_int4
+#endif
+
+#define BLOCK 16              // number of steps between two checks
+#define LEAST_BETA2 0.9f      // (193) holds for a block from this beta2 on: the second moment keeps 0.18 of itself
+#define LEAST_SPREAD 1e-30f   // second moment that is still a normal number after a block
+#define STILL 3.725290298e-9f // 2^-28: an eighth of half an ulp, relative to the parameter
+
+// The missed steps of an array. rates, roots: its columns of the table, from the first missed step on; highest: at
+// least the largest rate.
+typedef struct {
+  __global const float *rates, *roots;
+  uint steps;
+  float highest;
+  Step constants;
+} Missed;
+
+static inline Missed missed_steps(__global const float *rates, __global const float *roots, uint steps, Step s) {
+  Missed missed = {rates, roots, steps, s.beta2 >= LEAST_BETA2 ? 0.0f : INFINITY, s};
+  for (uint k = 0; k < steps; ++k) missed.highest = fmax(missed.highest, rates[TABLE_NUMBERS * k]);
+  return missed;
+}
+
+// Takes the missed steps from number `from` on of element i.
+RARE void catch_up_element(size_t i, uint from, Missed missed, Stepped model) {
+  Step s = missed.constants;
+  for (uint k = from; k < missed.steps; ++k) {
+    s.rate = missed.rates[TABLE_NUMBERS * k];
+    s.root = missed.roots[TABLE_NUMBERS * k];
+    if (s.root != 0.0f) step_element(i, 0.0f, s, model);
+  }
+}
+
+// Takes the missed steps of ABREAST elements from i on, as step_vector would.
+__attribute__((always_inline)) static inline void catch_up_vector(size_t i, Missed missed, Stepped model) {
+  const Step s = missed.constants;
+  const floatA beta1 = s.beta1, beta2 = s.beta2, none = 0.0f;
+  floatA p = LOADA(model.parameters + i), m = LOADA(model.first + i), v = LOADA(model.second + i);
+  for (uint begin = 0; begin < missed.steps; begin += BLOCK) {
+    const uint end = min(begin + BLOCK, missed.steps);
+    const intA moves = missed.highest * fabs(m) < STILL * fabs(p) * sqrt(v) & v >= LEAST_SPREAD;
+    const intA still = (m == 0.0f & v >= 0.0f | moves) & fmaA(p, p, v) < s.limit2;
+    if (!ANYA(~still)) { // no parameter changes in this block
+      const floatA next_m = fmaA(beta1, m, none), next_v = fmaA(beta2, v, none);
+      if (ANYA(AS_INTA(next_m) != AS_INTA(m))) {
+        for (uint k = begin; k < end; ++k) {
+          if (missed.roots[TABLE_NUMBERS * k] == 0.0f) continue;
+          m = fmaA(beta1, m, none);
+          v = fmaA(beta2, v, none);
+        }
+      } else if (ANYA(AS_INTA(next_v) != AS_INTA(v))) {
+        for (uint k = begin; k < end; ++k)
+          if (missed.roots[TABLE_NUMBERS * k] != 0.0f) v = fmaA(beta2, v, none);
+      } else {
+        break; // nothing changes any more
+      }
+      continue;
+    }
+    const floatA p_before = p, m_before = m, v_before = v;
+    intA taken = (intA)(-1);
+    for (uint k = begin; k < end; ++k) {
+      const float rate = missed.rates[TABLE_NUMBERS * k], root = missed.roots[TABLE_NUMBERS * k];
+      if (root == 0.0f) continue;
+      m = fmaA(beta1, m, none);
+      v = fmaA(beta2, v, none);
+      p = p - movement(rate, root, s.epsilon, m, v);
+      taken &= fmaA(p, p, v) < s.limit2;
+    }
+    if (ANYA(~taken)) { // one is refused in this block
+      STOREA(p_before, model.parameters + i);
+      STOREA(m_before, model.first + i);
+      STOREA(v_before, model.second + i);
+      for (uint lane = 0; lane < ABREAST; ++lane) catch_up_element(i + lane, begin, missed, model);
+      return;
+    }
+  }
+  STOREA(p, model.parameters + i);
+  STOREA(m, model.first + i);
+  STOREA(v, model.second + i);
+}
+
+#define MODEL(EACH)                                                                                                    \
+  EACH(0, means, 3, TABLE_ROOT, limit2)                                                                                \
+  EACH(1, quaternions, 4, TABLE_ROOT, limit2)                                                                          \
+  EACH(2, log_scales, 3, TABLE_ROOT, limit2)                                                                           \
+  EACH(3, opacity_logits, 1, TABLE_ROOT, limit2)                                                                       \
+  EACH(4, sh_dc, 3, TABLE_ROOT, limit2_sh)                                                                             \
+  EACH(5, sh_rest, sh_width, TABLE_ROOT_SH_REST, limit2_sh)
+
+__kernel void catch_up(__global const uint *chunks, const uint model_rows, __global const uint *last, const uint step,
+                       __global const float *table, const uint first_step, const uint sh_width, const float beta1,
+                       const float beta2, const float epsilon, const float limit2, const float limit2_sh,
+                       __global uint *readback, __global float *means, __global float *quaternions,
+                       __global float *log_scales, __global float *opacity_logits, __global float *sh_dc,
+                       __global float *sh_rest, __global float *first_means, __global float *first_quaternions,
+                       __global float *first_log_scales, __global float *first_opacity_logits,
+                       __global float *first_sh_dc, __global float *first_sh_rest, __global float *second_means,
+                       __global float *second_quaternions, __global float *second_log_scales,
+                       __global float *second_opacity_logits, __global float *second_sh_dc,
+                       __global float *second_sh_rest) {
+#if LANES > 1
+  const uint pieces = CHUNK_ROWS / ROWS;
+#else
+#define PIECES (CHUNK_ROWS / ABREAST / ITEMS) // of a column of a chunk
+  const uint pieces = PIECES * (14 + sh_width);
+#endif
+  const uint place = get_group_id(0) / pieces, piece = get_group_id(0) % pieces;
+  const size_t chunk_row = (size_t)CHUNK_ROWS * chunks[place];
+  if (chunk_row >= model_rows || last[place] >= step || readback[READBACK_STOPPED]) return;
+  const uint rows = min((size_t)CHUNK_ROWS, model_rows - chunk_row), steps = step - last[place];
+  __global const float *from = table + (size_t)TABLE_NUMBERS * (last[place] + 1 - first_step);
+#if LANES > 1
+  // One array of the model after another, so that runs are long enough for the processor's prefetcher.
+  const uint first = ROWS * piece;
+  if (first >= rows) return;
+  const uint end = min(first + ROWS, rows);
+#define CATCH_UP_ARRAY(number, group, width, root_at, limit)                                                           \
+  {                                                                                                                    \
+    const Stepped model = {group + (width) * chunk_row, first_##group + (width) * chunk_row,                           \
+                           second_##group + (width) * chunk_row};                                                      \
+    const Step s = {0.0f, 0.0f, beta1, beta2, epsilon, limit, readback};                                               \
+    const Missed missed = missed_steps(from + TABLE_RATES + number, from + root_at, steps, s);                         \
+    uint i = (width) * first;                                                                                          \
+    for (; i + LANES <= (width) * end; i += LANES) catch_up_vector(i, missed, model);                                  \
+    for (; i < (width) * end; ++i) catch_up_element(i, 0, missed, model);                                              \
+  }
+  MODEL(CATCH_UP_ARRAY)
+#else
+  Stepped model = {means, first_means, second_means};
+  uint width = 0, rates_at = 0, roots_at = 0, past = 0, vector = 0;
+  float limit = 0.0f;
+#define FIND_ARRAY(number, group, columns, root_at, limit2_of_group)                                                   \
+  if (piece >= past && piece < past + PIECES * (columns)) {                                                            \
+    model = (Stepped){group, first_##group, second_##group};                                                           \
+    width = columns, rates_at = TABLE_RATES + number, roots_at = root_at, limit = limit2_of_group;                     \
+    vector = (piece - past) * ITEMS + get_local_id(0);                                                                 \
+  }                                                                                                                    \
+  past += PIECES * (columns);
+  MODEL(FIND_ARRAY)
+  const size_t ahead = width * chunk_row;
+  model.parameters += ahead, model.first += ahead, model.second += ahead;
+  const Step s = {0.0f, 0.0f, beta1, beta2, epsilon, limit, readback};
+  const Missed missed = missed_steps(from + rates_at, from + roots_at, steps, s);
+  const uint begin = ABREAST * vector, end = width * rows;
+  if (begin + ABREAST <= end) {
+    catch_up_vector(begin, missed, model);
+  } else {
+    for (uint i = begin; i < end; ++i) catch_up_element(i, 0, missed, model);
+  }
+#endif
+}
