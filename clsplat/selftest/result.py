@@ -29,12 +29,14 @@ POSE_STAGES = ("pose",)
 """Further stages for training with pose refinement."""
 LENS_STAGES = ("lens",)
 """Further stages for training with lens refinement."""
+CHUNK_STAGES = ("catch_up",)
+"""Further stages for training of models of several chunks."""
 LIBRARY_STAGES = ("ewa", "harmonics", "splats", "values")
 """Further stages for the library's calls."""
 TRAINING_STAGES = (*FORWARD_STAGES, *BACKWARD_STAGES)
 SELFTEST_STAGES = (
     *(*FORWARD_STAGES, *CHANNEL_STAGES, *DEEP_STAGES, *HOLDOUT_STAGES, *RAY_STAGES, *MASK_STAGES, *BACKWARD_STAGES),
-    *(*APPEARANCE_STAGES, *DEPTH_STAGES, *POSE_STAGES, *LENS_STAGES, *LIBRARY_STAGES),
+    *(*APPEARANCE_STAGES, *DEPTH_STAGES, *POSE_STAGES, *LENS_STAGES, *CHUNK_STAGES, *LIBRARY_STAGES),
 )
 INDEX_STAGES = ("project", "duplicate", "sort", "ranges", "append")
 """Stages whose results are indices into the arrays of later stages."""
@@ -68,6 +70,7 @@ STAGE_BOUNDS_ULP: dict[str, tuple[float, str]] = {
     "depth": (1024, "as blend_grad"),
     "pose": (1024, "as exposure; sums of terms of both signs"),
     "lens": (1024, "19 measured; as pose"),
+    "catch_up": (64, "TODO measured"),
     "ewa": (1024, "95 measured, in the gradient of quaternions, whose terms cancel; else as project_grad"),
     "harmonics": (64, "10 measured; one root and one division"),
     "splats": (64, "2 measured; a root and two quotients"),

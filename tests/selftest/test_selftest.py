@@ -95,6 +95,7 @@ BROKEN = {
     "project_grad: lens[2].all = d_mx": ("lens[2].all = d_my", "lens"),
     "grid: risen[k] = b - a": ("risen[k] = a - b", "grid"),
     "grid: h * (level - (float)l)": ("h * level", "grid"),
+    "catch_up: p = p - movement(": ("p = p + movement(", "catch_up"),
     "ewa: field[4].all = -p.sxy / p.det": ("field[4].all = p.sxy / p.det", "ewa"),
     "ewa_grad: uv = -2.0f * (l22 * g_v)": ("uv = 2.0f * (l22 * g_v)", "ewa"),
     "sums: four.lo + four.hi": ("four.lo - four.hi", "ewa"),

@@ -154,7 +154,7 @@ def cases(device: Device) -> None:
     """Cases of stages by themselves, on a few rows or pixels, some of them twice for their builds that differ."""
     for name, case in CASES.items():
         size = (17, 7) if isinstance(case.sizes[0], tuple) else 9
-        for draw in range({"adam": 3, "marks": 2, "harmonics": 2, "settle": 2}.get(name, 1)):
+        for draw in range({"adam": 3, "marks": 2, "harmonics": 2, "settle": 2, "catch_up": 2}.get(name, 1)):
             given = case.random(np.random.default_rng([draw, *name.encode()]), size)
             if name == "adam":
                 given.rows = ("all", "sparse", "late")[draw]
