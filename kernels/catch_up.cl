@@ -4,8 +4,8 @@
 // Owner: A group owns ROWS rows of a chunk if LANES > 1; otherwise, ITEMS vectors of a chunk's array at a time.
 // Launch: LANES > 1: groups of one item, CHUNK_ROWS / ROWS for each entry of `chunks`. Otherwise groups of ITEMS items,
 //   PIECES for each float of a row, for each entry of `chunks`.
-// Buffers: chunks (entries), last (entries): numbers of chunks, or NO_CHUNK, and the last step that each has taken;
-//   table (steps, TABLE_NUMBERS): for each step from number `first_step` on the two roots of Step and the rates of the
+// Buffers: chunks (entries), last (entries): numbers of chunks, or NO_CHUNK, and the last step that each has taken with
+//   its gradients; caught (chunks of the model): the last step up to which each has been caught up; table (steps, TABLE_NUMBERS): for each step from number `first_step` on the two roots of Step and the rates of the
 //   six parameter groups, root 0 where a step leaves `sh_rest` alone; parameters and both moments of the model's
 //   model_rows rows, updated up to step `step`; readback (READBACK_SIZE) counts refusals. Other scalars are those of
 //   Step. After a stopped pass (duplicate.cl) nothing changes.
@@ -111,8 +111,8 @@ __attribute__((always_inline)) static inline void catch_up_vector(size_t i, Miss
   EACH(4, sh_dc, 3, TABLE_ROOT, limit2_sh)                                                                             \
   EACH(5, sh_rest, sh_width, TABLE_ROOT_SH_REST, limit2_sh)
 
-__kernel void catch_up(__global const uint *chunks, const uint model_rows, __global const uint *last, const uint step,
-                       __global const float *table, const uint first_step, const uint sh_width, const float beta1,
+__kernel void catch_up(__global const uint *chunks, const uint model_rows, __global const uint *last,
+                       __global const uint *caught, const uint step, __global const float *table, const uint first_step, const uint sh_width, const float beta1,
                        const float beta2, const float epsilon, const float limit2, const float limit2_sh,
                        __global uint *readback, __global float *means, __global float *quaternions,
                        __global float *log_scales, __global float *opacity_logits, __global float *sh_dc,
@@ -130,9 +130,11 @@ __kernel void catch_up(__global const uint *chunks, const uint model_rows, __glo
 #endif
   const uint place = get_group_id(0) / pieces, piece = get_group_id(0) % pieces;
   const size_t chunk_row = (size_t)CHUNK_ROWS * chunks[place];
-  if (chunk_row >= model_rows || last[place] >= step || readback[READBACK_STOPPED]) return;
-  const uint rows = min((size_t)CHUNK_ROWS, model_rows - chunk_row), steps = step - last[place];
-  __global const float *from = table + (size_t)TABLE_NUMBERS * (last[place] + 1 - first_step);
+  if (chunk_row >= model_rows || readback[READBACK_STOPPED]) return;
+  const uint taken = max(last[place], caught[chunks[place]]);
+  if (taken >= step) return;
+  const uint rows = min((size_t)CHUNK_ROWS, model_rows - chunk_row), steps = step - taken;
+  __global const float *from = table + (size_t)TABLE_NUMBERS * (taken + 1 - first_step);
 #if LANES > 1
   // One array of the model after another, so that runs are long enough for the processor's prefetcher.
   const uint first = ROWS * piece;
@@ -172,4 +174,13 @@ __kernel void catch_up(__global const uint *chunks, const uint model_rows, __glo
     for (uint i = begin; i < end; ++i) catch_up_element(i, 0, missed, model);
   }
 #endif
+}
+
+// caught (chunks of the model): `step` for each of the `entries` chunks, after they are caught up, so that a step that
+// is repeated does not catch them up again. After a stopped pass nothing changes.
+__kernel void note_caught_up(const uint entries, const uint model_rows, __global const uint *chunks, const uint step,
+                             __global const uint *readback, __global uint *caught) {
+  const uint place = get_global_id(0);
+  if (place >= entries || readback[READBACK_STOPPED]) return;
+  if ((size_t)CHUNK_ROWS * chunks[place] < model_rows) caught[chunks[place]] = step;
 }

@@ -51,17 +51,21 @@ CHUNKS_DEFINE: dict[str, object] = {"CHUNKS": True}
 """Define of kernels that run over a `ChunkList`."""
 
 
-def send_chunks(work: Workspace, name: str, numbers: NDArray[np.uint32], model_rows: int) -> ChunkList:
-    """Send a list of chunks to the workspace's array `name`.
+def padded_chunks(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """The numbers of chunks, then NO_CHUNK, in one of few lengths, so that arrays and command buffers are reused.
 
-    The list has one of few lengths, at most an eighth more than needed, so that arrays and command buffers are reused.
-
-    numbers: in rising order.
+    The length is at most an eighth more than needed, or 1.
     """
     wanted = max(len(numbers), 1)
     unit = 1 << max(wanted.bit_length() - 4, 0)
     padded = np.full(-(-wanted // unit) * unit, NO_CHUNK, np.uint32)
     padded[: len(numbers)] = numbers
+    return padded
+
+
+def send_chunks(work: Workspace, name: str, numbers: NDArray[np.uint32], model_rows: int) -> ChunkList:
+    """Send a list of chunks, in rising order, to the workspace's array `name`."""
+    padded = padded_chunks(numbers)
     array = work.array(name, padded.shape, np.uint32)
     array.send(padded)
     return ChunkList(array, model_rows)

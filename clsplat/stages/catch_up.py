@@ -12,7 +12,7 @@ from clsplat.arrays import Float32
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray
 from clsplat.device.context import Device
-from clsplat.device.launch import DEFAULT_GROUP_ITEMS, launch_groups
+from clsplat.device.launch import DEFAULT_GROUP_ITEMS, launch_groups, launch_items
 from clsplat.device.profile import stage
 from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
 from clsplat.layouts.columns import CHUNK_ROWS
@@ -40,6 +40,7 @@ def catch_up(
     model: tuple[DeviceGaussians, ...],
     chunks: ChunkList,
     last: DeviceArray,
+    caught: DeviceArray,
     step: int,
     table: DeviceArray,
     first_step: int,
@@ -50,7 +51,9 @@ def catch_up(
     Nothing changes if `readback` says that the step's pass has stopped.
 
     model: parameters, first and second moments of the whole model.
-    last: (entries of chunks,) uint32, the last step that each chunk has taken.
+    last: (entries of chunks,) uint32, the last step that each chunk has taken with its gradients.
+    caught: (chunks of the model,) uint32, the last step up to which each has been caught up; `step` is written for
+    these chunks. So a second call for one step, which is repeated, changes nothing.
     table: (steps, numbers), `step_table` of step number `first_step` and those after it. It has all missed steps.
     readback: (READBACK_SIZE,) uint32. Its last four entries count refused updates of elements, one for each step.
     """
@@ -73,6 +76,7 @@ def catch_up(
         items,
         *chunks.arguments,
         last,
+        caught,
         np.uint32(step),
         table,
         np.uint32(first_step),
@@ -82,3 +86,5 @@ def catch_up(
         readback.buffer,  # a buffer, so that the profile counts no traffic: it is written only on a fault
         *(arrays[group] for arrays in model for group in PARAMETER_GROUPS),
     )
+    noted = (chunks.model_rows, chunks.numbers, np.uint32(step), readback.buffer, caught)
+    launch_items(device, device.kernels("catch_up", defines).note_caught_up, entries, entries, *noted)

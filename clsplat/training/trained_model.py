@@ -12,10 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
-from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.chunks.order import ORDERED_ROWS, beside_parents, space_order
+from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
+from clsplat.models.edit import take
+from clsplat.optimisation.density_rules import FRESH
 from clsplat.rendering.memory_plan import Plan
 from clsplat.runs.checkpoints import Checkpoint, unusable
 from clsplat.stages.density import (
@@ -70,7 +73,9 @@ class TrainedModel:
         self._sh_degree, self._counts_contributions = sh_degree, counts_contributions
 
     def begin(self, initial: Gaussians) -> None:
-        """Start from a model on the host."""
+        """Start from a model on the host. The rows of a large one are put in order of their places in space."""
+        if len(initial) > ORDERED_ROWS:
+            initial = take(initial, space_order(initial.means).astype(np.int64))
         self.plan = self._make_plan(len(initial))
         if self.plan.streamed:
             self.set(host_gaussians(copy.deepcopy(initial), self.plan.rows))
@@ -168,7 +173,7 @@ class TrainedModel:
             self.second[group].fill(0.0)
         if plan.forget_contributions:
             self.statistics.forget_contributions()
-        return None if listed is None else listed.rows
+        return None if listed is None else self._in_order(listed.rows)
 
     def _zeros(self, count: int, coefficients: int) -> AnyGaussians:
         if isinstance(self.parameters, HostGaussians):
@@ -186,6 +191,20 @@ class TrainedModel:
         if isinstance(model, HostGaussians):
             return replace(model, rows=self.plan.rows) if self.plan.streamed else to_device(self._device, model)
         return model
+
+    def _in_order(self, listed: DeviceArray) -> DeviceArray:
+        """Put the new rows of a large model behind the rows that they come from, after `listed` has been carried out.
+
+        Returns the list that gives this order at once.
+        """
+        if listed.shape[0] <= ORDERED_ROWS:
+            return listed
+        entries = listed.get()
+        order = beside_parents(entries & ~FRESH)
+        if (order[1:] > order[:-1]).all():
+            return listed
+        self._move(list_rows(self._device, order, None).rows, lambda: None, new_statistics=False)
+        return upload(self._device, entries[order])
 
     def _halve(
         self,

@@ -44,6 +44,7 @@ from clsplat.training.step.late_adam import LateAdam
 from clsplat.training.step.monitor import StepMonitor
 from clsplat.training.step.position import Mark, Position
 from clsplat.training.step.speculative_steps import SpeculativeSteps
+from clsplat.training.step.visible_chunks import VisibleChunks
 from clsplat.training.supervision.depth_targets import DepthTargets
 from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.supervision.resolution import by_doubling
@@ -113,7 +114,8 @@ class Trainer:
         cameras = [self.local(view.camera) for view in self.views]
         mip_filter = MipFilter(self.config, self.device, self.rasterizer.work, cameras)
         late = [LateAdam(self.config.optimiser, self.rasterizer, len(initial))] if self.config.optimiser.late else []
-        self.components: tuple[Component, ...] = (*late, mip_filter, self.appearance, self.cameras, self.depths)
+        chunks = VisibleChunks(self.config, self.rasterizer, self.scene.length_unit, len(initial))
+        self.components: tuple[Component, ...] = (*late, mip_filter, self.appearance, self.cameras, self.depths, chunks)
         self._active = [component for component in self.components if component.on]
         self.model = TrainedModel(
             self.device,
@@ -182,7 +184,7 @@ class Trainer:
         result: Loss | Losses
         if self.batch is None:
             run = partial(self._run, step, inputs[0], reads_loss)
-            result = self.pending.launch(run, self._room(factor), reads_loss=reads_loss)
+            result = self.pending.launch(run, self._room(factor), number=self.step, reads_loss=reads_loss)
             if self.position.queue:  # upload the next step's photograph, at this resolution
                 self.photographs.ahead(self.position.queue[-1], factor)
         else:
@@ -198,7 +200,9 @@ class Trainer:
     def _prepare_components(self, views: int) -> None:
         """Let the components do the work that is due before a step of `views` views."""
         if due := [component for component in self._active if component.is_due(self.step, views)]:
-            self.catch_up()
+            if any(component.reads_all_rows for component in due):
+                self.catch_up()
+            self.settle()
             for component in due:
                 component.before_step(self.parameters)
 
@@ -234,9 +238,11 @@ class Trainer:
             return 0
         return self.pending.room(self.rasterizer, (factor, self.rasterizer), self.parameters.count)
 
-    def _begin_again(self) -> None:
-        """Prepare for repeating a step. This invalidates `mark`."""
+    def _begin_again(self, step: int) -> None:
+        """Prepare for repeating step number `step`. This invalidates `mark`."""
         self.mark = None
+        for component in self.components:
+            component.step_back(step - 1)
         self.repair()
 
     def settle(self) -> None:
@@ -248,6 +254,12 @@ class Trainer:
         self.settle()
         for component in self.components:
             component.complete(*self.model.with_moments)
+
+    def _catch_up_exactly(self) -> None:
+        """Make the postponed changes to Gaussians that change no bit of a result, after all launched steps are done."""
+        self.settle()
+        for component in self.components:
+            component.complete_exactly(*self.model.with_moments)
 
     @property
     def complete_parameters(self) -> AnyGaussians:
@@ -325,6 +337,8 @@ class Trainer:
         if self.mark is None:
             return False
         self.position.go_back(self.mark)
+        for component in self.components:
+            component.step_back(self.step)
         return True
 
     def repair(self, *, look: bool = False) -> None:
@@ -335,6 +349,8 @@ class Trainer:
         if look:
             self.settle()
             self.monitor.look()
+        if self.monitor.noticed:
+            self._catch_up_exactly()
         self._apply(self.monitor.examine(self.model.kinds()))
 
     def _apply(self, repair: Repair | None) -> None:
@@ -400,6 +416,8 @@ class Trainer:
         if self.batch is not None:
             self.batch.changed()
         if moved is None:
+            for component in self.components if plan.values or plan.changes else ():
+                component.rows_changed()
             return
         for component in self.components:
             component.rows_moved(moved)
@@ -437,6 +455,7 @@ class Trainer:
         The whole model is finite, unless `monitor.retries.lost`.
         """
         self.repair(look=True)
+        self._catch_up_exactly()
         arrays = self._arrays()
         if (
             repair := self.monitor.examine_all(arrays)

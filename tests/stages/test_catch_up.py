@@ -103,7 +103,8 @@ def caught_up(
     counts[READBACK.index("STOPPED")] = stopped
     readback = upload(device, counts)
     numbers = upload(device, np.array([*last, NO_CHUNK, NO_CHUNK], np.uint32))
-    given = (upload(device, np.array([*last.values(), 0, 0], np.uint32)), steps[-1].number)
+    caught = upload(device, np.zeros(-(-model[0].count // CHUNK_ROWS), np.uint32))
+    given = (upload(device, np.array([*last.values(), 0, 0], np.uint32)), caught, steps[-1].number)
     table = (upload(device, step_table(steps)), steps[0].number)
     catch_up(device, steps[0].config, model, ChunkList(numbers, model[0].count), *given, *table, readback)
     return read(model), readback.get()
@@ -242,7 +243,7 @@ def test_a_table_that_ends_too_early_is_refused(default_device: Device) -> None:
         upload(default_device, step_table(steps_of(DENSE, 1, 4))),
     )
     with pytest.raises(ValueError, match="has steps 1 to 4, expected up to 5"):
-        catch_up(default_device, DENSE, model, chunks, last, 5, table, 1, fresh_readback(default_device))
+        catch_up(default_device, DENSE, model, chunks, last, last, 5, table, 1, fresh_readback(default_device))
 
 
 @pytest.mark.slow_in_groups

@@ -66,7 +66,8 @@ def _launch(device: Device, _: Workspace, given: Inputs) -> Read:
     last[: len(given.last)] = list(given.last.values())
     table = step_table(AdamStep(config, number, rates) for number, rates in given.rates.items())
     chunks, step = ChunkList(upload(device, numbers), models[0].count), max(given.rates)
-    uploaded = upload(device, last), step, upload(device, table), given.first_step
+    caught = upload(device, np.zeros(-(-models[0].count // CHUNK_ROWS), np.uint32))
+    uploaded = upload(device, last), caught, step, upload(device, table), given.first_step
     catch_up(device, config, tuple(models), chunks, *uploaded, readback)
     by_name = dict(zip(given.arrays, models, strict=True))
     return lambda: {

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Components of a training in addition to the Gaussians: appearance, refined cameras, mip filter, known depths, late
-Adam.
+Adam, chunks in view.
 
 `Trainer` loops over a list of components. A new one is a subclass of `Component` and a line in `Trainer._start`.
 """
@@ -44,6 +44,11 @@ class Component:
         """Bytes per pixel on the device."""
         return 0
 
+    @property
+    def reads_all_rows(self) -> bool:
+        """True if `before_step` wants every postponed change to the Gaussians made."""
+        return True
+
     def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002
         """True if `before_step` has work before a step of `views` views that ends with view number `step`."""
         return False
@@ -62,12 +67,21 @@ class Component:
     def after_adam(self, gaussians: AnyGaussians) -> None:
         """Change the parameters after Adam's step."""
 
+    def step_back(self, step: int) -> None:
+        """Return to the state after step number `step`: later ones have failed before they changed a Gaussian."""
+
+    def complete_exactly(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
+        """Make the postponed changes that may be made at any time, because they give the same bits."""
+
     def complete(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
         """Make all changes to the parameters and their moments that are postponed, because all rows are now needed."""
 
     def completed(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> AnyGaussians:  # noqa: ARG002
         """The parameters as `complete` would leave them, without changing any array."""
         return parameters
+
+    def rows_changed(self) -> None:
+        """Forget data about the values of Gaussians, which have changed between two steps."""
 
     def rows_moved(self, listed: DeviceArray) -> None:
         """Follow rows that have moved, or forget data about individual rows.

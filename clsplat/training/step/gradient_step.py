@@ -18,6 +18,7 @@ from clsplat.optimisation.dropout import thinning_of
 from clsplat.optimisation.step_noise import NO_EXPLORATION, Exploration
 from clsplat.rendering.rasterizer import ForwardPass, PairCapacity, Rasterizer
 from clsplat.stages.adam import AdamStep, adam
+from clsplat.stages.bounds import ChunkList
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians, parts
 from clsplat.stages.loss import Loss, loss
 from clsplat.stages.loss_terms import LossTerm
@@ -112,10 +113,11 @@ class GradientStep:
         sent = self.rasterizer.send(camera, inputs.background)
         source = on_device(work, inputs.photograph)
         thinning, terms = thinning_of(self.config, self.step), loss_terms(self.config, inputs)
-        key = self._key(inputs, source, terms)
+        chunks = None if inputs.chunks is None else inputs.chunks.prepare(model, self.adam_step)
+        key = self._key(inputs, source, terms, chunks)
 
         def gradient(probe: StepProbe) -> tuple[ForwardPass, Loss, Slots, Sequence[DeviceArray | None]]:
-            forward = partial(self.rasterizer.forward, model[0], camera, sent[1], sent=sent)
+            forward = partial(self.rasterizer.forward, model[0], camera, sent[1], sent=sent, chunks=chunks)
             frame = forward(room=self.room, thinning=thinning, nearness=self.fields.nearness)
             probe.forward(frame)
             result = self._compare(model[0], inputs, source, frame, terms)
@@ -142,11 +144,13 @@ class GradientStep:
             probe.forward(frame)
             probe.loss(result)
             probe.pair_gradients(slots)
-        self._change(model, inputs, frame, slots, gradients, probe)
+        self._change(model, inputs, frame, slots, gradients, probe, chunks)
         self.learn(inputs, own)
         return result
 
-    def _key(self, inputs: ViewInputs, source: DeviceArray, terms: Sequence[LossTerm]) -> tuple[object, ...] | None:
+    def _key(
+        self, inputs: ViewInputs, source: DeviceArray, terms: Sequence[LossTerm], chunks: ChunkList | None
+    ) -> tuple[object, ...] | None:
         """All that the launches of a view's gradient depend on, except the model; None if they cannot be replayed in
         one: with exact counts, with parts or depths, or if a mask gives each photograph a divisor of its own."""
         keys, camera, room, fields = tuple(term.key for term in terms), inputs.camera, self.room, self.fields
@@ -154,7 +158,8 @@ class GradientStep:
             return None
         of_view = (self.rasterizer.device_of(camera), camera.width, camera.height, source.shape, source.dtype)
         of_step = (room.pairs, room.turn, room.appends, fields.absolute, fields.contributions, fields.nearness)
-        return (*of_view, *of_step, self.turn, self.config.thinning > 0, keys)
+        rows = None if chunks is None else chunks.key
+        return (*of_view, *of_step, self.turn, self.config.thinning > 0, keys, rows)
 
     def _compare(
         self,
@@ -203,18 +208,21 @@ class GradientStep:
         slots: Slots,
         gradients: DeviceGaussians | None,
         probe: StepProbe,
+        chunks: ChunkList | None,
     ) -> None:
-        """Take Adam's step for the model, part by part."""
+        """Take Adam's step for the model, part by part, or for some of its chunks."""
 
         def change() -> None:
             for start, stop, part in parts(self.rasterizer.work, *model, keep=True):
-                self._change_rows(self._rows(start, stop, part, inputs, frame, slots, gradients), inputs, probe)
+                end = stop if chunks is None else chunks.rows
+                self._change_rows(self._rows(start, end, part, inputs, frame, slots, gradients, chunks), inputs, probe)
 
         if self.room is None or gradients is not None or any(part.changes_rows for part in inputs.parts):
             change()
             return
         step, explore = self.adam_step, self.explore
-        key = (slots, *map(ref, model[1:]), step.updates_sh_rest, bool(explore.weights), explore.amount != 0)
+        rows = None if chunks is None else chunks.key
+        key = (slots, *map(ref, model[1:]), step.updates_sh_rest, bool(explore.weights), explore.amount != 0, rows)
         numbers = (*step_numbers(step, explore), *noise_numbers(explore), *probe.numbers)
         self.replayed(model[0], (*key, *probe.key), change, numbers, before=probe.before_replay)
 
@@ -227,8 +235,9 @@ class GradientStep:
         frame: ForwardPass,
         slots: Slots,
         gradients: DeviceGaussians | None,
+        chunks: ChunkList | None,
     ) -> StepRows:
-        """Rows [start, stop) of the model, with arrays for their gradients."""
+        """Rows [start, stop) of the model or of `chunks`, with arrays for their gradients."""
         by_lens = (part.lens_gradients(stop - start) for part in inputs.parts)
         return StepRows(
             start,
@@ -241,6 +250,7 @@ class GradientStep:
             slots.rows(start, stop),
             gradients,
             next((room for room in by_lens if room is not None), None),
+            chunks=chunks,
         )
 
     def _change_rows(self, rows: StepRows, inputs: ViewInputs, probe: StepProbe) -> None:
@@ -301,7 +311,7 @@ class GradientStep:
             adam(self.device, step, *models, rows.projected.tile_counts, readback)
         else:
             view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
-            project_step(rows.device, step, rows.model, *view, explore=self.explore)
+            project_step(rows.device, step, rows.model, *view, explore=self.explore, chunks=rows.chunks)
         noise(self.device, self.explore, rows.parameters, rows.start, readback)
 
 

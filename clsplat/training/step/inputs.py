@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,17 @@ from clsplat.camera import Camera
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.stages.adam import AdamStep
-from clsplat.stages.device_gaussians import DeviceGaussians
+from clsplat.stages.bounds import ChunkList
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians
 from clsplat.stages.loss_terms import DepthTerm
 from clsplat.stages.project import Projected, Screen, Slots
+
+
+class ChunksInView(Protocol):
+    """The chunks of the model over which a step runs."""
+
+    def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> ChunkList | None:
+        """Make the chunks ready for the step, and send their list. None if the step runs over the whole model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +40,7 @@ class ViewInputs:
     place: the view's number in the step.
     parts: the components' parts in it.
     name: the view's name, for messages.
+    chunks: the only chunks of the model that the view may show; None for the whole model.
     """
 
     view: int
@@ -45,6 +54,7 @@ class ViewInputs:
     place: int = 0
     parts: tuple[ViewPart, ...] = ()
     name: str = ""
+    chunks: ChunksInView | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +63,14 @@ class ViewRows:
 
     projected: projection of these rows in the step's view.
     screen: their screen-space gradients, valid after the rows have changed.
+    chunks: the chunks that were projected. Then [start, stop) are rows of this list.
     """
 
     start: int
     stop: int
     projected: Projected
     screen: Screen
+    chunks: ChunkList | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -71,22 +71,23 @@ class StepMonitor(StepProbe):
         step, parameters = self.step, rows.parameters
         size = (parameters.count, parameters.coefficients)
         build = (step.adam_step.updates_sh_rest, step.fields, rows.slots.first_slots is None, self.needs.gradients)
-        key = (*size, *build, *self.inputs.camera.model.defines.items())
+        key = (*size, *build, rows.chunks is None, *self.inputs.camera.model.defines.items())
         if key not in self.tried:
             with only_tried(step.device), only_tried(step.rasterizer.device), only_tried(rows.device):
                 step.change(rows, self.inputs)
-                self.add_statistics(self.statistics.rows(0, rows.stop - rows.start), rows)
+                self._add_rows(rows)
             self.tried.add(key)
         self.changes()
 
     def after_rows(self, rows: ViewRows) -> None:
         """Add the rows to the statistics."""
-        self.add_statistics(self.statistics.rows(rows.start, rows.stop), rows)
+        self._add_rows(rows)
 
-    def add_statistics(self, statistics: DensityStatistics, rows: ViewRows) -> None:
+    def _add_rows(self, rows: ViewRows) -> None:
         """Add the view to the statistics that density control needs of these rows."""
-        device, camera, screen = self.step.device, self.inputs.camera, rows.screen
+        device, camera, screen, chunks = self.step.device, self.inputs.camera, rows.screen, rows.chunks
+        statistics = self.statistics if chunks is not None else self.statistics.rows(rows.start, rows.stop)
         if self.needs.gradients:
-            add_statistics(device, statistics, camera, rows.projected, screen)
+            add_statistics(device, statistics, camera, rows.projected, screen, chunks)
         if screen.contributions is not None and statistics.current_totals is not None:
-            add_contributions(device, statistics, rows.projected, screen.contributions, self.inputs.area)
+            add_contributions(device, statistics, rows.projected, screen.contributions, self.inputs.area, chunks)

@@ -36,12 +36,14 @@ class _Step:
     """A step whose counts the host has not read.
 
     readback, counts: the counts on the device, and a function that waits for their copy.
+    number: number of its last view.
     before: the monitor's `last` before this step.
     kept: host memory that the device may still have to read.
     """
 
     run: Run
     turn: int
+    number: int
     result: Loss
     readback: DeviceArray
     counts: Callable[[], NDArray[Any]]
@@ -57,11 +59,12 @@ def by_capacity(device: Device) -> bool:
 class SpeculativeSteps:
     """A training's steps launched by capacity, at most two at a time, and the capacity of the next step.
 
-    begin: function that is called before a step is repeated. It first repairs the trouble that `monitor` has noticed.
+    begin: function that is called before a step is repeated, with the step's number. It first repairs the trouble that
+    `monitor` has noticed.
     redone: number of repeated steps.
     """
 
-    def __init__(self, device: Device, monitor: NonFiniteMonitor, begin: Callable[[], None]) -> None:
+    def __init__(self, device: Device, monitor: NonFiniteMonitor, begin: Callable[[int], None]) -> None:
         self.on = by_capacity(device)
         self._device, self._monitor, self._begin = device, monitor, begin
         self._steps: list[_Step] = []
@@ -109,9 +112,10 @@ class SpeculativeSteps:
         wanted = -(-wanted // step) * step
         return wanted if wanted <= rasterizer.capacity else 0
 
-    def launch(self, run: Run, room: int, *, reads_loss: bool) -> Loss:
+    def launch(self, run: Run, room: int, *, number: int, reads_loss: bool) -> Loss:
         """Run a step, by capacity unless `room` is 0, and then check the step before.
 
+        number: number of the step's last view.
         reads_loss: True to check this step too, because its loss will be read.
         """
         if not self.on:
@@ -128,7 +132,7 @@ class SpeculativeSteps:
         counted, under_way = self._frame.listed.counted, self._device.under_way
         assert counted.arriving is not None, "it was launched by capacity"
         assert counted.on_device is not None, "it was launched by capacity"
-        step = _Step(run, turn, result, counted.on_device, counted.arriving, before, list(under_way))
+        step = _Step(run, turn, number, result, counted.on_device, counted.arriving, before, list(under_way))
         self._steps.append(step)
         under_way.clear()
         self._look(0 if reads_loss else 1)
@@ -168,6 +172,6 @@ class SpeculativeSteps:
         steps[0].readback.set(values)
         self._monitor.last = steps[0].before
         for step in steps:
-            self._begin()
+            self._begin(step.number)
             step.result = step.run(step.turn, None)
             self.redone += 1

@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A step of a large model runs over the chunks that its view may show (docs/decisions/0052-chunks.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Bool, Float32, Float64
+from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_step
+from clsplat.chunks.culling import visible
+from clsplat.chunks.order import ORDERED_ROWS
+from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import DeviceArray, allocate
+from clsplat.device.launch import DEFAULT_GROUP_ITEMS
+from clsplat.gaussians import PARAMETER_GROUPS
+from clsplat.layouts.columns import CHUNK_ROWS
+from clsplat.optimisation.dropout import thinning_of
+from clsplat.rendering.rasterizer import MAX_COUNTED_PASSES, Rasterizer
+from clsplat.stages.adam import AdamStep
+from clsplat.stages.bounds import ChunkList, bounds, send_chunks
+from clsplat.stages.catch_up import catch_up, step_table
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians
+from clsplat.training.learning_rates import rates_at
+from clsplat.training.step.component import Component, Named
+from clsplat.training.step.inputs import ChunksInView, ViewInputs
+
+STEPS_PER_MEASUREMENT = 16
+"""Steps after which the bounds of the chunks that took part in them are measured again. More steps widen the bounds,
+whose growth by each step is an upper limit; fewer wait more often for the device."""
+MAX_SHARE_IN_VIEW = 0.9
+"""Share of the chunks in view above which a step runs over the whole model, as there is little to leave out."""
+MOST_MISSED_STEPS = 1024
+"""Steps after which a chunk is caught up even if no view shows it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Missed:
+    """Steps that chunks have missed because no view showed them.
+
+    numbers: the chunks, in rising order.
+    last: (chunks,) uint32, the last step that each has taken.
+    step: the step up to which they are caught up.
+    table: the steps from number `first_step` on (`stages.catch_up.step_table`).
+    """
+
+    numbers: NDArray[np.uint32]
+    last: NDArray[np.uint32]
+    step: int
+    table: Float32
+    first_step: int
+
+
+class VisibleChunks(Component):
+    """What a training knows of its model's chunks: bounds, how far Gaussians may have moved since they were measured,
+    and the last step that each chunk has taken.
+
+    A chunk that a step leaves out has no Gaussian that the view shows. Before a view shows it again, it takes the steps
+    that it has missed, with the bits that it would have. So no bit of a result depends on the bounds.
+
+    unit: the scene's length unit.
+    """
+
+    def __init__(self, config: TrainConfig, rasterizer: Rasterizer, unit: float, count: int) -> None:
+        self._config, self._rasterizer, self._unit = config, rasterizer, unit
+        self._step_limit = largest_step(config.optimiser)
+        self._hidden_limit = 0.0 if config.optimiser.sparse else hidden_path(config.optimiser)
+        self._begin(count, 0)
+
+    def _begin(self, count: int, step: int) -> None:
+        """Forget all bounds, of a model of `count` Gaussians that have all taken step number `step`."""
+        chunks = -(-count // CHUNK_ROWS)
+        self._count, self._found = count, np.full((chunks, 7), np.nan)  # bounds that are not finite leave nothing out
+        self._unmeasured = np.ones(chunks, np.bool_)
+        self._means_moved, self._scales_moved = np.zeros(chunks), np.zeros(chunks)
+        self._since: int | None = None
+        """Steps since the last measurement; None if there is none."""
+        self.step, self._last = step, np.full(chunks, step, np.uint32)
+        self._table, self._first_step = (
+            np.zeros((2 * MOST_MISSED_STEPS, 2 + len(PARAMETER_GROUPS)), np.float32),
+            step + 1,
+        )
+        """The steps from `_first_step` on, of which chunks may have missed some (`stages.catch_up.step_table`)."""
+        self._before: dict[int, NDArray[np.uint32]] = {}
+        """By number, `_last` as it was before the latest steps, which may be repeated."""
+        self._caught: DeviceArray | None = None
+
+    @property
+    def on(self) -> bool:
+        """True if a step changes hidden Gaussians at most by Adam, and reads gradients of none of them."""
+        config = self._config
+        by_adam_only = config.density.growth != "mcmc" and not config.antialiased and not config.optimiser.late
+        one_view = config.batch == 1 and not config.refines
+        return by_adam_only and one_view and self._rasterizer.device.max_group >= DEFAULT_GROUP_ITEMS
+
+    def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002
+        """True if bounds must be measured before the next step."""
+        return self._count > ORDERED_ROWS and (self._since is None or self._since >= STEPS_PER_MEASUREMENT)
+
+    @property
+    def reads_all_rows(self) -> bool:
+        """True if a chunk has missed so many steps that all are caught up at the next measurement."""
+        return self.step - int(self._last.min(initial=self.step)) >= MOST_MISSED_STEPS
+
+    def before_step(self, gaussians: AnyGaussians) -> None:
+        """Measure the bounds of chunks whose Gaussians may have moved."""
+        if not isinstance(gaussians, DeviceGaussians):
+            return
+        self._since = 0
+        numbers = np.flatnonzero(self._unmeasured).astype(np.uint32)
+        if len(numbers) == 0:
+            return
+        work = self._rasterizer.work
+        chunks = send_chunks(work, "chunks", numbers, gaussians.count)
+        self._found[numbers] = bounds(self._rasterizer.device, work, gaussians, chunks)[: len(numbers)]
+        self._unmeasured[numbers] = False
+        self._means_moved[numbers] = self._scales_moved[numbers] = 0.0
+
+    def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:
+        """The view, with the chunks that it may show."""
+        if count <= ORDERED_ROWS or self._since is None:
+            return inputs
+        (of_view,) = inputs
+        shown = self._shown(of_view, step)
+        whole = int(np.count_nonzero(shown)) > MAX_SHARE_IN_VIEW * len(shown)
+        self._since += 1
+        if whole:
+            shown[:] = True
+        numbers = np.flatnonzero(shown).astype(np.uint32)
+        missed = self._missed(shown, step - 1)
+        return [replace(of_view, chunks=_ChunksInView(self, numbers, missed, self._found, whole=whole))]
+
+    def _shown(self, of_view: ViewInputs, step: int) -> Bool:
+        """The chunks that the view may show, whose Gaussians may then move."""
+        thinning = thinning_of(self._config, step)
+        factor = 1.0 if thinning is None else thinning.factor
+        rates = rates_at(self._config, step, self._unit, 1.0)
+        hidden = np.minimum(self._step_limit * (step - 1 - self._last), self._hidden_limit)
+        measured = ChunkBounds(self._found[:, :3], self._found[:, 3:6], self._found[:, 6])
+        moved = [self._means_moved + hidden * rates["means"], self._scales_moved + hidden * rates["log_scales"]]
+        now = measured.widened(moved[0], moved[1], MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
+        shown = visible(now, of_view.camera, self._config.rasterizer, factor)
+        steps = self._step_limit + hidden[shown]
+        self._means_moved[shown] += steps * rates["means"]
+        self._scales_moved[shown] += steps * rates["log_scales"]
+        self._unmeasured |= shown
+        return shown
+
+    def _missed(self, chunks: Bool, step: int) -> Missed | None:
+        """The steps up to `step` that these chunks have missed; None if there is none."""
+        behind = chunks & (self._last < step)
+        if self._config.optimiser.sparse or not behind.any():
+            return None
+        numbers = np.flatnonzero(behind).astype(np.uint32)
+        last, first = self._last[numbers], int(self._last[numbers].min()) + 1
+        table = self._table[first - self._first_step : step + 1 - self._first_step].copy()
+        return Missed(numbers, last, step, table, first)
+
+    def prepare(self, model: tuple[DeviceGaussians, ...], step: AdamStep, chunks: _ChunksInView) -> ChunkList | None:
+        """Catch up the chunks that a step's view shows, and send their list. A repeated step is the same again."""
+        if chunks.of_rows is not self._found:  # rows have moved since, and all have taken every step
+            chunks = _ChunksInView(self, np.arange(len(self._last), dtype=np.uint32), None, self._found, whole=True)
+        if chunks.missed is not None:
+            self._catch_up(model, chunks.missed)
+        self._before = {step.number: self._last, **dict(list(self._before.items())[: MAX_COUNTED_PASSES - 1])}
+        self._last, self.step = self._last.copy(), step.number
+        self._last[chunks.numbers] = step.number
+        self._note(step)
+        work = self._rasterizer.work
+        return None if chunks.whole else send_chunks(work, "chunks", chunks.numbers, model[0].count)
+
+    def _note(self, step: AdamStep) -> None:
+        """Put a step into the table."""
+        if step.number - self._first_step >= len(self._table):
+            past = int(self._last.min()) + 1 - self._first_step
+            self._table[:-past] = self._table[past:].copy()
+            self._first_step += past
+        self._table[step.number - self._first_step] = step_table([step])[0]
+
+    def _catch_up(self, model: tuple[DeviceGaussians, ...], missed: Missed) -> None:
+        device, work, readback = self._rasterizer.device, self._rasterizer.work, self._rasterizer.readback
+        if self._caught is None:
+            self._caught = allocate(device, self._last.shape, np.uint32)
+            self._caught.fill(0)
+        chunks = send_chunks(work, "chunks_behind", missed.numbers, model[0].count)
+        last = work.array("last_steps", chunks.numbers.shape, np.uint32)
+        padded = np.full(last.shape, missed.step, np.uint32)
+        padded[: len(missed.last)] = missed.last
+        last.send(padded)
+        table = work.array("missed_steps", missed.table.shape)
+        table.send(missed.table)
+        steps = (last, self._caught, missed.step, table, missed.first_step)
+        catch_up(device, self._config.optimiser, model, chunks, *steps, readback)
+
+    def step_back(self, step: int) -> None:
+        """Return to the state after step number `step`. Chunks that were caught up after it are marked as such."""
+        if step < self.step:
+            self._last, self.step = self._before[step + 1], step
+
+    def complete(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
+        """Catch up all chunks."""
+        self.complete_exactly(parameters, first, second)
+
+    def completed(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> AnyGaussians:
+        """The parameters, after all chunks are caught up, in place: chunks have the same bits whenever that is."""
+        self.complete_exactly(parameters, first, second)
+        return parameters
+
+    def complete_exactly(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
+        """Catch up all chunks."""
+        missed = self._missed(np.ones(len(self._last), np.bool_), self.step)
+        if missed is None:
+            return
+        self._catch_up(_on_device((parameters, first, second)), missed)
+        self._last[missed.numbers] = missed.step
+        self._unmeasured[missed.numbers] = True
+
+    def rows_changed(self) -> None:
+        """Measure all bounds again."""
+        self._begin(self._count, self.step)
+
+    def rows_moved(self, listed: DeviceArray) -> None:
+        """Measure all bounds again."""
+        self._begin(listed.shape[0], self.step)
+
+    def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002
+        """Measure all bounds of the checkpoint's Gaussians."""
+        self._begin(count, step)
+
+
+@dataclass(frozen=True, eq=False)
+class _ChunksInView(ChunksInView):
+    """The chunks of a step's view, and the steps that some of them have missed.
+
+    of_rows: bounds of the chunks that are listed, an array of its own for each order of the model's rows.
+    whole: True if the step runs over the whole model, of which all chunks are listed.
+    """
+
+    of: VisibleChunks
+    numbers: NDArray[np.uint32]
+    missed: Missed | None
+    of_rows: Float64
+    whole: bool
+
+    def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> ChunkList | None:
+        """Catch up these chunks, and send their list."""
+        return self.of.prepare(_on_device(model), step, self)
+
+
+def _on_device(model: Sequence[AnyGaussians]) -> tuple[DeviceGaussians, ...]:
+    assert all(isinstance(each, DeviceGaussians) for each in model), "a streamed model has no chunks in view"
+    return tuple(each for each in model if isinstance(each, DeviceGaussians))
