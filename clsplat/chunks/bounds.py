@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -48,11 +49,25 @@ class ChunkBounds:
         """Number of chunks."""
         return len(self.largest)
 
-    @property
+    @cached_property
     def finite(self) -> Bool:
         """True (B,) for chunks with finite bounds."""
         every = np.column_stack([self.lowest, self.highest, self.largest])
         return np.asarray(np.isfinite(every).all(axis=1))
+
+    @cached_property
+    def terms(self) -> Float64:
+        """Rows (8, B): middles of the boxes (3), half sides (3), largest standard deviations, and for each box the sum
+        of its farthest corner's coordinates."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            middle, half = 0.5 * (self.lowest + self.highest).T, 0.5 * (self.highest - self.lowest).T
+            farthest = (np.abs(middle) + half).sum(axis=0)
+            return np.vstack([middle, half, np.exp(self.largest), farthest])
+
+    @cached_property
+    def radius(self) -> Float64:
+        """Half diagonals (B,) of the boxes."""
+        return np.asarray(np.linalg.norm(self.terms[3:6], axis=0))
 
     def widened(self, mean_step: float | Float64, log_scale_step: float | Float64, updates: int = 0) -> ChunkBounds:
         """The bounds after each coordinate of a mean, and each log scale, has moved by at most these steps.

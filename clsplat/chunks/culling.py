@@ -16,7 +16,7 @@ import numpy as np
 from clsplat.arrays import Bool, Float64
 from clsplat.camera import Camera, Window
 from clsplat.cameras.equirectangular import Equirectangular
-from clsplat.cameras.fisheye import MIN_FISHEYE_SLOPE, Fisheye, radii
+from clsplat.cameras.fisheye import MIN_FISHEYE_SLOPE, Fisheye
 from clsplat.cameras.model import CameraModel
 from clsplat.cameras.perspective import PerspectiveByRays
 from clsplat.chunks.bounds import ChunkBounds
@@ -43,30 +43,32 @@ kernels do so from 0.999."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Boxes:
-    """Boxes of B chunks in a camera's axes, and the camera's picture.
+class _Picture:
+    """A camera's picture.
 
-    world: (B, 3) each, middle and half sides of the boxes in the world.
-    middle, half: (B, 3), of boxes along the camera's axes around those.
-    radius: (B,), of spheres around those in the world.
-    size: (B,), the largest standard deviation in the camera's axes.
-    rounding: (B,), the rounding error of a mean in the camera's axes.
     reach: standard deviations at which a Gaussian ends.
+    stretch: the most by which the camera's matrix makes a length longer: more than 1 if it is not quite a rotation.
     low, high: (2,), borders of the tiles in pixels, from the principal point.
-    slack: (2,), rounding of a place on the picture in pixels, of places in and around it.
+    slack: (2,), rounding in pixels of a place near the picture.
+    depths: least and largest depth.
     """
 
     camera: Camera
-    world: tuple[Float64, Float64]
-    middle: Float64
-    half: Float64
-    radius: Float64
-    size: Float64
-    rounding: Float64
     reach: float
+    stretch: float
     low: Float64
     high: Float64
     slack: Float64
+    depths: tuple[float, float]
+
+    @classmethod
+    def of(cls, camera: Camera, reach: float) -> _Picture:
+        window = camera.window or Window(0, 0, camera.width, camera.height)
+        low = np.array([window.x - camera.cx, window.y - camera.cy])
+        high = low - TILE * (-np.array([camera.width, camera.height]) // TILE)
+        slack = _ROUNDING * (np.abs([camera.cx, camera.cy]) + np.abs(low) + np.abs(high))
+        depths = max(camera.near, 0.0), min(camera.far, float(np.finfo(np.float32).max))
+        return cls(camera, reach, float(np.linalg.norm(camera.rotation, 2)), low, high, slack, depths)
 
 
 def visible(
@@ -86,43 +88,22 @@ def visible(
     if not switches.frustum_cull or len(bounds) == 0:
         return np.ones(len(bounds), np.bool_)
     reach = 3.0 if switches.extent == "3sigma" else math.sqrt(2 * math.log(opacity_factor / switches.alpha_min))
+    picture = _Picture.of(camera, reach * _REACH_SLACK)
+    hidden = np.zeros(len(bounds), np.bool_)
     with np.errstate(all="ignore"):  # what is not finite compares as visible
-        boxes = _boxes(bounds, camera, reach * _REACH_SLACK)
-        hidden = _out_of_depth(boxes)
         if camera.model.along_rays:
+            cones = _cones(bounds, picture)
+            hidden |= _out_of_depth(cones, picture)
             for kind, beyond in _ALONG_RAYS.items():
                 if isinstance(camera.model, kind):
-                    hidden |= beyond(boxes)
+                    hidden |= beyond(cones, picture)
         elif camera.model.is_pinhole or camera.model.parallel:
-            hidden |= _beyond_planes(boxes, square=switches.tile_test == "square")
+            hidden |= _beyond_planes(bounds, picture, square=switches.tile_test == "square")
         return ~hidden | ~bounds.finite
 
 
-def _boxes(bounds: ChunkBounds, camera: Camera, reach: float) -> _Boxes:
-    window = camera.window or Window(0, 0, camera.width, camera.height)
-    corner = np.array([window.x - camera.cx, window.y - camera.cy])
-    tiles = -(-np.array([camera.width, camera.height]) // TILE)
-    middle, half = 0.5 * (bounds.lowest + bounds.highest), 0.5 * (bounds.highest - bounds.lowest)
-    stretch = float(np.linalg.norm(camera.rotation, 2))  # a pose may be off a rotation by a little
-    rounding = _CANCELLED * ((np.abs(middle) + half).sum(axis=1) + np.abs(camera.translation).sum())
-    centre, high = np.abs([camera.cx, camera.cy]), corner + TILE * tiles
-    return _Boxes(
-        camera=camera,
-        world=(middle, half),
-        middle=middle @ camera.rotation.T + camera.translation,
-        half=half @ np.abs(camera.rotation).T + rounding[:, None],
-        radius=stretch * np.sqrt((half * half).sum(axis=1)) + 2 * rounding,
-        size=stretch * np.exp(bounds.largest),
-        rounding=rounding,
-        reach=reach,
-        low=corner,
-        high=high,
-        slack=_ROUNDING * (centre + np.abs(corner) + np.abs(high)),
-    )
-
-
-def _beyond_planes(boxes: _Boxes, *, square: bool) -> Bool:
-    """True (B,) for chunks beyond a side of the picture on an image plane.
+def _beyond_planes(bounds: ChunkBounds, picture: _Picture, *, square: bool) -> Bool:
+    """True (B,) for chunks beyond a side of the picture on an image plane, or beyond the near or far plane.
 
     By (2) to (6) of docs/gradients.md, the half width of an ellipse is at most k (f sqrt(1 + r^2) s / z + b), with
     k the reach, s the largest scale, r the limit of x/z in the Jacobian, and b^2 the low-pass. An ellipse reaches the
@@ -136,11 +117,11 @@ def _beyond_planes(boxes: _Boxes, *, square: bool) -> Bool:
     square: True if Gaussians are listed in the square of their longest half axis, which is at most the root of the sum
     of both half axes' squares.
     """
-    camera, parallel = boxes.camera, boxes.camera.model.parallel
-    limits, blur = camera.frustum_limits, boxes.reach * _LOW_PASS_ROOT
-    normals, offsets, slopes = np.zeros((4, 3)), np.zeros(4), np.zeros(4)
+    camera, parallel = picture.camera, picture.camera.model.parallel
+    limits, blur = camera.frustum_limits, picture.reach * _LOW_PASS_ROOT
+    normals, offsets, slopes = np.zeros((6, 3)), np.zeros(6), np.zeros(6)
     for axis, focal in enumerate((camera.fx, camera.fy)):
-        for side, border in ((1, boxes.low[axis]), (-1, boxes.high[axis])):
+        for side, border in ((1, picture.low[axis]), (-1, picture.high[axis])):
             plane = 2 * axis + (side < 0)
             normals[plane, axis] = side * focal
             (offsets if parallel else normals[:, 2])[plane] = blur - side * border
@@ -149,147 +130,179 @@ def _beyond_planes(boxes: _Boxes, *, square: bool) -> Bool:
             slopes[plane] = focal * (1.0 if parallel else math.hypot(1.0, max(abs(nearest), abs(farthest))))
     if square:
         steepest = 1.0 if parallel else math.hypot(1.0, *np.abs(limits).max(axis=0))
-        slopes[:] = math.hypot(camera.fx, camera.fy) * steepest
-    middle, half = boxes.world
-    in_world = normals @ camera.rotation
-    farthest_corner = middle @ in_world.T + half @ np.abs(in_world).T + (normals @ camera.translation + offsets)
-    farthest_corner += boxes.reach * boxes.size[:, None] * slopes + boxes.rounding[:, None] * np.abs(normals).sum(
-        axis=1
-    )
-    farthest = np.abs(boxes.middle) + boxes.half
-    slack = _ROUNDING * (farthest @ np.abs(normals).T + np.abs(offsets))
-    slack += boxes.slack.max() * (1.0 if parallel else farthest[:, 2:])
-    return np.asarray((farthest_corner + slack < 0).any(axis=1))
-
-
-def _out_of_depth(boxes: _Boxes) -> Bool:
-    """True (B,) for chunks before the near or beyond the far plane."""
-    camera, distance = boxes.camera, np.linalg.norm(boxes.middle, axis=1)
-    depth, half = (boxes.middle[:, 2], boxes.half[:, 2]) if camera.model.flat else (distance, boxes.radius)
-    slack = _ROUNDING * (np.abs(depth) + half)
-    far = min(camera.far, float(np.finfo(np.float32).max))
-    out: Bool = (depth + half + slack < max(camera.near, 0.0)) | (depth - half - slack > far)
-    return out
+        slopes[:4] = math.hypot(camera.fx, camera.fy) * steepest
+    normals[4:, 2], offsets[4:] = [1.0, -1.0], [-picture.depths[0], picture.depths[1]]
+    in_world, lengths, sums = normals @ camera.rotation, np.linalg.norm(normals, axis=1), np.abs(normals).sum(axis=1)
+    along = np.column_stack([picture.reach * picture.stretch * slopes, _CANCELLED * sums])
+    farthest_corner = np.hstack([in_world, np.abs(in_world), along]) @ bounds.terms
+    constant = normals @ camera.translation + offsets
+    pixels = np.where(np.arange(6) < 4, picture.slack.max(), 0.0)
+    constant += _ROUNDING * np.abs(offsets) + _CANCELLED * sums * np.abs(camera.translation).sum()
+    constant += pixels if parallel else 0.0
+    away = bounds.terms[:3] - np.linalg.solve(camera.rotation, -camera.translation)[:, None]
+    distance = picture.stretch * (np.sqrt(np.einsum("ij,ij->j", away, away)) + bounds.radius)
+    by_distance = _ROUNDING * lengths + (0.0 if parallel else pixels)
+    farthest_corner += by_distance[:, None] * distance
+    return np.asarray((farthest_corner + constant[:, None]).min(axis=0) < 0)
 
 
 @dataclass(frozen=True, eq=False)
 class _Cones:
-    """Cones around the directions of B chunks' middles, with angles in radians. NaN where there is no such cone.
+    """Cones from the camera's centre around B chunks, with angles in radians. NaN where there is no such cone.
 
+    middle, half: (3, B), boxes along the camera's axes.
+    distance, radius: (B,), of spheres around the boxes of means in the world.
+    least: (B,), distance of the nearest mean that is not before the near plane.
+    size: (B,), the largest standard deviation.
     spread: (B,), half angle of the cone of all means.
-    cap: (B,), largest half angle of the cone of a Gaussian around its mean.
-    whole: (B,), half angle of the cone of all Gaussians, less than 90 degrees.
     """
 
+    middle: Float64
+    half: Float64
+    distance: Float64
+    radius: Float64
+    least: Float64
+    size: Float64
     spread: Float64
-    cap: Float64
-    whole: Float64
 
 
-def _cones(boxes: _Boxes, pixel: float) -> _Cones:
-    """The cones, from (12) and (13) of docs/cameras.md.
+def _cones(bounds: ChunkBounds, picture: _Picture) -> _Cones:
+    camera, terms = picture.camera, bounds.terms
+    rounding = _CANCELLED * (terms[7] + np.abs(camera.translation).sum())
+    middle = camera.rotation @ terms[:3] + camera.translation[:, None]
+    half = np.abs(camera.rotation) @ terms[3:6] + rounding
+    radius = picture.stretch * bounds.radius + 2 * rounding
+    distance = np.sqrt(np.einsum("ij,ij->j", middle, middle))
+    to_box = np.maximum(np.abs(middle) - half, 0.0)
+    least = np.maximum(distance - radius, np.sqrt(np.einsum("ij,ij->j", to_box, to_box)))
+    least = np.maximum(least, picture.depths[0]) * (1 - _ROUNDING)
+    spread = np.arcsin(radius / distance)  # NaN if the camera is inside
+    return _Cones(middle, half, distance, radius, least, picture.stretch * terms[6], spread)
 
-    A Gaussian's ellipse lies in the plane that touches the unit sphere at its mean's direction, and a ray reaches it at
-    the tangent of the angle between both. The ellipse's half axis is at most k (s / d + b w), with k the reach, s the
-    largest scale, d the distance, b^2 the low-pass and w the pixel's width.
+
+def _out_of_depth(cones: _Cones, picture: _Picture) -> Bool:
+    """True (B,) for chunks before the near or beyond the far plane, for models along rays."""
+    flat = picture.camera.model.flat
+    depth, half = (cones.middle[2], cones.half[2]) if flat else (cones.distance, cones.radius)
+    slack = half + _ROUNDING * (np.abs(depth) + half)
+    out: Bool = (depth + slack < picture.depths[0]) | (depth - slack > picture.depths[1])
+    return out
+
+
+def _caps(cones: _Cones, picture: _Picture, pixel: float) -> tuple[Float64, Float64]:
+    """Half angles (B,), in radians, of the largest cone of a Gaussian around its mean, and of the cone of all of them.
+
+    By (12) and (13) of docs/cameras.md, a Gaussian's ellipse lies in the plane that touches the unit sphere at its
+    mean's direction, and a ray reaches the plane at the tangent of the angle between both. The ellipse's half axis is
+    at most k (s / d + b w), with k the reach, s the largest scale, d the distance, b^2 the low-pass and w the pixel's
+    width. The cone of all is NaN from 90 degrees on.
 
     pixel: the largest width of a pixel on the tangent plane, in radians.
     """
-    distance = np.linalg.norm(boxes.middle, axis=1)
-    to_box = np.linalg.norm(np.maximum(np.abs(boxes.middle) - boxes.half, 0.0), axis=1)
-    least = np.maximum(np.maximum(distance - boxes.radius, to_box), boxes.camera.near) * (1 - _ROUNDING)
-    spread = np.arcsin(boxes.radius / distance)  # NaN if the camera is inside
-    cap = np.arctan(boxes.reach * (boxes.size / least + _LOW_PASS_ROOT * pixel)) + _ANGLE_SLACK
-    whole = spread + cap
-    return _Cones(spread, cap, np.where(whole < 0.5 * math.pi, whole, np.nan))
+    cap = np.arctan(picture.reach * (cones.size / cones.least + _LOW_PASS_ROOT * pixel)) + _ANGLE_SLACK
+    whole = cones.spread + cap
+    return cap, np.where(whole < 0.5 * math.pi, whole, np.nan)
 
 
-def _half_turn(cones: _Cones, level: Float64) -> Float64:
-    """Half of the angle (B,) that the cones cover around an axis; NaN for a cone that nearly contains the axis.
+def _half_turn(sine: Float64, level: Float64) -> Float64:
+    """Half of the angle (B,) that cones cover around an axis; NaN for a cone that nearly contains the axis.
 
     The cones of single Gaussians then contain it even less: sin(whole - spread) / sin(a - spread) falls with the
     spread, if the angle a to the axis is larger than the whole.
 
+    sine: (B,), of the cones' half angles `whole`.
     level: (B,), sine of the angle between a cone's middle and the axis.
     """
-    ratio = np.sin(cones.whole) / level
+    ratio = sine / level
     return np.where(ratio < _POLE, np.arcsin(ratio), np.nan) + _ANGLE_SLACK
 
 
-def _beyond_panorama(boxes: _Boxes) -> Bool:
-    """True (B,) for chunks that a part of a panorama does not show: above, below or beside it, at any turn."""
-    camera, (x, y, z) = boxes.camera, boxes.middle.T
-    focal = np.array([camera.fx, camera.fy])
-    cones = _cones(boxes, max(max(1.0, 0.5 / camera.fy) / camera.fx, 1 / camera.fy))
-    across = np.hypot(x, z)
+def _beyond_panorama(cones: _Cones, picture: _Picture) -> Bool:
+    """True (B,) for chunks that a part of a panorama does not show: above, below or at its sides, at any turn."""
+    camera, (x, y, z) = picture.camera, cones.middle
+    _, whole = _caps(cones, picture, max(max(1.0, 0.5 / camera.fy) / camera.fx, 1 / camera.fy))
+    across = np.sqrt(x * x + z * z)
     latitude, longitude = np.arctan2(y, across), np.arctan2(x, z)
-    slack = boxes.slack + _ROUNDING * 2 * math.pi * focal
-    beyond: Bool = camera.fy * (latitude + cones.whole) + slack[1] < boxes.low[1]
-    beyond |= camera.fy * (latitude - cones.whole) - slack[1] > boxes.high[1]
+    slack = picture.slack + _ROUNDING * 2 * math.pi * np.array([camera.fx, camera.fy])
+    beyond: Bool = camera.fy * (latitude + whole) + slack[1] < picture.low[1]
+    beyond |= camera.fy * (latitude - whole) - slack[1] > picture.high[1]
     turn = 2 * math.pi * camera.fx
-    away = camera.fx * longitude - 0.5 * (boxes.low[0] + boxes.high[0])
+    away = camera.fx * longitude - 0.5 * (picture.low[0] + picture.high[0])
     away = np.abs(away - turn * np.round(away / turn))
-    aside = camera.fx * _half_turn(cones, across / np.hypot(across, y))
-    beyond |= away - aside - slack[0] > 0.5 * (boxes.high[0] - boxes.low[0])
+    aside = camera.fx * _half_turn(np.sin(whole), across / cones.distance)
+    beyond |= away - aside - slack[0] > 0.5 * (picture.high[0] - picture.low[0])
     return beyond
 
 
-def _beyond_borders(boxes: _Boxes) -> Bool:
+def _beyond_borders(cones: _Cones, picture: _Picture) -> Bool:
     """True (B,) for chunks beyond a side of a perspective picture along rays.
 
     A border is an angle in the plane of its axis and z. The kernels take a Gaussian's box as infinite where it comes
     near z = 0, so chunks with means near it are visible.
     """
-    camera = boxes.camera
-    cones = _cones(boxes, 1 / min(camera.fx, camera.fy))
-    distance = np.linalg.norm(boxes.middle, axis=1)
-    least = np.maximum(boxes.middle[:, 2] - boxes.half[:, 2], camera.near)
-    beyond = np.zeros(len(distance), np.bool_)
+    camera, z = picture.camera, cones.middle[2]
+    _, whole = _caps(cones, picture, 1 / min(camera.fx, camera.fy))
+    least, sine = np.maximum(z - cones.half[2], picture.depths[0]), np.sin(whole)
+    beyond = np.zeros(len(z), np.bool_)
     steepest = 0.5 * math.pi - _LEAST_AHEAD
     for axis, focal in enumerate((camera.fx, camera.fy)):
-        along = boxes.middle[:, axis]
-        ahead = least > _LEAST_AHEAD * (np.abs(along) + boxes.half[:, axis])
-        angle = np.arctan2(along, boxes.middle[:, 2])
-        aside = _half_turn(cones, np.hypot(along, boxes.middle[:, 2]) / distance)
-        low, high = (boxes.low[axis] - boxes.slack[axis]) / focal, (boxes.high[axis] + boxes.slack[axis]) / focal
+        along, slack = cones.middle[axis], picture.slack[axis]
+        ahead = least > _LEAST_AHEAD * (np.abs(along) + cones.half[axis])
+        angle = np.arctan2(along, z)
+        aside = _half_turn(sine, np.sqrt(along * along + z * z) / cones.distance)
+        low, high = (picture.low[axis] - slack) / focal, (picture.high[axis] + slack) / focal
         beyond |= ahead & (angle + aside < min(math.atan(low), steepest))
         beyond |= ahead & (angle - aside > max(math.atan(high), -steepest))
     return beyond
 
 
-def _beyond_fisheye(boxes: _Boxes) -> Bool:
+def _radius(camera: Camera, theta: Float64) -> Float64:
+    """Image radii (B,) of a fisheye, in focal lengths, at angles theta (B,) from the axis: (18) of docs/cameras.md."""
+    if not any(camera.radial):
+        return theta
+    square, (k1, k2, k3, k4) = theta * theta, camera.radial
+    return theta * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
+
+
+def _beyond_fisheye(cones: _Cones, picture: _Picture) -> Bool:
     """True (B,) for chunks that a fisheye does not show: beyond a side of its picture, or beyond its largest angle.
 
     The kernels bound a Gaussian by a rectangle along its mean's direction on the picture: from `inner` to `outer`, and
     `aside` to both sides. If a Gaussian may contain the axis, or reach the largest angle, the bound is a square around
     the axis. The rectangle's corner is then at most 1.5 times as far out as the square's side.
     """
-    camera, (x, y, z), fold = boxes.camera, boxes.middle.T, boxes.camera.fold[0]
+    camera, (x, y, z), fold = picture.camera, cones.middle, picture.camera.fold[0]
     widest = 1.5 / MIN_FISHEYE_SLOPE if any(camera.radial) else max(1.0, 0.5 / (math.pi * camera.fx))
-    cones = _cones(boxes, widest / min(camera.fx, camera.fy))
-    theta, azimuth = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)
-    least_sine = np.minimum(np.sin(theta - cones.spread), np.sin(theta + cones.spread))
-    ratio = np.sin(cones.cap) / least_sine
-    ring = (least_sine > 0) & (ratio < _POLE)
-    ring &= (theta - cones.whole > _ANGLE_SLACK) & (theta + cones.whole < fold - _ANGLE_SLACK)
-    outer = radii(camera, np.minimum(theta + cones.whole, fold))[0]
-    inner = radii(camera, np.maximum(theta - cones.whole, 0.0))[0] * np.sqrt(1 - ratio**2)
-    half_turn = np.arcsin(np.sin(cones.spread) / np.sin(theta)) + _ANGLE_SLACK
+    cap, whole = _caps(cones, picture, widest / min(camera.fx, camera.fy))
+    across = np.sqrt(x * x + y * y)
+    theta = np.arctan2(across, z)
+    sine, spread_sine = across / cones.distance, cones.radius / cones.distance
+    spread_cosine = np.sqrt(1 - spread_sine * spread_sine)
+    least_sine = sine * spread_cosine - np.abs(z / cones.distance) * spread_sine  # of the angles theta +- spread
+    ratio = np.sin(cap) / least_sine
+    turn_sine = spread_sine / sine + _ANGLE_SLACK  # of half the angle that the means cover around the axis
+    turn_cosine = np.sqrt(1 - turn_sine * turn_sine)
+    ring = (least_sine > 0) & (ratio < _POLE) & (turn_sine < 1)
+    ring &= (theta - whole > _ANGLE_SLACK) & (theta + whole < fold - _ANGLE_SLACK)
+    outer = _radius(camera, np.minimum(theta + whole, fold))
+    inner = _radius(camera, np.maximum(theta - whole, 0.0)) * np.sqrt(1 - ratio * ratio)
+    aside = outer * ratio
     beyond: Bool = theta - cones.spread - _ANGLE_SLACK > fold
-    for axis, focal in enumerate((camera.fx, camera.fy)):
-        for side, border in ((1, boxes.low[axis]), (-1, -boxes.high[axis])):
-            away = np.abs(np.angle(np.exp(1j * (azimuth - 0.5 * math.pi * axis - (0 if side > 0 else math.pi)))))
-            first, last = away - half_turn, away + half_turn
-            cosine = np.cos(np.maximum(first, 0.0))
-            sine = np.maximum(np.abs(np.sin(first)), np.abs(np.sin(last)))
-            sine = np.where((first < 0.5 * math.pi) & (last > 0.5 * math.pi), 1.0, sine)
-            support = np.where(cosine > 0, outer, inner) * cosine + sine * outer * ratio
+    for along, slack, focal, borders in (
+        (x / across, picture.slack[0], camera.fx, (picture.low[0], -picture.high[0])),
+        (y / across, picture.slack[1], camera.fy, (picture.low[1], -picture.high[1])),
+    ):
+        turned = turn_sine * np.sqrt(1 - along * along)
+        for side, border in zip((1, -1), borders, strict=True):
+            # cosine of the smallest angle between a mean's direction and that of the border's axis
+            nearest = np.where(side * along > turn_cosine, 1.0, side * along * turn_cosine + turned)
+            support = np.where(nearest > 0, outer, inner) * nearest + aside
             support = np.where(ring, support, 1.5 * outer)
-            beyond |= focal * support + boxes.slack[axis] + _ROUNDING * focal < border
+            beyond |= focal * support + slack + _ROUNDING * focal < border
     return beyond
 
 
-_ALONG_RAYS: dict[type[CameraModel], Callable[[_Boxes], Bool]] = {
+_ALONG_RAYS: dict[type[CameraModel], Callable[[_Cones, _Picture], Bool]] = {
     Equirectangular: _beyond_panorama,
     PerspectiveByRays: _beyond_borders,
     Fisheye: _beyond_fisheye,
