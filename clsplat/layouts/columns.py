@@ -36,6 +36,9 @@ LOSS_RING = 16
 It is a power of two and a multiple of LOSS_ROWS, and at least the window's 11 plus LOSS_ROWS - 1.
 """
 
+CHUNK_ROWS = 1024
+"""Number of consecutive rows of a model in a chunk; the last chunk may have fewer."""
+
 POSE_ROWS = 64
 """Number of Gaussians whose terms of a pose gradient are added in sequence, before the sums are added."""
 

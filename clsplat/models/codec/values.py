@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
+from clsplat.chunks.order import MORTON_BITS_PER_AXIS, every_third_bit
 from clsplat.errors import InputError, warn
 from clsplat.gaussians import Gaussians
 from clsplat.spherical_harmonics import SH_C0
@@ -34,7 +35,6 @@ Every real file has more bytes than that, because positions take several bytes e
 """
 OTHER_QUATERNION_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Row i: the components of a quaternion other than component i."""
-MORTON_BITS_PER_AXIS = 21
 MAX_FLOAT_HIGHLIGHT = 2.0
 """Largest float colour up to which white is taken to be 1, unless all colours are whole numbers."""
 UNIT_COLOUR_SHARE = 0.95
@@ -43,13 +43,6 @@ UNIT_RANGE_TOLERANCE = 1e-3
 """Tolerance of colours above white (relative) and of opacities outside [0, 1], because of half floats and averages."""
 GAUSSIAN_ARRAY_NOUNS = ("a position", "a rotation", "a scale", "an opacity", "a colour")
 """Nouns for the arrays of `Gaussians`, for messages."""
-_MORTON_SPREAD_STEPS = (
-    (32, 0x1F00000000FFFF),
-    (16, 0x1F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
-)
 
 
 def empty(count: int, degree: int) -> Gaussians:
@@ -288,7 +281,5 @@ def morton_order(means: Float32) -> NDArray[np.int64]:
     codes = np.zeros(len(means), np.uint64)
     for axis in range(3):
         code = ((means[:, axis] - low[axis]) * scale[axis]).astype(np.uint64)
-        for shift, mask in _MORTON_SPREAD_STEPS:
-            code = (code | code << np.uint64(shift)) & np.uint64(mask)
-        codes |= code << np.uint64(axis)
+        codes |= every_third_bit(code) << np.uint64(axis)
     return np.argsort(codes, kind="stable")

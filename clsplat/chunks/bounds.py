@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bounds of a chunk's Gaussians, and how far they may have moved since they were measured."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from clsplat.arrays import Bool, Float32, Float64
+from clsplat.config.training import OptimiserConfig
+from clsplat.layouts.columns import CHUNK_ROWS
+
+_HALF_ULP = 2.0**-24
+"""Largest rounding error of a float32, relative to its value."""
+_ROUNDING = 1e-6
+"""Relative growth, by float32 rounding, of what a step of Adam keeps of a moment: eight roundings and more."""
+_SLACK = 1e-3
+"""Relative slack of the bounds. It covers the rounding of a step, and second moments that underflow."""
+_LEAST_EPSILON = 1e-15
+"""Smallest epsilon of Adam with which second moments that underflow move a parameter by less than _SLACK."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChunkBounds:
+    """Bounds of B chunks, in float64.
+
+    lowest, highest: (B, 3), of the means, in world units.
+    largest: (B,), the largest log scale.
+    """
+
+    lowest: Float64
+    highest: Float64
+    largest: Float64
+
+    @classmethod
+    def measured(cls, means: Float32, log_scales: Float32) -> ChunkBounds:
+        """The bounds of the chunks of a model, from means and log scales (n, 3). A NaN among them makes a NaN."""
+        starts = np.arange(0, len(means), CHUNK_ROWS)
+        if len(starts) == 0:
+            return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+        lowest, highest = np.minimum.reduceat(means, starts), np.maximum.reduceat(means, starts)
+        largest = np.maximum.reduceat(log_scales.max(axis=1), starts)
+        return cls(lowest.astype(np.float64), highest.astype(np.float64), largest.astype(np.float64))
+
+    def __len__(self) -> int:
+        """Number of chunks."""
+        return len(self.largest)
+
+    @cached_property
+    def finite(self) -> Bool:
+        """True (B,) for chunks with finite bounds."""
+        every = np.column_stack([self.lowest, self.highest, self.largest])
+        return np.asarray(np.isfinite(every).all(axis=1))
+
+    @cached_property
+    def terms(self) -> Float64:
+        """Rows (8, B): middles of the boxes (3), half sides (3), largest standard deviations, and for each box the sum
+        of its farthest corner's coordinates."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            middle, half = 0.5 * (self.lowest + self.highest).T, 0.5 * (self.highest - self.lowest).T
+            farthest = (np.abs(middle) + half).sum(axis=0)
+            return np.vstack([middle, half, np.exp(self.largest), farthest])
+
+    @cached_property
+    def radius(self) -> Float64:
+        """Half diagonals (B,) of the boxes."""
+        return np.asarray(np.linalg.norm(self.terms[3:6], axis=0))
+
+    def widened(self, mean_step: float | Float64, log_scale_step: float | Float64, updates: int = 0) -> ChunkBounds:
+        """The bounds after each coordinate of a mean, and each log scale, has moved by at most these steps.
+
+        mean_step, log_scale_step: a number, or one for each chunk (B,).
+        updates: number of updates of a parameter in this time, each of which rounds it to float32.
+        """
+        with np.errstate(invalid="ignore", over="ignore"):
+            size = np.maximum(np.abs(self.lowest), np.abs(self.highest)).max(axis=1)
+            by = _with_rounding(mean_step, size, updates)[:, None]
+            larger = _with_rounding(log_scale_step, np.abs(self.largest), updates)
+            return ChunkBounds(self.lowest - by, self.highest + by, self.largest + larger)
+
+
+def _with_rounding(step: float | Float64, size: Float64, updates: int) -> Float64:
+    """The movement (B,) of values of at most `size` (B,) by `step` in all, if each of `updates` parts is rounded.
+
+    A movement d makes values of at most size + d, and so roundings of at most (size + d) 2^-24 each.
+    """
+    share = updates * _HALF_ULP
+    if share >= 1:
+        return np.full(len(size), np.inf)
+    moved: Float64 = (step + share * size) / (1 - share)
+    return moved
+
+
+def largest_step(config: OptimiserConfig) -> float:
+    """The most by which a step of Adam moves a parameter, as a multiple of the learning rate: 7.3 by default.
+
+    Let b1, b2 be the decays, r = b1^2 / b2 < 1, and S(x) = 1 + x + ... + x^(t - 1). After t steps with gradients g_i,
+    Cauchy and Schwarz give for the moments m and v:
+
+        |m| <= (1 - b1) sum b1^(t - i) |g_i|
+             = (1 - b1) sum r^((t - i) / 2) b2^((t - i) / 2) |g_i|
+            <= (1 - b1) sqrt(S(r)) sqrt(v / (1 - b2)).
+
+    With the corrections by 1 - b1^t = (1 - b1) S(b1) and 1 - b2^t, the step is at most sqrt(S(r) S(b2)) / S(b1) rates.
+    This is 1 at t = 1, and rises towards its limit
+
+        (1 - b1) / sqrt((1 - b2) (1 - r)).
+
+    It rises because log S(e^u) grows from t to t + 1 by a convex function of u, and b1 is the geometric mean of r and
+    b2. A row that has had fewer updates than its step counts has a smaller S(r), so the bound holds for it too.
+
+    The kernel's decays are float32, and corrections in float64: both are taken into account. Infinite if r >= 1, or
+    if epsilon is so small that second moments under float32's range matter.
+    """
+    beta1, beta2, root = _decays(config)
+    if root >= 1 or beta2 >= 1 or config.epsilon < _LEAST_EPSILON:
+        return math.inf
+    limit = (1 - beta1) / math.sqrt((1 - beta2) * (1 - root**2))
+    # A correction and its moment have decays that differ by rounding; their quotient is between 1 and its first value.
+    first = (1 - beta1) / (1 - config.beta1)
+    second = math.sqrt((1 - config.beta2) / (1 - beta2))
+    return limit * max(first, 1.0) * max(second, 1.0) * (1 + _SLACK)
+
+
+def hidden_path(config: OptimiserConfig) -> float:
+    """The most by which all later steps with gradient 0 move a parameter, as a multiple of their largest learning rate.
+
+    It is 66 by default. In the k-th such step, the first moment has fallen to b1^k and the root of the second to
+    b2^(k / 2) of its value. So by the argument of `largest_step` the step is at most (b1 / sqrt(b2))^k times its bound,
+    and the sum over k = 1, 2, ... is a geometric series. With sparse Adam, which takes no such step, it is not needed.
+    """
+    _, _, root = _decays(config)
+    step = largest_step(config)
+    return step * root / (1 - root) if math.isfinite(step) else math.inf
+
+
+def _decays(config: OptimiserConfig) -> tuple[float, float, float]:
+    """The decays of the kernel's moments, and the root of r: b1 / sqrt(b2), grown by rounding."""
+    beta1, beta2 = float(np.float32(config.beta1)), float(np.float32(config.beta2))
+    root = beta1 / math.sqrt(beta2) * (1 + _ROUNDING) if beta2 > 0 else math.inf
+    return beta1, beta2, root

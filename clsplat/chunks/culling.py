@@ -1,0 +1,311 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Chunks that a camera may see: all but those of which no row can reach a tile of the picture.
+
+The bounds are of what kernels/project.cl and project_rays.cl compute, so a chunk is left out only if they would count
+no tile for each of its rows. Opacities count as 1, and rotations of Gaussians as unknown.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from clsplat.arrays import Bool, Float64
+from clsplat.camera import Camera, Window
+from clsplat.cameras.equirectangular import Equirectangular
+from clsplat.cameras.fisheye import MIN_FISHEYE_SLOPE, Fisheye
+from clsplat.cameras.model import CameraModel
+from clsplat.cameras.perspective import PerspectiveByRays
+from clsplat.chunks.bounds import ChunkBounds
+from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.layouts.columns import TILE
+
+_DEFAULT_RASTERIZER = RasterizerConfig()
+_LOW_PASS_ROOT = math.sqrt(0.3)
+"""Root of the larger variance, in px^2, that projection adds (LOW_PASS in kernels/shared/gaussian.h)."""
+_REACH_SLACK = 1.001
+"""Factor of a Gaussian's reach. The kernels round it by 1e-4 at most, and along rays enlarge it by as much."""
+_ROUNDING = 1e-5
+"""Slack relative to the terms of a plane. A mean in two floats is rounded to float32 at the end, by 6e-8."""
+_CANCELLED = 1e-11
+"""Slack relative to coordinates in the world, which may cancel in the camera: what two floats, and float64, round."""
+_ANGLE_SLACK = 1e-4
+"""Slack of directions in radians. In float32 they are rounded by 1e-6, and 22 times that near a pole."""
+_LEAST_AHEAD = 2e-4
+"""Tangent of the angle to the plane z = 0 under which an end of a box along rays is infinite (LEAST_AHEAD in
+kernels/shared/camera/perspective_rays.h), doubled."""
+_POLE = 0.99
+"""Sine of a cone over that of its middle's angle to an axis, from which the cone counts as containing the axis. The
+kernels do so from 0.999."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Picture:
+    """A camera's picture.
+
+    reach: standard deviations at which a Gaussian ends.
+    stretch: the most by which the camera's matrix makes a length longer: more than 1 if it is not quite a rotation.
+    low, high: (2,), borders of the tiles in pixels, from the principal point.
+    slack: (2,), rounding in pixels of a place near the picture.
+    depths: least and largest depth.
+    """
+
+    camera: Camera
+    reach: float
+    stretch: float
+    low: Float64
+    high: Float64
+    slack: Float64
+    depths: tuple[float, float]
+
+    @classmethod
+    def of(cls, camera: Camera, reach: float) -> _Picture:
+        window = camera.window or Window(0, 0, camera.width, camera.height)
+        low = np.array([window.x - camera.cx, window.y - camera.cy])
+        high = low - TILE * (-np.array([camera.width, camera.height]) // TILE)
+        slack = _ROUNDING * (np.abs([camera.cx, camera.cy]) + np.abs(low) + np.abs(high))
+        depths = max(camera.near, 0.0), min(camera.far, float(np.finfo(np.float32).max))
+        return cls(camera, reach, float(np.linalg.norm(camera.rotation, 2)), low, high, slack, depths)
+
+
+def visible(
+    bounds: ChunkBounds,
+    camera: Camera,
+    config: RasterizerConfig = _DEFAULT_RASTERIZER,
+    opacity_factor: float = 1.0,
+) -> Bool:
+    """True (B,) for chunks that may have a row with a tile in the camera's picture; False only if none has one.
+
+    Chunks whose bounds are not finite are visible. Rows appended to a chunk must be in its bounds.
+
+    config: the rasterizer's settings, on which a Gaussian's reach depends.
+    opacity_factor: the factor by which the pass multiplies opacities (thinning), at least 1.
+    """
+    switches = config.switches()
+    if not switches.frustum_cull or len(bounds) == 0:
+        return np.ones(len(bounds), np.bool_)
+    reach = 3.0 if switches.extent == "3sigma" else math.sqrt(2 * math.log(opacity_factor / switches.alpha_min))
+    picture = _Picture.of(camera, reach * _REACH_SLACK)
+    hidden = np.zeros(len(bounds), np.bool_)
+    with np.errstate(all="ignore"):  # what is not finite compares as visible
+        if camera.model.along_rays:
+            cones = _cones(bounds, picture)
+            hidden |= _out_of_depth(cones, picture)
+            for kind, beyond in _ALONG_RAYS.items():
+                if isinstance(camera.model, kind):
+                    hidden |= beyond(cones, picture)
+        elif camera.model.is_pinhole or camera.model.parallel:
+            hidden |= _beyond_planes(bounds, picture, square=switches.tile_test == "square")
+        return ~hidden | ~bounds.finite
+
+
+def _beyond_planes(bounds: ChunkBounds, picture: _Picture, *, square: bool) -> Bool:
+    """True (B,) for chunks beyond a side of the picture on an image plane, or beyond the near or far plane.
+
+    By (2) to (6) of docs/gradients.md, the half width of an ellipse is at most k (f sqrt(1 + r^2) s / z + b), with
+    k the reach, s the largest scale, r the limit of x/z in the Jacobian, and b^2 the low-pass. An ellipse reaches the
+    left border l, from the principal point, if f x/z + k (f sqrt(1 + r^2) s / z + b) >= l. Times z > 0 this is
+
+        f x + (k b - l) z + k f sqrt(1 + r^2) s >= 0,
+
+    which is linear in the mean: a box is beyond the border if its farthest corner along (f, 0, k b - l) is. Means
+    beyond the left border have r between the Jacobian's limit and the border. For parallel rays z is 1 and r is 0.
+
+    square: True if Gaussians are listed in the square of their longest half axis, which is at most the root of the sum
+    of both half axes' squares.
+    """
+    camera, parallel = picture.camera, picture.camera.model.parallel
+    limits, blur = camera.frustum_limits, picture.reach * _LOW_PASS_ROOT
+    normals, offsets, slopes = np.zeros((6, 3)), np.zeros(6), np.zeros(6)
+    for axis, focal in enumerate((camera.fx, camera.fy)):
+        for side, border in ((1, picture.low[axis]), (-1, picture.high[axis])):
+            plane = 2 * axis + (side < 0)
+            normals[plane, axis] = side * focal
+            (offsets if parallel else normals[:, 2])[plane] = blur - side * border
+            nearest = np.clip(border / focal, limits[0, axis], limits[1, axis])
+            farthest = limits[0 if side > 0 else 1, axis]
+            slopes[plane] = focal * (1.0 if parallel else math.hypot(1.0, max(abs(nearest), abs(farthest))))
+    if square:
+        steepest = 1.0 if parallel else math.hypot(1.0, *np.abs(limits).max(axis=0))
+        slopes[:4] = math.hypot(camera.fx, camera.fy) * steepest
+    normals[4:, 2], offsets[4:] = [1.0, -1.0], [-picture.depths[0], picture.depths[1]]
+    in_world, lengths, sums = normals @ camera.rotation, np.linalg.norm(normals, axis=1), np.abs(normals).sum(axis=1)
+    along = np.column_stack([picture.reach * picture.stretch * slopes, _CANCELLED * sums])
+    farthest_corner = np.hstack([in_world, np.abs(in_world), along]) @ bounds.terms
+    constant = normals @ camera.translation + offsets
+    pixels = np.where(np.arange(6) < 4, picture.slack.max(), 0.0)
+    constant += _ROUNDING * np.abs(offsets) + _CANCELLED * sums * np.abs(camera.translation).sum()
+    constant += pixels if parallel else 0.0
+    away = bounds.terms[:3] - np.linalg.solve(camera.rotation, -camera.translation)[:, None]
+    distance = picture.stretch * (np.sqrt(np.einsum("ij,ij->j", away, away)) + bounds.radius)
+    by_distance = _ROUNDING * lengths + (0.0 if parallel else pixels)
+    farthest_corner += by_distance[:, None] * distance
+    return np.asarray((farthest_corner + constant[:, None]).min(axis=0) < 0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cones:
+    """Cones from the camera's centre around B chunks, with angles in radians. NaN where there is no such cone.
+
+    middle, half: (3, B), boxes along the camera's axes.
+    distance, radius: (B,), of spheres around the boxes of means in the world.
+    least: (B,), distance of the nearest mean that is not before the near plane.
+    size: (B,), the largest standard deviation.
+    spread: (B,), half angle of the cone of all means.
+    """
+
+    middle: Float64
+    half: Float64
+    distance: Float64
+    radius: Float64
+    least: Float64
+    size: Float64
+    spread: Float64
+
+
+def _cones(bounds: ChunkBounds, picture: _Picture) -> _Cones:
+    camera, terms = picture.camera, bounds.terms
+    rounding = _CANCELLED * (terms[7] + np.abs(camera.translation).sum())
+    middle = camera.rotation @ terms[:3] + camera.translation[:, None]
+    half = np.abs(camera.rotation) @ terms[3:6] + rounding
+    radius = picture.stretch * bounds.radius + 2 * rounding
+    distance = np.sqrt(np.einsum("ij,ij->j", middle, middle))
+    to_box = np.maximum(np.abs(middle) - half, 0.0)
+    least = np.maximum(distance - radius, np.sqrt(np.einsum("ij,ij->j", to_box, to_box)))
+    least = np.maximum(least, picture.depths[0]) * (1 - _ROUNDING)
+    spread = np.arcsin(radius / distance)  # NaN if the camera is inside
+    return _Cones(middle, half, distance, radius, least, picture.stretch * terms[6], spread)
+
+
+def _out_of_depth(cones: _Cones, picture: _Picture) -> Bool:
+    """True (B,) for chunks before the near or beyond the far plane, for models along rays."""
+    flat = picture.camera.model.flat
+    depth, half = (cones.middle[2], cones.half[2]) if flat else (cones.distance, cones.radius)
+    slack = half + _ROUNDING * (np.abs(depth) + half)
+    out: Bool = (depth + slack < picture.depths[0]) | (depth - slack > picture.depths[1])
+    return out
+
+
+def _caps(cones: _Cones, picture: _Picture, pixel: float) -> tuple[Float64, Float64]:
+    """Half angles (B,), in radians, of the largest cone of a Gaussian around its mean, and of the cone of all of them.
+
+    By (12) and (13) of docs/cameras.md, a Gaussian's ellipse lies in the plane that touches the unit sphere at its
+    mean's direction, and a ray reaches the plane at the tangent of the angle between both. The ellipse's half axis is
+    at most k (s / d + b w), with k the reach, s the largest scale, d the distance, b^2 the low-pass and w the pixel's
+    width. The cone of all is NaN from 90 degrees on.
+
+    pixel: the largest width of a pixel on the tangent plane, in radians.
+    """
+    cap = np.arctan(picture.reach * (cones.size / cones.least + _LOW_PASS_ROOT * pixel)) + _ANGLE_SLACK
+    whole = cones.spread + cap
+    return cap, np.where(whole < 0.5 * math.pi, whole, np.nan)
+
+
+def _half_turn(sine: Float64, level: Float64) -> Float64:
+    """Half of the angle (B,) that cones cover around an axis; NaN for a cone that nearly contains the axis.
+
+    The cones of single Gaussians then contain it even less: sin(whole - spread) / sin(a - spread) falls with the
+    spread, if the angle a to the axis is larger than the whole.
+
+    sine: (B,), of the cones' half angles `whole`.
+    level: (B,), sine of the angle between a cone's middle and the axis.
+    """
+    ratio = sine / level
+    return np.where(ratio < _POLE, np.arcsin(ratio), np.nan) + _ANGLE_SLACK
+
+
+def _beyond_panorama(cones: _Cones, picture: _Picture) -> Bool:
+    """True (B,) for chunks that a part of a panorama does not show: above, below or at its sides, at any turn."""
+    camera, (x, y, z) = picture.camera, cones.middle
+    _, whole = _caps(cones, picture, max(max(1.0, 0.5 / camera.fy) / camera.fx, 1 / camera.fy))
+    across = np.sqrt(x * x + z * z)
+    latitude, longitude = np.arctan2(y, across), np.arctan2(x, z)
+    slack = picture.slack + _ROUNDING * 2 * math.pi * np.array([camera.fx, camera.fy])
+    beyond: Bool = camera.fy * (latitude + whole) + slack[1] < picture.low[1]
+    beyond |= camera.fy * (latitude - whole) - slack[1] > picture.high[1]
+    turn = 2 * math.pi * camera.fx
+    away = camera.fx * longitude - 0.5 * (picture.low[0] + picture.high[0])
+    away = np.abs(away - turn * np.round(away / turn))
+    aside = camera.fx * _half_turn(np.sin(whole), across / cones.distance)
+    beyond |= away - aside - slack[0] > 0.5 * (picture.high[0] - picture.low[0])
+    return beyond
+
+
+def _beyond_borders(cones: _Cones, picture: _Picture) -> Bool:
+    """True (B,) for chunks beyond a side of a perspective picture along rays.
+
+    A border is an angle in the plane of its axis and z. The kernels take a Gaussian's box as infinite where it comes
+    near z = 0, so chunks with means near it are visible.
+    """
+    camera, z = picture.camera, cones.middle[2]
+    _, whole = _caps(cones, picture, 1 / min(camera.fx, camera.fy))
+    least, sine = np.maximum(z - cones.half[2], picture.depths[0]), np.sin(whole)
+    beyond = np.zeros(len(z), np.bool_)
+    steepest = 0.5 * math.pi - _LEAST_AHEAD
+    for axis, focal in enumerate((camera.fx, camera.fy)):
+        along, slack = cones.middle[axis], picture.slack[axis]
+        ahead = least > _LEAST_AHEAD * (np.abs(along) + cones.half[axis])
+        angle = np.arctan2(along, z)
+        aside = _half_turn(sine, np.sqrt(along * along + z * z) / cones.distance)
+        low, high = (picture.low[axis] - slack) / focal, (picture.high[axis] + slack) / focal
+        beyond |= ahead & (angle + aside < min(math.atan(low), steepest))
+        beyond |= ahead & (angle - aside > max(math.atan(high), -steepest))
+    return beyond
+
+
+def _radius(camera: Camera, theta: Float64) -> Float64:
+    """Image radii (B,) of a fisheye, in focal lengths, at angles theta (B,) from the axis: (18) of docs/cameras.md."""
+    if not any(camera.radial):
+        return theta
+    square, (k1, k2, k3, k4) = theta * theta, camera.radial
+    return theta * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
+
+
+def _beyond_fisheye(cones: _Cones, picture: _Picture) -> Bool:
+    """True (B,) for chunks that a fisheye does not show: beyond a side of its picture, or beyond its largest angle.
+
+    The kernels bound a Gaussian by a rectangle along its mean's direction on the picture: from `inner` to `outer`, and
+    `aside` to both sides. If a Gaussian may contain the axis, or reach the largest angle, the bound is a square around
+    the axis. The rectangle's corner is then at most 1.5 times as far out as the square's side.
+    """
+    camera, (x, y, z), fold = picture.camera, cones.middle, picture.camera.fold[0]
+    widest = 1.5 / MIN_FISHEYE_SLOPE if any(camera.radial) else max(1.0, 0.5 / (math.pi * camera.fx))
+    cap, whole = _caps(cones, picture, widest / min(camera.fx, camera.fy))
+    across = np.sqrt(x * x + y * y)
+    theta = np.arctan2(across, z)
+    sine, spread_sine = across / cones.distance, cones.radius / cones.distance
+    spread_cosine = np.sqrt(1 - spread_sine * spread_sine)
+    least_sine = sine * spread_cosine - np.abs(z / cones.distance) * spread_sine  # of the angles theta +- spread
+    ratio = np.sin(cap) / least_sine
+    turn_sine = spread_sine / sine + _ANGLE_SLACK  # of half the angle that the means cover around the axis
+    turn_cosine = np.sqrt(1 - turn_sine * turn_sine)
+    ring = (least_sine > 0) & (ratio < _POLE) & (turn_sine < 1)
+    ring &= (theta - whole > _ANGLE_SLACK) & (theta + whole < fold - _ANGLE_SLACK)
+    outer = _radius(camera, np.minimum(theta + whole, fold))
+    inner = _radius(camera, np.maximum(theta - whole, 0.0)) * np.sqrt(1 - ratio * ratio)
+    aside = outer * ratio
+    beyond: Bool = theta - cones.spread - _ANGLE_SLACK > fold
+    for along, slack, focal, borders in (
+        (x / across, picture.slack[0], camera.fx, (picture.low[0], -picture.high[0])),
+        (y / across, picture.slack[1], camera.fy, (picture.low[1], -picture.high[1])),
+    ):
+        turned = turn_sine * np.sqrt(1 - along * along)
+        for side, border in zip((1, -1), borders, strict=True):
+            # cosine of the smallest angle between a mean's direction and that of the border's axis
+            nearest = np.where(side * along > turn_cosine, 1.0, side * along * turn_cosine + turned)
+            support = np.where(nearest > 0, outer, inner) * nearest + aside
+            support = np.where(ring, support, 1.5 * outer)
+            beyond |= focal * support + slack + _ROUNDING * focal < border
+    return beyond
+
+
+_ALONG_RAYS: dict[type[CameraModel], Callable[[_Cones, _Picture], Bool]] = {
+    Equirectangular: _beyond_panorama,
+    PerspectiveByRays: _beyond_borders,
+    Fisheye: _beyond_fisheye,
+}
+"""For models along rays: the chunks that are beyond their pictures. Of other models along rays every chunk counts as
+visible between the near and the far plane."""
