@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bounds of a chunk's Gaussians, and how far they may have moved since they were measured."""
+"""Bounds of a chunk's Gaussians, and how far Adam may have moved them since they were measured.
+
+Noise, density control and repairs move Gaussians too. After them a chunk is measured again.
+"""
 
 from __future__ import annotations
 

@@ -43,8 +43,8 @@ kernels do so from 0.999."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Picture:
-    """A camera's picture.
+class _PictureBorders:
+    """A picture's borders, and the limits of what its camera shows.
 
     reach: standard deviations at which a Gaussian ends.
     stretch: the most by which the camera's matrix makes a length longer: more than 1 if it is not quite a rotation.
@@ -62,7 +62,7 @@ class _Picture:
     depths: tuple[float, float]
 
     @classmethod
-    def of(cls, camera: Camera, reach: float) -> _Picture:
+    def of(cls, camera: Camera, reach: float) -> _PictureBorders:
         window = camera.window or Window(0, 0, camera.width, camera.height)
         low = np.array([window.x - camera.cx, window.y - camera.cy])
         high = low - TILE * (-np.array([camera.width, camera.height]) // TILE)
@@ -88,7 +88,7 @@ def visible(
     if not switches.frustum_cull or len(bounds) == 0:
         return np.ones(len(bounds), np.bool_)
     reach = 3.0 if switches.extent == "3sigma" else math.sqrt(2 * math.log(opacity_factor / switches.alpha_min))
-    picture = _Picture.of(camera, reach * _REACH_SLACK)
+    picture = _PictureBorders.of(camera, reach * _REACH_SLACK)
     hidden = np.zeros(len(bounds), np.bool_)
     with np.errstate(all="ignore"):  # what is not finite compares as visible
         if camera.model.along_rays:
@@ -102,7 +102,7 @@ def visible(
         return ~hidden | ~bounds.finite
 
 
-def _beyond_planes(bounds: ChunkBounds, picture: _Picture, *, square: bool) -> Bool:
+def _beyond_planes(bounds: ChunkBounds, picture: _PictureBorders, *, square: bool) -> Bool:
     """True (B,) for chunks beyond a side of the picture on an image plane, or beyond the near or far plane.
 
     By (2) to (6) of docs/gradients.md, the half width of an ellipse is at most k (f sqrt(1 + r^2) s / z + b), with
@@ -166,7 +166,7 @@ class _Cones:
     spread: Float64
 
 
-def _cones(bounds: ChunkBounds, picture: _Picture) -> _Cones:
+def _cones(bounds: ChunkBounds, picture: _PictureBorders) -> _Cones:
     camera, terms = picture.camera, bounds.terms
     rounding = _CANCELLED * (terms[7] + np.abs(camera.translation).sum())
     middle = camera.rotation @ terms[:3] + camera.translation[:, None]
@@ -180,7 +180,7 @@ def _cones(bounds: ChunkBounds, picture: _Picture) -> _Cones:
     return _Cones(middle, half, distance, radius, least, picture.stretch * terms[6], spread)
 
 
-def _out_of_depth(cones: _Cones, picture: _Picture) -> Bool:
+def _out_of_depth(cones: _Cones, picture: _PictureBorders) -> Bool:
     """True (B,) for chunks before the near or beyond the far plane, for models along rays."""
     flat = picture.camera.model.flat
     depth, half = (cones.middle[2], cones.half[2]) if flat else (cones.distance, cones.radius)
@@ -189,7 +189,7 @@ def _out_of_depth(cones: _Cones, picture: _Picture) -> Bool:
     return out
 
 
-def _caps(cones: _Cones, picture: _Picture, pixel: float) -> tuple[Float64, Float64]:
+def _caps(cones: _Cones, picture: _PictureBorders, pixel: float) -> tuple[Float64, Float64]:
     """Half angles (B,), in radians, of the largest cone of a Gaussian around its mean, and of the cone of all of them.
 
     By (12) and (13) of docs/cameras.md, a Gaussian's ellipse lies in the plane that touches the unit sphere at its
@@ -217,7 +217,7 @@ def _half_turn(sine: Float64, level: Float64) -> Float64:
     return np.where(ratio < _POLE, np.arcsin(ratio), np.nan) + _ANGLE_SLACK
 
 
-def _beyond_panorama(cones: _Cones, picture: _Picture) -> Bool:
+def _beyond_panorama(cones: _Cones, picture: _PictureBorders) -> Bool:
     """True (B,) for chunks that a part of a panorama does not show: above, below or at its sides, at any turn."""
     camera, (x, y, z) = picture.camera, cones.middle
     _, whole = _caps(cones, picture, max(max(1.0, 0.5 / camera.fy) / camera.fx, 1 / camera.fy))
@@ -234,7 +234,7 @@ def _beyond_panorama(cones: _Cones, picture: _Picture) -> Bool:
     return beyond
 
 
-def _beyond_borders(cones: _Cones, picture: _Picture) -> Bool:
+def _beyond_borders(cones: _Cones, picture: _PictureBorders) -> Bool:
     """True (B,) for chunks beyond a side of a perspective picture along rays.
 
     A border is an angle in the plane of its axis and z. The kernels take a Gaussian's box as infinite where it comes
@@ -264,7 +264,7 @@ def _radius(camera: Camera, theta: Float64) -> Float64:
     return theta * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
 
 
-def _beyond_fisheye(cones: _Cones, picture: _Picture) -> Bool:
+def _beyond_fisheye(cones: _Cones, picture: _PictureBorders) -> Bool:
     """True (B,) for chunks that a fisheye does not show: beyond a side of its picture, or beyond its largest angle.
 
     The kernels bound a Gaussian by a rectangle along its mean's direction on the picture: from `inner` to `outer`, and
@@ -302,7 +302,7 @@ def _beyond_fisheye(cones: _Cones, picture: _Picture) -> Bool:
     return beyond
 
 
-_ALONG_RAYS: dict[type[CameraModel], Callable[[_Cones, _Picture], Bool]] = {
+_ALONG_RAYS: dict[type[CameraModel], Callable[[_Cones, _PictureBorders], Bool]] = {
     Equirectangular: _beyond_panorama,
     PerspectiveByRays: _beyond_borders,
     Fisheye: _beyond_fisheye,

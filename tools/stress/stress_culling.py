@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compare the culling of chunks with every Gaussian in them, for many random cameras and boxes.
 
-    tools/stress/run culling [--pairs 1e6] [--seed 0]
+    tools/stress/run culling [--pairs 1e6] [--seed 0] [--device DEVICE]
 
 A pair is a camera and a box of Gaussians, most of them at a border of the picture. The box is measured; then Adam moves
 the Gaussians for up to 300 steps that show them and 5000 that do not, by random and adversarial gradients. The widened
-box must be visible if one of the Gaussians has a tile, in float64. The exit status is 1 if a Gaussian is missed. Prints
-a table with, for each kind of camera, the pairs, those with a tile, those found visible, and the Gaussians missed.
+box must be visible if one of the Gaussians has a tile, in float64 or by a device's kernels. Prints a table with, for
+each kind of camera, the pairs, those with a tile, those found visible, and the Gaussians missed. The exit status is 1
+if a Gaussian is missed.
 """
 
 from __future__ import annotations
@@ -20,13 +21,21 @@ import numpy as np
 from measuring import plain_parser
 from tile_boxes import reach_a_tile
 
-from clsplat.arrays import Float32, Float64
+from clsplat.arrays import Bool, Float32, Float64
 from clsplat.camera import Camera, Window
 from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_step
 from clsplat.chunks.culling import visible
 from clsplat.config.training import OptimiserConfig
+from clsplat.device.buffers import Workspace, upload
+from clsplat.device.context import Device, open_device
+from clsplat.gaussians import Gaussians
 from clsplat.rotations import rotation_from_quaternion
+from clsplat.stages.device_camera import pack_camera
+from clsplat.stages.device_gaussians import upload_gaussians
+from clsplat.stages.project import project
 
+Reach = Callable[[Float64, Float64, Float64, Float64, Camera], Bool]
+"""True (N,) for Gaussians with a tile: arguments as of `reach_a_tile`."""
 BOXES, ROWS = 200, 8
 """Boxes before a camera, and Gaussians in a box."""
 PATHS = 64
@@ -97,6 +106,7 @@ def windowed(rng: np.random.Generator, camera: Camera) -> Camera:
     """A part of the camera's picture, or a picture around it."""
     x, y = (int(each) for each in rng.integers(-300, 400, 2))
     width, height = (int(each) for each in rng.integers(1, 300, 2))
+    width = min(width, camera.width) if camera.model.wraps else width  # at most a full turn
     part = camera.cropped(x, y, width, height)
     assert isinstance(part.window, Window)
     return replace(part, window=replace(part.window, clamp=float(rng.choice([0.3, 2.0]))))
@@ -204,7 +214,25 @@ class Movements:
         return moved, scaled, mean_rates * bound, scale_rate * bound, steps
 
 
-def compare(rng: np.random.Generator, kind: str, movements: Movements, boxes: int = BOXES) -> tuple[Tally, Camera]:
+def by_kernels(device: Device) -> Reach:
+    """The Gaussians to which the kernels of projection give a tile."""
+    work = Workspace(device)
+
+    def reach(means: Float64, quaternions: Float64, log_scales: Float64, logits: Float64, camera: Camera) -> Bool:
+        rows = [each.astype(np.float32) for each in (means, quaternions, log_scales, logits)]
+        model = Gaussians(rows[0], rows[1], rows[2], rows[3], np.zeros((len(means), 1, 3), np.float32))
+        of_model = device.with_switches(camera.model.defines)
+        view = upload(device, pack_camera(camera))
+        projected = project(of_model, work, upload_gaussians(device, model), camera, view)
+        shown: Bool = projected.tile_counts.get() > 0
+        return shown
+
+    return reach
+
+
+def compare(
+    rng: np.random.Generator, kind: str, movements: Movements, reach: Reach = reach_a_tile, boxes: int = BOXES
+) -> tuple[Tally, Camera]:
     """Compare culling with every Gaussian, for a camera of this kind. Returns the numbers, and the camera."""
     camera = KINDS[kind](rng)
     means, quaternions, log_scales, logits, distances = rows_of(rng, camera, boxes)
@@ -214,7 +242,7 @@ def compare(rng: np.random.Generator, kind: str, movements: Movements, boxes: in
     found = visible(bounds.widened(mean_step, scale_step, steps), camera)
     flat = (each.reshape(boxes * ROWS, -1).astype(np.float64) for each in (moved, quaternions, scaled))
     places, turns, sizes = flat
-    reached = reach_a_tile(places, turns, sizes, logits.reshape(-1).astype(np.float64), camera).reshape(boxes, ROWS)
+    reached = reach(places, turns, sizes, logits.reshape(-1).astype(np.float64), camera).reshape(boxes, ROWS)
     missed = int((reached & ~found[:, None]).sum())
     return Tally(boxes, int(reached.any(axis=1).sum()), int(found.sum()), missed), camera
 
@@ -224,7 +252,9 @@ def main(argv: Sequence[str]) -> int:
     parser = plain_parser(__doc__)
     parser.add_argument("--pairs", type=float, default=1e6, help="number of pairs, default 1e6")
     parser.add_argument("--seed", type=int, default=0, help="seed of the random numbers, default 0")
+    parser.add_argument("--device", help="count tiles by the kernels of this device of clsplat devices")
     arguments = parser.parse_args(argv)
+    reach = by_kernels(open_device(arguments.device)) if arguments.device else reach_a_tile
     rng, begun = np.random.default_rng(arguments.seed), time.perf_counter()
     movements = Movements(rng, OptimiserConfig())
     cameras = math.ceil(arguments.pairs / BOXES / len(KINDS))
@@ -233,7 +263,7 @@ def main(argv: Sequence[str]) -> int:
     for kind in KINDS:
         sums = Tally()
         for _ in range(cameras):
-            tally, camera = compare(rng, kind, movements)
+            tally, camera = compare(rng, kind, movements, reach)
             if tally.missed and not sums.missed:
                 print("missed before", " ".join(f"{camera}".split()))
             for name, value in vars(tally).items():
