@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Steps over the chunks in view: the bytes of steps over the whole model, whatever is repeated or looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calls import noted
+from quick import quick
+from same_bytes import State, make_too_small, outcome, stopped
+from tiny import cameras, hidden_model, run_steps, short
+
+from clsplat.chunks.order import beside_parents, space_order
+from clsplat.config.training import OptimiserConfig, TrainConfig
+from clsplat.device.context import Device
+from clsplat.errors import DriverError
+from clsplat.gaussians import Gaussians
+from clsplat.layouts.columns import CHUNK_ROWS
+from clsplat.scenes.scene import Scene
+from clsplat.training import trained_model
+from clsplat.training.step import gradient_step, visible_chunks
+from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
+from clsplat.training.step.visible_chunks import Missed, VisibleChunks
+from clsplat.training.trainer import Trainer
+
+ROWS = 6 * CHUNK_ROWS + 100
+CONFIG = short(iterations=40, report=False, warmup=(), density={"min_contribution": 0.01, "max_gaussians": 9000})
+SPARSE = replace(CONFIG, optimiser=OptimiserConfig(sparse=True))
+
+
+def wide_model(rows: int = ROWS) -> Gaussians:
+    """The tiny scene's Gaussians many times, at its place and at seven places around it, of which a view shows some."""
+    small, rng = hidden_model(), np.random.default_rng(5)
+    rows_of = rng.integers(0, len(small), rows)
+    taken = {name: array[rows_of].copy() for name, array in small.arrays().items()}
+    model = replace(small, **taken)
+    place = np.arange(rows) * 8 // rows
+    angle = place * 2 * np.pi / 7
+    away = 12 * (place > 0)[:, None] * np.column_stack([np.cos(angle), np.zeros(rows), np.sin(angle)])
+    model.means += away.astype(np.float32)
+    model.means += rng.normal(0, 0.1, model.means.shape).astype(np.float32)
+    model.log_scales -= 1
+    model.opacity_logits -= 2
+    return model
+
+
+@pytest.fixture(autouse=True)
+def _small_models_have_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(visible_chunks, "ORDERED_ROWS", 2 * CHUNK_ROWS)
+    monkeypatch.setattr(trained_model, "ORDERED_ROWS", 2 * CHUNK_ROWS)
+
+
+@pytest.fixture
+def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The share of the chunks in view, of each step that looks at its chunks."""
+    found: list[float] = []
+    real = visible_chunks.visible
+
+    def visible(*arguments: Any) -> Any:
+        shown = real(*arguments)
+        found.append(float(shown.mean()))
+        return shown
+
+    monkeypatch.setattr(visible_chunks, "visible", visible)
+    return found
+
+
+def state(trainer: Trainer) -> State:
+    """All arrays of a checkpoint."""
+    return {name: array.copy() for name, array in trainer.checkpoint()[0].items()}
+
+
+def trained(
+    scene: Scene,
+    config: TrainConfig,
+    device: Device,
+    steps: int,
+    *,
+    whole: bool = False,
+    change: Callable[[Trainer], None] = lambda _: None,
+) -> tuple[State, Trainer]:
+    """A training's state after some steps. whole: every step runs over the whole model. change: called before them."""
+    with pytest.MonkeyPatch.context() as patch:
+        if whole:
+            patch.setattr(visible_chunks, "ORDERED_ROWS", 1 << 30)
+        trainer = Trainer(scene, config, device, wide_model())
+        change(trainer)
+        run_steps(steps, trainer)
+        return state(trainer), trainer
+
+
+def assert_same(got: State, wanted: State) -> None:
+    assert got.keys() == wanted.keys()
+    for name, array in wanted.items():
+        assert got[name].shape == array.shape, name
+        assert got[name].tobytes() == array.tobytes(), name
+
+
+SETTINGS = {
+    "dense": CONFIG,
+    "sparse": SPARSE,
+    "thinning and penalties": replace(CONFIG, thinning=0.3, penalty=0.02, background="random"),
+    "higher bands wait": replace(CONFIG, optimiser=OptimiserConfig(sh_rest_every=3), sh_degree_every=7),
+    "absolute gradients": short(iterations=40, report=False, warmup=(), density={"absolute_gradients": True}),
+    "exposure": replace(CONFIG, appearance="exposure"),
+    "by rays": replace(CONFIG, perspective="rays"),
+}
+
+
+@pytest.mark.parametrize("lanes", quick([8, 1], 8))
+@pytest.mark.parametrize("capacity", quick("01", "0"))
+@pytest.mark.parametrize("name", quick(SETTINGS, "dense", "sparse"))
+def test_the_bytes_of_the_whole_model(
+    scene: Scene,
+    device: Device,
+    shares: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    capacity: str,
+    lanes: int,
+) -> None:
+    monkeypatch.setenv(BY_CAPACITY_VARIABLE, capacity)
+    config, device = SETTINGS[name], device if lanes > 1 else device.with_shape(lanes=1, items=64)
+    wanted, _ = trained(scene, config, device, 32, whole=True)
+    assert not shares
+    got, trainer = trained(scene, config, device, 32)
+    assert_same(got, wanted)
+    assert trainer.parameters.count > 2 * CHUNK_ROWS
+    assert len(shares) == 32
+    assert min(shares) < 0.5, "some chunks are left out"
+
+
+@pytest.mark.parametrize("optimiser", ["dense", "sparse"])
+@pytest.mark.parametrize("steps", [(7,), (12, 13), (15, 25), (32,)])
+def test_steps_that_are_repeated(
+    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, optimiser: str, steps: Collection[int]
+) -> None:
+    monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
+    config = SETTINGS[optimiser]
+    wanted, _ = trained(scene, config, default_device, 32, whole=True)
+    got, trainer = trained(scene, config, default_device, 32, change=lambda t: make_too_small(monkeypatch, t, steps))
+    assert trainer.pending.redone > 0
+    assert_same(got, wanted)
+
+
+def test_chunks_are_caught_up_in_time(scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted, _ = trained(scene, SETTINGS["dense"], default_device, 32, whole=True)
+    for most, measured in ((5, 1), (3, 7), (1, 16)):
+        monkeypatch.setattr(visible_chunks, "MOST_MISSED_STEPS", most)
+        monkeypatch.setattr(visible_chunks, "STEPS_PER_MEASUREMENT", measured)
+        calls: list[tuple[Any, ...]] = []
+        with monkeypatch.context() as patch:
+            noted(patch, VisibleChunks, "_catch_up", partial(note, calls))
+            got, _ = trained(scene, CONFIG, default_device, 32)
+        assert_same(got, wanted)
+        missed: list[Missed] = [call[-1] for call in calls]
+        assert 0 < max(each.step - int(each.last.min()) for each in missed) <= most + measured
+
+
+def note(calls: list[tuple[Any, ...]], *arguments: Any) -> None:
+    calls.append(arguments)
+
+
+def test_a_look_changes_no_byte(scene: Scene, default_device: Device) -> None:
+    wanted, _ = trained(scene, CONFIG, default_device, 32, whole=True)
+    trainer = Trainer(scene, CONFIG, default_device, wide_model())
+    for step in range(32):
+        trainer.train_step()
+        if step % 3 == 0:
+            trainer.draw(cameras()[step % 5])
+        if step % 5 == 0:
+            trainer.gaussians()
+        if step % 7 == 0:
+            trainer.checkpoint()
+    assert_same(state(trainer), wanted)
+
+
+@pytest.fixture
+def _starts_wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every training starts from `wide_model`."""
+    start = Trainer._start
+
+    def begin(trainer: Trainer) -> None:
+        trainer.given = wide_model()
+        start(trainer)
+
+    monkeypatch.setattr(Trainer, "_start", begin)
+
+
+@pytest.mark.usefixtures("_starts_wide")
+@pytest.mark.parametrize("step", [13, 20])
+def test_interrupted_and_resumed(scene: Scene, default_device: Device, tmp_path: Path, step: int) -> None:
+    config = replace(CONFIG, checkpoint_every=0)
+    wanted = outcome(scene, config, default_device, tmp_path / "undisturbed")
+    assert_same(stopped(step, scene, config, default_device, tmp_path / "stopped"), wanted)
+
+
+def test_a_step_that_fails_leaves_the_state_before_it(
+    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted, _ = trained(scene, CONFIG, default_device, 32, whole=True)
+    trainer = Trainer(scene, CONFIG, default_device, wide_model())
+    run_steps(22, trainer)
+    with monkeypatch.context() as patch:
+        patch.setattr(gradient_step, "loss", fail)
+        with pytest.raises(DriverError):
+            trainer.train_step()
+    assert trainer.step_back()
+    saved, _ = trainer.checkpoint()
+    run_steps(10, trainer)
+    assert_same(state(trainer), wanted)
+    before, _ = trained(scene, CONFIG, default_device, 22, whole=True)
+    assert_same(saved, before)
+
+
+def fail(*_: object, **__: object) -> None:
+    raise DriverError("the loss failed")
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        replace(CONFIG, batch=2),
+        replace(CONFIG, antialiased=True),
+        replace(CONFIG, refine_poses=True),
+        replace(CONFIG, optimiser=OptimiserConfig(late=True)),
+        short(iterations=40, report=False, density={"growth": "mcmc", "max_gaussians": 9000}),
+    ],
+    ids=["batch", "antialiased", "poses", "late", "mcmc"],
+)
+def test_other_steps_take_the_whole_model(
+    scene: Scene, default_device: Device, shares: list[float], config: TrainConfig
+) -> None:
+    trainer = Trainer(scene, config, default_device, wide_model())
+    run_steps(2, trainer)
+    assert not shares
+
+
+def test_a_small_model_keeps_its_order(scene: Scene, default_device: Device, shares: list[float]) -> None:
+    model = wide_model(2 * CHUNK_ROWS)
+    trainer = Trainer(scene, CONFIG, default_device, model)
+    np.testing.assert_array_equal(trainer.parameters["means"].get(), model.means)
+    run_steps(2, trainer)
+    assert not shares
+
+
+def test_new_rows_stand_behind_their_parents(
+    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = wide_model()
+    trainer = Trainer(scene, CONFIG, default_device, model)
+    np.testing.assert_array_equal(trainer.parameters["means"].get(), model.means[space_order(model.means)])
+    moved: list[np.ndarray[Any, Any]] = []
+    monkeypatch.setattr(VisibleChunks, "rows_moved", lambda _, listed: moved.append(listed.get()))
+    plans: list[np.ndarray[Any, Any]] = []
+    noted(monkeypatch, trained_model, "beside_parents", plans.append)
+    run_steps(16, trainer)
+    (entries,), (sources,) = moved, plans
+    assert (np.diff(sources.astype(np.int64)) < 0).any(), "density control adds new rows at the end"
+    old = entries & ~trained_model.FRESH
+    assert (np.diff(old.astype(np.int64)) >= 0).all()
+    np.testing.assert_array_equal(old, sources[beside_parents(sources)])
