@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
@@ -14,6 +14,7 @@ from typing_extensions import Self
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, floats_of, group_shapes
+from clsplat.layouts.columns import CHUNK_ROWS
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +136,36 @@ def parts(
             for model, part in zip(streamed, uploaded, strict=True):
                 for name, array in part.arrays.items():
                     array.read_into(model[name].values[start:stop])
+
+
+def upload_chunks(
+    work: Workspace, numbers: NDArray[np.uint32], *models: HostGaussians
+) -> tuple[tuple[DeviceGaussians, ...], Callable[[], None]]:
+    """Upload the rows of these chunks, in rising order, one after the other.
+
+    Returns the models, valid until the next call, and a function that copies their changes back to the host.
+    """
+    rows = [slice(CHUNK_ROWS * int(number), CHUNK_ROWS * (int(number) + 1)) for number in numbers]
+    uploaded, copies = [], []
+    for index, model in enumerate(models):
+        arrays = {}
+        for name, whole in model.arrays.items():
+            some = np.concatenate([whole.values[each] for each in rows])
+            arrays[name] = work.array(f"part{index}_{name}", some.shape, some.dtype)
+            arrays[name].set(some)
+            copies.append((arrays[name], some, whole.values))
+        uploaded.append(DeviceGaussians(arrays["means"].shape[0], model.coefficients, arrays))
+
+    def copy_back() -> None:
+        for array, some, whole in copies:
+            array.read_into(some)
+            begin = 0
+            for each in rows:
+                end = begin + len(whole[each])
+                whole[each] = some[begin:end]
+                begin = end
+
+    return tuple(uploaded), copy_back
 
 
 def allocate_gaussians(device: Device, count: int, coefficients: int, *, zero: bool = False) -> DeviceGaussians:

@@ -18,7 +18,7 @@ from tiny import cameras, hidden_model, run_steps, short
 
 from clsplat.chunks.order import beside_parents, space_order
 from clsplat.config.training import OptimiserConfig, TrainConfig
-from clsplat.device.context import Device
+from clsplat.device.context import Device, open_device
 from clsplat.errors import DriverError
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import CHUNK_ROWS
@@ -29,20 +29,28 @@ from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
 from clsplat.training.step.visible_chunks import Missed, VisibleChunks
 from clsplat.training.trainer import Trainer
 
-ROWS = 6 * CHUNK_ROWS + 100
-CONFIG = short(iterations=40, report=False, warmup=(), density={"min_contribution": 0.01, "max_gaussians": 9000})
+ROWS = 11 * CHUNK_ROWS + 100
+CONFIG = short(iterations=40, report=False, warmup=(), density={"max_gaussians": 16_000})
+LITTLE = 7 << 20
+"""Bytes of device memory with which `wide_model` is streamed."""
 SPARSE = replace(CONFIG, optimiser=OptimiserConfig(sparse=True))
 
 
-def wide_model(rows: int = ROWS) -> Gaussians:
-    """The tiny scene's Gaussians many times, at its place and at seven places around it, of which a view shows some."""
+def wide_model(rows: int = ROWS, *, around: bool = True) -> Gaussians:
+    """The tiny scene's Gaussians many times, at eight places.
+
+    The first place is the scene's, which every view shows, and four are above, which no view shows. Three are around
+    it, of which a view shows some, or, if not `around`, above too.
+    """
     small, rng = hidden_model(), np.random.default_rng(5)
     rows_of = rng.integers(0, len(small), rows)
     taken = {name: array[rows_of].copy() for name, array in small.arrays().items()}
     model = replace(small, **taken)
     place = np.arange(rows) * 8 // rows
-    angle = place * 2 * np.pi / 7
-    away = 12 * (place > 0)[:, None] * np.column_stack([np.cos(angle), np.zeros(rows), np.sin(angle)])
+    beside, above = (place > 4) & around, (place > 0) & ((place <= 4) | (not around))
+    angle = place * 2 * np.pi / 3
+    away = np.column_stack([12 * beside * np.cos(angle), 30 * above, 12 * beside * np.sin(angle)])
+    away[:, 0] += 9 * above * place
     model.means += away.astype(np.float32)
     model.means += rng.normal(0, 0.1, model.means.shape).astype(np.float32)
     model.log_scales -= 1
@@ -83,13 +91,14 @@ def trained(
     steps: int,
     *,
     whole: bool = False,
+    around: bool = True,
     change: Callable[[Trainer], None] = lambda _: None,
 ) -> tuple[State, Trainer]:
     """A training's state after some steps. whole: every step runs over the whole model. change: called before them."""
     with pytest.MonkeyPatch.context() as patch:
         if whole:
             patch.setattr(visible_chunks, "ORDERED_ROWS", 1 << 30)
-        trainer = Trainer(scene, config, device, wide_model())
+        trainer = Trainer(scene, config, device, wide_model(around=around))
         change(trainer)
         run_steps(steps, trainer)
         return state(trainer), trainer
@@ -108,6 +117,7 @@ SETTINGS = {
     "thinning and penalties": replace(CONFIG, thinning=0.3, penalty=0.02, background="random"),
     "higher bands wait": replace(CONFIG, optimiser=OptimiserConfig(sh_rest_every=3), sh_degree_every=7),
     "absolute gradients": short(iterations=40, report=False, warmup=(), density={"absolute_gradients": True}),
+    "contributions": short(iterations=40, report=False, warmup=(), density={"min_contribution": 1e-6}),
     "exposure": replace(CONFIG, appearance="exposure"),
     "by rays": replace(CONFIG, perspective="rays"),
 }
@@ -134,6 +144,20 @@ def test_the_bytes_of_the_whole_model(
     assert trainer.parameters.count > 2 * CHUNK_ROWS
     assert len(shares) == 32
     assert min(shares) < 0.5, "some chunks are left out"
+
+
+@pytest.mark.parametrize("optimiser", ["dense", "sparse"])
+def test_a_streamed_model(scene: Scene, default_device: Device, shares: list[float], optimiser: str) -> None:
+    """With sparse Adam only the chunks in view are uploaded; the model has the bytes of one that is on the device."""
+    wanted, _ = trained(scene, SETTINGS[optimiser], default_device, 16, whole=True, around=False)
+    limited = open_device(memory_limit=LITTLE)
+    parts: list[int] = []
+    with pytest.MonkeyPatch.context() as patch:
+        noted(patch, visible_chunks, "upload_chunks", lambda _, numbers, *__: parts.append(len(numbers)))
+        got, trainer = trained(scene, SETTINGS[optimiser], limited, 16, around=False)
+    assert trainer.plan.streamed
+    assert_same(got, wanted)
+    assert bool(parts) == (optimiser == "sparse"), (trainer.plan.rows, shares)
 
 
 @pytest.mark.parametrize("optimiser", ["dense", "sparse"])

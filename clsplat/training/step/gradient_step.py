@@ -26,7 +26,7 @@ from clsplat.stages.noise import noise, noise_numbers
 from clsplat.stages.project import Slots, project_grad, project_step, step_numbers, thinning_numbers
 from clsplat.stages.target import is_photograph, on_device, target
 from clsplat.training.density import StatisticsNeeds
-from clsplat.training.step.inputs import StepRows, ViewInputs, ViewRows
+from clsplat.training.step.inputs import PlacedChunks, StepRows, ViewInputs, ViewRows
 from clsplat.training.step.loss_terms import loss_terms
 
 R = TypeVar("R")
@@ -114,10 +114,12 @@ class GradientStep:
         source = on_device(work, inputs.photograph)
         thinning, terms = thinning_of(self.config, self.step), loss_terms(self.config, inputs)
         chunks = None if inputs.chunks is None else inputs.chunks.prepare(model, self.adam_step)
-        key = self._key(inputs, source, terms, chunks)
+        model = model if chunks is None else chunks.model
+        listed = None if chunks is None else chunks.in_model
+        key = self._key(inputs, source, terms, listed)
 
         def gradient(probe: StepProbe) -> tuple[ForwardPass, Loss, Slots, Sequence[DeviceArray | None]]:
-            forward = partial(self.rasterizer.forward, model[0], camera, sent[1], sent=sent, chunks=chunks)
+            forward = partial(self.rasterizer.forward, model[0], camera, sent[1], sent=sent, chunks=listed)
             frame = forward(room=self.room, thinning=thinning, nearness=self.fields.nearness)
             probe.forward(frame)
             result = self._compare(model[0], inputs, source, frame, terms)
@@ -145,6 +147,8 @@ class GradientStep:
             probe.loss(result)
             probe.pair_gradients(slots)
         self._change(model, inputs, frame, slots, gradients, probe, chunks)
+        if chunks is not None and chunks.finish is not None:
+            chunks.finish()
         self.learn(inputs, own)
         return result
 
@@ -208,20 +212,20 @@ class GradientStep:
         slots: Slots,
         gradients: DeviceGaussians | None,
         probe: StepProbe,
-        chunks: ChunkList | None,
+        chunks: PlacedChunks | None,
     ) -> None:
         """Take Adam's step for the model, part by part, or for some of its chunks."""
 
         def change() -> None:
             for start, stop, part in parts(self.rasterizer.work, *model, keep=True):
-                end = stop if chunks is None else chunks.rows
+                end = stop if chunks is None else frame.projected.tile_counts.shape[0]
                 self._change_rows(self._rows(start, end, part, inputs, frame, slots, gradients, chunks), inputs, probe)
 
         if self.room is None or gradients is not None or any(part.changes_rows for part in inputs.parts):
             change()
             return
         step, explore = self.adam_step, self.explore
-        rows = None if chunks is None else chunks.key
+        rows = None if chunks is None else chunks.listed.key
         key = (slots, *map(ref, model[1:]), step.updates_sh_rest, bool(explore.weights), explore.amount != 0, rows)
         numbers = (*step_numbers(step, explore), *noise_numbers(explore), *probe.numbers)
         self.replayed(model[0], (*key, *probe.key), change, numbers, before=probe.before_replay)
@@ -235,7 +239,7 @@ class GradientStep:
         frame: ForwardPass,
         slots: Slots,
         gradients: DeviceGaussians | None,
-        chunks: ChunkList | None,
+        chunks: PlacedChunks | None,
     ) -> StepRows:
         """Rows [start, stop) of the model or of `chunks`, with arrays for their gradients."""
         by_lens = (part.lens_gradients(stop - start) for part in inputs.parts)
@@ -311,7 +315,8 @@ class GradientStep:
             adam(self.device, step, *models, rows.projected.tile_counts, readback)
         else:
             view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
-            project_step(rows.device, step, rows.model, *view, explore=self.explore, chunks=rows.chunks)
+            chunks = None if rows.chunks is None else rows.chunks.in_model
+            project_step(rows.device, step, rows.model, *view, explore=self.explore, chunks=chunks)
         noise(self.device, self.explore, rows.parameters, rows.start, readback)
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -19,11 +20,30 @@ from clsplat.stages.loss_terms import DepthTerm
 from clsplat.stages.project import Projected, Screen, Slots
 
 
+@dataclass(frozen=True, eq=False)
+class PlacedChunks:
+    """Chunks that are ready for a step.
+
+    listed: their numbers in the model.
+    model: the model that the kernels get: the whole model, or, if it is streamed, the rows of these chunks alone.
+    finish: function that copies the changes back to a streamed model.
+    """
+
+    listed: ChunkList
+    model: tuple[AnyGaussians, ...]
+    finish: Callable[[], None] | None = None
+
+    @property
+    def in_model(self) -> ChunkList | None:
+        """The chunks for kernels that read `model`; None if it has no other rows."""
+        return None if self.finish else self.listed
+
+
 class ChunksInView(Protocol):
     """The chunks of the model over which a step runs."""
 
-    def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> ChunkList | None:
-        """Make the chunks ready for the step, and send their list. None if the step runs over the whole model."""
+    def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> PlacedChunks | None:
+        """Make the chunks ready for the step. None if the step runs over the whole model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,14 +83,14 @@ class ViewRows:
 
     projected: projection of these rows in the step's view.
     screen: their screen-space gradients, valid after the rows have changed.
-    chunks: the chunks that were projected. Then [start, stop) are rows of this list.
+    chunks: the chunks that were projected. Then [start, stop) are rows of these.
     """
 
     start: int
     stop: int
     projected: Projected
     screen: Screen
-    chunks: ChunkList | None = field(default=None, kw_only=True)
+    chunks: PlacedChunks | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)

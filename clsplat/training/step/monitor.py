@@ -69,7 +69,7 @@ class StepMonitor(StepProbe):
         """Try in the sandbox every kernel that changes the state, before the first row changes: a driver may fail in
         any of them."""
         step, parameters = self.step, rows.parameters
-        size = (parameters.count, parameters.coefficients)
+        size = (parameters.count if rows.chunks is None else 0, parameters.coefficients)
         build = (step.adam_step.updates_sh_rest, step.fields, rows.slots.first_slots is None, self.needs.gradients)
         key = (*size, *build, rows.chunks is None, *self.inputs.camera.model.defines.items())
         if key not in self.tried:
@@ -85,8 +85,9 @@ class StepMonitor(StepProbe):
 
     def _add_rows(self, rows: ViewRows) -> None:
         """Add the view to the statistics that density control needs of these rows."""
-        device, camera, screen, chunks = self.step.device, self.inputs.camera, rows.screen, rows.chunks
-        statistics = self.statistics if chunks is not None else self.statistics.rows(rows.start, rows.stop)
+        device, camera, screen = self.step.device, self.inputs.camera, rows.screen
+        chunks = None if rows.chunks is None else rows.chunks.listed
+        statistics = self.statistics.rows(rows.start, rows.stop) if chunks is None else self.statistics
         if self.needs.gradients:
             add_statistics(device, statistics, camera, rows.projected, screen, chunks)
         if screen.contributions is not None and statistics.current_totals is not None:

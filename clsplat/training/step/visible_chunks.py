@@ -21,12 +21,12 @@ from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.optimisation.dropout import thinning_of
 from clsplat.rendering.rasterizer import MAX_COUNTED_PASSES, Rasterizer
 from clsplat.stages.adam import AdamStep
-from clsplat.stages.bounds import ChunkList, bounds, send_chunks
+from clsplat.stages.bounds import bounds, send_chunks
 from clsplat.stages.catch_up import catch_up, step_table
-from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians, upload_chunks
 from clsplat.training.learning_rates import rates_at
 from clsplat.training.step.component import Component, Named
-from clsplat.training.step.inputs import ChunksInView, ViewInputs
+from clsplat.training.step.inputs import ChunksInView, PlacedChunks, ViewInputs
 
 STEPS_PER_MEASUREMENT = 16
 """Steps after which the bounds of the chunks that took part in them are measured again. More steps widen the bounds,
@@ -80,10 +80,9 @@ class VisibleChunks(Component):
         self._since: int | None = None
         """Steps since the last measurement; None if there is none."""
         self.step, self._last = step, np.full(chunks, step, np.uint32)
-        self._table, self._first_step = (
-            np.zeros((2 * MOST_MISSED_STEPS, 2 + len(PARAMETER_GROUPS)), np.float32),
-            step + 1,
-        )
+        self._first_step = step + 1
+        most = 2 * (MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)  # twice, so that the table is seldom moved
+        self._table = np.zeros((most, 2 + len(PARAMETER_GROUPS)), np.float32)
         """The steps from `_first_step` on, of which chunks may have missed some (`stages.catch_up.step_table`)."""
         self._before: dict[int, NDArray[np.uint32]] = {}
         """By number, `_last` as it was before the latest steps, which may be repeated."""
@@ -108,17 +107,27 @@ class VisibleChunks(Component):
 
     def before_step(self, gaussians: AnyGaussians) -> None:
         """Measure the bounds of chunks whose Gaussians may have moved."""
-        if not isinstance(gaussians, DeviceGaussians):
-            return
+        streams = isinstance(gaussians, HostGaussians)
+        if streams and not (self._config.optimiser.sparse and self._config.thinning == 0):
+            return  # neither the missed steps nor the random numbers are those of a part of the model
         self._since = 0
         numbers = np.flatnonzero(self._unmeasured).astype(np.uint32)
         if len(numbers) == 0:
             return
-        work = self._rasterizer.work
-        chunks = send_chunks(work, "chunks", numbers, gaussians.count)
-        self._found[numbers] = bounds(self._rasterizer.device, work, gaussians, chunks)[: len(numbers)]
+        self._found[numbers] = self._measured(gaussians, numbers)
         self._unmeasured[numbers] = False
         self._means_moved[numbers] = self._scales_moved[numbers] = 0.0
+
+    def _measured(self, gaussians: AnyGaussians, numbers: NDArray[np.uint32]) -> Float32:
+        """Bounds (chunks, 7) of these chunks."""
+        if isinstance(gaussians, DeviceGaussians):
+            work = self._rasterizer.work
+            chunks = send_chunks(work, "chunks", numbers, gaussians.count)
+            return bounds(self._rasterizer.device, work, gaussians, chunks)[: len(numbers)]
+        rows = (CHUNK_ROWS * numbers.astype(np.int64)[:, None] + np.arange(CHUNK_ROWS)).ravel()
+        rows = rows[rows < gaussians.count]
+        found = ChunkBounds.measured(*(gaussians[group].values[rows] for group in ("means", "log_scales")))
+        return np.hstack([found.lowest, found.highest, found.largest[:, None]]).astype(np.float32)
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:
         """The view, with the chunks that it may show."""
@@ -160,21 +169,30 @@ class VisibleChunks(Component):
         table = self._table[first - self._first_step : step + 1 - self._first_step].copy()
         return Missed(numbers, last, step, table, first)
 
-    def prepare(self, model: tuple[DeviceGaussians, ...], step: AdamStep, chunks: _ChunksInView) -> ChunkList | None:
+    def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep, chunks: _ChunksInView) -> PlacedChunks | None:
         """Catch up the chunks that a step's view shows, and send their list. A repeated step is the same again."""
         if chunks.of_rows is not self._found:  # rows have moved since, and all have taken every step
             chunks = _ChunksInView(self, np.arange(len(self._last), dtype=np.uint32), None, self._found, whole=True)
         if chunks.missed is not None:
-            self._catch_up(model, chunks.missed)
+            self._catch_up(_on_device(model), chunks.missed)
         self._before = {step.number: self._last, **dict(list(self._before.items())[: MAX_COUNTED_PASSES - 1])}
         self._last, self.step = self._last.copy(), step.number
         self._last[chunks.numbers] = step.number
         self._note(step)
+        streamed = [each for each in model if isinstance(each, HostGaussians)]
+        if chunks.whole or (streamed and CHUNK_ROWS * len(chunks.numbers) > streamed[0].rows):
+            return None
         work = self._rasterizer.work
-        return None if chunks.whole else send_chunks(work, "chunks", chunks.numbers, model[0].count)
+        listed = send_chunks(work, "chunks", chunks.numbers, model[0].count)
+        if not streamed:
+            return PlacedChunks(listed, model)
+        numbers = chunks.numbers if len(chunks.numbers) else np.zeros(1, np.uint32)  # a model has a row
+        return PlacedChunks(listed, *upload_chunks(work, numbers, *streamed))
 
     def _note(self, step: AdamStep) -> None:
-        """Put a step into the table."""
+        """Put a step into the table, from which steps go that all chunks have taken."""
+        if self._config.optimiser.sparse:
+            return
         if step.number - self._first_step >= len(self._table):
             past = int(self._last.min()) + 1 - self._first_step
             self._table[:-past] = self._table[past:].copy()
@@ -246,9 +264,9 @@ class _ChunksInView(ChunksInView):
     of_rows: Float64
     whole: bool
 
-    def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> ChunkList | None:
+    def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> PlacedChunks | None:
         """Catch up these chunks, and send their list."""
-        return self.of.prepare(_on_device(model), step, self)
+        return self.of.prepare(model, step, self)
 
 
 def _on_device(model: Sequence[AnyGaussians]) -> tuple[DeviceGaussians, ...]:
