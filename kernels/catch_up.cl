@@ -27,7 +27,7 @@
 
 #define BLOCK 16              // number of steps between two checks
 #define LEAST_BETA2 0.9f      // (193) holds for a block from this beta2 on
-#define STILL 3.725290298e-9f // 2^-28: an eighth of half an ulp, relative to the parameter
+#define STILL 3.725290298e-9f // 2^-28: an eighth of the least half ulp, relative to the parameter
 
 // The missed steps of an array. rates, roots: its columns of the table, from the first missed step on; highest: at
 // least the largest rate.
