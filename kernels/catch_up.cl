@@ -26,9 +26,8 @@
 #endif
 
 #define BLOCK 16              // number of steps between two checks
-#define LEAST_BETA2 0.9f      // (193) holds for a block from this beta2 on: the second moment keeps 0.18 of itself
-#define LEAST_SPREAD 1e-30f   // second moment that is still a normal number after a block
-#define STILL 3.725290298e-9f // 2^-28: an eighth of half an ulp, relative to the parameter
+#define LEAST_BETA2 0.9f      // (193) holds for a block from this beta2 on
+#define STILL 3.725290298e-9f // 2^-28: an eighth of the least half ulp, relative to the parameter
 
 // The missed steps of an array. rates, roots: its columns of the table, from the first missed step on; highest: at
 // least the largest rate.
@@ -62,8 +61,8 @@ __attribute__((always_inline)) static inline void catch_up_vector(size_t i, Miss
   floatA p = LOADA(model.parameters + i), m = LOADA(model.first + i), v = LOADA(model.second + i);
   for (uint begin = 0; begin < missed.steps; begin += BLOCK) {
     const uint end = min(begin + BLOCK, missed.steps);
-    const intA moves = missed.highest * fabs(m) < STILL * fabs(p) * sqrt(v) & v >= LEAST_SPREAD;
-    const intA still = (m == 0.0f & v >= 0.0f | moves) & fmaA(p, p, v) < s.limit2;
+    const intA lost = missed.highest * fabs(m) < STILL * fabs(p) * sqrt(v);
+    const intA still = (m == 0.0f & v >= 0.0f | lost) & fmaA(p, p, v) < s.limit2;
     if (!ANYA(~still)) { // no parameter changes in this block
       const floatA next_m = fmaA(beta1, m, none), next_v = fmaA(beta2, v, none);
       if (ANYA(AS_INTA(next_m) != AS_INTA(m))) {

@@ -70,7 +70,7 @@ STAGE_BOUNDS_ULP: dict[str, tuple[float, str]] = {
     "depth": (1024, "as blend_grad"),
     "pose": (1024, "as exposure; sums of terms of both signs"),
     "lens": (1024, "19 measured; as pose"),
-    "catch_up": (64, "TODO measured"),
+    "catch_up": (64, "8 measured, in first moments: beta1 in float32 is off by 2.6e-8 in each of 20 steps"),
     "ewa": (1024, "95 measured, in the gradient of quaternions, whose terms cancel; else as project_grad"),
     "harmonics": (64, "10 measured; one root and one division"),
     "splats": (64, "2 measured; a root and two quotients"),

@@ -39,6 +39,7 @@ BUILTIN float mad(float a, float b, float c) { return a * b + c; }
 BUILTIN float sqrt(float x) { return __builtin_sqrtf(x); }
 BUILTIN float4 sqrt(float4 x) { return (float4)(sqrt(x.x), sqrt(x.y), sqrt(x.z), sqrt(x.w)); }
 BUILTIN float fabs(float x) { return __builtin_fabsf(x); }
+BUILTIN float4 fabs(float4 x) { return (float4)(fabs(x.x), fabs(x.y), fabs(x.z), fabs(x.w)); }
 BUILTIN float ceil(float x) { return __builtin_ceilf(x); }
 BUILTIN float floor(float x) { return __builtin_floorf(x); }
 BUILTIN float trunc(float x) { return __builtin_truncf(x); }
