@@ -91,7 +91,10 @@ class DeviceArray:
             self.device.calls.fills += 1
             pattern = np.asarray(value, self.dtype)
             fill = partial(_begin_fill, self.device.queue, self.buffer, pattern, 0, self.nbytes)
-            self._note("fill", fill())
+            try:
+                self._note("fill", fill())
+            except cl.Error as error:
+                raise self.device.failed(_WRITING, error) from None
             for commands in self.device.command_buffers:
                 commands.add_fill(fill, self.buffer.int_ptr, pattern.tobytes(), self.nbytes)
 
@@ -163,7 +166,7 @@ class DeviceArray:
             self.device.under_way.clear()
 
     def _copied(self, work: str, *ends: Any, **how: Any) -> cl.Event:
-        """The event of a copy. Raises DriverError if it fails, or a kernel or the device before it."""
+        """The event of a copy. Raises DriverError or CapacityError if it fails, or a kernel or the device before it."""
         try:
             return cl.enqueue_copy(self.device.queue, *ends, **how)
         except cl.Error as error:
@@ -232,10 +235,7 @@ def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity:
     try:
         buffer = _Buffer(device.context, cl.mem_flags.READ_WRITE, nbytes)
     except cl.MemoryError:
-        raise CapacityError(
-            f"{device.name} has no memory left for a buffer of {amount(nbytes)}, with "
-            f"{amount(device.memory.used)} in use: set --max-device-mem below {amount(device.memory.used)}"
-        ) from None
+        raise device.used_up(f"a buffer of {amount(nbytes)}") from None
     device.memory.add(buffer, nbytes)
     if (word := _poison()) is not None:
         _fill_bytes(device, buffer, word, nbytes)

@@ -15,7 +15,8 @@ from clsplat.camera import Camera
 from clsplat.config.checks import parse_bytes
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import DeviceArray, upload
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.errors import InputError, of_argument
 from clsplat.gaussians import Gaussians
 from clsplat.images.holdouts import Surfaces

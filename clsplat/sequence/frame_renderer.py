@@ -12,7 +12,7 @@ from clsplat.camera import Camera
 from clsplat.config.channels import light_and_rest
 from clsplat.config.pictures import DEEP_STRIP_FLOATS
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.device.context import open_device
+from clsplat.device.selection import open_device
 from clsplat.errors import DriverError, warn
 from clsplat.frame.deep_exr import write_deep
 from clsplat.frame.draw import Planes, feature_floats, on_tiles

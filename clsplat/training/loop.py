@@ -144,16 +144,18 @@ class TrainingSession:
         """Write a checkpoint of the state at the start of the step, if that is intact.
 
         Called after a failed or interrupted trial of kernels, after a failed command of the driver (also of a GPU that
-        is lost), and for a photograph that cannot be read.
+        is lost), where the device's memory is used up, and for a photograph that cannot be read.
 
         Returns the end of an error message, which names the checkpoint, or "".
         """
-        if self.run is None or not self.trainer.step_back():
+        if self.run is None:
             return ""
+        earlier = f"; {self.run.resume_command} continues from the last checkpoint" if self.run.checkpoints() else ""
+        if not self.trainer.step_back():
+            return earlier
         try:
             self.save()
         except (ClsplatError, OSError) as error:
-            earlier = f"; {self.run.resume_command} continues from the last one" if self.run.checkpoints() else ""
             return f"; its checkpoint could not be written ({error}){earlier}"
         if not 0 < self.trainer.step <= self.saved:
             return ""
@@ -357,10 +359,10 @@ class TrainingSession:
         self.tell_plan()
         try:
             self.make_steps(between)
-        except (DriverError, TrialInterrupted) as error:  # a checkpoint saves the work so far
+        except (DriverError, CapacityError, TrialInterrupted) as error:  # a checkpoint saves the work so far
             written = self.rescue()
-            if written and isinstance(error, DriverError):
-                raise DriverError(f"{error}{written}") from error
+            if written and not isinstance(error, TrialInterrupted):
+                raise type(error)(f"{error}{written}") from error
             raise
         trainer.finish()
         model = trainer.gaussians()

@@ -26,7 +26,8 @@ from typing_extensions import NotRequired, TypedDict
 from clsplat.camera import Camera, Projection
 from clsplat.config.training import TrainConfig
 from clsplat.device import cl
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.errors import ClsplatError, InputError
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.layouts.columns import REFUSED, SPLAT

@@ -180,7 +180,7 @@ def test_an_error_is_expected_with_its_words(status: int | None, errors: str, tr
 
 
 def test_a_machine_without_pips_driver_has_none(tmp_path: Path) -> None:
-    code = "from clsplat.device.context import list_devices as l; import subprocess, sys; print(len(l()))"
+    code = "from clsplat.device.selection import list_devices as l; import subprocess, sys; print(len(l()))"
     child = code + "; print(subprocess.run([sys.executable, '-c', sys.argv[1]], capture_output=True, text=True).stdout)"
     for name in ("drivers", "no-drivers", "home", "tmp"):
         (tmp_path / name).mkdir()

@@ -67,7 +67,7 @@ TAIL = 25
 SHORT = """
 import sys
 from clsplat.cli.main import main
-from clsplat.device.context import list_devices, open_device
+from clsplat.device.selection import list_devices, open_device
 from clsplat.device.drivers.driver_records import memory_path
 from clsplat.errors import ClsplatError
 from clsplat.selftest.driver_check import require

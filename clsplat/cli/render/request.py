@@ -14,7 +14,7 @@ from clsplat.config.channels import CRYPTOMATTE_CHANNELS
 from clsplat.config.checks import parse_bytes
 from clsplat.config.holdout import HoldoutConfig
 from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding, PictureConfig, VideoConfig, WarpConfig
-from clsplat.device.context import find_device, list_devices
+from clsplat.device.selection import find_device, list_devices
 from clsplat.errors import InputError, warn
 from clsplat.images.alpha import background_colour
 from clsplat.images.frame_files import check_format, parse_channels
