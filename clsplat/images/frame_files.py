@@ -360,7 +360,8 @@ def _spec(shape: tuple[int, ...], names: Sequence[str], kind: Any, header: Frame
 
 
 def record_text(attributes: Mapping[str, Any]) -> str:
-    """Provenance record of a header's attributes, as text for headers without custom ones; '' if there is none."""
+    """The provenance among a header's attributes as one text, for formats without custom attributes; '' if a digest is
+    missing."""
     model, settings = attributes.get(MODEL_DIGEST_ATTRIBUTE), attributes.get(SETTINGS_DIGEST_ATTRIBUTE)
     return f"clsplat model {model} settings {settings}" if model and settings else ""
 

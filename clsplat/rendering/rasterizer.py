@@ -81,7 +81,7 @@ class ForwardPass:
 
     bands: one band of all tiles, unless memory is short.
     listed: the lists of the last band.
-    refused: the counts that `adam` had written to `Rasterizer.readback` when this pass read it back.
+    refused: how many elements Adam has refused to update, by reason (`REFUSED`), when this pass read the counts back.
     """
 
     camera: Camera

@@ -67,7 +67,7 @@ Other channels, if requested: (H, W) or (H, W, floats) float32, as docs/channels
 
 
 def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:
-    """The SH coefficients of a model that the settings keep for rendering, and how they are stored.
+    """Which SH coefficients of a model the settings keep for rendering, and how they are stored.
 
     Raises InputError if a coefficient is too large for float16.
     """

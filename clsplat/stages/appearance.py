@@ -92,7 +92,7 @@ class Gains:
 
     @classmethod
     def on(cls, device: Device, logs: NDArray[np.float32], pull: csr_array | None = None) -> Gains:
-        """Gains with these initial logs, and zero moments. pull: the sparse matrix; zero if not given."""
+        """Gains with these initial logs, and zero moments. pull: the sparse matrix of `Gains`; None for zeros."""
         zeros = np.zeros_like(logs)
         gains = np.exp2(logs.astype(np.float64)).astype(np.float32)
         held, start, first, second, factors = (upload(device, value) for value in (logs, logs, zeros, zeros, gains))

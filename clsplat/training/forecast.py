@@ -21,7 +21,7 @@ The prior is a factor times a power of the initial number of Gaussians. Five sce
 1.5 times as many.
 """
 GROWTH_RAMP = (0.35, 0.55, 0.75, 0.9)
-"""Growth of the first densifications, as fractions of the peak: split Gaussians have to accumulate gradients first."""
+"""Growth at the first densifications, as fractions of the peak."""
 PEAK_DENSIFICATIONS = 3
 """Number of densifications after the ramp in which the growth stays at its peak."""
 GROWTH_DECAY_STEPS, GROWTH_FLOOR_FRACTION = 1100.0, 0.2

@@ -115,7 +115,7 @@ static inline void add_pixel(float *sums, const Pixels *p, uint cell, float g, f
     }                                                                                                                  \
   }
 
-// The indices of the pairs that an item fetches for a batch, the last of which is at `batch` - 1.
+// Loads the Gaussian and the slot of an item's fetch number `fetch`. A batch's pairs run backwards from `batch` - 1.
 #define FETCH_INDICES(fetch, batch)                                                                                    \
   {                                                                                                                    \
     const int from = max((batch) - 1 - ITEM - fetch * ITEMS, begin);                                                   \

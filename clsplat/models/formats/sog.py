@@ -359,7 +359,7 @@ def write(
             for picture in files:
                 atomic_write(path.with_name(picture.name), picture.read_bytes())
             atomic_write(path, text)
-            for name in {*SH_IMAGE_FILES} - {picture.name for picture in files}:  # of an earlier model with higher SH
+            for name in {*SH_IMAGE_FILES} - {picture.name for picture in files}:  # left by a model of higher SH degree
                 path.with_name(name).unlink(missing_ok=True)
             return
         total = sum(picture.stat().st_size for picture in files)

@@ -242,7 +242,10 @@ def _rest(stream: Any, path: Path) -> bytes:
 
 @contextmanager
 def _decompressing(path: Path, place: str) -> Iterator[None]:
-    """Context manager: turn errors of a truncated or damaged stream into InputError. place: for the message."""
+    """Context manager: turn errors of a truncated or damaged stream into InputError.
+
+    place: place in the stream as the message names it, such as "at its end".
+    """
     import zstandard
 
     try:

@@ -261,7 +261,9 @@ def _masks(images: Path, paths: list[Path], use: MaskUse | None) -> dict[str, Pa
     photos = [_FoundPhoto(sfm_photos.photo_name(images, path), path) for path in paths]
     found = masks_beside(photos, others=OTHER_MASK_FOLDERS)
     if not found:
-        raise InputError(f"{images}: has no masks, expected masks/IMAGE.jpg.png beside the photos or in their folder")
+        raise InputError(
+            f"{images}: has no masks, expected masks/IMAGE.jpg.png next to the photos' folder or inside it"
+        )
     warn_of_sense(found.values(), use, images)
     return found
 

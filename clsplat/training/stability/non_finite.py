@@ -102,9 +102,9 @@ class NonFiniteMonitor:
             self._noticed = (self.last.with_bad_loss() or self.last, "loss", 0)
 
     def examine(self, models: Mapping[str, AnyGaussians]) -> Repair | None:
-        """Repair for the noticed trouble; None without trouble.
+        """The repair of the non-finite values that `notice` recorded; None if there are none.
 
-        models: parameters, first and second moments.
+        models: arrays by kind: parameters, first and second moments.
         """
         if self._noticed is None:
             return None

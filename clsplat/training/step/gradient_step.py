@@ -293,7 +293,7 @@ class GradientStep:
             part.update(gradient, self.rasterizer.readback)
 
     def update(self, rows: StepRows) -> None:
-        """Take Adam's step for some rows; compute the gradient of projection if that is not done yet."""
+        """Take Adam's step for some rows, after the gradient of projection if that is still missing; then add noise."""
         step, readback = self.adam_step, self.rasterizer.readback
         if rows.gradients is not None:
             parameters, first, second = rows.model
