@@ -24,7 +24,7 @@
 
 // A pair: its slot, then its depth's bits. The lists are in the order of depth, then slot.
 typedef uint2 Pair;
-// Fills up a list in local memory. It comes after every pair.
+// Fills the unused end of a list in local memory. It sorts after every pair.
 #define NO_PAIR ((Pair)(0xffffffff))
 
 // Swaps two pairs if the first comes after the second. One comparison of 64 bits and four selections.

@@ -389,7 +389,7 @@ class Workspace:
             return result
         if known is not None:
             known[1].check(commands, numbers)
-            for read in known[1].reads:  # copy into the memory of the known result
+            for read in known[1].reads:  # copy into the memory of the result that is returned
                 read()
             return known[0]  # type: ignore[no-any-return]  # as above
         command_buffers = self._command_buffers.setdefault(of, {})

@@ -94,7 +94,7 @@ class ForwardPass:
     refused: tuple[int, ...] = ()
 
     def by(self, camera: Camera) -> ForwardPass:
-        """The same arrays as the pass of another camera of this model and size."""
+        """A copy of this pass, with the same arrays, for another camera of the same model and size."""
         lists = (self.projected, self.bands, self.listed, self.blended)
         return self if camera is self.camera else ForwardPass(camera, self.camera_array, self.background, *lists)
 

@@ -352,7 +352,11 @@ class _MotionEnd:
 def _motion_end(
     name: str, camera: Camera, other: Camera | None, gaussians: Gaussians | None, *, asked: bool
 ) -> _MotionEnd:
-    """The end of the motion from a camera to another, or to itself. Raises InputError, which names the channel."""
+    """The end of the motion that a channel shows: from `camera` to `other`, or to `camera` itself if `other` is None.
+
+    name: name of the channel, for the InputError that this may raise.
+    asked: True if the channel is wanted.
+    """
     other = other or camera
     other.check()
     if asked and camera.model.without_motion:

@@ -27,7 +27,7 @@ class Moments:
     """Cameras of one frame at several times, evaluated in advance for processes that cannot read the shot's source.
 
     first: the camera at the first time.
-    times: (T,), rising, in frames relative to the frame.
+    times: (T,), in increasing order, in frames relative to the frame.
     values: (T, 18), the quantities that change over time: fx, fy, cx, cy, near, far, rotation (9) and translation (3).
     """
 

@@ -60,7 +60,8 @@ class GainEntries:
 
     @classmethod
     def of_lens(cls, model: ColourModel) -> GainEntries:
-        """The update of a lens's entries. Their sums follow the photograph's; their mean over all lenses is kept."""
+        """The update of a lens's entries. Their column sums come after the photograph's; their mean over the lenses is
+        not moved to 0."""
         return cls(first_row=model.entries, centred=False)
 
 

@@ -162,8 +162,8 @@ class TrainingSession:
         return f"; a checkpoint of step {self.trainer.step} is written: {self.run.resume_command} continues from it"
 
     def go_back(self) -> bool:
-        """Report non-finite values. After too many troubled steps, go back to the last checkpoint with smaller learning
-        rates.
+        """Report non-finite values. After too many steps with such values, go back to the last checkpoint with smaller
+        learning rates.
 
         After too many returns it raises ClsplatError. Returns True if training went back.
         """
@@ -185,7 +185,8 @@ class TrainingSession:
             self.saved = -1
             self.save()  # the smaller learning rates must survive a crash
         warnings.warn(
-            f"step {stopped}: {len(retries.troubled)} of the last {TROUBLE_WINDOW_STEPS} steps had trouble: "
+            f"step {stopped}: {len(retries.troubled)} of the last {TROUBLE_WINDOW_STEPS} steps had "
+            "values that were not finite: "
             f"training returns to step {trainer.step}, with learning rates multiplied "
             f"by {trainer.monitor.retries.rate_factor:g}"
         )
@@ -200,16 +201,16 @@ class TrainingSession:
         self.trainer.monitor.incidents.clear()
 
     def tell_the_rest(self) -> None:
-        """Warn of the number of troubled steps that were only counted."""
+        """Warn of the number of steps with non-finite values that were only counted."""
         self.trainer.repair()
         self.tell_trouble()
         if untold := self.troubles.total() - len(self.troubles):
             warnings.warn(f"{untold} more steps had values that were not finite")
 
     def give_up(self) -> None:
-        """Write a bundle that reproduces the trouble into the run's folder, and raise ClsplatError."""
+        """Write a bundle that reproduces the non-finite values into the run's folder, and raise ClsplatError."""
         incident = self.trainer.monitor.latest
-        assert incident is not None, "retries are used up only after trouble"
+        assert incident is not None, "retries are used up only by steps with non-finite values"
         trouble = (
             f"{incident}, and {MAX_CHECKPOINT_RETURNS} returns to a checkpoint with smaller learning rates did not help"
         )

@@ -5,7 +5,7 @@
 
 prints the number of non-finite values after each stage of that step. The exit status is 0 if there are any, else 1.
 A bundle has the format of a checkpoint, and the inputs of one view: a photograph, a camera and a background. It has
-only the Gaussians concerned if these reproduce the trouble on their own, otherwise all Gaussians.
+only the Gaussians concerned if these reproduce the non-finite values on their own, otherwise all Gaussians.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class StepRecord(TypedDict):
     versions, device: of the machine that trained.
     depth_factor: factor of the known depths, if they are compared.
     of: numbers of Gaussians in the bundle and in the training.
-    reproduced: True if the bundle reproduces the trouble.
+    reproduced: True if the bundle reproduces the non-finite values.
     """
 
     step: int

@@ -126,7 +126,7 @@ class Server:
             async def moved(camera: Any) -> None:
                 nonlocal fov, before
                 size = (camera.image_width, camera.image_height)
-                # a resize fits the field of view of the start again, but not that of a camera that the user clicked
+                # a resize fits the start's field of view anew, but keeps that of a camera that was clicked
                 if size != before and min(size) > 0 and math.isclose(camera.fov, fov, rel_tol=1e-6):
                     fov = camera.fov = start.fov_on(*size)
                 before = size

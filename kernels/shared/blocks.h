@@ -129,7 +129,7 @@ typedef struct {
 #endif
 } __attribute__((aligned(16))) Staged;
 
-// What blending keeps of a pair: each pixel of RAYS needs the Gaussian.
+// The number that blending keeps of a pair. With RAYS it is the Gaussian's, whose splat each pixel reads.
 #ifdef RAYS
 #define KEPT(gaussian, pair) (gaussian)
 #else

@@ -31,7 +31,7 @@
 #define FOR_FIELDS(field) _Pragma("unroll") for (int field = 0; field < SLOT_STRIDE; ++field)
 #define FOR_STRIP(c) _Pragma("unroll") for (int c = 0; c < STRIP_CELLS; ++c)
 
-// The fields that finish_row computes; the others have sums over pixels. Each pixel of RAYS has its own v.
+// The fields that finish_row computes; the others have sums over pixels. With RAYS each pixel has its own v.
 #ifdef RAYS
 #define OF_ROW(field) 0
 #define CELL_FIELDS SLOT_STRIDE

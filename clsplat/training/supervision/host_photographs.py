@@ -169,7 +169,7 @@ class HostPhotographs:
             self._pending.pop(key).cancel()
 
     def _tell(self) -> None:
-        """Warn of trouble with the cache. Threads that read ahead only note it."""
+        """Warn of failures of the cache. Threads that read ahead only record them."""
         if self.decoder.store is not None:
             for text in self.decoder.store.notes():
                 warn(text)
