@@ -195,7 +195,7 @@ class FramePipeline:
         return draw, between(space, colours.output), rows
 
     def _with_ranks(self, planes: Planes) -> Planes:
-        """The planes, with mattes in the form that is written to files."""
+        """The planes, in which mattes are converted to the form that files have."""
         return {
             name: ranked(plane, self._mattes[name].names) if name in self._mattes else plane
             for name, plane in planes.items()

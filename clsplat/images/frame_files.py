@@ -327,7 +327,10 @@ def deep_spec(width: int, height: int, encoding: Encoding, header: FrameFileHead
 
 
 def _exr_spec(shape: tuple[int, ...], names: Sequence[str], formats: Sequence[Any], header: FrameFileHeader) -> Any:
-    """OpenImageIO's specification of an EXR part. formats: one for each channel, or one for all channels."""
+    """OpenImageIO's specification of an EXR part.
+
+    formats: a pixel format for each channel, or a single one for all channels.
+    """
     several = len(set(formats)) > 1
     spec = _spec(shape, names, oiio.FLOAT if several else formats[0], header)
     if several:

@@ -43,10 +43,10 @@ class ModelSeries:
     ) -> None:
         """Read the first sample.
 
-        frames: frames of the samples, ascending.
+        frames: frames of the samples, in increasing order.
         read: function that reads the sample at an index; raises InputError.
         where: prefix of messages.
-        held: keep the means of the first sample before it, and of the last sample after it.
+        held: True to keep the means fixed before the first sample and after the last; else their motion continues.
         """
         self.frames, self.where, self.held = tuple(frames), where, held
         self._read = read

@@ -43,8 +43,8 @@ class Moments:
         for time, camera in zip(rising, cameras, strict=True):
             if camera.projection != cameras[0].projection:
                 raise InputError(
-                    f"an open shutter: the camera is {cameras[0].projection} {rising[0]:g} frames from the frame and "
-                    f"{camera.projection} {time:g} frames from it, expected one projection"
+                    f"an open shutter: {rising[0]:g} frames from the frame its camera is {cameras[0].projection}, and "
+                    f"{time:g} frames from it {camera.projection}; expected one projection"
                 )
         return cls(cameras[0], rising, np.array([_values(camera) for camera in cameras]))
 

@@ -177,7 +177,8 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
 
 
 def _unmarked(models: dict[str, HostGaussians]) -> dict[str, HostGaussians]:
-    """The models, with zeros in place of non-finite moments, which may mark a refused step."""
+    """The models with zeros in place of moments that are not finite. Such a moment may mark a step that `adam`
+    refused."""
     for kind in ("first", "second"):
         arrays = {g: HostArray(finite_or_zero(array.values)) for g, array in models[kind].arrays.items()}
         models[kind] = replace(models[kind], arrays=arrays)

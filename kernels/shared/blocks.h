@@ -162,7 +162,7 @@ static inline uint stage(__local Staged *place, uint gaussian, uint kept, uint s
   return blocks;
 }
 
-// A bit for each block b of which numbers[b] is above `floor`.
+// The blocks b for which numbers[b] is above `floor`, a bit each.
 static inline uint blocks_above(int floor, __local const int *numbers) {
   uint blocks = 0;
   _Pragma("unroll") for (int block = 0; block < BLOCKS; ++block) blocks |= (uint)(numbers[block] > floor) << block;

@@ -58,7 +58,8 @@ class HostPhotographs:
 
     @cached_property
     def least(self) -> int:
-        """Smallest limit in bytes: the views of a step, a view that is read ahead, and the memory to decode it."""
+        """The smallest limit in bytes that suffices for the views of a step, one view that is read ahead, and its
+        decoding."""
         return self._needed(1)
 
     @cached_property
