@@ -125,7 +125,7 @@ class Device:
 
         registers: maximum registers per work-item, if the driver has an option for it; 0 for no limit.
         """
-        if self._why_another:  # not shown earlier: until this first use, the self-test may still choose another shape
+        if self._why_another:  # shown only now: until this first use, the self-test may still choose another shape
             tell_once(self._why_another)
         if self._switches:
             text = kernel_source(stem)

@@ -136,7 +136,7 @@ class CaseBench:
     def twice(self, launch: Callable[[], T], take: Callable[[T], list[Array]]) -> tuple[T, StageOutcome]:
         """Run a stage twice. Returns its second result, and the outcome with the arrays on the host and milliseconds.
 
-        A difference from the first run, which includes the kernel builds, is reported as trouble.
+        A difference from the first run, which includes the kernel builds, is reported as a fault.
         """
         first = take(launch())
         value, ms = self.device.timed(launch)

@@ -86,7 +86,7 @@ class Forecast:
     def see(self, report: TimedStep) -> None:
         """Record a report."""
         step, count, seconds = report.step, report.gaussians, report.seconds
-        if self.last is None or step <= self.last[0]:  # after a return to a checkpoint
+        if self.last is None or step <= self.last[0]:  # training has returned to a checkpoint
             self.begun, self.last = self.begun or (step, count), (step, count, seconds)
             return
         before, previous, at = self.last

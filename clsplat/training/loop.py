@@ -92,7 +92,7 @@ def _interruption() -> Iterator[Callable[[], int]]:
 
     def asked() -> int:
         if not first:
-            for number in before:  # again, because kernel compilers have installed their own handlers
+            for number in before:  # installed again, because kernel compilers have installed their own handlers
                 signal.signal(number, ask)
         return first
 

@@ -189,7 +189,7 @@ def read_bundle(path: Path) -> Bundle:
     """Read a bundle. Raises InputError for other files."""
     try:
         return _bundle_of(read_checkpoint(path), path)
-    except Exception as error:  # as for a checkpoint: zipfile raises nearly anything for a flipped bit
+    except Exception as error:  # zipfile raises nearly anything for a flipped bit, as in a checkpoint
         if isinstance(error, InputError) and str(path) in str(error):
             raise
         why = f"{type(error).__name__}: {error}"[:300]

@@ -319,7 +319,7 @@ class ViserPage:
         except ClsplatError as error:
             self.tell(str(error))
         except OSError as error:
-            self.tell(re.sub(r": '.*'$", "", str(error)))  # without paths of this machine
+            self.tell(re.sub(r": '.*'$", "", str(error)))  # removes paths of this machine
 
 
 def png(image: Image) -> bytes:

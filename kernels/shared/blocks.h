@@ -122,7 +122,7 @@ typedef struct {
   float mx, my, l11, l12; // mx, my: the mean, relative to the tile's first pixel
   float l22, log2o, red, green;
   float blue;
-  uint kept, blocks, slot; // kept: the Gaussian, or what a kernel needs instead
+  uint kept, blocks, slot; // kept: the Gaussian, or the number that a kernel needs in its place
 #ifdef NEARNESS
   float near;     // nearness, 1 / depth
   uint unused[3]; // padding to 16 bytes; set, so that copies read no uninitialised memory

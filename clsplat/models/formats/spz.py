@@ -295,7 +295,7 @@ def _fixed(block: Bytes) -> Float32:
 
 
 def _first_three(block: Bytes) -> Float32:
-    """Version 2: bytes (n, 3) of x y z -> quaternions w x y z (n, 4)."""
+    """Convert bytes (n, 3) of x y z, as version 2 stores them, to quaternions w x y z (n, 4)."""
     result = np.empty((len(block), 4), np.float32)
     result[:, 1:] = block * np.float32(1 / 127.5) - np.float32(1)
     result[:, 0] = np.sqrt(np.maximum(0, 1 - np.square(result[:, 1:]).sum(axis=1)))
@@ -308,7 +308,7 @@ def _smallest_three(block: Bytes) -> Float32:
     fields = packed[:, None] >> np.array([20, 10, 0], np.uint32)
     three = (fields & 511).astype(np.float32) * np.float32(SQRT_HALF / 511)
     three = np.where(fields & 512, -three, three)
-    return values.restore_largest(packed >> 30, three)[:, [3, 0, 1, 2]]  # from x y z w
+    return values.restore_largest(packed >> 30, three)[:, [3, 0, 1, 2]]  # the file's order is x y z w
 
 
 def write(
@@ -423,7 +423,7 @@ def _to_byte(steps: Float32) -> Bytes:
 
 
 def _to_fixed(steps: Float64) -> Bytes:
-    """24-bit values (n, 3) -> bytes (n, 3, 3), low byte first."""
+    """Convert 24-bit values (n, 3) to bytes (n, 3, 3), low byte first."""
     return np.rint(steps).astype("<i4")[:, :, None].view(np.uint8)[:, :, :3]
 
 

@@ -186,7 +186,7 @@ def _images(
         exact = _find_file(keys)
         name = called(listed, None, file, path.parent)
         if exact == file or not file.is_relative_to(path.parent):
-            name = listed + file.name[len(PurePosixPath(listed).name) :]  # with the extension of the file
+            name = listed + file.name[len(PurePosixPath(listed).name) :]  # adds the file's extension
         lens, parts = _lens(keys, file, size)
         in_parts += [name] if parts else []
         rotation, translation, _ = opengl_pose(keys.frame.get("transform_matrix"), keys.where, "'transform_matrix'")

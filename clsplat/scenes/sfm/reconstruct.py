@@ -43,7 +43,7 @@ SFM_CAMERA_MODELS = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADI
                  "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")  # fmt: skip
 
 PLACED_CAMERAS_UNIT = "cameras stand"
-# for each stage of the worker: text for the user, and database table that gets a row for each photograph or pair
+# each stage has a text for the user, and a table of the database that gets a row for each photograph or pair
 _PROGRESS_BY_STAGE = {
     "features": ("finding features", "keypoints"),
     "matches": ("matching photos", "two_view_geometries"),
@@ -135,7 +135,7 @@ def reconstruct(
 
     workers = threads or os.cpu_count() or 1
     output.parent.mkdir(parents=True, exist_ok=True)
-    # in the parent folder of the output, so that the last step is a rename within one file system
+    # it is in the output's parent folder, so that the last step is a rename within one file system
     work = Path(tempfile.mkdtemp(prefix=f".{output.name}-sfm-", dir=output.parent))
     try:
         photos = _staged_photos(images, paths, copies, work / "photos", report, workers)

@@ -137,7 +137,7 @@ class GradientStep:
         else:
             numbers, given = thinning_numbers(thinning), (source,)
             frame, result, slots, own = self.replayed(model[0], key, lambda: gradient(StepProbe()), numbers, given)
-            self.device.under_way.append(source.buffer)  # as in `target`
+            self.device.under_way.append(source.buffer)  # keeps the photograph alive, as in `target`
             frame = frame.by(camera)
             probe.forward(frame)
             probe.loss(result)

@@ -39,7 +39,7 @@ class LateAdam(Component):
 
     def _begin(self, last: NDArray[np.uint32], missed: MissedSteps, step: int) -> None:
         self._last, self._missed, self.step = upload(self._device, last), missed, step
-        self._tables: dict[int, Float32] = {step: missed.rounded()}  # of the steps that may have to be repeated too
+        self._tables: dict[int, Float32] = {step: missed.rounded()}  # also tables of steps that may be repeated
         self._table = allocate(self._device, self._tables[step].shape, np.float32)
 
     @property
@@ -129,7 +129,7 @@ class LateAdam(Component):
 
 @dataclass(frozen=True, eq=False)
 class _ShownRows(ViewPart):
-    """The rows that a view shows take their missed steps."""
+    """The part of a view in which the rows that it shows take their missed steps."""
 
     late: LateAdam
 
