@@ -32,8 +32,8 @@ _begin_read = getattr(
     _inner, "_enqueue_read_buffer", lambda queue, buffer, host, **how: cl.enqueue_copy(queue, host, buffer, **how)
 )
 _begin_fill = getattr(_inner, "_enqueue_fill_buffer", cl.enqueue_fill_buffer)
-"""pyopencl's functions inside `enqueue_copy` and `enqueue_fill_buffer`. Those themselves, which ask the driver about
-both ends and the queue first, where a version has no such functions."""
+"""pyopencl's functions inside `enqueue_copy` and `enqueue_fill_buffer`, which do not first ask the driver about both
+ends and the queue. A version of pyopencl that lacks them gets `enqueue_copy` and `enqueue_fill_buffer`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,8 @@ from clsplat.gaussians import Gaussians
 from clsplat.models.edit import take
 
 CACHED_SAMPLES_SINGLE, CACHED_SAMPLES_PAIR = 2, 3
-"""Number of samples in memory after a request for one sample, or for two neighbours. One is the next sample."""
+"""Number of samples kept in memory after a request for one sample, or for two neighbours. It is one more than
+requested, as the next sample is read ahead."""
 MAX_TRACKED_CHANGE_RATIO = 0.25
 """Largest ratio at which rows count as tracked, that is, as the same Gaussian in two samples. The ratio is the median
 change of a row between the samples over the median difference of two rows.
