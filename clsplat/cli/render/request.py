@@ -89,7 +89,8 @@ def checked(flags: RenderVerb) -> Request:
 
 
 def _colour(colour: ColourConfig) -> ColourConfig:
-    """Colour settings with the absolute path of the OCIO configuration, for processes in other folders."""
+    """Colour settings with the absolute path of the OCIO configuration, as processes that render may run in other
+    folders."""
     source = colour.ocio_config or os.environ.get("OCIO", "")
     if source and "://" not in source:
         source = str(Path(source).absolute())
@@ -97,7 +98,7 @@ def _colour(colour: ColourConfig) -> ColourConfig:
 
 
 def _warp(warp: WarpConfig) -> WarpConfig:
-    """Lens settings with the absolute path of the map, for processes in other folders."""
+    """Lens settings with the absolute path of the map, as processes that render may run in other folders."""
     return replace(warp, stmap=str(Path(warp.stmap).absolute())) if warp.stmap else warp
 
 

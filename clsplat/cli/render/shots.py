@@ -24,7 +24,7 @@ from clsplat.shots.readers.usd_settings import FULL_DATA_WINDOW, window_named
 from clsplat.shots.stereo import pair_of_stage, shot_of
 
 STEREO_ROLE_ATTRIBUTE = "stereoRole"
-"""Attribute of a stereo pair's cameras, which --stereo stage applies."""
+"""Attribute that marks the left and the right camera of a stage, for `--stereo stage`."""
 _STAGE_FLOAT32_TOLERANCE = 1e-6
 """Tolerance for equal fractions of a frame: a stage stores them in float32."""
 _PIXEL_CENTRE_TOLERANCE_PX = 1e-3

@@ -288,7 +288,7 @@ def _unpack(
 
 
 def _fixed(block: Bytes) -> Float32:
-    """Bytes (n, 9) -> signed 24-bit integers (n, 3)."""
+    """Convert bytes (n, 9) to signed 24-bit integers (n, 3)."""
     wide = np.zeros((len(block), 3, 4), np.uint8)
     wide[:, :, 1:] = block.reshape(-1, 3, 3)
     return (wide.view("<i4")[:, :, 0] >> 8).astype(np.float32)
