@@ -98,7 +98,7 @@ def frame_items(device: Device, tiles: int) -> int:
 
 
 def items_for(tiles: int, units: int, items: int, most: int) -> int:
-    """Number of `frame_items` on a GPU with so many compute units. items, most: the least and the greatest."""
+    """The result of `frame_items` on a GPU with `units` compute units: `items` or more, and at most `most`."""
     while 2 * items <= most and 2 * items * tiles <= _BUSY_ITEMS * units:
         items *= 2
     return items
