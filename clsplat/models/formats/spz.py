@@ -434,7 +434,7 @@ def _to_first_three(unit: Float32) -> Bytes:
 
 
 def _to_smallest_three(unit: Float32) -> Bytes:
-    """Unit quaternions w x y z (n, 4) -> bytes (4 n,), version 3 and later."""
+    """Convert unit quaternions w x y z (n, 4) to bytes (4 n,), as version 3 and later store them."""
     q = unit[:, [1, 2, 3, 0]]
     largest = np.abs(q).argmax(axis=1)
     negate = np.take_along_axis(q, largest[:, None], axis=1) < 0
