@@ -9,7 +9,8 @@ from pathlib import Path
 
 from clsplat.config.checks import parse_bytes
 from clsplat.config.training import TrainConfig
-from clsplat.device.context import Device, DeviceInfo, list_devices, open_devices
+from clsplat.device.context import Device
+from clsplat.device.selection import DeviceInfo, list_devices, open_devices
 from clsplat.errors import InputError, of_argument
 from clsplat.gaussians import Gaussians
 from clsplat.rendering.memory_plan import Plan

@@ -75,8 +75,9 @@ PROJECTIONS: dict[str, CameraModel] = {model.projection: model for model in CAME
 JACOBIAN_CLAMP_HALF_FRAMES = 0.3
 DEFAULT_NEAR_PLANE = 0.01
 """Default near plane in world units, for cameras and models without their own."""
-MIN_NEAR_PLANES_PER_EXTENT = 100.0
-"""A scene gets a smaller near plane if its length unit is less than this many times the default near plane."""
+MIN_SIZE_IN_NEAR_PLANES = 100.0
+"""Minimum of a scene's length unit, and of a small model's size, in near planes: if it is less in default near planes,
+the scene or model gets a smaller near plane."""
 ROTATION_TOLERANCE = 1e-2
 """Largest allowed entry of |R^T R - I|. It is this large because poses may be typed with few digits or be float32."""
 MAX_FOCAL_PX = 1e12

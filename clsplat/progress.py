@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress on standard error: a live bar on a terminal, else a plain line every ten seconds. Also tables of text."""
+"""Progress on standard error: a live bar on a terminal, else a plain line every ten seconds. It also formats tables."""
 
 from __future__ import annotations
 

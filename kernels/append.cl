@@ -24,7 +24,7 @@
 
 // A pair: its slot, then its depth's bits. The lists are in the order of depth, then slot.
 typedef uint2 Pair;
-// Fills up a list in local memory. It comes after every pair.
+// Fills the unused end of a list in local memory. It sorts after every pair.
 #define NO_PAIR ((Pair)(0xffffffff))
 
 // Swaps two pairs if the first comes after the second. One comparison of 64 bits and four selections.
@@ -41,8 +41,8 @@ static inline void order_two(Pair *one, Pair *other) {
 
 // Two steps of the network over pairs (count) in local memory: pairs `step` apart, or in a mirrored step at equal
 // distances from the ends of a block of 2 step, then pairs step / 2 apart. An item does both for four pairs in
-// registers, which may go past `count`, up to the next power of two. If step is 1, the first is one that has been done,
-// or comes before all others and may do anything.
+// registers, which may go past `count`, up to the next power of two. If step is 1, the first is an additional
+// one: it repeats a step that has been done, or comes before all others, when any exchange is allowed.
 static inline void order_steps(__local Pair *pairs, uint count, uint step, int mirrored) {
   const uint apart = max(step / 2, 1u), within = apart - 1;
   const uint near = PLACE(apart), far = PLACE(mirrored ? 3 * apart - 1 : 2 * apart), turned = mirrored ? near : 0;

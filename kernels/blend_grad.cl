@@ -201,7 +201,7 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
 #include "shared/walk.h"
 #endif
 
-// The gradient by a pixel's final transmittance; background: its part through the background's colour.
+// The gradient with respect to a pixel's final transmittance. background: its part through the background's colour.
 #ifdef ALPHA_GRADIENT
 #define AT_END(background) ((background) + by_t)
 #define NEAR_PLANE 4

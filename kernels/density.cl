@@ -49,8 +49,8 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
   radii[row] = radii[row] > radius ? radii[row] : radius;
 }
 
-// contributions (n) of the Gaussians with tiles to this view, in pixels; area: number of full-size pixels in a pixel of
-// this view -> totals, largest (n): sum and maximum over the views.
+// contributions (n) to this view, in pixels, of the Gaussians that have tiles; area: number of full-size pixels in a
+// pixel of this view -> totals, largest (n): sum and maximum over the views.
 __kernel void contribution_statistics(const uint n, const float area, __global const uint *tile_counts,
                                       __global const float *contributions, __global float *totals,
                                       __global float *largest CHUNK_PARAMETERS) {

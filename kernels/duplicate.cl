@@ -217,7 +217,8 @@ __kernel void duplicate_slots(const uint visible, const int tiles_x, const int t
   }
 }
 
-// slot_from_pair (pairs), by depth; tiles, gaussian_from_slot (pairs), by slot -> tile_keys, pair_ids (pairs), by
+// Brings the pairs from the order of slots into the order of depth. Reads slot_from_pair (pairs), in order of depth,
+// and tiles and gaussian_from_slot (pairs), in order of slots; writes tile_keys and pair_ids (pairs), in order of
 // depth.
 __kernel void order_pairs(const uint pairs, __global const uint *slot_from_pair, __global const uint *tiles,
                           __global const uint *gaussian_from_slot, __global uint *tile_keys, __global uint2 *pair_ids) {

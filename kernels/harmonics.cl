@@ -1,4 +1,5 @@
-// Colours from spherical harmonics, in given directions or in the directions from a camera's centre to the means.
+// Colours from spherical harmonics, in given directions or in the directions from a camera's centre to the means. Only
+// the library's calls use it; renders and trainings have their own code in project.cl and shared/sh.h.
 //
 // Owner: A work-item owns LANES Gaussians. Their bases are computed in vectors, their sums one Gaussian at a time.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.

@@ -1,4 +1,5 @@
-// The gradient of colours from spherical harmonics, with respect to the coefficients and the directions.
+// The gradient of colours from spherical harmonics, with respect to the coefficients and the directions. Only the
+// library's calls use it; a training has its own code in shared/project_grad.h.
 //
 // Owner: A work-item owns LANES Gaussians.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.

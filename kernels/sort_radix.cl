@@ -176,7 +176,7 @@ GROUP __kernel void radix_scatter(SCATTER) {
   }
   for (uint tile_begin = begin; tile_begin < end; tile_begin += TILE) {
     const uint count = min((uint)TILE, end - tile_begin);
-    // Padding after the last key gets the largest digit, so that the stable sort leaves it behind all keys.
+    // Padding after the last key gets the largest digit, so that the stable sort leaves it after all keys.
     for (uint i = item; i < TILE; i += ITEMS) {
       tile[GAPPED(i)] = (i < count ? DIGIT(keys[tile_begin + i]) : digits - 1) << 16 | i;
     }

@@ -22,7 +22,7 @@
 // Rounding of a, b and c may change the determinant by this fraction of a c.
 #define ROUNDING 5.9604645e-8f
 
-// log2 of an alpha that is too small for every pixel.
+// log2 of an alpha that is too small to show in any pixel.
 #define NO_ALPHA -1e3f
 
 __kernel void splats(const uint n, const int tiles_x, const int tiles_y, const int width, __global const int *radii,

@@ -28,7 +28,8 @@ from pipeline import QUICK_SHAPES, shaped, shapes_of
 from same_bytes import undisturbed  # noqa: F401  # a fixture
 from tiny import CONFIG, FEW, short, write_scene
 
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 
 begin_session()
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:

@@ -71,8 +71,8 @@ class DemoVerb(Verb):
         if wrong := sorted(name for name in given if name.startswith(others)):
             flag = wrong[0].replace("_", "-")
             raise InputError(
-                f"--{flag}: --town makes photographs and trains nothing, expected it without --town, or as a flag of "
-                "clsplat train"
+                f"--{flag}: has no effect with --town, which trains nothing; omit --town, or give --{flag} to clsplat "
+                "train"
                 if self.town is not None
                 else f"--{flag}: expected it with --town, such as --town 2x2"
             )

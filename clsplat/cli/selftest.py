@@ -19,7 +19,7 @@ from clsplat.progress import aligned
 from clsplat.version import package_version
 
 if TYPE_CHECKING:
-    from clsplat.device.context import DeviceInfo
+    from clsplat.device.selection import DeviceInfo
     from clsplat.selftest.driver_check import DriverReport
     from clsplat.selftest.result import Result
 
@@ -101,8 +101,9 @@ def record(info: DeviceInfo, report: DriverReport) -> dict[str, object]:
 def _bug_report(records: list[dict[str, object]]) -> dict[str, object]:
     """Content of a bug report: the results, times of devices that can be trusted, and facts about the installation."""
     from clsplat.cli.doctor import lines
-    from clsplat.device.context import all_devices, limits
+    from clsplat.device.context import all_devices
     from clsplat.device.drivers.shapes import failures
+    from clsplat.device.selection import limits
 
     for entry, device in zip(records, (all_devices()[int(str(entry["index"]))] for entry in records), strict=True):
         entry |= {"limits": limits(device), "refused": failures(device)}
@@ -120,7 +121,7 @@ def times(device: str) -> dict[str, object]:
     from clsplat.bench.stages import bench
     from clsplat.bench.workload import Subject
     from clsplat.demo.measured_view import measured_view
-    from clsplat.device.context import open_device
+    from clsplat.device.selection import open_device
     from clsplat.errors import ClsplatError
 
     try:

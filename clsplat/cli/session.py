@@ -15,7 +15,8 @@ from clsplat.progress import StageProgress
 
 if TYPE_CHECKING:
     from clsplat.config.training import Lenses, Missing
-    from clsplat.device.context import Device, DeviceInfo
+    from clsplat.device.context import Device
+    from clsplat.device.selection import DeviceInfo
     from clsplat.evaluation.held_out import Evaluation
     from clsplat.gaussians import Gaussians
     from clsplat.rendering.renderer import Renderer
@@ -40,8 +41,8 @@ class Services:
 
     load_scene: Callable[..., Scene] = imported("clsplat.scenes.loading.load_scene")
     findings: Callable[..., list[Finding]] = imported("clsplat.scenes.analysis.photo_findings.findings")
-    open_device: Callable[..., Device] = imported("clsplat.device.context.open_device")
-    open_devices: Callable[..., list[Device]] = imported("clsplat.device.context.open_devices")
+    open_device: Callable[..., Device] = imported("clsplat.device.selection.open_device")
+    open_devices: Callable[..., list[Device]] = imported("clsplat.device.selection.open_devices")
     require: Callable[..., Device] = imported("clsplat.selftest.driver_check.require")
     reconstruct: Callable[..., Path] = imported("clsplat.scenes.sfm.reconstruct.reconstruct")
     train: Callable[..., Gaussians] = imported("clsplat.api.train")
@@ -81,8 +82,8 @@ def load_scene(
 
 def chosen_devices(selector: str | None) -> list[DeviceInfo]:
     """The device that `selector` names, or all devices. Raises DeviceError if there is none."""
-    from clsplat.device.context import find_device, list_devices
     from clsplat.device.drivers.quirks import no_device
+    from clsplat.device.selection import find_device, list_devices
 
     devices = list_devices() if selector is None else [find_device(selector)]
     if not devices:

@@ -33,8 +33,9 @@ class TuneVerb(Verb):
 def run(verb: TuneVerb, _: Services) -> int:
     """Print the time of each kernel shape, and save the quickest."""
     from clsplat.bench.shapes import tune
-    from clsplat.device.context import all_devices, find_device
+    from clsplat.device.context import all_devices
     from clsplat.device.drivers.shapes import default_shape, save_shape, saved_path
+    from clsplat.device.selection import find_device
 
     info = find_device(verb.device.selector)
     device = all_devices()[info.index]

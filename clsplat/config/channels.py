@@ -99,7 +99,7 @@ def floats_of(source: Source) -> dict[str, int]:
 
 
 def feature_names(names: Iterable[str]) -> tuple[str, ...]:
-    """Kernel names of the features among these channels."""
+    """The names in the kernels of those channels that are features."""
     asked = set(names)
     return tuple(row.kernel for name, row in FRAME_CHANNELS.items() if name in asked and row.source == "features")
 

@@ -250,8 +250,8 @@ class TrainConfig:
     Used if masks or alpha mean transparent. Training's background is then random, and --background applies only to
     evaluations."""
     warmup: tuple[int, ...] = (250, 500)
-    """Steps after which the training resolution doubles. With two steps training starts at a quarter of the size, with
-    '' at the full size."""
+    """Training steps after which the resolution doubles. Training starts at a quarter of the size with a list of two,
+    at the full size with ''."""
     resolution: int = 0
     """Longest image side in pixels, in training and evaluation; 0 keeps the images' size up to 1600."""
     photos: Photos = "auto"

@@ -14,7 +14,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.scenes.start.initialise import from_points
 
 MEASURED_GAUSSIANS = 20_000
-"""Number of Gaussians: enough to keep a GPU busy in photographs of this size."""
+"""Number of Gaussians: enough to keep a GPU busy at the size of `measured_view`'s photograph."""
 COEFFICIENTS = 16
 """SH coefficients per channel: degree 3, which training reaches after 3000 steps."""
 

@@ -12,7 +12,7 @@ from clsplat.api import train
 from clsplat.config.cli_defaults import DEMO_ITERATIONS
 from clsplat.config.training import TrainConfig
 from clsplat.demo.ray_caster import write_photos
-from clsplat.device.context import open_device
+from clsplat.device.selection import open_device
 from clsplat.errors import InputError, examples
 from clsplat.evaluation.held_out import Evaluation
 from clsplat.files.atomic import atomic_write

@@ -32,8 +32,8 @@ _begin_read = getattr(
     _inner, "_enqueue_read_buffer", lambda queue, buffer, host, **how: cl.enqueue_copy(queue, host, buffer, **how)
 )
 _begin_fill = getattr(_inner, "_enqueue_fill_buffer", cl.enqueue_fill_buffer)
-"""pyopencl's functions inside `enqueue_copy` and `enqueue_fill_buffer`. Those themselves, which ask the driver about
-both ends and the queue first, where a version has no such functions."""
+"""pyopencl's functions inside `enqueue_copy` and `enqueue_fill_buffer`, which do not first ask the driver about both
+ends and the queue. A version of pyopencl that lacks them gets `enqueue_copy` and `enqueue_fill_buffer`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,10 @@ class DeviceArray:
             self.device.calls.fills += 1
             pattern = np.asarray(value, self.dtype)
             fill = partial(_begin_fill, self.device.queue, self.buffer, pattern, 0, self.nbytes)
-            self._note("fill", fill())
+            try:
+                self._note("fill", fill())
+            except cl.Error as error:
+                raise self.device.failed(_WRITING, error) from None
             for commands in self.device.command_buffers:
                 commands.add_fill(fill, self.buffer.int_ptr, pattern.tobytes(), self.nbytes)
 
@@ -163,7 +166,7 @@ class DeviceArray:
             self.device.under_way.clear()
 
     def _copied(self, work: str, *ends: Any, **how: Any) -> cl.Event:
-        """The event of a copy. Raises DriverError if it fails, or a kernel or the device before it."""
+        """The event of a copy. Raises DriverError or CapacityError if it fails, or a kernel or the device before it."""
         try:
             return cl.enqueue_copy(self.device.queue, *ends, **how)
         except cl.Error as error:
@@ -232,10 +235,7 @@ def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity:
     try:
         buffer = _Buffer(device.context, cl.mem_flags.READ_WRITE, nbytes)
     except cl.MemoryError:
-        raise CapacityError(
-            f"{device.name} has no memory left for a buffer of {amount(nbytes)}, with "
-            f"{amount(device.memory.used)} in use: set --max-device-mem below {amount(device.memory.used)}"
-        ) from None
+        raise device.used_up(f"a buffer of {amount(nbytes)}") from None
     device.memory.add(buffer, nbytes)
     if (word := _poison()) is not None:
         _fill_bytes(device, buffer, word, nbytes)
@@ -389,7 +389,7 @@ class Workspace:
             return result
         if known is not None:
             known[1].check(commands, numbers)
-            for read in known[1].reads:  # copy into the memory of the known result
+            for read in known[1].reads:  # copy into the memory of the result that is returned
                 read()
             return known[0]  # type: ignore[no-any-return]  # as above
         command_buffers = self._command_buffers.setdefault(of, {})

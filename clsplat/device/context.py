@@ -1,35 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Selection of devices, and the class of an open device, which has its queue, kernel shape and kernels."""
+"""The visible devices, and the class of an open device, which has its queue, kernel shape and kernels."""
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from clsplat.config.checks import device_names
-from clsplat.device import forks
 from clsplat.device.command_buffer import CommandBuffer
-from clsplat.device.drivers.capabilities import capabilities_of, pretended
+from clsplat.device.drivers import forks
+from clsplat.device.drivers.capabilities import capabilities_of
 from clsplat.device.drivers.cpu_name import name_processor
 from clsplat.device.drivers.driver_records import tell_once
-from clsplat.device.drivers.quirks import compiles_by_size, no_device, register_limit, subgroup_ways, title
-from clsplat.device.drivers.shapes import Shape, asked_shape, default_shape, shape_of, shape_text
+from clsplat.device.drivers.quirks import compiles_by_size, register_limit, subgroup_ways, title
+from clsplat.device.drivers.shapes import Shape, shape_of
 from clsplat.device.drivers.worker_process import DRIVER_TIMEOUT_VARIABLE, driver_timeout
 from clsplat.device.memory_account import Memory
 from clsplat.device.profile import Calls, Recorder
 from clsplat.device.program import Kernel, Kernels, build, text_of, variant_of
 from clsplat.device.sandbox import KernelTrials
 from clsplat.device.source import kernel_source
-from clsplat.errors import DeviceError, DriverError, KernelBuildError, switched_on
+from clsplat.errors import CapacityError, ClsplatError, DeviceError, DriverError, KernelBuildError, amount, switched_on
 from clsplat.process import undisturbed
 
 T = TypeVar("T")
@@ -37,20 +33,6 @@ T = TypeVar("T")
 SYNC_VARIABLE = "CLSPLAT_SYNC"
 """Environment variable that makes each launch wait for its kernel. So an error message names the kernel that hangs or
 fails."""
-
-
-@dataclass(frozen=True)
-class DeviceInfo:
-    """A device's entry in the list of `clsplat devices`."""
-
-    index: int
-    name: str
-    platform: str
-    version: str
-    kind: str
-    compute_units: int
-    memory_bytes: int
-    shape: str
 
 
 def all_devices() -> list[cl.Device]:
@@ -75,44 +57,6 @@ def _visible() -> list[cl.Device]:
         except cl.Error:
             continue
     return devices
-
-
-def list_devices() -> list[DeviceInfo]:
-    """Every visible OpenCL device, GPUs and CPUs, in the order of their index.
-
-    Raises DeviceError if CLSPLAT_SHAPE or CLSPLAT_PRETEND is invalid for every device.
-    """
-    asked_shape()
-    return [
-        DeviceInfo(
-            index=index,
-            name=device.name.strip(),
-            platform=device.platform.name.strip(),
-            version=device.platform.version.strip(),
-            kind=capabilities_of(device).kind,
-            compute_units=device.max_compute_units,
-            memory_bytes=device.global_mem_size,
-            shape=shape_text(device),
-        )
-        for index, device in enumerate(all_devices())
-    ]
-
-
-def limits(device: cl.Device) -> dict[str, object]:
-    """The device's limits on kernel launches, for a bug report."""
-    names = (
-        *("driver_version", "opencl_c_version", "extensions", "max_clock_frequency", "max_compute_units"),
-        *("max_work_group_size", "local_mem_size", "max_constant_buffer_size", "max_mem_alloc_size", "global_mem_size"),
-        *("mem_base_addr_align", "native_vector_width_float", "single_fp_config", "host_unified_memory"),
-    )
-    values: dict[str, object] = {}
-    for name in names:
-        try:
-            value = getattr(device, name)
-        except cl.Error as error:
-            value = str(error)
-        values[name] = value.strip() if isinstance(value, str) else int(value)
-    return values
 
 
 class Device:
@@ -181,7 +125,7 @@ class Device:
 
         registers: maximum registers per work-item, if the driver has an option for it; 0 for no limit.
         """
-        if self._why_another:  # not shown earlier: until this first use, the self-test may still choose another shape
+        if self._why_another:  # shown only now: until this first use, the self-test may still choose another shape
             tell_once(self._why_another)
         if self._switches:
             text = kernel_source(stem)
@@ -261,7 +205,10 @@ class Device:
         *,
         wait: bool = False,
     ) -> cl.Event:
-        """Put a kernel on the queue. Wait for it if `wait`, or if CLSPLAT_SYNC=1. Raises DriverError."""
+        """Put a kernel on the queue. Wait for it if `wait`, or if CLSPLAT_SYNC=1.
+
+        Raises DriverError, and CapacityError if the device has no memory left for it.
+        """
         try:
             event = kernel.cl_kernel(self.queue, size, local, *values)
             self.calls.launches += 1
@@ -276,7 +223,9 @@ class Device:
             commands.add_launch(self.queue, kernel, size, local, values)
         return event
 
-    def _not_launched(self, kernel: Kernel, error: cl.Error) -> DriverError:
+    def _not_launched(self, kernel: Kernel, error: cl.Error) -> ClsplatError:
+        if isinstance(error, cl.MemoryError):
+            return self.used_up(f"{kernel.name} of {kernel.variant.stem}.cl")
         return self.trials.error(kernel.variant, kernel.name, f"cannot be launched: {' '.join(str(error).split())}")
 
     def record(self, work: Callable[[], T], given: Sequence[cl.Buffer] = ()) -> tuple[T, CommandBuffer | None]:
@@ -294,7 +243,7 @@ class Device:
         return result, commands if commands.is_all_of(self.calls.since(before)) else None
 
     def replay(self, commands: CommandBuffer) -> None:
-        """Put the commands of a command buffer on the queue. Raises DriverError, like `enqueue`."""
+        """Put the commands of a command buffer on the queue. Raises DriverError and CapacityError, like `enqueue`."""
         kernel = None
         try:
             for kernel, call in commands.entries:  # noqa: B007  # the loop variable names the kernel in an error
@@ -324,16 +273,26 @@ class Device:
             raise self.trials.error(kernel.variant, kernel.name, f"failed with OpenCL's status {status}")
 
     def finish(self) -> None:
-        """Wait until the device is idle. Raises DriverError."""
+        """Wait until the device is idle. Raises DriverError and CapacityError."""
         try:
             self.queue.finish()
         except cl.Error as error:
             raise self.failed("waiting for the device", error) from None
         self.under_way.clear()
 
-    def failed(self, work: str, error: cl.Error) -> DriverError:
+    def failed(self, work: str, error: cl.Error) -> ClsplatError:
         """The error of a command that is no launch. A kernel's failure, or a lost device, may show only there."""
+        if isinstance(error, cl.MemoryError):
+            return self.used_up(work)
         return DriverError(f"{title(self.cl_device)}: {work} failed ({' '.join(str(error).split())})")
+
+    def used_up(self, work: str) -> CapacityError:
+        """The error if the driver finds no memory for something, at its allocation or, with many drivers, at its first
+        use."""
+        used = amount(self.memory.used)
+        return CapacityError(
+            f"{self.name} has no memory left for {work}, with {used} in use: set --max-device-mem below {used}"
+        )
 
     def timed(self, work: Callable[[], T]) -> tuple[T, float]:
         """The result of `work`, and the milliseconds that it took. The device is idle before and after."""
@@ -395,109 +354,3 @@ class Device:
 
     def __repr__(self) -> str:
         return f"<Device {self.name} | {self.driver.split('  ')[0].strip()} | {self.shape.label}>"
-
-
-def select(selector: str | None) -> cl.Device:
-    """The device for a selector: an index, `cpu`, `gpu`, or part of a device's name, platform or version.
-
-    None selects by `CLSPLAT_DEVICE` if set, else the first GPU, else the first device. Raises DeviceError.
-    """
-    driver_timeout()  # raises InputError for an invalid environment variable now, not at the first kernel
-    devices = list(zip(all_devices(), list_devices(), strict=True))
-    if not devices:
-        raise no_device()
-    named = f"--device {selector}" if selector else f"CLSPLAT_DEVICE={os.environ.get('CLSPLAT_DEVICE', '')}"
-    selector = selector or os.environ.get("CLSPLAT_DEVICE") or None
-    if selector is None:
-        return next((device for device, info in devices if info.kind == "gpu"), devices[0][0])
-    wanted = selector.lower() if selector.strip() else None  # a blank would match any name
-    for device, info in devices:
-        words = f"{info.name} {info.platform} {info.version}".lower()
-        by_name = wanted is not None and (wanted == info.kind or wanted in words)
-        if int(selector) == info.index if selector.isdigit() else by_name:
-            return device
-    names = "; ".join(f"{info.index}: {info.name} ({info.version.split('  ')[0]})" for _, info in devices)
-    raise DeviceError(f"{named}: no such device, expected cpu, gpu, a part of a name, or an index of these: {names}")
-
-
-def find_device(selector: str | None) -> DeviceInfo:
-    """The entry of the device that `selector` names (see `select`). Raises DeviceError."""
-    chosen = select(selector)
-    return list_devices()[all_devices().index(chosen)]
-
-
-def _names(selector: str | None) -> list[str]:
-    """The selectors in `selector`, which are separated by commas. Raises DeviceError if it is not text."""
-    if not isinstance(selector, str | None):
-        raise DeviceError(f"device is {selector!r}, expected text, such as '0', 'gpu' or a part of a name")
-    return device_names(selector)
-
-
-def _part_of(name: str) -> tuple[str, int | None]:
-    """NAME and NUMBER of a part, written NAME/NUMBER; the number is None for a whole device."""
-    whole, slash, number = name.rpartition("/")
-    return (whole, int(number)) if slash and whole and number.isdigit() else (name, None)
-
-
-@lru_cache(maxsize=8)
-def _divided(index: int, parts: int) -> list[cl.Device]:
-    """Equal parts of the `index`-th device, by OpenCL's device fission; empty if it cannot be divided equally."""
-    device = all_devices()[index]
-    try:
-        units = device.max_compute_units // parts
-        return list(device.create_sub_devices([cl.device_partition_property.EQUALLY, units])) if units else []
-    except cl.Error:
-        return []
-
-
-@lru_cache(maxsize=8)
-def _open(
-    index: int, shape: Shape, why: str, _pretended: str, *, profile: bool, part: tuple[int, int] | None = None
-) -> Device:
-    device = all_devices()[index]
-    if part is None:
-        return Device(device, shape, profile=profile, why=why)
-    divided = _divided(index, part[1])
-    if len(divided) < part[1]:
-        units = f"{device.max_compute_units} compute unit{'' if device.max_compute_units == 1 else 's'}"
-        raise DeviceError(
-            f"--device {index}/{part[0]}: {title(device)}, with {units}, cannot be divided into {part[1]} equal parts; "
-            f"expected a device that can be divided, or --device {index} for the whole"
-        )
-    chosen = divided[part[0]]
-    shape = replace(shape, chunks=default_shape(chosen).chunks)
-    return Device(chosen, shape, profile=profile, why=why, part=(device, part[0]))
-
-
-def open_devices(
-    selector: str | None = None, memory_limit: int | None = None, *, profile: bool = False
-) -> list[Device]:
-    """Open the devices of a list of selectors (see `select`), separated by commas.
-
-    NAME/K is part K, from 0, of a device. OpenCL divides the device into max(2, largest K + 1) equal parts.
-    Without a limit, repeated calls return the same object for the same device.
-
-    memory_limit: maximum bytes of all buffers of each returned device.
-    profile: make queues that record timings.
-    Raises DeviceError if a device is named twice.
-    """
-    chosen: list[tuple[int, int | None]] = []
-    for name in _names(selector):
-        whole, number = _part_of(name)
-        index = all_devices().index(select(whole if selector or number is not None else None))
-        if any(index == other and (number == part or None in (number, part)) for other, part in chosen):
-            raise DeviceError(f"--device {selector}: has {name} twice, expected different devices, or parts of them")
-        chosen.append((index, number))
-    opened = []
-    for index, number in chosen:
-        parts = max([2, *(part + 1 for other, part in chosen if other == index and part is not None)])
-        part = None if number is None else (number, parts)
-        opened.append(_open(index, *shape_of(all_devices()[index]), pretended(), profile=profile, part=part))
-    return opened if memory_limit is None else [device.with_memory_limit(memory_limit) for device in opened]
-
-
-def open_device(selector: str | None = None, memory_limit: int | None = None, *, profile: bool = False) -> Device:
-    """Open the one device that `selector` names (see `open_devices`)."""
-    if len(_names(selector)) > 1:
-        raise DeviceError(f"--device {selector}: expected one device here; only train and render take several")
-    return open_devices(selector, memory_limit, profile=profile)[0]

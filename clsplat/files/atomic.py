@@ -104,7 +104,7 @@ def atomic_name(path: str | os.PathLike[str], needs: int | None = None) -> Itera
         written = 0
         with suppress(OSError):
             written = temporary.stat().st_size
-            temporary.unlink()  # before the message, which tells the free space
+            temporary.unlink()  # removed before the message is made, which tells the free space
         names = (None, str(temporary), str(path))
         if isinstance(error, OSError) and error.errno and not isinstance(error, WriteError) and error.filename in names:
             # The error names the temporary file, which users do not know, or no file if the disk is full.

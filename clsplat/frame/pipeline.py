@@ -167,9 +167,10 @@ class FramePipeline:
         return drawn
 
     def draw_deep(self, bins: int, frame: FrameRequest) -> tuple[DrawDeep, Convert, Callable[[Camera], int]]:
-        """Like `draw` for deep pictures: the DrawDeep, and the function that converts its colours to the file's.
+        """Prepare a deep frame, like `draw` a flat one.
 
-        The third result is a function from a camera to the number of rows in its strips.
+        Returns the function that renders it, the function that converts its colours to those of the file, and a
+        function from a camera to the number of rows of a strip.
         """
         sampling, colours, device = self._sampling(frame), self.colours, self._renderer.device
         space = colours.light if self._in_light(frame) else colours.model
@@ -194,7 +195,7 @@ class FramePipeline:
         return draw, between(space, colours.output), rows
 
     def _with_ranks(self, planes: Planes) -> Planes:
-        """The planes, with mattes in the form that is written to files."""
+        """The planes, in which mattes are converted to the form that files have."""
         return {
             name: ranked(plane, self._mattes[name].names) if name in self._mattes else plane
             for name, plane in planes.items()

@@ -45,7 +45,7 @@ def strip_rows(
     samples = config.supersample if config else 1
     most = min(frame_pixels(device, feature_floats(names), planes), STRIP_PIXELS)
     across = -(-camera.width * samples // TILE) * TILE * samples
-    rows = most // across - 2 * TILE  # for windows that begin inside a tile, and margins of a filter
+    rows = most // across - 2 * TILE  # leaves room for windows that begin inside a tile, and for a filter's margins
     if rows >= camera.height:
         return camera.height
     return max(rows // TILE, 1) * TILE

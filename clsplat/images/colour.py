@@ -147,11 +147,12 @@ class Colours:
             self._ocio_name(LINEAR)
 
     def is_linear(self, space: str) -> bool:
-        """True if `space`, one of the job's, is linear."""
+        """True if `space`, a colour space of the job, is linear."""
         return space == LINEAR or (space != SRGB and bool(self._config.isColorSpaceLinear(space)))
 
     def has_rec709(self, space: str) -> bool:
-        """True if `space`, one of the job's, has Rec.709's primaries and white point. Its curve does not matter."""
+        """True if `space`, a colour space of the job, has Rec.709's primaries and white point, with any transfer
+        curve."""
         if space in _SPACE_ALIASES:
             return True
         light = np.array([[[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]], np.float32)
@@ -241,8 +242,8 @@ class Colours:
     def _matrix(self, source: str, target: str) -> Float32 | None:
         """Matrix (3, 3) of a conversion, a row for each source channel; None if the conversion is not linear.
 
-        With a matrix OpenImageIO need not convert each frame: each call loads the configuration again, which takes
-        longer than a frame.
+        With a matrix, frames are converted without OpenImageIO. Its every call loads the configuration again, which
+        takes longer than rendering a frame.
         """
         light = np.array([[[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0], [4, -1, 2], [0.2, 0.01, 0.5]]], np.float32)
         colours = self._converted(light, source, target)

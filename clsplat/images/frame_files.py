@@ -327,7 +327,10 @@ def deep_spec(width: int, height: int, encoding: Encoding, header: FrameFileHead
 
 
 def _exr_spec(shape: tuple[int, ...], names: Sequence[str], formats: Sequence[Any], header: FrameFileHeader) -> Any:
-    """OpenImageIO's specification of an EXR part. formats: one for each channel, or one for all channels."""
+    """OpenImageIO's specification of an EXR part.
+
+    formats: a pixel format for each channel, or a single one for all channels.
+    """
     several = len(set(formats)) > 1
     spec = _spec(shape, names, oiio.FLOAT if several else formats[0], header)
     if several:
@@ -360,7 +363,8 @@ def _spec(shape: tuple[int, ...], names: Sequence[str], kind: Any, header: Frame
 
 
 def record_text(attributes: Mapping[str, Any]) -> str:
-    """Provenance record of a header's attributes, as text for headers without custom ones; '' if there is none."""
+    """The provenance among a header's attributes as one text, for formats without custom attributes; '' if a digest is
+    missing."""
     model, settings = attributes.get(MODEL_DIGEST_ATTRIBUTE), attributes.get(SETTINGS_DIGEST_ATTRIBUTE)
     return f"clsplat model {model} settings {settings}" if model and settings else ""
 

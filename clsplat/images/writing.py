@@ -112,7 +112,7 @@ def write_rows(path: Path, spec: Any, kind: str, pieces: Iterable[tuple[Any, int
                 reasons.append(file.geterror())  # OpenImageIO reports the error to this thread only
             return done
 
-        with ThreadPoolExecutor(1) as pool:  # compression takes longer than rendering most frames
+        with ThreadPoolExecutor(1) as pool:  # for most frames, compression takes longer than rendering
             under_way = None
             for pixels, count in pieces:
                 if under_way is not None:

@@ -13,7 +13,8 @@ from numpy.typing import DTypeLike
 
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import DeviceArray, Workspace
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.errors import of_argument
 from clsplat.rendering.build_flags import kernel_defines
 

@@ -18,7 +18,8 @@ from clsplat.gaussians import Gaussians
 from clsplat.models.edit import take
 
 CACHED_SAMPLES_SINGLE, CACHED_SAMPLES_PAIR = 2, 3
-"""Number of samples in memory after a request for one sample, or for two neighbours. One is the next sample."""
+"""Number of samples kept in memory after a request for one sample, or for two neighbours. It is one more than
+requested, as the next sample is read ahead."""
 MAX_TRACKED_CHANGE_RATIO = 0.25
 """Largest ratio at which rows count as tracked, that is, as the same Gaussian in two samples. The ratio is the median
 change of a row between the samples over the median difference of two rows.
@@ -43,10 +44,10 @@ class ModelSeries:
     ) -> None:
         """Read the first sample.
 
-        frames: frames of the samples, ascending.
+        frames: frames of the samples, in increasing order.
         read: function that reads the sample at an index; raises InputError.
         where: prefix of messages.
-        held: keep the means of the first sample before it, and of the last sample after it.
+        held: True to keep the means fixed before the first sample and after the last; else their motion continues.
         """
         self.frames, self.where, self.held = tuple(frames), where, held
         self._read = read

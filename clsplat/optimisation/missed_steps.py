@@ -28,7 +28,7 @@ class MissedSteps:
             factors = np.zeros((MOST_MISSED + 1, len(groups), 3))
             factors[:, :, 1:] = 1.0
         self.groups, self.factors = tuple(groups), factors
-        # The kernels of Adam have the decays in float32: over 256 steps 0.999 differs by 3e-6 from that.
+        # Adam's kernels have the decays in float32. Over 256 steps, 0.999 in float64 would differ from theirs by 3e-6.
         self._decays = np.array([config.beta1, config.beta2], np.float32).astype(np.float64)
 
     def add(self, scales: Mapping[str, float]) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Entries of photographs and lenses: distances in a picture, pull, and update by Adam.
+"""The entries of photographs and lenses: distances in a picture, the pull to initial values, and the update by Adam.
 
 Float64 twin of kernels/appearance.cl and kernels/shared/develop.h.
 """

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The lists of tiles, by one sort of all pairs: twin of kernels/append.cl, and of duplicate.cl and ranges.cl."""
+"""The lists of tiles, made by one sort of all pairs: the twin of kernels/append.cl, and of duplicate.cl with
+ranges.cl."""
 
 from __future__ import annotations
 

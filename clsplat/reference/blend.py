@@ -182,7 +182,7 @@ def blend_grad(
         gradients.colors[gaussian] = (weight[:, :, None] * d_image[box]).sum(axis=(0, 1))
         behind[box] += alpha[:, :, None] * (color - behind[box])
 
-        free = added & (splat.raw <= BLEND_ALPHA_MAX)  # at the cap, alpha does not depend on the Gaussian
+        free = added & (splat.raw <= BLEND_ALPHA_MAX)  # an alpha at the cap does not depend on the Gaussian
         _set_shape_gradients(gradients, projected, gaussian, splat, np.where(free, d_alpha, 0.0), alpha)
     return gradients
 

@@ -66,7 +66,8 @@ def features(
 ) -> dict[str, Float64]:
     """Features of each Gaussian, arrays (N, 1 to 3), keyed by channel.
 
-    before: the camera of backward motion; None for `after`.
+    after: the camera to which forward motion leads.
+    before: the camera to which backward motion leads; None for `after`.
     """
     arrays = parameters(gaussians)
     means = arrays["means"]
@@ -82,7 +83,10 @@ def features(
 def channels(
     projected: Seen, gaussians: Gaussians, camera: Camera, after: Camera, earlier: Camera | None = None
 ) -> ChannelsTwin:
-    """Blend the channels front to back. earlier: the camera of backward motion; None for `after`."""
+    """Blend the channels front to back.
+
+    after, earlier: cameras, as `after` and `before` of `features`.
+    """
     width, height = camera.width, camera.height
     by_name = features(projected, gaussians, camera, after, earlier)
     rows = np.concatenate(list(by_name.values()), axis=1)

@@ -33,7 +33,7 @@ class Deep:
 
 
 class _Cut:
-    """State of the loop (73) over layers. slack: for each pixel. whole: the light in front of all layers."""
+    """State of the loop (73) over layers. slack: the slack s of each pixel. whole: the light in front of all layers."""
 
     def __init__(self, slack: Float64, whole: Float64) -> None:
         self.slack, self.count = slack, np.ones(slack.shape, np.int64)

@@ -26,8 +26,8 @@ LOW_PASS_ANTIALIASED_PX2 = 0.1
 MIN_COMPENSATION = 0.005
 COLOUR_LIMIT = 1e9
 BOX_SLACK = 0.1
-"""Added to the bound q <= 2 ln(255 o) of a Gaussian's box. So alphas down to 5 % below 1/255 are evaluated, and margins
-up to 5 % are correct."""
+"""Added to the bound q <= 2 ln(255 o) of a Gaussian's box. So alphas down to 5 % below 1/255 are evaluated, and the
+margins between alphas and 1/255 are correct up to 5 %."""
 
 PARAMETER_NAMES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 """The arrays of `Gaussians` that `project` takes, in its order."""

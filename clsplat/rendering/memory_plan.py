@@ -108,6 +108,7 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
 
     If not everything fits at once, the tiles are divided into bands. If that would make many bands, the parameters are
     also streamed in parts. Bands come first because they repeat little work, while parts cross the bus in every step.
+    A frame with more pairs than `Plan.pairs` is divided by `stages.duplicate.plan_bands`.
 
     alignment: the number of rows is a multiple of this.
     Raises CapacityError if not even the smallest pieces fit.
@@ -133,6 +134,7 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
         least = budget - room + alignment * need.model + max(need.gaussians // 8, 1) * need.pair
         raise CapacityError(
             f"{need.gaussians:,} Gaussians at this size of image need at least about {mebibytes(least)} of device "
-            f"memory, or {mebibytes(need.total)} to be processed at once, but {mebibytes(budget)} are allowed"
+            f"memory, or {mebibytes(need.total)} to be processed at once, but {mebibytes(budget)} are allowed: allow "
+            "more (--max-device-mem), or use a smaller resolution or fewer Gaussians"
         )
     return streamed

@@ -82,7 +82,7 @@ class ForwardPass:
 
     bands: one band of all tiles, unless memory is short.
     listed: the lists of the last band.
-    refused: the counts that `adam` had written to `Rasterizer.readback` when this pass read it back.
+    refused: how many elements Adam has refused to update, by reason (`REFUSED`), when this pass read the counts back.
     """
 
     camera: Camera
@@ -95,7 +95,7 @@ class ForwardPass:
     refused: tuple[int, ...] = ()
 
     def by(self, camera: Camera) -> ForwardPass:
-        """The same arrays as the pass of another camera of this model and size."""
+        """A copy of this pass, with the same arrays, for another camera of the same model and size."""
         lists = (self.projected, self.bands, self.listed, self.blended)
         return self if camera is self.camera else ForwardPass(camera, self.camera_array, self.background, *lists)
 

@@ -15,7 +15,8 @@ from clsplat.camera import Camera
 from clsplat.config.checks import parse_bytes
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import DeviceArray, upload
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.errors import InputError, of_argument
 from clsplat.gaussians import Gaussians
 from clsplat.images.holdouts import Surfaces
@@ -66,7 +67,7 @@ Other channels, if requested: (H, W) or (H, W, floats) float32, as docs/channels
 
 
 def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:
-    """The SH coefficients of a model that the settings keep for rendering, and how they are stored.
+    """Which SH coefficients of a model the settings keep for rendering, and how they are stored.
 
     Raises InputError if a coefficient is too large for float16.
     """
@@ -351,7 +352,11 @@ class _MotionEnd:
 def _motion_end(
     name: str, camera: Camera, other: Camera | None, gaussians: Gaussians | None, *, asked: bool
 ) -> _MotionEnd:
-    """The end of the motion from a camera to another, or to itself. Raises InputError, which names the channel."""
+    """The end of the motion that a channel shows: from `camera` to `other`, or to `camera` itself if `other` is None.
+
+    name: name of the channel, for the InputError that this may raise.
+    asked: True if the channel is wanted.
+    """
     other = other or camera
     other.check()
     if asked and camera.model.without_motion:
@@ -373,7 +378,7 @@ def _in_the_world(named: ChannelResult, camera: Camera, gaussians: Gaussians | A
     origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
     if (of_distances := camera.depths_of_distances()) is not None:
         named |= {name: named[name] * of_distances for name in ("depth", *DEPTH_PLANES)}
-    if "position" in named and origin.any():  # as precise as float32 allows
+    if "position" in named and origin.any():  # the sum is as precise as float32 allows
         shown = named["count"][:, :, None] > 0
         named["position"] = np.where(shown, named["position"] + origin, 0).astype(np.float32)
     return named

@@ -158,7 +158,8 @@ def _kept(curve: ChartSeries, log_y: bool) -> Points:
 
 
 def _heights(drawn: Sequence[ChartSeries], log_y: bool) -> list[list[float]]:
-    """Values of each series on the y axis. For areas, they are the sums of the stack."""
+    """The y values of each series, on the scale of the axis. For areas they are the sums of the stack up to the
+    series."""
     heights = [[math.log10(y) if log_y else y for _, y in curve.points] for curve in drawn]
     stacked: list[list[float]] = np.cumsum(heights, axis=0).tolist() if drawn[0].kind == "area" else heights
     return stacked

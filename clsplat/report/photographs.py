@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of a report on photographs: their masks, and their exposures as learnt."""
+"""The parts of a report that are about photographs: their masks, and the exposures that were learnt for them."""
 
 from __future__ import annotations
 

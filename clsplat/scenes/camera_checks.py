@@ -171,7 +171,7 @@ def _poses(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
         if meeting < MIN_CONVERGING_FRACTION_INVERTED or _facing(flat) > MAX_CONVERGING_FRACTION_AS_GIVEN:
             return ""
         evidence = (
-            f"the cameras face no common point, but {100 * meeting:.0f} % face one place if the poses have {words}"
+            f"the cameras face no common point, but {100 * meeting:.0f} % of them face one if the poses have {words}"
         )
     return f"{evidence}: were they exported like that? Export them again, or correct the file"
 

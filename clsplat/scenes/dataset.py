@@ -180,7 +180,8 @@ class Lens:
         return replace(self, width=width, height=height, params=tuple(params))
 
     def refocused(self, log: float, x: float, y: float) -> Lens:
-        """Same lens with focal lengths times exp(log), and principal point shifted by x and y focal lengths."""
+        """The same lens with its focal lengths multiplied by exp(log), and its principal point shifted by x and y, in
+        focal lengths."""
         camera, params = self._camera(), list(self.params)
         shift = (x * camera.focal_length_x, y * camera.focal_length_y)
         for index, by in zip(camera.principal_point_idxs(), shift, strict=True):

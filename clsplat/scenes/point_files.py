@@ -133,7 +133,7 @@ def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
 
 
 def _read_las(path: Path) -> Cloud:
-    """Read a LAS or LAZ with laspy."""
+    """Read a LAS or LAZ file with laspy."""
     with open_input(path, "a cloud of points") as file:
         if file.read(4) != b"LASF":
             raise InputError(f"{path}: is not a LAS or LAZ file, although it has such an extension")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
-from clsplat.camera import DEFAULT_NEAR_PLANE, MIN_NEAR_PLANES_PER_EXTENT, Camera
+from clsplat.camera import DEFAULT_NEAR_PLANE, MIN_SIZE_IN_NEAR_PLANES, Camera
 from clsplat.config.depth import NO_DEPTH, DepthUse
 from clsplat.config.points import SCENE_POINTS_ONLY, StartPoints
 from clsplat.config.training import MANY_PHOTOGRAPHS
@@ -335,7 +335,7 @@ class Scene:
     @property
     def near(self) -> float:
         """Near plane, in world units, of a model of this scene (docs/decisions/0019)."""
-        return min(DEFAULT_NEAR_PLANE, self.length_unit / MIN_NEAR_PLANES_PER_EXTENT)
+        return min(DEFAULT_NEAR_PLANE, self.length_unit / MIN_SIZE_IN_NEAR_PLANES)
 
 
 def spread(items: Sequence[T], most: int) -> list[T]:

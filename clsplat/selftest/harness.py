@@ -103,7 +103,10 @@ def cropped(planes: Array, size: Camera | tuple[int, int]) -> Array:
 
 
 def planes_of(image: Array, beside: float = 0.0) -> Float32:
-    """Planes (C, rows, stride) of an image (H, W, C). beside: the value of the padding."""
+    """Planes (C, rows, stride) of an image (H, W, C).
+
+    beside: the value of the pixels beside the image, which pad the planes.
+    """
     height, width, channels = image.shape
     planes = np.full((channels, *padded_size(width, height)), beside, np.float32)
     planes[:, :height, :width] = image.transpose(2, 0, 1)
@@ -133,7 +136,7 @@ class CaseBench:
     def twice(self, launch: Callable[[], T], take: Callable[[T], list[Array]]) -> tuple[T, StageOutcome]:
         """Run a stage twice. Returns its second result, and the outcome with the arrays on the host and milliseconds.
 
-        A difference from the first run, which includes the kernel builds, is reported as trouble.
+        A difference from the first run, which includes the kernel builds, is reported as a fault.
         """
         first = take(launch())
         value, ms = self.device.timed(launch)

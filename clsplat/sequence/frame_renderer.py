@@ -12,7 +12,7 @@ from clsplat.camera import Camera
 from clsplat.config.channels import light_and_rest
 from clsplat.config.pictures import DEEP_STRIP_FLOATS
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.device.context import open_device
+from clsplat.device.selection import open_device
 from clsplat.errors import DriverError, warn
 from clsplat.frame.deep_exr import write_deep
 from clsplat.frame.draw import Planes, feature_floats, on_tiles
@@ -251,7 +251,7 @@ class FrameRenderer:
         """
         framing = self.options.pictures.framing
         rows = strip_rows(self._renderer.device, camera, self.options.channels, framing, planes)
-        floats = self._objects * camera.width * framing.supersample**2  # for the planes of all objects
+        floats = self._objects * camera.width * framing.supersample**2  # floats in a row of the planes of all objects
         most = DEEP_STRIP_FLOATS // max(floats, 1)
         return rows if most >= camera.height else min(rows, max(most // TILE, 1) * TILE)
 

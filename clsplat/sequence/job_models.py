@@ -80,7 +80,7 @@ class JobModels:
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """Frame numbers, rising, for which changing models have files."""
+        """Frame numbers, in increasing order, for which changing models have files."""
         return tuple(sorted({number for files in self.numbered for number in files}))
 
     def state(self, frame: float) -> State | None:

@@ -159,11 +159,12 @@ class Task:
 
     @property
     def views(self) -> tuple[Task, ...]:
-        """The frames that the file holds: this one, and the right eye's if one file has both."""
+        """The frames that the file holds: this one, and the right eye's if one file has both eyes."""
         return (self,) if self.right is None else (self, self.right)
 
     def at(self, time: float) -> Camera:
-        """Camera of the whole frame at a time in frames from the frame, with the models' near plane and ray setting."""
+        """Camera of the whole frame at a time, in frames after this one; with the models' near plane and ray
+        setting."""
         near = self.nears.get(time)
         if time == 0 or self.stretch is None:
             return self.camera if near in (None, self.camera.near) else replace(self.camera, near=near)

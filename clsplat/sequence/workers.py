@@ -168,7 +168,7 @@ def run_tasks(
             devices.submit(render, renderer).add_done_callback(tell_failure)
         for record in encoded(tasks, (finished.get().result() for _ in tasks), video):
             if video is not None:
-                room.release()  # frames start in order, so that the next frame of the video already holds a place
+                room.release()  # frames start in order, so that the video's next frame never waits for this place
             on_done(record)
     except KeyboardInterrupt:
         abandon()  # a thread may wait for a driver that hangs

@@ -27,7 +27,8 @@ UNKNOWN_FIELD_PATTERN = re.compile(r"%[-+ ]?\d*\.?\d*[diouxXeEfgGcsV]|[{}][^{}]*
 
 
 def parse_frames(text: str) -> list[int]:
-    """Frame numbers of a list such as 1-100, 1-100:2, 1-100x2, 10-1 or 7,12,30-40, without duplicates, in rising order.
+    """Frame numbers of a list such as 1-100, 1-100:2, 1-100x2, 10-1 or 7,12,30-40, without duplicates, in increasing
+    order.
 
     A step counts from the start of its range and must be at least 1. Negative numbers are allowed: -5--1 is five
     frames. Raises InputError for any other text.
@@ -52,7 +53,7 @@ def parse_frames(text: str) -> list[int]:
 
 
 def ranges(frames: Sequence[int]) -> str:
-    """Short text for rising frame numbers, such as 1-3,7. Only the first eight ranges are listed."""
+    """Short text for frame numbers in increasing order, such as 1-3,7. Only the first eight ranges are listed."""
     runs: list[list[int]] = []
     for frame in frames:
         if runs and frame == runs[-1][1] + 1:
@@ -97,7 +98,7 @@ def has_number(pattern: str) -> bool:
 
 
 def numbered_files(pattern: str) -> dict[int, Path]:
-    """Existing files that match a pattern such as `model.####.ply`, by frame number, in rising order.
+    """Existing files that match a pattern such as `model.####.ply`, by frame number, in increasing order.
 
     Several fields, such as one in the folder and one in the file name, stand for the same number. Raises InputError for
     an unknown field.

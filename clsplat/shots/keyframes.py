@@ -35,16 +35,17 @@ class Key:
 def interpolate(keys: Sequence[Key], frames: Sequence[float], *, loop: float | None = None) -> list[Camera]:
     """Interpolate cameras at `frames`. Before the first key and after the last, the camera stays at that key.
 
-    keys: key frames at rising frames, with cameras of one size and projection.
+    keys: key frames in increasing order of frame, with cameras of one size and projection.
     loop: number of frames after which the first key repeats; must exceed the span of the keys.
-    Rotations take the shorter arc from key to key; rolls turn through their full difference. Raises ValueError for no
-    keys, or frames that do not rise.
+    Rotations take the shorter arc from key to key; rolls turn through their full difference.
+
+    Raises ValueError if there are no keys, if they are not in this order, or if they span `loop` frames or more.
     """
     if not keys:
         raise ValueError("expected at least one key")
     times = np.array([key.frame for key in keys], np.float64)
     if not (np.diff(times) > 0).all() or (loop is not None and not times[-1] - times[0] < loop):
-        raise ValueError("expected keys at rising frames, which span less than the loop if there is one")
+        raise ValueError("expected keys in increasing order of frame, which span less than the loop if there is one")
     at = np.asarray(frames, np.float64)
     positions = np.stack([key.camera.position for key in keys])
     rotations = Rotation.from_matrix(np.stack([key.camera.rotation.T for key in keys]))
@@ -105,7 +106,7 @@ def tangents(times: Float64, slopes: Float64) -> Float64:
     result = np.concatenate([slopes[:1], slopes[-1:]])
     if len(slopes) > 1:
         inner = (after * slopes[:-1] + before * slopes[1:]) / (before + after)
-        # at an end, the slope of the same parabola, unless it points backwards
+        # the tangent at an end is the slope of the same parabola, unless that points backwards
         first = ((2 * before[0] + after[0]) * slopes[0] - before[0] * slopes[1]) / (before[0] + after[0])
         last = ((2 * after[-1] + before[-1]) * slopes[-1] - after[-1] * slopes[-2]) / (before[-1] + after[-1])
         first = first if first @ slopes[0] > 0 else np.zeros_like(first)

@@ -27,7 +27,7 @@ class Moments:
     """Cameras of one frame at several times, evaluated in advance for processes that cannot read the shot's source.
 
     first: the camera at the first time.
-    times: (T,), rising, in frames relative to the frame.
+    times: (T,), in increasing order, in frames relative to the frame.
     values: (T, 18), the quantities that change over time: fx, fy, cx, cy, near, far, rotation (9) and translation (3).
     """
 
@@ -43,8 +43,8 @@ class Moments:
         for time, camera in zip(rising, cameras, strict=True):
             if camera.projection != cameras[0].projection:
                 raise InputError(
-                    f"an open shutter: the camera is {cameras[0].projection} {rising[0]:g} frames from the frame and "
-                    f"{camera.projection} {time:g} frames from it, expected one projection"
+                    f"an open shutter: {rising[0]:g} frames from the frame its camera is {cameras[0].projection}, and "
+                    f"{time:g} frames from it {camera.projection}; expected one projection"
                 )
         return cls(cameras[0], rising, np.array([_values(camera) for camera in cameras]))
 

@@ -41,7 +41,7 @@ class Optics:
 
     @property
     def still(self) -> Optics:
-        """The same settings with an instantaneous shutter and a pinhole."""
+        """The same settings with an instantaneous shutter, and a pinhole in place of the lens."""
         return replace(self, shutter=(0.0, 0.0), f_stop=0.0)
 
     def named(self) -> Iterator[str]:

@@ -43,12 +43,12 @@ class Frame:
 class Shot:
     """The frames to render, and settings of their source.
 
-    frames: frames in rising order of their numbers.
+    frames: frames in increasing order of their numbers.
     warnings: one line each, for the user.
     fps: frames per second, if the source gives it.
     unapplied: names of the source's settings that are not applied to the frames.
     moment: the camera at a time in frames, if the source defines one for every time.
-    authored: rising times at which the source has values.
+    authored: times at which the source has values, in increasing order.
     reach: first and last time at which the source has values for the camera's transform.
     window: part of the frame that the source asks for, as in `usd_settings.Settings`.
     """

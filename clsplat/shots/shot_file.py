@@ -54,7 +54,7 @@ _TRANSFORM_STEPS: dict[str, tuple[int, Callable[[list[float]], Float64]]] = {
 
 @dataclass(frozen=True, eq=False)
 class AnimatedProperty:
-    """A property over time: rising frames (k,), and the values (k, d) at these."""
+    """A property over time: frames (k,) in increasing order, and the values (k, d) at these."""
 
     frames: Float64
     values: Float64

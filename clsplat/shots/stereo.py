@@ -27,8 +27,9 @@ def for_eye(pattern: str, eye: str) -> str:
 
 
 def seen_by(camera: Camera, eye: Eye, distance: float, convergence: float = math.inf) -> Camera:
-    """The camera of one eye. The eyes are `distance` world units apart, centred on `camera`, which shows a whole frame.
+    """The camera of one eye. The eyes are `distance` world units apart, one on each side of `camera`.
 
+    camera: of a whole frame, not of a strip or window.
     Both eyes look in the camera's direction. The principal point is shifted so that points at the depth `convergence`
     fall on the same pixel in both. Raises InputError if the camera is not perspective.
     """

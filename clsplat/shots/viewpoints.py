@@ -70,7 +70,7 @@ def focus_point(cameras: Sequence[Camera]) -> Float64:
 
 
 def covered_arc(azimuths: Float64) -> tuple[float, float]:
-    """Start and width, in radians, of the shortest arc that holds all azimuths (n,), in the direction of rising
+    """Start and width, in radians, of the shortest arc that holds all azimuths (n,), in the direction of increasing
     angles."""
     ordered = np.sort(np.mod(azimuths, 2 * np.pi))
     gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)

@@ -60,7 +60,8 @@ class GainEntries:
 
     @classmethod
     def of_lens(cls, model: ColourModel) -> GainEntries:
-        """The update of a lens's entries. Their sums follow the photograph's; their mean over all lenses is kept."""
+        """The update of a lens's entries. Their column sums come after the photograph's; their mean over the lenses is
+        not moved to 0."""
         return cls(first_row=model.entries, centred=False)
 
 
@@ -92,7 +93,7 @@ class Gains:
 
     @classmethod
     def on(cls, device: Device, logs: NDArray[np.float32], pull: csr_array | None = None) -> Gains:
-        """Gains with these initial logs, and zero moments. pull: the sparse matrix; zero if not given."""
+        """Gains with these initial logs, and zero moments. pull: the sparse matrix of `Gains`; None for zeros."""
         zeros = np.zeros_like(logs)
         gains = np.exp2(logs.astype(np.float64)).astype(np.float32)
         held, start, first, second, factors = (upload(device, value) for value in (logs, logs, zeros, zeros, gains))

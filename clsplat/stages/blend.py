@@ -98,7 +98,7 @@ def frame_items(device: Device, tiles: int) -> int:
 
 
 def items_for(tiles: int, units: int, items: int, most: int) -> int:
-    """Number of `frame_items` on a GPU with so many compute units. items, most: the least and the greatest."""
+    """The result of `frame_items` on a GPU with `units` compute units: `items` or more, and at most `most`."""
     while 2 * items <= most and 2 * items * tiles <= _BUSY_ITEMS * units:
         items *= 2
     return items
@@ -106,7 +106,7 @@ def items_for(tiles: int, units: int, items: int, most: int) -> int:
 
 _GRADIENT_REGISTERS = {64: 96}
 """Maximum registers per work-item of `blend_grad`, by the number of work-items that share a tile, where the driver
-accepts a limit. Without one NVIDIA's assembler keeps to 80, as counted, and then loads wait for one another."""
+accepts a limit. Without a limit NVIDIA's assembler takes 80, with which loads have to wait for one another."""
 
 
 def launch_tiles(

@@ -29,7 +29,7 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
     """
     if camera.width > (turn := camera.model.turn(camera)) * (1 + 1e-6):
         wide = f"{camera.width} pixels wide, but a full turn has {turn:.1f} pixels"
-        raise InputError(f"{camera.model.named} camera is {wide}: expected at most a full turn")
+        raise InputError(f"{camera.model.named} camera is {wide}: expected a width of at most a full turn")
     window = camera.window or Window(0, 0, camera.width, camera.height)
     half_w, half_h = 0.5 * window.width / camera.fx, 0.5 * window.height / camera.fy
     values = {

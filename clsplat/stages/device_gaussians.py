@@ -32,7 +32,8 @@ class ShStorage:
 
     @property
     def floats(self) -> int:
-        """Memory per Gaussian, in floats of 4 bytes. An SH degree counts as one; halves count as half, rounded up."""
+        """Memory per Gaussian, in floats of 4 bytes. The SH degree, if stored, takes one. Coefficients stored as halves
+        take half a float each, rounded up in all."""
         rest = 3 * (self.coefficients - 1)
         kept = -(-rest // 2) if self.half else rest
         return floats_of(self.coefficients) - rest + kept + (self.degrees is not None)

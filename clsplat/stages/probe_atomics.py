@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.device.buffers import allocate, upload
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
 from clsplat.device.drivers.capabilities import capabilities_of
 from clsplat.device.launch import launch_groups
+from clsplat.device.selection import open_device
 from clsplat.errors import DriverError, KernelBuildError
 
 _GROUPS, _COUNTERS = 64, 5

@@ -265,7 +265,7 @@ def project_step(
         *(config.beta1, config.beta2, config.epsilon),
         *numbers[weights:],
         *(PARAMETER_GROUPS["means"].limit ** 2, PARAMETER_GROUPS["sh_dc"].limit ** 2),
-        readback.buffer,  # a buffer, so that the profile counts no traffic: it is written only on a fault
+        readback.buffer,  # not the array, so that the profile counts no traffic: it is written only on a fault
         *(arrays[group] for arrays in model for group in PARAMETER_GROUPS),
         *(() if chunks is None else chunks.arguments),
     )

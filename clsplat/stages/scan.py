@@ -15,8 +15,8 @@ from clsplat.device.launch import launch_groups
 CHUNK_ELEMENTS_PER_ITEM = 16
 """A chunk has this many elements per work-item of a group, or a multiple of this."""
 MIN_CHUNK_ELEMENTS, MAX_SINGLE_CHUNK_ELEMENTS = 1024, 1 << 14
-"""For groups of one item: minimum elements of a chunk, and the most elements that are scanned as a single chunk. A
-second launch would cost more time than that chunk."""
+"""For groups of one item: minimum elements of a chunk, and maximum elements that are scanned as one chunk. Several
+chunks need a second launch, which takes longer than they save with so few elements."""
 MAX_SCAN_GROUPS = 2048
 """Maximum number of groups in a scan or sort, for groups of several items. It is limited because each group reads the
 counts of all groups before it."""

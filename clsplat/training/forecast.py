@@ -21,7 +21,7 @@ The prior is a factor times a power of the initial number of Gaussians. Five sce
 1.5 times as many.
 """
 GROWTH_RAMP = (0.35, 0.55, 0.75, 0.9)
-"""Growth of the first densifications, as fractions of the peak: split Gaussians have to accumulate gradients first."""
+"""Growth at the first densifications, as fractions of the peak."""
 PEAK_DENSIFICATIONS = 3
 """Number of densifications after the ramp in which the growth stays at its peak."""
 GROWTH_DECAY_STEPS, GROWTH_FLOOR_FRACTION = 1100.0, 0.2
@@ -86,7 +86,7 @@ class Forecast:
     def see(self, report: TimedStep) -> None:
         """Record a report."""
         step, count, seconds = report.step, report.gaussians, report.seconds
-        if self.last is None or step <= self.last[0]:  # after a return to a checkpoint
+        if self.last is None or step <= self.last[0]:  # training has returned to a checkpoint
             self.begun, self.last = self.begun or (step, count), (step, count, seconds)
             return
         before, previous, at = self.last
@@ -162,7 +162,8 @@ class Forecast:
         return 1.0, self.pixels / span.factor**2, span.gaussians, span.reads / span.steps
 
     def _cost(self) -> tuple[Float64, float]:
-        """Seconds per unit of each of the `_amounts` (4,), and the factor by which recent steps took longer."""
+        """The seconds that a unit of each of the `_amounts` takes, (4,), and the factor by which recent steps took
+        longer than that."""
         spans = self.spans[1:] or self.spans  # the first span includes building kernels
         parts = np.array(self.amounts[-len(spans) :])
         steps, seconds = np.array([(span.steps, span.seconds) for span in spans]).T
@@ -184,9 +185,9 @@ class Forecast:
 
 
 def _course(density: DensityConfig, step: int, peak: int = 0) -> float:
-    """Growth of a densification by the paper's rule as a fraction of the peak.
+    """The growth of a densification by the paper's rule, as a fraction of the peak growth.
 
-    peak: step up to which the growth does not decay.
+    peak: step up to which the growth does not decay, even if it would by the density settings alone.
     """
     index = step // density.every - density.start // density.every - 1
     if index < len(GROWTH_RAMP):

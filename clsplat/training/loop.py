@@ -92,7 +92,7 @@ def _interruption() -> Iterator[Callable[[], int]]:
 
     def asked() -> int:
         if not first:
-            for number in before:  # again, because kernel compilers have installed their own handlers
+            for number in before:  # installed again, because kernel compilers have installed their own handlers
                 signal.signal(number, ask)
         return first
 
@@ -144,24 +144,26 @@ class TrainingSession:
         """Write a checkpoint of the state at the start of the step, if that is intact.
 
         Called after a failed or interrupted trial of kernels, after a failed command of the driver (also of a GPU that
-        is lost), and for a photograph that cannot be read.
+        is lost), where the device's memory is used up, and for a photograph that cannot be read.
 
         Returns the end of an error message, which names the checkpoint, or "".
         """
-        if self.run is None or not self.trainer.step_back():
+        if self.run is None:
             return ""
+        earlier = f"; {self.run.resume_command} continues from the last checkpoint" if self.run.checkpoints() else ""
+        if not self.trainer.step_back():
+            return earlier
         try:
             self.save()
         except (ClsplatError, OSError) as error:
-            earlier = f"; {self.run.resume_command} continues from the last one" if self.run.checkpoints() else ""
             return f"; its checkpoint could not be written ({error}){earlier}"
         if not 0 < self.trainer.step <= self.saved:
             return ""
         return f"; a checkpoint of step {self.trainer.step} is written: {self.run.resume_command} continues from it"
 
     def go_back(self) -> bool:
-        """Report non-finite values. After too many troubled steps, go back to the last checkpoint with smaller learning
-        rates.
+        """Report non-finite values. After too many steps with such values, go back to the last checkpoint with smaller
+        learning rates.
 
         After too many returns it raises ClsplatError. Returns True if training went back.
         """
@@ -183,7 +185,8 @@ class TrainingSession:
             self.saved = -1
             self.save()  # the smaller learning rates must survive a crash
         warnings.warn(
-            f"step {stopped}: {len(retries.troubled)} of the last {TROUBLE_WINDOW_STEPS} steps had trouble: "
+            f"step {stopped}: {len(retries.troubled)} of the last {TROUBLE_WINDOW_STEPS} steps had "
+            "values that were not finite: "
             f"training returns to step {trainer.step}, with learning rates multiplied "
             f"by {trainer.monitor.retries.rate_factor:g}"
         )
@@ -198,16 +201,16 @@ class TrainingSession:
         self.trainer.monitor.incidents.clear()
 
     def tell_the_rest(self) -> None:
-        """Warn of the number of troubled steps that were only counted."""
+        """Warn of the number of steps with non-finite values that were only counted."""
         self.trainer.repair()
         self.tell_trouble()
         if untold := self.troubles.total() - len(self.troubles):
             warnings.warn(f"{untold} more steps had values that were not finite")
 
     def give_up(self) -> None:
-        """Write a bundle that reproduces the trouble into the run's folder, and raise ClsplatError."""
+        """Write a bundle that reproduces the non-finite values into the run's folder, and raise ClsplatError."""
         incident = self.trainer.monitor.latest
-        assert incident is not None, "retries are used up only after trouble"
+        assert incident is not None, "retries are used up only by steps with non-finite values"
         trouble = (
             f"{incident}, and {MAX_CHECKPOINT_RETURNS} returns to a checkpoint with smaller learning rates did not help"
         )
@@ -357,10 +360,10 @@ class TrainingSession:
         self.tell_plan()
         try:
             self.make_steps(between)
-        except (DriverError, TrialInterrupted) as error:  # a checkpoint saves the work so far
+        except (DriverError, CapacityError, TrialInterrupted) as error:  # a checkpoint saves the work so far
             written = self.rescue()
-            if written and isinstance(error, DriverError):
-                raise DriverError(f"{error}{written}") from error
+            if written and not isinstance(error, TrialInterrupted):
+                raise type(error)(f"{error}{written}") from error
             raise
         trainer.finish()
         model = trainer.gaussians()

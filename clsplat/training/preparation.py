@@ -44,7 +44,7 @@ def _length_unit(scene: Scene, resumed: Run | None, *, is_prepared: bool) -> flo
     """Length unit in world units; None for the extent, which in some scenes depends on the start points.
 
     A run that has begun keeps its unit, which is the extent if its record is missing.
-    is_prepared: True if the scene has its unit already, and start points that may not count, such as a sky.
+    is_prepared: True if the scene already has its unit, and points from which none can be computed, such as a sky's.
     """
     record = None if resumed is None else scene_record.read(resumed)
     if record is not None:

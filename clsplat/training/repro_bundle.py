@@ -5,7 +5,7 @@
 
 prints the number of non-finite values after each stage of that step. The exit status is 0 if there are any, else 1.
 A bundle has the format of a checkpoint, and the inputs of one view: a photograph, a camera and a background. It has
-only the Gaussians concerned if these reproduce the trouble on their own, otherwise all Gaussians.
+only the Gaussians concerned if these reproduce the non-finite values on their own, otherwise all Gaussians.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from typing_extensions import NotRequired, TypedDict
 from clsplat.camera import Camera, Projection
 from clsplat.config.training import TrainConfig
 from clsplat.device import cl
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.errors import ClsplatError, InputError
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.layouts.columns import REFUSED, SPLAT
@@ -82,7 +83,7 @@ class StepRecord(TypedDict):
     versions, device: of the machine that trained.
     depth_factor: factor of the known depths, if they are compared.
     of: numbers of Gaussians in the bundle and in the training.
-    reproduced: True if the bundle reproduces the trouble.
+    reproduced: True if the bundle reproduces the non-finite values.
     """
 
     step: int
@@ -176,7 +177,8 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
 
 
 def _unmarked(models: dict[str, HostGaussians]) -> dict[str, HostGaussians]:
-    """The models, with zeros in place of non-finite moments, which may mark a refused step."""
+    """The models with zeros in place of moments that are not finite. Such a moment may mark a step that `adam`
+    refused."""
     for kind in ("first", "second"):
         arrays = {g: HostArray(finite_or_zero(array.values)) for g, array in models[kind].arrays.items()}
         models[kind] = replace(models[kind], arrays=arrays)
@@ -187,7 +189,7 @@ def read_bundle(path: Path) -> Bundle:
     """Read a bundle. Raises InputError for other files."""
     try:
         return _bundle_of(read_checkpoint(path), path)
-    except Exception as error:  # as for a checkpoint: zipfile raises nearly anything for a flipped bit
+    except Exception as error:  # zipfile raises nearly anything for a flipped bit, as in a checkpoint
         if isinstance(error, InputError) and str(path) in str(error):
             raise
         why = f"{type(error).__name__}: {error}"[:300]

@@ -16,6 +16,7 @@ from clsplat.chunks.order import ORDERED_ROWS, beside_parents, space_order
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
+from clsplat.errors import CapacityError
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
 from clsplat.models.edit import take
 from clsplat.optimisation.density_rules import FRESH
@@ -143,15 +144,18 @@ class TrainedModel:
 
     def widen(self, coefficients: int) -> None:
         """Make room for more SH coefficients, which start from zero."""
-        models = [*self.kinds().values()] if self.plan.gathers else self._take_down()
+        if not self.plan.gathers:
+            self._take_down()
         self.parameters, self.first, self.second = (
-            self._placed(widen(self._device, model, coefficients)) for model in models
+            self._placed(widen(self._device, model, coefficients)) for model in self.with_moments
         )
 
     def rearrange(self, plan: RowPlan, changes: Callable[[], None]) -> DeviceArray | None:
         """Carry out a plan of density control, or of a repair. Returns the list of rows if rows have moved.
 
-        changes: function that is called after the kernels have been tried in the sandbox, just before the first change.
+        changes: function that is called just before the first change, when the kernels have been tried in the sandbox
+            and the moved rows have their memory.
+        Raises CapacityError, before any change, if there is too little memory for the moved rows.
         """
         listed = plan.listed
         if plan.rows is not None:
@@ -180,11 +184,9 @@ class TrainedModel:
             return host_zeros(count, coefficients, self.parameters.rows)
         return allocate_gaussians(self._device, count, coefficients, zero=True)
 
-    def _take_down(self) -> list[HostGaussians]:
+    def _take_down(self) -> None:
         """Move parameters, first and second moments to the host, and free them on the device."""
-        models = [to_host(model) for model in self.kinds().values()]
-        del self.parameters, self.first, self.second
-        return models
+        self.parameters, self.first, self.second = [to_host(model) for model in self.with_moments]
 
     def _placed(self, model: AnyGaussians) -> AnyGaussians:
         """The model on the device or on the host, as the plan assigns; it is moved there if necessary."""
@@ -224,15 +226,20 @@ class TrainedModel:
         gathers = self.plan.gathers
         with only_tried(self._device):
             try_gather(self._device, listed.shape[0], self.parameters)
+        try:
+            self.plan = self._make_plan(listed.shape[0])
+            rows: DeviceArray | NDArray[np.uint32] = listed
+            if not (gathers and self.plan.gathers):
+                self._take_down()
+                rows = listed.get()
+            moved = [
+                gather(self._device, rows, model, renews=index > 0) for index, model in enumerate(self.with_moments)
+            ]
+        except CapacityError as error:
+            count = self.parameters.count
+            raise CapacityError(f"{error}; with --density.max-gaussians {count} the model grows no further") from None
         changes()
-        self.plan = self._make_plan(listed.shape[0])
-        rows: DeviceArray | NDArray[np.uint32] = listed
-        models = [*self.kinds().values()]
-        if not (gathers and self.plan.gathers):
-            del models
-            models, rows = [*self._take_down()], listed.get()
         statistics = self.statistics
-        moved = [gather(self._device, rows, model, renews=index > 0) for index, model in enumerate(models)]
-        del models
+        self.free()
         self.set(*(self._placed(model) for model in moved))
         carry(self._device, listed, statistics, self.statistics, densified=new_statistics)

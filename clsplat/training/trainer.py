@@ -292,7 +292,7 @@ class Trainer:
             component.after_adam(self.parameters)
 
     def _watched(self, inputs: ViewInputs, step: GradientStep, number: int) -> StepMonitor:
-        """Probe of a view."""
+        """The probe that watches a view's step. number: number of views so far, this one included."""
         needs = self.strategy.needs(number)
         return StepMonitor(
             step, number, inputs, needs, self.statistics, self.monitor, self.pending, self.tried, self._unmark

@@ -27,7 +27,7 @@ from clsplat.viewer.pose import MAX_PAGE_PICTURE_PIXELS
 MAX_MODELS_ON_DEVICE = 2
 """Maximum number of models on the device: the model of the file, and an edited model."""
 CHANNEL_FLOATS_PER_GAUSSIAN = 3
-"""Minimum number of floats per Gaussian for channels other than colour."""
+"""Floats per Gaussian for channels other than colour, for which the limit of a picture's size leaves memory."""
 
 
 def draft(config: RasterizerConfig) -> RasterizerConfig:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A page of the viewer in viser: its controls and their actions. `appearance` applies the settings."""
+"""The viewer's page, made with viser: its controls and what they do. `viewer.appearance` applies their values to the
+model and to the picture."""
 
 from __future__ import annotations
 
@@ -305,7 +306,8 @@ class ViserPage:
             and width * height <= 4 * MAX_PAGE_PICTURE_PIXELS
         ):
             raise InputError(
-                f"the screenshot has {width}x{height} pixels, expected at most {4 * MAX_PAGE_PICTURE_PIXELS:,}"
+                f"the screenshot would have {width}x{height} pixels, expected 1 to {MAX_PAGE_SIDE_PX:,} on a side and "
+                f"at most {4 * MAX_PAGE_PICTURE_PIXELS:,} in all"
             )
         image, _ = model.picture(pose.camera(width, height), self.viewer.look, exact=True)
         self.client.send_file_download("screenshot.png", png(image), save_immediately=True)
@@ -317,7 +319,7 @@ class ViserPage:
         except ClsplatError as error:
             self.tell(str(error))
         except OSError as error:
-            self.tell(re.sub(r": '.*'$", "", str(error)))  # without paths of this machine
+            self.tell(re.sub(r": '.*'$", "", str(error)))  # removes paths of this machine
 
 
 def png(image: Image) -> bytes:

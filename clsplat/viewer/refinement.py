@@ -18,7 +18,8 @@ REST_INTERVAL_RATIO = 3.0
 MOTION_PICTURE_SECONDS = 0.04
 """Time limit in seconds of a picture in motion, including its encoding and excluding the browser."""
 MAX_UNPREPARED_EXACT_SECONDS = 0.6
-"""Maximum seconds of an exact picture that follows a coarse one directly, without pictures of growing size between."""
+"""Maximum seconds that an exact picture may take to follow a coarse one directly. Before a slower one, pictures of
+growing size are shown."""
 MIN_MOTION_SCALE = 1 / 8
 """Minimum size of a picture relative to the page. A smaller picture would not be recognisable."""
 PAGE_JPEG_QUALITIES = (60, 95)

@@ -33,7 +33,7 @@ class Page(Protocol):
 class Viewer:
     """A viewer: its page, refinement, look and pose.
 
-    trouble: the last error message on the page; "" after a picture was shown.
+    trouble: the last error message on the page; "" since a picture was shown.
     """
 
     page: Page

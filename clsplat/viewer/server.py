@@ -65,7 +65,7 @@ class Address:
             addresses = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
             family, kind, protocol, _, address = addresses[0]
             with socket.socket(family, kind, protocol) as probe:
-                if os.name == "posix":  # like asyncio; on Windows it would take over another server's port
+                if os.name == "posix":  # as asyncio does; on Windows this would take over another server's port
                     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(address)
                 probe.listen()
@@ -126,7 +126,7 @@ class Server:
             async def moved(camera: Any) -> None:
                 nonlocal fov, before
                 size = (camera.image_width, camera.image_height)
-                # a resize fits the field of view of the start again, but not that of a camera that the user clicked
+                # a resize fits the start's field of view anew, but keeps that of a camera that was clicked
                 if size != before and min(size) > 0 and math.isclose(camera.fov, fov, rel_tol=1e-6):
                     fov = camera.fov = start.fov_on(*size)
                 before = size

@@ -122,14 +122,14 @@ typedef struct {
   float mx, my, l11, l12; // mx, my: the mean, relative to the tile's first pixel
   float l22, log2o, red, green;
   float blue;
-  uint kept, blocks, slot; // kept: the Gaussian, or what a kernel needs instead
+  uint kept, blocks, slot; // kept: the Gaussian, or the number that a kernel needs in its place
 #ifdef NEARNESS
   float near;     // nearness, 1 / depth
   uint unused[3]; // padding to 16 bytes; set, so that copies read no uninitialised memory
 #endif
 } __attribute__((aligned(16))) Staged;
 
-// What blending keeps of a pair: each pixel of RAYS needs the Gaussian.
+// The number that blending keeps of a pair. With RAYS it is the Gaussian's, whose splat each pixel reads.
 #ifdef RAYS
 #define KEPT(gaussian, pair) (gaussian)
 #else
@@ -162,7 +162,7 @@ static inline uint stage(__local Staged *place, uint gaussian, uint kept, uint s
   return blocks;
 }
 
-// A bit for each block b of which numbers[b] is above `floor`.
+// The blocks b for which numbers[b] is above `floor`, a bit each.
 static inline uint blocks_above(int floor, __local const int *numbers) {
   uint blocks = 0;
   _Pragma("unroll") for (int block = 0; block < BLOCKS; ++block) blocks |= (uint)(numbers[block] > floor) << block;

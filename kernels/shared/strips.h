@@ -31,7 +31,7 @@
 #define FOR_FIELDS(field) _Pragma("unroll") for (int field = 0; field < SLOT_STRIDE; ++field)
 #define FOR_STRIP(c) _Pragma("unroll") for (int c = 0; c < STRIP_CELLS; ++c)
 
-// The fields that finish_row computes; the others have sums over pixels. Each pixel of RAYS has its own v.
+// The fields that finish_row computes; the others have sums over pixels. With RAYS each pixel has its own v.
 #ifdef RAYS
 #define OF_ROW(field) 0
 #define CELL_FIELDS SLOT_STRIDE
@@ -115,7 +115,7 @@ static inline void add_pixel(float *sums, const Pixels *p, uint cell, float g, f
     }                                                                                                                  \
   }
 
-// The indices of the pairs that an item fetches for a batch, the last of which is at `batch` - 1.
+// Loads the Gaussian and the slot of an item's fetch number `fetch`. A batch's pairs run backwards from `batch` - 1.
 #define FETCH_INDICES(fetch, batch)                                                                                    \
   {                                                                                                                    \
     const int from = max((batch) - 1 - ITEM - fetch * ITEMS, begin);                                                   \

@@ -1,5 +1,5 @@
 // The gradient of blending with one Gaussian per item, BY_GAUSSIAN. The items of a group process the pixels of a tile
-// one behind the other. Each item has a Gaussian and its sums in registers; the state of the pixels is in local memory.
+// one after another. Each item has a Gaussian and its sums in registers; the state of the pixels is in local memory.
 //
 // The pixels are in ITEMS chunks, each a part of a row. In round r item j is at chunk (r - j) % ITEMS. So each chunk
 // gets the Gaussians in order, an item begins its next Gaussian right after its last chunk, and there is one barrier

@@ -16,7 +16,7 @@ from pipeline import shaped
 
 from clsplat.bench import shapes as tune
 from clsplat.cli.main import main
-from clsplat.device.context import Device, list_devices
+from clsplat.device.context import Device
 from clsplat.device.drivers import shapes
 from clsplat.device.drivers.shapes import (
     Shape,
@@ -28,6 +28,7 @@ from clsplat.device.drivers.shapes import (
     saved_shapes,
     shape_of,
 )
+from clsplat.device.selection import list_devices
 from clsplat.errors import DeviceError
 
 A, B, C = Shape(8, 1, 8), Shape(16, 1, 8), Shape(4, 1, 8)

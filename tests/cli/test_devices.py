@@ -12,7 +12,7 @@ from calls import Capture, error_line, only, printed, rejected
 
 from clsplat.bench.workload import synthetic
 from clsplat.cli.main import main
-from clsplat.device.context import list_devices, open_device
+from clsplat.device.selection import list_devices, open_device
 
 
 def listed(capsys: Capture, *flags: str) -> list[dict[str, object]]:

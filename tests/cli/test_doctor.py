@@ -15,8 +15,8 @@ from calls import Capture, printed, rejected
 from clsplat.bench import stages
 from clsplat.cli.selftest import times
 from clsplat.demo import measured_view
-from clsplat.device.context import list_devices
 from clsplat.device.drivers import diagnostics
+from clsplat.device.selection import list_devices
 from clsplat.errors import CapacityError
 
 

@@ -24,7 +24,7 @@ from systems import posix
 from tiny import HEIGHT, WIDTH, cameras, hidden_model
 
 from clsplat.cli.main import main
-from clsplat.device.context import list_devices
+from clsplat.device.selection import list_devices
 from clsplat.gaussians import Gaussians
 from clsplat.rendering.renderer import Renderer
 from clsplat.shots import choose_shot

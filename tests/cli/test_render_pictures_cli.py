@@ -16,8 +16,7 @@ from calls import Capture, error_line, fails, printed, ran
 from headers import exr_attributes, png_chunks
 from pictures import write_pixels
 from quick import quick
-from rendered import camera_file, contents
-from systems import can_link
+from rendered import SHOT_FRAMES, camera_file, contents, render_shot
 from tiny import HEIGHT, WIDTH, hidden_model
 
 from clsplat.cli.main import main
@@ -25,7 +24,6 @@ from clsplat.config.pictures import ColourConfig
 from clsplat.images.colour import LINEAR, Colours, comment, linear_to_srgb, srgb_to_linear
 from clsplat.images.video import video_missing
 
-COUNT = 4
 HALF = 2.0**-11
 """What rounding to a half loses, relative."""
 FLAGS = [
@@ -36,21 +34,9 @@ FLAGS = [
 ]
 
 
-@pytest.fixture(scope="module")
-def shot(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """A model and a camera that goes to the right, as arguments of render."""
-    folder = tmp_path_factory.mktemp("shot")
-    hidden_model().save(folder / "model.ply")
-    return [str(folder / "model.ply"), "--cameras", str(camera_file(folder / "cameras.json", {1: -0.5, COUNT: 0.5}))]
-
-
-def render(shot: list[str], folder: Path, flags: str = "", pattern: str = "a.####.exr") -> int:
-    return main(["render", *shot, "-o", str(folder / pattern), "--progress", "none", *flags.split()])
-
-
 def picture(shot: list[str], folder: Path, flags: str = "", frame: int = 2) -> tuple[np.ndarray, Any]:
     """Pixels and specification of one frame."""
-    assert render(shot, folder, f"--frames {frame} {flags}") == 0
+    assert render_shot(shot, folder, f"--frames {frame} {flags}") == 0
     image = oiio.ImageBuf(str(folder / f"a.{frame:04d}.exr"))
     return image.get_pixels(oiio.FLOAT), image.spec()
 
@@ -165,14 +151,14 @@ def test_shutter(shot: list[str], plain: np.ndarray, tmp_path: Path) -> None:
     later, _ = picture(shot, tmp_path, f"{flags} --shutter-open 0 --shutter-close 1")
     assert np.abs(later[:, :, 4] - plain[:, :, 4]).max() > 0.01
     # the camera goes on at both ends as it did there, at one speed: each frame is blurred as much
-    ends = [blur(picture(shot, tmp_path, f"{flags} --shutter-angle 360", frame)[0]) for frame in (1, COUNT)]
+    ends = [blur(picture(shot, tmp_path, f"{flags} --shutter-angle 360", frame)[0]) for frame in (1, SHOT_FRAMES)]
     assert max(ends) < 0.95 * blur(plain)
 
 
 def test_motion_of_an_open_shutter(shot: list[str], tmp_path: Path) -> None:
     flags = "--channels alpha,motion --samples 2"
-    whole, _ = picture(shot, tmp_path, flags, COUNT)
-    late, _ = picture(shot, tmp_path, f"{flags} --shutter-open 0 --shutter-close 0.5", COUNT)
+    whole, _ = picture(shot, tmp_path, flags, SHOT_FRAMES)
+    late, _ = picture(shot, tmp_path, f"{flags} --shutter-open 0 --shutter-close 0.5", SHOT_FRAMES)
     seen = (whole[:, :, 0] > 0.5) & (late[:, :, 0] > 0.5)
     # a frame's way from the middle of the shutter on, at one speed; depths differ by what the camera has moved
     np.testing.assert_allclose(np.median(late[seen][:, 1]), np.median(whole[seen][:, 1]), rtol=0.02)
@@ -193,7 +179,7 @@ def test_lens(shot: list[str], plain: np.ndarray, tmp_path: Path) -> None:
 
 
 def test_deep(shot: list[str], plain: np.ndarray, tmp_path: Path, capsys: Capture) -> None:
-    assert render(shot, tmp_path, "--deep --deep.bins 4 --frames 2") == 0
+    assert render_shot(shot, tmp_path, "--deep --deep.bins 4 --frames 2") == 0
     image = oiio.ImageBuf(str(tmp_path / "a.0002.exr"))
     assert image.spec().deep
     data = image.deepdata()
@@ -203,12 +189,12 @@ def test_deep(shot: list[str], plain: np.ndarray, tmp_path: Path, capsys: Captur
     before = (tmp_path / "a.0002.exr").stat().st_mtime_ns
     whole = (tmp_path / "a.0002.exr").read_bytes()
     again = "--deep --deep.bins 4 --frames 2 --skip-existing"
-    assert render(shot, tmp_path, again) == 0
+    assert render_shot(shot, tmp_path, again) == 0
     assert (tmp_path / "a.0002.exr").stat().st_mtime_ns == before
     (tmp_path / "a.0002.exr").write_bytes(whole[:-100])
-    assert render(shot, tmp_path, again) == 0
+    assert render_shot(shot, tmp_path, again) == 0
     assert (tmp_path / "a.0002.exr").read_bytes() == whole
-    assert render(shot, tmp_path, "--alpha --frames 2 --skip-existing") == 0  # a flat one is another
+    assert render_shot(shot, tmp_path, "--alpha --frames 2 --skip-existing") == 0  # a flat one is another
     assert not oiio.ImageBuf(str(tmp_path / "a.0002.exr")).spec().deep
 
 
@@ -217,14 +203,14 @@ def test_deep_of_a_shutter_and_a_lens(shot: list[str], tmp_path: Path) -> None:
         "--model-colorspace lin_rec709 --colorspace lin_rec709 --samples 4 --shutter-angle 360 --aperture 0.1 --focus 2"
     )
     flat, _ = picture(shot, tmp_path / "flat", f"{flags} --alpha")
-    assert render(shot, tmp_path / "deep", f"{flags} --deep --frames 2") == 0
+    assert render_shot(shot, tmp_path / "deep", f"{flags} --deep --frames 2") == 0
     image = oiio.ImageBuf(str(tmp_path / "deep" / "a.0002.exr"))
     over = oiio.ImageBufAlgo.flatten(image).get_pixels(oiio.FLOAT)
     np.testing.assert_allclose(over[:, :, :4], flat, atol=4e-6)  # slices of four samples, merged
     before = (tmp_path / "deep" / "a.0002.exr").stat().st_mtime_ns
-    assert render(shot, tmp_path / "deep", f"{flags} --deep --frames 2 --skip-existing") == 0
+    assert render_shot(shot, tmp_path / "deep", f"{flags} --deep --frames 2 --skip-existing") == 0
     assert (tmp_path / "deep" / "a.0002.exr").stat().st_mtime_ns == before
-    assert render(shot, tmp_path / "deep", f"{flags} --deep --frames 2 --skip-existing --samples 5") == 0
+    assert render_shot(shot, tmp_path / "deep", f"{flags} --deep --frames 2 --skip-existing --samples 5") == 0
     assert (tmp_path / "deep" / "a.0002.exr").stat().st_mtime_ns != before
 
 
@@ -261,13 +247,13 @@ def test_a_frame_of_other_settings_is_not_what_is_wanted(
     files = [camera_file(tmp_path / f"{index}.json", {1: x}) for index, x in enumerate(places)]
     first, second = ([*shot[:2], str(file)] for file in files)
     flags = "--channels rgb,depth" if change == "--parts several" else ""
-    assert render(first, tmp_path, flags) == 0
+    assert render_shot(first, tmp_path, flags) == 0
     before = (tmp_path / "a.0001.exr").stat().st_mtime_ns
     more = f"{flags} {'' if change in ('moved', 'nothing') else change} --skip-existing"
-    assert render(second, tmp_path, more) == 0
+    assert render_shot(second, tmp_path, more) == 0
     assert ((tmp_path / "a.0001.exr").stat().st_mtime_ns == before) == kept
     written = (tmp_path / "a.0001.exr").stat().st_mtime_ns
-    assert render(second, tmp_path, more) == 0
+    assert render_shot(second, tmp_path, more) == 0
     assert (tmp_path / "a.0001.exr").stat().st_mtime_ns == written
     told = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
     again = [line for line in told if "1 of the frames that are there were made of another model, or with" in line]
@@ -281,25 +267,25 @@ def test_files_without_attributes_say_how_they_were_made(
 ) -> None:
     """In a text of their header, so that there is no file beside them."""
     pattern = f"a.####.{extension}"
-    assert render(shot, tmp_path, "--frames 1,2", pattern) == 0
+    assert render_shot(shot, tmp_path, "--frames 1,2", pattern) == 0
     assert len(list(tmp_path.iterdir())) == 2
     before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
-    assert render(shot, tmp_path, "--frames 1,2 --skip-existing", pattern) == 0
+    assert render_shot(shot, tmp_path, "--frames 1,2 --skip-existing", pattern) == 0
     assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
     assert capsys.readouterr().err == ""
     document = json.loads(Path(shot[2]).read_text())
     document["keys"][1]["position"] = [0.5, 0, -3.9]  # frame 1 is where it was, frame 2 is not
     (tmp_path / "moved.json").write_text(json.dumps(document))
     moved = [*shot[:2], str(tmp_path / "moved.json")]
-    (line,) = ran(capsys, render, moved, tmp_path, "--frames 1,2 --skip-existing", pattern).err.splitlines()
+    (line,) = ran(capsys, render_shot, moved, tmp_path, "--frames 1,2 --skip-existing", pattern).err.splitlines()
     assert "1 of the frames that are there were made of another model, or with other cameras or settings" in line
     changed = {path.name for path, stamp in before.items() if path.stat().st_mtime_ns != stamp}
     assert changed == {f"a.0002.{extension}"}
     other = {"jpg": "--quality 50"}.get(extension, "--bits 16")
-    assert render(moved, tmp_path, f"--frames 1,2 --skip-existing {other}", pattern) == 0
+    assert render_shot(moved, tmp_path, f"--frames 1,2 --skip-existing {other}", pattern) == 0
     assert "2 of the frames that are there were made of another model, or with other" in capsys.readouterr().err
     replace(hidden_model(), sh=0.9 * hidden_model().sh).save(tmp_path / "other.ply")
-    assert render([str(tmp_path / "other.ply"), *moved[1:]], tmp_path, f"--skip-existing {other}", pattern) == 0
+    assert render_shot([str(tmp_path / "other.ply"), *moved[1:]], tmp_path, f"--skip-existing {other}", pattern) == 0
     assert "2 of the frames that are there were made of another model" in capsys.readouterr().err
 
 
@@ -308,115 +294,26 @@ def test_frames_that_do_not_say_how_they_were_made(shot: list[str], tmp_path: Pa
         made = {"Software": "clsplat of an earlier version"}
         write_pixels(tmp_path / f"a.{number:04d}.jpg", np.zeros((HEIGHT, WIDTH, 3), np.uint8), attributes=made)
     for more in ("", "--dry-run"):
-        assert render(shot, tmp_path, f"--skip-existing --quality 5 {more}", "a.####.jpg") == 0
+        assert render_shot(shot, tmp_path, f"--skip-existing --quality 5 {more}", "a.####.jpg") == 0
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("clsplat: warning: --skip-existing: 4 existing frames have no record of their settings")
         assert line.endswith("a.0001.jpg; they are kept unchecked")
-    assert render(shot, tmp_path, "", "a.####.png") == 0
+    assert render_shot(shot, tmp_path, "", "a.####.png") == 0
     assert "clsplat:settings" in " ".join(png_chunks(tmp_path / "a.0001.png"))
-    assert render(shot, tmp_path, "--skip-existing --bits 16", "a.####.png") == 0
+    assert render_shot(shot, tmp_path, "--skip-existing --bits 16", "a.####.png") == 0
     assert png_chunks(tmp_path / "a.0001.png")["IHDR"][8] == 16, "bits"
-
-
-@pytest.mark.needs("av")
-def test_video(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
-    import av
-
-    small = tmp_path / "small.mp4"
-    flags = "--video.fps 12 --video.crf 10 --video.preset fast --count 9 --path through --json"
-    records = json.loads(ran(capsys, render, shot, tmp_path, flags, "a.mp4").out)
-    assert [record["frame"] for record in records] == list(range(1, 10))
-    assert {record["path"] for record in records} == {str(tmp_path / "a.mp4")}
-    assert render(shot, tmp_path, flags.replace("crf 10", "crf 45"), small.name) == 0
-    assert small.stat().st_size < (tmp_path / "a.mp4").stat().st_size
-    assert render(shot, tmp_path, f"{flags} --device all", "all.mp4") == 0
-    assert (tmp_path / "all.mp4").read_bytes() == (tmp_path / "a.mp4").read_bytes()
-    assert sorted(contents(tmp_path)) == ["a.mp4", "all.mp4", "small.mp4"]
-    with av.open(str(tmp_path / "a.mp4")) as container:
-        stream = container.streams.video[0]
-        frames = [frame.to_ndarray() for frame in container.decode(stream)]
-    assert (stream.average_rate, len(frames)) == (12, 9)
-    assert render(shot, tmp_path, "--path through --count 9", "####.exr") == 0
-    for index, frame in enumerate(frames, 1):  # in their order: each is nearest to its own
-        means = [oiio.ImageBuf(str(tmp_path / f"{at:04d}.exr")).get_pixels(oiio.FLOAT) for at in (index, 10 - index)]
-        lumas = [16 + 219 * np.clip(image, 0, 1) @ [0.2126, 0.7152, 0.0722] for image in means]
-        errors = [np.abs(frame[:HEIGHT] - luma).mean() for luma in lumas]
-        assert index == 5 or errors[0] < errors[1]
-
-
-@pytest.mark.needs("av")
-@pytest.mark.parametrize(("name", "flags"), [("a.mp4", "--video.crf 10"), ("a.mov", "--video.prores 4444 --alpha")])
-def test_a_video_says_how_it_was_made(name: str, flags: str, shot: list[str], tmp_path: Path, capsys: Capture) -> None:
-    video = tmp_path / name
-    assert render(shot, tmp_path, flags, name) == 0
-    stamp, whole = video.stat().st_mtime_ns, video.read_bytes()
-    captured = ran(capsys, render, shot, tmp_path, f"{flags} --skip-existing --json", name)
-    assert captured.err == ""
-    assert all(record["skipped"] for record in json.loads(captured.out))
-    assert video.stat().st_mtime_ns == stamp
-    for change, content in (("--frames 1-3", whole), ("--region 0,0,8,8", whole), ("", whole[: len(whole) * 2 // 3])):
-        video.write_bytes(content)
-        assert render(shot, tmp_path, f"{flags} --skip-existing {change}", name) == 0
-        assert (
-            f"--skip-existing: {video} is not whole, or was made of another model or frames" in capsys.readouterr().err
-        )
-    assert video.read_bytes() == whole
-    video.write_bytes(b"precious")
-    assert "exists already" in fails(capsys, render, shot, tmp_path, f"{flags} --skip-existing", name)
-    assert video.read_bytes() == b"precious"
-
-
-@pytest.mark.needs("av")
-@pytest.mark.parametrize("kind", ["file", "link"])
-def test_a_video_that_is_there_is_replaced_only_if_asked(
-    kind: str, shot: list[str], tmp_path: Path, capsys: Capture
-) -> None:
-    video, target = tmp_path / "a.mp4", tmp_path / "real.mp4"
-    if kind == "file":
-        video.write_bytes(b"precious")
-    elif can_link():
-        video.symlink_to(target)
-    else:
-        pytest.skip("this user may not make symbolic links")
-    assert render(shot, tmp_path, "", "a.mp4") == 2
-    said = f"clsplat: error: {video}: exists already; name another file, or give --overwrite to replace it\n"
-    assert capsys.readouterr().err == said
-    assert not target.exists() and (kind == "link" or video.read_bytes() == b"precious")
-    assert render(shot, tmp_path, "--dry-run", "a.mp4") == 0, "which writes nothing"
-    assert render(shot, tmp_path, "--overwrite", "a.mp4") == 0
-    assert video.read_bytes()[4:8] == b"ftyp"
-
-
-@pytest.mark.needs("av")
-def test_a_video_has_the_rate_of_its_cameras(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
-    import av
-
-    document = json.loads(Path(shot[2]).read_text())
-    (tmp_path / "cameras.json").write_text(json.dumps({**document, "fps": 29.97}))
-    own = [*shot[:2], str(tmp_path / "cameras.json")]
-    for name, flags, rate in (("own", "", "30000/1001"), ("asked", "--video.fps 25", "25")):
-        assert render(own, tmp_path, flags, f"{name}.mp4") == 0
-        with av.open(str(tmp_path / f"{name}.mp4")) as container:
-            assert str(container.streams.video[0].average_rate) == rate
-        capsys.readouterr()
-        assert render(own, tmp_path, f"{flags} --dry-run", f"{name}.mp4") == 0
-        assert f"video     {rate} frames a second" in capsys.readouterr().out
-    (tmp_path / "cameras.json").write_text(json.dumps({**document, "fps": 1e9}))
-    assert render(own, tmp_path, "", "fast.mp4") == 2
-    assert "has 1e+09 frames a second, expected 0.01 to 1000; give --video.fps" in error_line(capsys)
-    assert render(own, tmp_path, "--frames 1", "fast.exr") == 0, "which has no rate"
 
 
 def test_strips(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     flags = f"--width {20 * WIDTH} --frames 2 --channels rgb,alpha,depth --max-device-mem"
     plenty, little = (f"{flags} {size}" for size in ("1GiB", "4MiB"))
-    assert render(shot, tmp_path / "plenty", plenty) == 0
-    plan = json.loads(ran(capsys, render, shot, tmp_path, f"{little} --dry-run --json").out)
+    assert render_shot(shot, tmp_path / "plenty", plenty) == 0
+    plan = json.loads(ran(capsys, render_shot, shot, tmp_path, f"{little} --dry-run --json").out)
     assert plan["devices"][0]["strips"] > 1
     assert plan["devices"][0]["needed"] <= 4 << 20
-    assert render(shot, tmp_path / "little", little) == 0
+    assert render_shot(shot, tmp_path / "little", little) == 0
     assert contents(tmp_path / "little") == contents(tmp_path / "plenty")
-    assert render(shot, tmp_path / "parts", f"{little} --parts several") == 2
+    assert render_shot(shot, tmp_path / "parts", f"{little} --parts several") == 2
     assert "--parts several: a picture of 960x800 is written in strips" in error_line(capsys)
     assert not (tmp_path / "parts").exists()
 
@@ -426,19 +323,19 @@ EVERYTHING += "--samples 3 --aperture 0.1 --focus 4"
 
 
 def test_the_plan(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
-    text = ran(capsys, render, shot, tmp_path / "new", f"{EVERYTHING} --dry-run").out
+    text = ran(capsys, render_shot, shot, tmp_path / "new", f"{EVERYTHING} --dry-run").out
     for part in (
         f"{WIDTH + 6}x{HEIGHT + 6} at -3,-3 of {WIDTH}x{HEIGHT}",
         "colour    sRGB to ACEScg",
         "samples   3 frames for one, shutter from -0.25 to 0.25 frames, lens in focus at 4, 2x2 a pixel, box",
     ):
         assert part in text
-    plan = json.loads(ran(capsys, render, shot, tmp_path / "new", f"{EVERYTHING} --dry-run --json").out)
+    plan = json.loads(ran(capsys, render_shot, shot, tmp_path / "new", f"{EVERYTHING} --dry-run --json").out)
     wanted = {"model_colorspace": "sRGB", "colorspace": "ACEScg", "samples": 3, "supersample": 2, "deep_bins": 0}
     assert {name: plan[name] for name in wanted} == wanted
     assert plan["frames"][0]["window"] == [-3, -3, WIDTH, HEIGHT]
     assert plan["devices"][0]["strips"] == 1
-    assert render(shot, tmp_path / "new", "--deep --deep.bins 5 --dry-run") == 0
+    assert render_shot(shot, tmp_path / "new", "--deep --deep.bins 5 --dry-run") == 0
     assert "channels  rgb, alpha in 5 slices by depth" in capsys.readouterr().out
     assert not (tmp_path / "new").exists()
 
@@ -452,7 +349,7 @@ def test_headers_tell_the_truth_of_colours(shot: list[str], tmp_path: Path, caps
         "lin_rec709": (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, *d65),
     }
     for space, values in wanted.items():
-        assert render(shot, tmp_path, f"--frames 2 --colorspace {space}") == 0
+        assert render_shot(shot, tmp_path, f"--frames 2 --colorspace {space}") == 0
         kind, data = exr_attributes(tmp_path / "a.0002.exr")["chromaticities"]
         assert kind == "chromaticities"
         np.testing.assert_allclose(np.frombuffer(data, "<f4"), values, rtol=1e-6, err_msg=space)
@@ -467,7 +364,7 @@ def test_headers_tell_the_truth_of_colours(shot: list[str], tmp_path: Path, caps
 def test_matrices_in_the_header_are_those_of_openexr(shot: list[str], tmp_path: Path) -> None:
     """A point ahead of the camera by its definitions: z of the camera's space is along the view, y is up; in NDC (0, 0)
     is the upper left corner, (1, 1) the lower right one."""
-    assert render(shot, tmp_path, "--frames 1") == 0
+    assert render_shot(shot, tmp_path, "--frames 1") == 0
     found = exr_attributes(tmp_path / "a.0001.exr")
     assert "worldToScreen" not in found
     to_camera, to_ndc = (np.frombuffer(found[name][1], "<f4").reshape(4, 4) for name in ("worldToCamera", "worldToNDC"))
@@ -491,9 +388,9 @@ def test_everything_on_a_farm(shot: list[str], tmp_path: Path) -> None:
         n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None, host="127.0.0.1", protocol="tcp://"
     ) as cluster:
         for name, flags, pattern in cases:
-            assert render(shot, tmp_path / name / "here", flags, pattern) == 0
+            assert render_shot(shot, tmp_path / name / "here", flags, pattern) == 0
             address = f"--scheduler {cluster.scheduler_address}"
-            assert render(shot, tmp_path / name / "there", f"{flags} {address}", pattern) == 0
+            assert render_shot(shot, tmp_path / name / "there", f"{flags} {address}", pattern) == 0
             assert contents(tmp_path / name / "there") == contents(tmp_path / name / "here") != {}, name
 
 
@@ -536,8 +433,8 @@ def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Captu
         ("--colorspace ACEScct", "a.mp4", "its colours would be ACEScct, expected sRGB's primaries; write .exr, or"),
     ]
     for flags, pattern, message in cases:
-        assert message in fails(capsys, render, shot, tmp_path / "new", flags, pattern), flags
+        assert message in fails(capsys, render_shot, shot, tmp_path / "new", flags, pattern), flags
     monkeypatch.setitem(sys.modules, "av", None)
-    assert render(shot, tmp_path / "new", "", "a.mp4") == 2
+    assert render_shot(shot, tmp_path / "new", "", "a.mp4") == 2
     assert "a.mp4: video needs PyAV, which is not installed" in error_line(capsys)
     assert not (tmp_path / "new").exists()

@@ -8,9 +8,10 @@ from compare import assert_same_arrays
 from tiny import CONFIG, write_scene
 
 from clsplat.api import train
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
 from clsplat.device.drivers import driver_records
 from clsplat.device.drivers.capabilities import PRETEND_VARIABLE, capabilities_of
+from clsplat.device.selection import open_device
 from clsplat.errors import DeviceError
 from clsplat.gaussians import Gaussians
 from clsplat.scenes.loading import load_scene

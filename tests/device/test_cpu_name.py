@@ -49,7 +49,7 @@ def pocl_3() -> list[int]:
 
 CHILD = """
 import ctypes, os, sys
-from clsplat.device import context
+from clsplat.device import context, selection
 from clsplat.device.drivers import cpu_name
 device = context.all_devices()[int(sys.argv[1])]
 place = cpu_name._place(device.int_ptr)
@@ -59,7 +59,7 @@ if sys.argv[3] == "mended":
     cpu_name.name_processor(device)
 else:
     context.name_processor = lambda device: ""
-opened = context.open_device(sys.argv[1])
+opened = selection.open_device(sys.argv[1])
 opened.kernels("probe", {"FMA_BY_CONTRACTION": True})
 """
 

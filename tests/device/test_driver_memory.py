@@ -19,7 +19,7 @@ from calls import Capture, printed, refuses, warned
 from dying import ALWAYS, DRIVER, Standing
 
 from clsplat.cli.main import main
-from clsplat.device import context, launch
+from clsplat.device import context, launch, selection
 from clsplat.device.buffers import allocate
 from clsplat.device.context import Device
 from clsplat.device.drivers import driver_records, shapes, worker_process
@@ -105,7 +105,7 @@ def test_a_shape_that_one_device_cannot_take(elsewhere: Path, monkeypatch: pytes
     told = {each["index"]: each["shape"] for each in json.loads(printed(capsys, ["devices", "--json"]).out)}
     assert told.pop(0) == "cannot take CLSPLAT_SHAPE=1x1024"
     assert set(told.values()) <= {"1 lanes x 1024 items"}
-    refuses(r"CLSPLAT_SHAPE=1x1024: .* expected at most 256 items", context.open_device, "0", error=DeviceError)
+    refuses(r"CLSPLAT_SHAPE=1x1024: .* expected at most 256 items", selection.open_device, "0", error=DeviceError)
     monkeypatch.setenv("CLSPLAT_SHAPE", "wide")
     assert "expected LANESxITEMS" in printed(capsys, ["devices"], status=2).err
 
@@ -120,14 +120,14 @@ def test_only_what_is_used_warns_and_names_what_is_taken(
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert main(["devices"]) == 0
-        opened = context.open_device()
+        opened = selection.open_device()
     assert "warning" not in capsys.readouterr().err
     assert opened.shape == second
     warned(f"shape {first.label} failed: it failed; {second.label} is used instead", opened.kernels, "scan")
     driver_records.tell_once.cache_clear()
     monkeypatch.setattr(driver_check, "_short_test", lambda tried, _: "as well" if tried.shape == second else "")
     with pytest.warns(UserWarning, match=f"shape {first.label} failed: it failed; {third.label} is used") as told:
-        driver_check.require(context.open_device()).kernels("scan")
+        driver_check.require(selection.open_device()).kernels("scan")
     assert sum("is used instead" in str(each.message) for each in told) == 1
 
 
@@ -138,7 +138,7 @@ def test_a_failure_is_forgotten_when_what_failed_works(
     device, label, index = standing_device.cl_device, standing_device.shape.label, DRIVER
     standing("abort", 1)
     with pytest.raises(DriverError):
-        context.open_device().kernels("scan")
+        selection.open_device().kernels("scan")
     failed = driver_records.entries(device)[label].failed
     assert "probe.cl" in failed
     monkeypatch.setattr(driver_check, "examine", lambda *_: DriverReport())
@@ -176,7 +176,7 @@ def test_a_python_that_cannot_be_started(
     assert main(["bench", "--gaussians", "300", "--size", "64x48", "--repeat", "1"]) == 1
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
     assert line.endswith("CLSPLAT_TRUST_DRIVER=1 skips the trial")
-    refuses("CLSPLAT_TRUST_DRIVER=1", context.open_device().kernels, "scan", error=DriverError)
+    refuses("CLSPLAT_TRUST_DRIVER=1", selection.open_device().kernels, "scan", error=DriverError)
 
 
 @POSIX
@@ -186,7 +186,7 @@ def test_a_trial_ends_at_once_when_the_process_is_asked_to(standing: Standing) -
     noted = []
     before = signal.signal(signal.SIGINT, lambda *_: noted.append(True))
     try:
-        kernels = context.open_device().kernels
+        kernels = selection.open_device().kernels
         timer = threading.Timer(1.0, lambda: os.kill(os.getpid(), signal.SIGINT))
         timer.start()
         begun = time.monotonic()
@@ -202,7 +202,7 @@ def test_a_trial_ends_at_once_when_the_process_is_asked_to(standing: Standing) -
 
 def test_other_threads_do_not_wait_for_a_trial_either(standing: Standing) -> None:
     standing("hang", 1)
-    device, ends = context.open_device(), []
+    device, ends = selection.open_device(), []
 
     def work() -> None:
         try:

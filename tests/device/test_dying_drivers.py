@@ -19,7 +19,7 @@ from tiny import CONFIG
 
 from clsplat.cli.main import main
 from clsplat.config.training import TrainConfig
-from clsplat.device import context, sandbox
+from clsplat.device import sandbox, selection
 from clsplat.device.context import Device
 from clsplat.device.drivers import driver_records
 from clsplat.device.drivers.shapes import shapes_in_turn
@@ -108,7 +108,7 @@ def test_a_process_that_ended_once_is_no_failure(
 
 def test_what_failed_is_not_waited_for_twice(standing: Standing, monkeypatch: pytest.MonkeyPatch) -> None:
     standing("abort", 1)
-    device = context.open_device()
+    device = selection.open_device()
     refuses("signal 6", device.kernels, "scan", error=DriverError)
     monkeypatch.setattr(sandbox._Process, "ask", lambda *_: pytest.fail("it was tried again"))
     refuses("signal 6", device.kernels, "scan", error=DriverError)
@@ -155,13 +155,13 @@ def test_a_trial_that_there_is_no_memory_for_is_left_out(
     """That is no sign of a bad driver; nor is it tried at every launch, or told of more than once."""
     standing(how, 1)
     with pytest.warns(UserWarning, match="not enough memory to try every kernel") as told:
-        context.open_device().kernels("scan")
+        selection.open_device().kernels("scan")
     assert sum("not enough memory" in str(each.message) for each in told) == 1
     assert not any(
         entry.failed or entry.kernels for entry in driver_records.entries(standing_device.cl_device).values()
     )
     monkeypatch.setattr(sandbox._Process, "ask", lambda *_: pytest.fail("it was tried again"))
-    context.open_device()._built("scan", context.open_device()._fma[0])
+    selection.open_device()._built("scan", selection.open_device()._fma[0])
 
 
 def test_what_failed_in_every_shape_is_tried_anew(

@@ -47,7 +47,7 @@ def test_devices_are_found_and_nothing_is_left(tmp_path: Path) -> None:
     environment = {**os.environ, "HOME": "/dev/null/home", "TMPDIR": str(tmp_path)}
     for name in ("POCL_CACHE_DIR", "XDG_CACHE_HOME"):
         environment.pop(name, None)
-    code = "from clsplat.device.context import list_devices; print(len(list_devices()))"
+    code = "from clsplat.device.selection import list_devices; print(len(list_devices()))"
     usual, without = (python("-c", code, env=env).stdout for env in (dict(os.environ), environment))
     assert int(without) == int(usual) > 0
     assert not list(tmp_path.iterdir())

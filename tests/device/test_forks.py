@@ -14,8 +14,9 @@ import pytest
 from calls import python, refuses
 from scenes import one
 
-from clsplat.device import forks
-from clsplat.device.context import Device, all_devices, open_device
+from clsplat.device.context import Device, all_devices
+from clsplat.device.drivers import forks
+from clsplat.device.selection import open_device
 from clsplat.errors import DeviceError
 from clsplat.rendering.renderer import Renderer
 

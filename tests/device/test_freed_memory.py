@@ -17,7 +17,7 @@ from clsplat.device.context import Device
 
 BUILD = """
 import sys
-from clsplat.device.context import open_device
+from clsplat.device.selection import open_device
 device = open_device(sys.argv[1]).with_shape(sys.argv[2])
 for stem, defines in (("duplicate", {}), ("duplicate", {"RAYS": 1}), ("scan", {}), ("sort_radix", {})):
     device.kernels(stem, defines)

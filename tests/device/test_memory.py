@@ -10,7 +10,8 @@ from calls import refuses
 from clsplat.cli.main import main
 from clsplat.config.checks import parse_bytes
 from clsplat.device.buffers import Workspace, allocate
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.errors import CapacityError
 
 

@@ -87,7 +87,7 @@ def test_what_fails_twice_is_an_error(
 MASKS = """
 import os, signal, sys, threading
 {before}
-from clsplat.device.context import open_device
+from clsplat.device.selection import open_device
 thread = threading.Thread(target=open_device, args=({index!r},))
 thread.start() if {aside} else open_device({index!r})
 thread.join() if {aside} else None

@@ -11,7 +11,8 @@ import pytest
 from calls import refuses
 from scenes import random_cloud
 
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.errors import DriverError
 from clsplat.rendering.renderer import Renderer
 

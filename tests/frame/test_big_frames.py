@@ -17,7 +17,7 @@ from quick import quick
 from clsplat.camera import Camera, Window
 from clsplat.config.channels import FRAME_CHANNELS
 from clsplat.config.pictures import Encoding, FramingConfig, SamplingConfig
-from clsplat.device.context import open_device
+from clsplat.device.selection import open_device
 from clsplat.errors import InputError
 from clsplat.frame.draw import drawn_by
 from clsplat.frame.samples import sample_cameras, sampled, supersampled

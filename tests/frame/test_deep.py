@@ -19,7 +19,8 @@ from slices import flattened, in_front
 
 from clsplat.camera import Camera, Window
 from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding, PictureConfig
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.frame.deep import render_deep
 from clsplat.frame.deep_exr import write_deep
 from clsplat.frame.pipeline import FramePipeline, FrameRequest

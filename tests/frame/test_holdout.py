@@ -15,7 +15,8 @@ from pipeline import EVERY_SHAPE, shaped, shapes_of
 
 from clsplat.camera import Camera
 from clsplat.config.pictures import FramingConfig
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.frame.draw import drawn_by
 from clsplat.frame.holdout import Cut
 from clsplat.frame.samples import supersampled

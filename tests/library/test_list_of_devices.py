@@ -13,7 +13,7 @@ from calls import refuses
 
 import clsplat
 from clsplat import api
-from clsplat.device.context import list_devices
+from clsplat.device.selection import list_devices
 from clsplat.errors import DeviceError
 from clsplat.library.harmonics import spherical_harmonics
 

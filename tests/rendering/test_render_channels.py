@@ -12,7 +12,7 @@ from compare import assert_same_bits
 from quick import quick
 
 from clsplat.camera import PROJECTIONS, Projection
-from clsplat.device.context import open_device
+from clsplat.device.selection import open_device
 from clsplat.errors import InputError
 from clsplat.models.edit import take
 from clsplat.rendering.renderer import ChannelResult, Renderer, RenderResult

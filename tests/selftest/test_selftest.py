@@ -19,11 +19,12 @@ from quick import quick
 
 import clsplat.stages
 from clsplat.cli.main import main
-from clsplat.device.context import Device, all_devices, list_devices
+from clsplat.device.context import Device, all_devices
 from clsplat.device.drivers import driver_records
 from clsplat.device.drivers.shapes import shape_of
 from clsplat.device.drivers.worker_process import CHILD_MESSAGE_PREFIX, DRIVER_TIMEOUT_VARIABLE, TRUST_DRIVER_VARIABLE
 from clsplat.device.program import BREAK_KERNEL_VARIABLE
+from clsplat.device.selection import list_devices
 from clsplat.errors import DeviceError
 from clsplat.selftest import driver_check
 from clsplat.selftest import result as stage_groups

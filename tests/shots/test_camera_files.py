@@ -354,6 +354,6 @@ def test_the_examples_of_the_documentation(tmp_path: Path) -> None:
 def test_the_kernels_refuse_what_they_do_not_have(tmp_path: Path) -> None:
     panorama = first(tmp_path, projection="equirectangular", fov_x=360)
     pack_camera(panorama)
-    with pytest.raises(InputError, match=r"but a full turn has 60\.0 pixels: expected at most"):
+    with pytest.raises(InputError, match=r"but a full turn has 60\.0 pixels: expected a width of at most"):
         pack_camera(replace(panorama, width=64, fx=60 / (2 * np.pi)))
     pack_camera(first(tmp_path))

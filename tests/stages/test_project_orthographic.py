@@ -14,7 +14,8 @@ from test_project_rays import FEATURES, assert_as_the_twin
 
 from clsplat.camera import Camera
 from clsplat.config.rasterizer import BenchSwitches
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.errors import InputError
 from clsplat.frame.draw import on_tiles
 from clsplat.reference import every_pixel

@@ -109,6 +109,13 @@ def refuses(
     return message
 
 
+def refusal(read: Callable[[], object]) -> str:
+    """The message of the InputError, which is one printable line."""
+    said = refuses(".", read)
+    assert said.isprintable()
+    return said
+
+
 def complaint(path: object, call: Callable[..., object], *arguments: Any, **options: Any) -> str:
     """The message of the InputError that a call raises, without the path at its beginning."""
     start = f"{path}: "

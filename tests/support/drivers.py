@@ -16,8 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.device.context import DeviceInfo, all_devices, list_devices
+from clsplat.device.context import all_devices
 from clsplat.device.drivers.shapes import Shape, default_shape
+from clsplat.device.selection import DeviceInfo, list_devices
 from clsplat.files.atomic import atomic_write
 from clsplat.selftest.driver_check import examine
 

@@ -14,11 +14,12 @@ from tiny import short
 
 from clsplat.cli.main import main
 from clsplat.config.training import OptimiserConfig
-from clsplat.device import context, sandbox
-from clsplat.device.context import Device, all_devices, open_device
+from clsplat.device import sandbox, selection
+from clsplat.device.context import Device, all_devices
 from clsplat.device.drivers import driver_records
 from clsplat.device.drivers.quirks import wants_cache
 from clsplat.device.drivers.worker_process import TRUST_DRIVER_VARIABLE
+from clsplat.device.selection import open_device
 
 ALWAYS = 10**6
 """A number that is larger than the number of kernel texts in any test."""
@@ -64,7 +65,7 @@ def forget() -> None:
     """Bring clsplat to the state of a new process: without open devices, and without processes that try kernels."""
     for process in sandbox._processes.values():
         process.close()
-    context._open.cache_clear()
+    selection._open.cache_clear()
     driver_records.tell_once.cache_clear()
 
 

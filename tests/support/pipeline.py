@@ -17,7 +17,8 @@ from scenes import Scene
 from clsplat.camera import Camera
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import upload
-from clsplat.device.context import Device, all_devices, open_device
+from clsplat.device.context import Device, all_devices
+from clsplat.device.selection import open_device
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import PLAIN_SLOTS, SPLAT, SlotFields
 from clsplat.reference.render import forward, render_grad

@@ -10,9 +10,13 @@ from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
-from tiny import HEIGHT, WIDTH
+from tiny import HEIGHT, WIDTH, hidden_model
 
 from clsplat.arrays import Float32
+from clsplat.cli.main import main
+
+SHOT_FRAMES = 4
+"""Number of frames of `shot_of_a_model`."""
 
 
 def camera_file(
@@ -46,3 +50,15 @@ def pixels_of(path: Path, part: int = 0) -> Float32:
 def contents(folder: Path) -> dict[str, bytes]:
     """Contents of a folder's files, by name."""
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def shot_of_a_model(folder: Path) -> list[str]:
+    """Write a model and a camera that goes to the right. Returns them as arguments of `clsplat render`."""
+    hidden_model().save(folder / "model.ply")
+    cameras = camera_file(folder / "cameras.json", {1: -0.5, SHOT_FRAMES: 0.5})
+    return [str(folder / "model.ply"), "--cameras", str(cameras)]
+
+
+def render_shot(shot: list[str], folder: Path, flags: str = "", pattern: str = "a.####.exr") -> int:
+    """The exit status of `clsplat render` for a shot."""
+    return main(["render", *shot, "-o", str(folder / pattern), "--progress", "none", *flags.split()])

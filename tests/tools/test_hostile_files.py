@@ -8,10 +8,8 @@ import io
 import json
 import os
 import random
-import struct
 import warnings
 import zipfile
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +18,7 @@ import calls
 import numpy as np
 import pytest
 import stress_files
-from calls import warned
+from calls import refusal
 from hostile import (
     READERS,
     Reader,
@@ -33,36 +31,17 @@ from hostile import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pictures import write_pixels
 from quick import quick
-from spoilers import SPOILERS, npy
+from spoilers import SPOILERS
 from stress_files import stress, verdict
 from systems import links, posix
 
-from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, plain
-from clsplat.images import reading, writing
-from clsplat.images.reading import find_images, image_size, read_image
 from clsplat.models.codec import ply_file
 from clsplat.models.formats import ply
-from clsplat.runs import run as runs
 from clsplat.scenes import point_files
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.readers import colmap, transforms
-from clsplat.scenes.sfm import reconstruct
-
-
-def refusal(read: Callable[[], object]) -> str:
-    """The message of the InputError, which is one line."""
-    said = calls.refuses(".", read)
-    assert said.isprintable()
-    return said
-
-
-def peak_of(read: Callable[[], object]) -> int:
-    """Bytes that Python and NumPy had at most while `read` was refused."""
-    return calls.peak_of(lambda: refusal(read))
-
 
 # The sample
 
@@ -219,7 +198,7 @@ def test_names_in_a_ply_header_are_made_plain(tmp_path: Path) -> None:
 def test_one_long_word_is_no_table_of_long_words(tmp_path: Path) -> None:
     row = " ".join(["0.5"] * len(ply.REQUIRED_PLY_PROPERTIES))
     path = model(tmp_path, ascii_model([row] * 200 + [row[:-3] + "0." + "5" * 500_000]))
-    assert peak_of(lambda: ply.read(path)) < 20e6
+    assert calls.peak_of(lambda: refusal(lambda: ply.read(path))) < 20e6
     path = model(tmp_path, ascii_model([row, row + "9" * 2_000_000]))
     assert "line of more than" in refusal(lambda: ply.read(path))
 
@@ -228,7 +207,7 @@ def test_text_cannot_claim_more_rows_than_bytes(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(ply_file, "IO_BLOCK_ROWS", 4)
     row = " ".join(["0.5"] * len(ply.REQUIRED_PLY_PROPERTIES))
     path = model(tmp_path, ascii_model([row] * 9, 10**8))
-    assert peak_of(lambda: ply.read(path)) < 1e6
+    assert calls.peak_of(lambda: refusal(lambda: ply.read(path))) < 1e6
 
 
 def test_wide_rows_are_read_a_few_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,7 +231,7 @@ def test_a_cloud_has_each_property_once_and_claims_at_most_what_it_has(
         head = f"ply\nformat {form} 1.0\nelement vertex {count}\n{properties}end_header\n"
         path = model(tmp_path, f"{head}1 2 3 4 5 6 7 8\n".encode())
         assert said in refusal(lambda path=path: point_files.read_point_cloud(path))
-        assert peak_of(lambda path=path: point_files.read_point_cloud(path)) < 2e6
+        assert calls.peak_of(lambda path=path: refusal(lambda: point_files.read_point_cloud(path))) < 2e6
 
 
 @settings(max_examples=60, deadline=None)
@@ -396,216 +375,6 @@ def test_any_document(tmp_path_factory: pytest.TempPathFactory, document: Any) -
     path = tmp_path_factory.getbasetemp() / "transforms.json"
     path.write_text(json.dumps(document))
     assert str(path) in refusal(lambda: transforms.read_transforms(path))
-
-
-# Pictures
-
-
-@links
-def test_links_that_go_round(tmp_path: Path) -> None:
-    make_photos(tmp_path)
-    for name in ("a", "b", "c"):
-        (tmp_path / "photos" / name).symlink_to(".")
-        (tmp_path / name).symlink_to("photos")
-    assert [path.name for path in find_images(tmp_path)] == ["a.png", "b.png", "picture.jpg"]
-
-
-def chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-
-def test_a_png_of_100_000_by_100_000_pixels(tmp_path: Path) -> None:
-    path = tmp_path / "a.png"
-    rest = chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b"")
-    for side, kind, said in (
-        (100_000, 2, "does not decode"),
-        (30_000, 0, "30000 x 30000"),
-    ):  # its limit, ours
-        head = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, kind, 0, 0, 0))
-        path.write_bytes(reading.PNG_SIGNATURE + head + rest)
-        for read in (image_size, read_image):
-            assert said in refusal(lambda read=read: read(path))
-
-
-def test_an_exr_shown_as_100_000_by_100_000_pixels(tmp_path: Path) -> None:
-    path, black = tmp_path / "a.exr", np.zeros((8, 8, 3), np.float32)
-    write_pixels(path, black, "half", full_width=100_000, full_height=100_000)
-    assert peak_of(lambda: read_image(path)) < 1e6
-    write_pixels(path, black, "half", full_width=3000, full_height=3000)
-    assert read_image(path).shape == (3000, 3000, 3)
-
-
-def test_large_flat_pictures_are_pictures(tmp_path: Path) -> None:
-    """What compresses best of what there is."""
-    path = tmp_path / "a.png"
-    writing.write_image(path, np.zeros((3000, 4000), np.uint8))
-    assert path.stat().st_size < 40_000
-    assert read_image(path).shape == (3000, 4000, 3)
-
-
-def test_a_decoder_that_says_what_is_no_text() -> None:
-    class Decoder:
-        def geterror(self) -> str:
-            return b"\xff".decode()
-
-    assert reading.error_of(Decoder()) == "in a message that is not text"
-
-
-def test_a_png_of_empty_chunks_takes_no_long_look(tmp_path: Path) -> None:
-    path = tmp_path / "a.png"
-    with open(path, "wb") as file:
-        file.write(reading.PNG_SIGNATURE)
-        file.truncate(1 << 29)
-    with pytest.raises(InputError):
-        reading._check_png_is_whole(path)
-
-
-def test_names_that_no_scene_can_list(tmp_path: Path) -> None:
-    make_photos(tmp_path)
-    for name in ("a\nb.png", "\udcff.png"):
-        odd = tmp_path / "photos" / name
-        odd.write_bytes((tmp_path / "photos" / "a.png").read_bytes())
-        assert "rename it" in refusal(lambda: reconstruct.sfm_photos.find_photos(tmp_path / "photos"))
-        odd.unlink()
-
-
-def test_a_picture_whose_name_is_no_text(tmp_path: Path) -> None:
-    path = tmp_path / "\udcff.png"
-    make_photos(tmp_path)
-    path.write_bytes((tmp_path / "photos" / "a.png").read_bytes())
-    assert "rename it" in refusal(lambda: read_image(path))
-
-
-def test_warnings_of_a_scene_are_plain_lines(tmp_path: Path) -> None:
-    make_colmap_text(tmp_path)
-    for name in ("a\nb.png", "\udcff.png"):
-        (tmp_path / "images" / name).write_bytes(b"")
-    warnings = load_scene(tmp_path).warnings
-    assert warnings
-    assert all(warning.isprintable() for warning in warnings)
-
-
-# Runs
-
-
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
-        ('clsplat = "1"\n[train]\niterations = ' + "9" * 400, "iterations"),
-        ('clsplat = "1"\n[train]\niterations = ' + "9" * 5000, "TOML"),
-        ('clsplat = "1"\n[train.optimiser]\nbeta1 = nan', "beta1"),
-        ('clsplat = "1"\n[train.density]\nsplit_factor = ' + "9" * 400, "split_factor"),
-        ('clsplat = "1"\nx = ' + "[" * 5000 + "]" * 5000, "TOML"),
-    ],
-    ids=["long", "longer", "nan", "long float", "nested"],
-)
-def test_settings_that_are_none(text: str, named: str, tmp_path: Path) -> None:
-    make_run(tmp_path)
-    path = tmp_path / "run/config.toml"
-    path.write_text(text)
-    message = refusal(lambda: runs.Run.open(path.parent))
-    assert str(path) in message
-    assert named in message
-
-
-@pytest.mark.parametrize(
-    "line", ['{"step": [1]}', '{"step": "1"}', '{"step": true}', '{"step": null}', "[" * 50_000, "[]"]
-)
-def test_metrics_that_are_none_are_left_out(line: str, tmp_path: Path) -> None:
-    make_run(tmp_path)
-    run = runs.Run.open(tmp_path / "run")
-    with open(run.metrics_path, "a") as file:
-        file.write(f'{line}\n{{"step": 9}}\n')
-    assert [record["step"] for record in run.read_metrics()] == [1, 2, 9]
-    run.truncate_metrics(2)
-    assert run.metrics_path.read_text().count("\n") == 2
-    run.eval_path.write_text(line)
-    assert run.model_record()["step"] == 2
-
-
-def archive(path: Path, members: list[tuple[str, bytes]], *, packed: bool = False) -> None:
-    compression = zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED
-    with warnings.catch_warnings(), zipfile.ZipFile(path, "w", compression) as file:
-        warnings.simplefilter("ignore")
-        for name, data in members:
-            file.writestr(name, data)
-
-
-def state(text: bytes) -> tuple[str, bytes]:
-    return ("state.json.npy", npy(np.frombuffer(text, np.uint8)))
-
-
-GOOD = state(b'{"step": 2, "state": {}}')
-WEIGHTS = npy(np.arange(12, dtype=np.float32).reshape(4, 3))
-CHECKPOINTS: dict[str, list[tuple[str, bytes]]] = {
-    "claim": [GOOD, ("a.npy", WEIGHTS.replace(b"(4, 3), }   ", b"(40000000, 3), }"[:12] + b"   "))],
-    "packed": [GOOD, ("a.npy", npy(np.zeros(10**6)))],
-    "pickle": [GOOD, ("a.npy", npy(np.array([{}], object), allow_pickle=True))],
-    "twice": [GOOD, ("a.npy", WEIGHTS), ("a.npy", WEIGHTS)],
-    "foreign": [GOOD, ("../../a", WEIGHTS)],
-    "no state": [("a.npy", WEIGHTS)],
-    "nested": [state(b"[" * 100_000)],
-    "no step": [state(b'{"step": "2", "state": {}}')],
-    "negative step": [state(b'{"step": -2, "state": {}}')],
-    "infinite step": [state(b'{"step": 1e999, "state": {}}')],
-    "no dictionary": [state(b'{"step": 2, "state": []}')],
-}
-
-
-@pytest.mark.parametrize("kind", CHECKPOINTS)
-def test_checkpoints_that_are_none_are_passed_over(kind: str, tmp_path: Path) -> None:
-    make_run(tmp_path)
-    run = runs.Run.open(tmp_path / "run")
-    archive(run.checkpoints_path / "step-0000002.npz", CHECKPOINTS[kind], packed=kind == "packed")
-    checkpoint = warned("is a damaged checkpoint", run.load_latest_checkpoint)
-    assert checkpoint.step == 1
-
-
-def test_a_checkpoint_may_be_made_so(tmp_path: Path) -> None:
-    make_run(tmp_path)
-    run = runs.Run.open(tmp_path / "run")
-    archive(run.checkpoints_path / "step-0000002.npz", [GOOD, ("a.npy", WEIGHTS)])
-    checkpoint = run.load_latest_checkpoint()
-    np.testing.assert_array_equal(checkpoint.arrays["a"], np.arange(12, dtype=np.float32).reshape(4, 3))
-    checkpoint.arrays["a"][0] = 1  # training goes on in it
-
-
-@pytest.mark.parametrize(
-    "array",
-    [
-        *(np.float32(3), np.zeros((0, 3)), np.ones(4, bool), np.asfortranarray(np.ones((4, 3)))),
-        *(np.arange(3, dtype=">u2"), np.zeros(2, complex)),
-    ],
-)
-def test_every_array_of_numbers_comes_back(array: Any, tmp_path: Path) -> None:
-    run = runs.Run.create(tmp_path / "run", TrainConfig())
-    run.save_checkpoint(1, {"a": np.asarray(array)}, {})
-    checkpoint = run.load_latest_checkpoint()
-    assert checkpoint.arrays["a"].dtype == array.dtype
-    np.testing.assert_array_equal(checkpoint.arrays["a"], array)
-
-
-def test_a_checkpoints_directory_claims_at_most_what_it_has(tmp_path: Path) -> None:
-    make_run(tmp_path)
-    path = tmp_path / "run/checkpoints/step-0000002.npz"
-    data = bytearray(path.read_bytes())
-    end = data.rindex(b"PK\5\6")
-    data[end + 12 : end + 16] = struct.pack("<I", 0xFFFFFFF0)
-    path.write_bytes(data)
-    with pytest.warns(UserWarning, match="is a damaged checkpoint"):
-        assert calls.peak_of(runs.Run.open(tmp_path / "run").load_latest_checkpoint) < 1e7
-
-
-# Results of structure from motion
-
-
-@pytest.mark.parametrize(
-    "text", ["{}", "[]", "null", "[" * 100_000, '{"fingerprint": 3}', '{"fingerprint": "0", "files": [3]}', "{"]
-)
-def test_records_that_are_none(text: str, tmp_path: Path) -> None:
-    (tmp_path / "sfm.json").write_text(text)
-    refused = refusal(lambda: reconstruct._is_finished(tmp_path, tmp_path / "photos", "0", overwrite=False))
-    assert str(tmp_path) in refused
 
 
 def test_spoiling_is_a_matter_of_the_seed_alone() -> None:

@@ -19,7 +19,8 @@ ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="tools/ci/machines.py is for systems with process groups")
 if os.name != "nt":
     import machines
-    from machines import Found, Machine, Step, environment_of, run_all, run_machine, table, wrong
+    from machine_runs import Machine, Step, environment_of, run_all, run_machine, table, wrong
+    from machines import Found
 
 ALL = {
     "pypi": True,
@@ -148,7 +149,7 @@ def test_ctrl_c_ends_what_runs(tmp_path: Path) -> None:
     code = f"import pathlib, time; pathlib.Path({str(begun)!r}).touch(); time.sleep(600)"
     script = (
         f"import sys; sys.path.insert(0, {str(ROOT / 'tools/ci')!r})\n"
-        "from machines import Machine, Step, run_all\n"
+        "from machine_runs import Machine, Step, run_all\n"
         f"step = Step('it', (sys.executable, '-c', {code!r}), 600)\n"
         "sys.exit(run_all([Machine('one', '', (step,)), Machine('two', '', (step,))]))"
     )
@@ -180,7 +181,7 @@ def test_an_error_is_expected_with_its_words(status: int | None, errors: str, tr
 
 
 def test_a_machine_without_pips_driver_has_none(tmp_path: Path) -> None:
-    code = "from clsplat.device.context import list_devices as l; import subprocess, sys; print(len(l()))"
+    code = "from clsplat.device.selection import list_devices as l; import subprocess, sys; print(len(l()))"
     child = code + "; print(subprocess.run([sys.executable, '-c', sys.argv[1]], capture_output=True, text=True).stdout)"
     for name in ("drivers", "no-drivers", "home", "tmp"):
         (tmp_path / name).mkdir()

@@ -13,8 +13,8 @@ from calls import python, refuses
 from drivers import KEPT, NARROW
 from quick import quick
 
-from clsplat.device.context import list_devices
 from clsplat.device.drivers.shapes import Shape
+from clsplat.device.selection import list_devices
 from clsplat.selftest.driver_check import DriverReport
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -28,9 +28,10 @@ from gpu_scenes import fox_like
 from trial_table import table
 from trial_variants import DRY, OUTPUTS, USUAL, VARIANTS, TrialScene, Variant, VariedDevice, compared
 
-from clsplat.device.context import all_devices, list_devices
+from clsplat.device.context import all_devices
 from clsplat.device.drivers.shapes import default_shape
 from clsplat.device.program import text_of
+from clsplat.device.selection import list_devices
 from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import ClsplatError
 

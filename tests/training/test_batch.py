@@ -19,7 +19,8 @@ from tiny import CONFIG, short
 
 from clsplat.api import train
 from clsplat.config.training import OptimiserConfig, TrainConfig
-from clsplat.device.context import Device, open_devices
+from clsplat.device.context import Device
+from clsplat.device.selection import open_devices
 from clsplat.errors import DeviceError, DriverError, InputError
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.reference.adam import adam as reference

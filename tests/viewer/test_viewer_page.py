@@ -20,7 +20,7 @@ from tiny import CONFIG, cameras
 from viewer_browser import SLOW, choose, clsplat
 
 from clsplat.cli.main import main
-from clsplat.device.context import open_device
+from clsplat.device.selection import open_device
 from clsplat.gaussians import Gaussians
 from clsplat.images.reading import read_image
 from clsplat.rendering.renderer import Renderer

@@ -26,7 +26,8 @@ from plotting import Panel, plot_growth
 
 from clsplat.bench.workload import synthetic
 from clsplat.device.buffers import upload
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.progress import aligned
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.device_gaussians import upload_gaussians

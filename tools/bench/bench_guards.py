@@ -24,7 +24,8 @@ from measuring import Result, machine, options_parser, parsed, show, tool
 from clsplat.bench.stages import trainer_of
 from clsplat.bench.workload import load_subject, synthetic
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.training.trainer import Trainer
 
 WARM_UP = 3

@@ -34,7 +34,8 @@ from clsplat.bench.stages import calls_of
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.command_buffer import CommandBuffer
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.progress import aligned
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.scenes.loading import load_scene

@@ -25,7 +25,8 @@ import numpy as np
 import pyopencl as cl
 from measuring import Result, machine, options_parser, parsed, show, tool
 
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.progress import aligned
 
 LAUNCHES = 11

@@ -27,7 +27,8 @@ from clsplat.bench.workload import Subject, synthetic
 from clsplat.camera import Camera
 from clsplat.cli.bench import parse_size
 from clsplat.device.buffers import upload
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.library.rasterize import rasterize
 from clsplat.progress import aligned
 from clsplat.rendering.rasterizer import Rasterizer

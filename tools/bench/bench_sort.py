@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from plotting import Panel, plot_growth
 
 from clsplat.device.buffers import Workspace, upload
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.errors import ClsplatError
 from clsplat.progress import aligned
 from clsplat.stages.sort import sort

@@ -25,7 +25,7 @@ from needs import chromium_path
 from scenes import make_gaussians
 from viewer_browser import clsplat
 
-from clsplat.device.context import open_device
+from clsplat.device.selection import open_device
 from clsplat.gaussians import Gaussians
 from clsplat.runs.run import model_file
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from clsplat.bench.workload import synthetic
 from clsplat.cli.bench import parse_size
 from clsplat.config.checks import parse_bytes
-from clsplat.device.context import open_device
+from clsplat.device.selection import open_device
 from clsplat.frame.draw import drawn_by
 from clsplat.frame.strips import strip_rows, write_in_strips
 from clsplat.rendering.renderer import Renderer

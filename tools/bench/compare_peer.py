@@ -35,7 +35,8 @@ from pathlib import Path
 from measuring import Result, machine, plain_parser, require, show, tool
 
 from clsplat.config.training import TrainConfig
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.errors import InputError
 from clsplat.progress import aligned
 from clsplat.scenes.loading import load_scene

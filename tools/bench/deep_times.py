@@ -28,7 +28,7 @@ from clsplat.bench.workload import synthetic
 from clsplat.camera import Camera
 from clsplat.cli.bench import parse_size
 from clsplat.config.pictures import ColourConfig, Encoding, PictureConfig, SamplingConfig
-from clsplat.device.context import open_device
+from clsplat.device.selection import open_device
 from clsplat.frame.deep_exr import write_deep
 from clsplat.frame.pipeline import FramePipeline, FrameRequest
 from clsplat.gaussians import Gaussians

@@ -29,7 +29,7 @@ from torch.nn.functional import conv2d
 from clsplat import load_scene
 from clsplat.api import train
 from clsplat.config.training import TrainConfig
-from clsplat.device.context import open_device
+from clsplat.device.selection import open_device
 from clsplat.evaluation.held_out import EvaluatedModel, evaluate
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene, View

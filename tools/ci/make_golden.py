@@ -22,7 +22,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"
 from golden_frames import checksums
 from tiny import loss_curve, write_scene
 
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.scenes.loading import load_scene
 from clsplat.selftest.worker import run, shape_label
 

@@ -33,7 +33,7 @@ from measuring import plain_parser, require, tool
 from clsplat.bench.workload import Subject
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import upload
-from clsplat.device.context import open_device
+from clsplat.device.selection import open_device
 from clsplat.files.atomic import atomic_write
 from clsplat.layouts.columns import SPLAT, TILE
 from clsplat.rendering.rasterizer import Rasterizer

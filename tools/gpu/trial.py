@@ -57,9 +57,10 @@ from trial_variants import DRY, USUAL, USUAL_SHAPE, VARIANTS, TrialScene, Varied
 from clsplat.bench.stages import bench
 from clsplat.bench.workload import Subject, synthetic
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.device.context import Device, all_devices, list_devices, select
+from clsplat.device.context import Device, all_devices
 from clsplat.device.drivers.shapes import default_shape, most_items
 from clsplat.device.drivers.worker_process import TRUST_DRIVER_VARIABLE
+from clsplat.device.selection import list_devices, select
 from clsplat.device.source import kernel_root
 from clsplat.errors import ClsplatError
 from clsplat.files.atomic import atomic_write

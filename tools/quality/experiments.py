@@ -37,7 +37,7 @@ from clsplat.camera import Camera
 from clsplat.config.cli_defaults import TEST_EVERY
 from clsplat.config.training import TrainConfig
 from clsplat.demo.ray_caster import cameras
-from clsplat.device.context import open_device
+from clsplat.device.selection import open_device
 from clsplat.evaluation import metrics
 from clsplat.images.alpha import Image, background_colour, composite
 from clsplat.rendering.renderer import Renderer

@@ -11,7 +11,7 @@ import numpy as np
 from quality.made_scenes import own_blocks, rescaled, single_blocks
 from quality.trainings import Rows, Trained, call, picture_of, psnr_of, trained
 
-from clsplat.device.context import open_device
+from clsplat.device.selection import open_device
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
 from clsplat.runs.scene_record import length_unit_of, read

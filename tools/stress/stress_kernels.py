@@ -26,7 +26,8 @@ from stress_frames import compare as compare_frame
 from stress_projection import ERRORS, compare
 from stress_stages import stages
 
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 
 Array = NDArray[Any]
 BATCH = 5000

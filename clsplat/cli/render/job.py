@@ -165,7 +165,7 @@ def _check_pair(task: Task, left: Camera, right: Camera) -> None:
     if sizes[0] != sizes[1]:
         what = f"is {sizes[0]} for the left eye and {sizes[1]}"
         raise InputError(f"--stereo: frame {task.number} {what} for the right; {advice}")
-    # compared with the precision of the headers of frames from a stage
+    # compared as float32, the precision in which the headers of a stage's frames store it
     shapes = [str(np.float32(eye.fy / eye.fx)) for eye in (left, right)]
     if task.optics is not None and shapes[0] != shapes[1]:
         what = f"has pixels of the aspect ratio {shapes[0]} for the left eye and {shapes[1]}"

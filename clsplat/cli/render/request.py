@@ -14,7 +14,7 @@ from clsplat.config.channels import CRYPTOMATTE_CHANNELS
 from clsplat.config.checks import parse_bytes
 from clsplat.config.holdout import HoldoutConfig
 from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding, PictureConfig, VideoConfig, WarpConfig
-from clsplat.device.context import find_device, list_devices
+from clsplat.device.selection import find_device, list_devices
 from clsplat.errors import InputError, warn
 from clsplat.images.alpha import background_colour
 from clsplat.images.frame_files import check_format, parse_channels
@@ -89,7 +89,8 @@ def checked(flags: RenderVerb) -> Request:
 
 
 def _colour(colour: ColourConfig) -> ColourConfig:
-    """Colour settings with the absolute path of the OCIO configuration, for processes in other folders."""
+    """Colour settings with the absolute path of the OCIO configuration, as processes that render may run in other
+    folders."""
     source = colour.ocio_config or os.environ.get("OCIO", "")
     if source and "://" not in source:
         source = str(Path(source).absolute())
@@ -97,7 +98,7 @@ def _colour(colour: ColourConfig) -> ColourConfig:
 
 
 def _warp(warp: WarpConfig) -> WarpConfig:
-    """Lens settings with the absolute path of the map, for processes in other folders."""
+    """Lens settings with the absolute path of the map, as processes that render may run in other folders."""
     return replace(warp, stmap=str(Path(warp.stmap).absolute())) if warp.stmap else warp
 
 

@@ -24,7 +24,7 @@ from clsplat.shots.readers.usd_settings import FULL_DATA_WINDOW, window_named
 from clsplat.shots.stereo import pair_of_stage, shot_of
 
 STEREO_ROLE_ATTRIBUTE = "stereoRole"
-"""Attribute of a stereo pair's cameras, which --stereo stage applies."""
+"""Attribute that marks the left and the right camera of a stage, for `--stereo stage`."""
 _STAGE_FLOAT32_TOLERANCE = 1e-6
 """Tolerance for equal fractions of a frame: a stage stores them in float32."""
 _PIXEL_CENTRE_TOLERANCE_PX = 1e-3
@@ -52,7 +52,7 @@ def _cameras_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[s
         if flags.usd_camera is not None:
             raise InputError(f"--usd-camera {flags.usd_camera}: expected the USD stage in --cameras with it")
         own = own_cameras(None if flags.transform else run_of(flags.model))
-        check_around(flags.path, among_own=bool(own) and flags.up is None)  # before the models are loaded
+        check_around(flags.path, among_own=bool(own) and flags.up is None)  # checked before the models are loaded
         shots = [shot_around(models().at(1), flags.path, count=flags.count, size=size, up=flags.up, own=own)]
     elif flags.up is not None:
         raise InputError(f"--up {flags.up}: is for paths around the model, expected no --cameras with it")

@@ -22,7 +22,7 @@ from clsplat.shots.viewpoints import look_at
 AIR_VIEW_RADIANS, STREET_VIEW_RADIANS = math.radians(62.0), math.radians(78.0)
 """Angles of view across the longer side, of the flights and in the streets."""
 STRAIGHT_FLIGHT_METRES, SLANTED_FLIGHT_METRES, CAR_CAMERA_METRES = 55.0, 48.0, 2.4
-"""Heights of the cameras above the ground: straight down, oblique, and on a car."""
+"""Heights above the ground of cameras that look straight down, of oblique cameras, and of cameras on a car."""
 SLANT_RADIANS = math.radians(40.0)
 """Angle of the oblique cameras' axes below the horizon."""
 TOWN_FISHEYE_COEFFICIENTS = (-0.02, 0.0005, 0.0, 0.0)

@@ -232,7 +232,8 @@ def _mark_streets(colours: Float32, fx: Float32, fy: Float32, width: Float32) ->
 
 
 def _band(place: Float32, middle: float, half: float, width: Float32) -> Float32:
-    """Fraction (n,) of a pixel, of this width at `place`, that is within `half` of `middle`."""
+    """The part (n,) of a pixel that a band covers. The band reaches from `middle` - `half` to `middle` + `half`; the
+    pixel has its centre at `place` and the width `width`."""
     away = np.abs(place - np.float32(middle))
     low = np.maximum(away - width / 2, -half)
     return np.asarray(np.clip((np.minimum(away + width / 2, half) - low) / width, 0, 1))

@@ -98,7 +98,7 @@ class Caster:
         self._inner: dict[int, list[_Part]] = {}
 
     def sight(self, first: int, last: int) -> Sight:
-        """The surfaces that the rays of the rows from `first` to `last` meet."""
+        """The surfaces that the rays of the picture's rows `first` to `last` meet."""
         directions = world_rays(self.camera, first, last)
         rays = _Rays(directions, self.position, first)
         done = set()

@@ -86,7 +86,7 @@ def write_town(
         points = _write_model(result, config, planned, seen)
         record = {"town": config.record(), "photographs": len(planned), "points": points}
         atomic_write(result / TOWN_RECORD_FILE, (json.dumps(record, indent=2) + "\n").encode())
-        check_folder(output, overwrite=overwrite)  # again, since others may have written there meanwhile
+        check_folder(output, overwrite=overwrite)  # check again, since another process may have written there meanwhile
         move_into_place(work, place)
     except KeyboardInterrupt as error:
         error.args = ("before the town was complete: no file of it is left, and the same command starts anew",)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OpenCL drivers: their names, faults and capabilities, and the record of their test results."""
+"""OpenCL drivers: their names, faults, capabilities and use after a fork, and the record of their test results."""

@@ -252,7 +252,7 @@ def make_cache_folder(environment: MutableMapping[str, str] = os.environ) -> Pat
     owner = os.getpid()
 
     def remove() -> None:
-        if os.getpid() == owner:  # not in a fork of it
+        if os.getpid() == owner:  # but not in a fork of that process
             shutil.rmtree(folder, ignore_errors=True)
 
     atexit.register(remove)

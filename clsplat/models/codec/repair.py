@@ -166,7 +166,8 @@ def _spread(opacities: Float32) -> bool:
 
 
 def _white(logits: Float32) -> float:
-    """Value that stands for an opacity of 1: 1, or for whole numbers 100, 255 or more."""
+    """The stored value that means an opacity of 1. It is 1, or for whole numbers 100, 255 or the maximum of a wider
+    type."""
     whole = (
         logits.max() > LARGEST_USEFUL_LOGIT
         and bool((logits == np.rint(logits)).all())

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.camera import DEFAULT_NEAR_PLANE, MIN_NEAR_PLANES_PER_EXTENT
+from clsplat.camera import DEFAULT_NEAR_PLANE, MIN_SIZE_IN_NEAR_PLANES
 from clsplat.errors import InputError, warn
 from clsplat.files.documents import is_file, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
@@ -239,7 +239,7 @@ def _near_of(gaussians: Gaussians) -> float:
     some = gaussians.means[:: max(len(gaussians) // MODEL_SIZE_SAMPLES, 1)].astype(np.float64)
     size = float(np.median(np.linalg.norm(some - np.median(some, axis=0), axis=1)))
     return (
-        size / MIN_NEAR_PLANES_PER_EXTENT
+        size / MIN_SIZE_IN_NEAR_PLANES
         if 0 < size < SMALL_MODEL_NEAR_PLANES * DEFAULT_NEAR_PLANE
         else DEFAULT_NEAR_PLANE
     )

@@ -224,7 +224,8 @@ def check_comments(comments: Sequence[str]) -> None:
 
 
 def _local_means(file: BinaryIO, header: PlyHeader) -> Float32 | None:
-    """Means (n, 3) of LOCAL_MEANS_ELEMENT; None if it does not follow the vertices. Raises InputError if too short."""
+    """Means (n, 3) of LOCAL_MEANS_ELEMENT; None if it does not follow the vertices. Raises InputError if it
+    is too short."""
     wanted = Element(LOCAL_MEANS_ELEMENT, header.vertex.count, [(name, "f4") for name in POSITION_PROPERTIES])
     behind = len(header.before) + 1
     if header.format == "ascii" or header.elements[behind : behind + 1] != [wanted]:

@@ -301,7 +301,8 @@ class _Meta:
             return packing.at_ends(low + (high - low) * part, low, high, part).astype(np.float32)
 
     def warn_of_nulls(self, entries: Float32, indices: Bytes) -> None:
-        """Warn of null in the codebook of scales, except at the beginning: entries ascend, so -inf comes first."""
+        """Warn of nulls in the codebook of scales, except at its beginning: the entries are in increasing order, so
+        that a null there stands for -inf."""
         null = np.isinf(entries)
         if (count := int(null.sum())) and null[int((~null).argmax()) :].any():
             users = int(null[indices].any(axis=1).sum())
@@ -359,7 +360,7 @@ def write(
             for picture in files:
                 atomic_write(path.with_name(picture.name), picture.read_bytes())
             atomic_write(path, text)
-            for name in {*SH_IMAGE_FILES} - {picture.name for picture in files}:  # of an earlier model with higher SH
+            for name in {*SH_IMAGE_FILES} - {picture.name for picture in files}:  # left by a model of higher SH degree
                 path.with_name(name).unlink(missing_ok=True)
             return
         total = sum(picture.stat().st_size for picture in files)

@@ -242,7 +242,10 @@ def _rest(stream: Any, path: Path) -> bytes:
 
 @contextmanager
 def _decompressing(path: Path, place: str) -> Iterator[None]:
-    """Context manager: turn errors of a truncated or damaged stream into InputError. place: for the message."""
+    """Context manager: turn errors of a truncated or damaged stream into InputError.
+
+    place: place in the stream as the message names it, such as "at its end".
+    """
     import zstandard
 
     try:
@@ -285,14 +288,14 @@ def _unpack(
 
 
 def _fixed(block: Bytes) -> Float32:
-    """Bytes (n, 9) -> signed 24-bit integers (n, 3)."""
+    """Convert bytes (n, 9) to signed 24-bit integers (n, 3)."""
     wide = np.zeros((len(block), 3, 4), np.uint8)
     wide[:, :, 1:] = block.reshape(-1, 3, 3)
     return (wide.view("<i4")[:, :, 0] >> 8).astype(np.float32)
 
 
 def _first_three(block: Bytes) -> Float32:
-    """Version 2: bytes (n, 3) of x y z -> quaternions w x y z (n, 4)."""
+    """Convert bytes (n, 3) of x y z, as version 2 stores them, to quaternions w x y z (n, 4)."""
     result = np.empty((len(block), 4), np.float32)
     result[:, 1:] = block * np.float32(1 / 127.5) - np.float32(1)
     result[:, 0] = np.sqrt(np.maximum(0, 1 - np.square(result[:, 1:]).sum(axis=1)))
@@ -305,7 +308,7 @@ def _smallest_three(block: Bytes) -> Float32:
     fields = packed[:, None] >> np.array([20, 10, 0], np.uint32)
     three = (fields & 511).astype(np.float32) * np.float32(SQRT_HALF / 511)
     three = np.where(fields & 512, -three, three)
-    return values.restore_largest(packed >> 30, three)[:, [3, 0, 1, 2]]  # from x y z w
+    return values.restore_largest(packed >> 30, three)[:, [3, 0, 1, 2]]  # the file's order is x y z w
 
 
 def write(
@@ -420,7 +423,7 @@ def _to_byte(steps: Float32) -> Bytes:
 
 
 def _to_fixed(steps: Float64) -> Bytes:
-    """24-bit values (n, 3) -> bytes (n, 3, 3), low byte first."""
+    """Convert 24-bit values (n, 3) to bytes (n, 3, 3), low byte first."""
     return np.rint(steps).astype("<i4")[:, :, None].view(np.uint8)[:, :, :3]
 
 
@@ -431,7 +434,7 @@ def _to_first_three(unit: Float32) -> Bytes:
 
 
 def _to_smallest_three(unit: Float32) -> Bytes:
-    """Unit quaternions w x y z (n, 4) -> bytes (4 n,), version 3 and later."""
+    """Convert unit quaternions w x y z (n, 4) to bytes (4 n,), as version 3 and later store them."""
     q = unit[:, [1, 2, 3, 0]]
     largest = np.abs(q).argmax(axis=1)
     negate = np.take_along_axis(q, largest[:, None], axis=1) < 0

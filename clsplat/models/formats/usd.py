@@ -146,7 +146,7 @@ def _open(path: Path) -> Any:
     stage = open_stage(path, os.path.realpath(path), Usd.Stage.LoadNone)
     folder = Path(os.path.realpath(path)).parent
     for layer in stage.GetUsedLayers():
-        file = Ar.SplitPackageRelativePathOuter(layer.realPath)[0]  # for a layer in a .usdz, the .usdz
+        file = Ar.SplitPackageRelativePathOuter(layer.realPath)[0]  # a layer in a .usdz gives the .usdz
         if file and not Path(os.path.realpath(file)).is_relative_to(folder):
             raise InputError(f"{path}: refers to {layer.realPath}, expected layers in the same folder or below it")
     del diagnostics

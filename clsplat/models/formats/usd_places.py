@@ -336,7 +336,7 @@ def _of_prototypes() -> Any:
 
 
 def _of_classes() -> Any:
-    """USD predicate for the same prims and for classes, which are never drawn."""
+    """USD predicate for the prims of `_of_prototypes`, and for those of classes, which are never drawn."""
     from pxr import Usd
 
     return Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)

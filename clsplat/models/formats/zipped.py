@@ -127,7 +127,7 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def _parts(member: zipfile.ZipInfo) -> tuple[str, ...]:
-    """Folders and name of a file in an archive."""
+    """Path of a file in an archive, as its folders and its name."""
     return PurePosixPath(member.filename.replace("\\", "/")).parts
 
 

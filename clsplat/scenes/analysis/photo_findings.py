@@ -256,7 +256,7 @@ def _some(scene: Scene, iterations: int) -> Finding | None:
     most = max(most, int(SUPPORTED_GAUSSIANS_PER_POINT * points), 1)
     why = f"{count} training photographs, with {points:,} points and {pixels / 1e6:.1f} million pixels"
     sparse, bound = {"thinning": 0.2, "penalty": 0.02}, {"density.max_gaussians": most}
-    early = {"eval_at": (iterations // 3,)} if scene.test_views and iterations >= 3 else {}  # to reveal overfitting
+    early = {"eval_at": (iterations // 3,)} if scene.test_views and iterations >= 3 else {}  # reveals overfitting
     options = ({**sparse, **bound, **early}, {**sparse, **bound}, sparse, {"thinning": 0.2})
     return Finding("some views", f"{why}, support about {most:,} Gaussians", options)
 
@@ -307,7 +307,7 @@ def _sky_part(visible: VisiblePoints, view: View) -> float:
         & (steps < MAX_SKY_PIXEL_STEP)
         & ((blue > MIN_SKY_BLUE_EXCESS) | (light > MAX_EXPOSURE_COLOUR))
     )
-    reached = np.logical_and.accumulate(likely, axis=0)  # from the border down
+    reached = np.logical_and.accumulate(likely, axis=0)  # counts from the upper border down
     part = float(reached.mean())
     if part < MIN_SKY_PIXEL_FRACTION or not likely[0].mean() > 0.5:
         return 0.0

@@ -133,8 +133,8 @@ def _coincident(scene: Scene) -> str:
     if lost <= MAX_COINCIDENT_FRACTION * count:
         return ""
     return (
-        f"{lost:,} of {count:,} points coincide with another point: their Gaussians start with almost no size, or "
-        "as copies; remove duplicate points from the cloud"
+        f"{lost:,} of {count:,} points coincide with another point: their Gaussians start as copies of each "
+        "other, or with almost no size; remove duplicate points from the cloud"
     )
 
 

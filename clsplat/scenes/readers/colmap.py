@@ -245,7 +245,9 @@ def _file(folder: Path, stem: str) -> Path | None:
             return path
     if not os.path.isdir(folder):  # noqa: PTH112  # Path raises for names too long
         return None
-    lower = {f"{stem}{extension}".lower() for extension in (".bin", ".txt")}  # hierarchical-3d-gaussians: points3d
+    lower = {
+        f"{stem}{extension}".lower() for extension in (".bin", ".txt")
+    }  # hierarchical-3d-gaussians writes points3d
     return next((path for path in sorted(folder.iterdir()) if path.name.lower() in lower and is_file(path)), None)
 
 

@@ -122,17 +122,15 @@ def _pictures(path: Path, readers: list[Keys], images: Path | None, missing: Mis
 
 
 def _smaller_folders(lost: list[Path], folder: Path) -> dict[Path, Path]:
-    """The folders of missing pictures that have no pictures themselves, but a downscaled copy beside them that does.
-
-    Returns the copy of each such folder.
-    """
+    """For each folder of missing pictures that has no pictures, its downscaled copy next to it, if that has some."""
     names = {parent for file in lost for parent in file.parents if folder in parent.parents}
     found = {name: or_smaller(name) for name in sorted(names)}
     return {name: copy for name, copy in found.items() if copy != name}
 
 
 def _moved(file: Path | None, copies: Mapping[Path, Path]) -> Path | None:
-    """The file in the downscaled copy of its outermost folder that has one, or the file itself if there is no copy."""
+    """The file's counterpart in a downscaled copy, of the outermost of its folders that `copies` names; else the
+    file."""
     usual = next((parent for parent in reversed(file.parents) if parent in copies), None) if file is not None else None
     return file if file is None or usual is None else copies[usual] / file.relative_to(usual)
 
@@ -188,7 +186,7 @@ def _images(
         exact = _find_file(keys)
         name = called(listed, None, file, path.parent)
         if exact == file or not file.is_relative_to(path.parent):
-            name = listed + file.name[len(PurePosixPath(listed).name) :]  # with the extension of the file
+            name = listed + file.name[len(PurePosixPath(listed).name) :]  # adds the file's extension
         lens, parts = _lens(keys, file, size)
         in_parts += [name] if parts else []
         rotation, translation, _ = opengl_pose(keys.frame.get("transform_matrix"), keys.where, "'transform_matrix'")

@@ -358,7 +358,7 @@ def _alike(names: Iterable[str]) -> list[list[_Place]]:
 def _found(
     groups: Iterable[list[P]], rank: Callable[[P], tuple[Hashable, ...]], why: Callable[[P, P], str]
 ) -> dict[str, Copy]:
-    """Find the copies in each group: photographs that match an earlier photograph in the order of `rank`.
+    """Find the copies in each group. A photograph is a copy if it matches an earlier one, in the order of `rank`.
 
     The earlier photograph may itself be a copy.
     why: function of the earlier and the later photograph. Returns the evidence for a copy; "" if they differ.

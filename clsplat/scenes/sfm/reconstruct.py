@@ -43,7 +43,7 @@ SFM_CAMERA_MODELS = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADI
                  "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")  # fmt: skip
 
 PLACED_CAMERAS_UNIT = "cameras stand"
-# for each stage of the worker: text for the user, and database table that gets a row for each photograph or pair
+# each stage has a text for the user, and a table of the database that gets a row for each photograph or pair
 _PROGRESS_BY_STAGE = {
     "features": ("finding features", "keypoints"),
     "matches": ("matching photos", "two_view_geometries"),
@@ -135,7 +135,7 @@ def reconstruct(
 
     workers = threads or os.cpu_count() or 1
     output.parent.mkdir(parents=True, exist_ok=True)
-    # in the parent folder of the output, so that the last step is a rename within one file system
+    # it is in the output's parent folder, so that the last step is a rename within one file system
     work = Path(tempfile.mkdtemp(prefix=f".{output.name}-sfm-", dir=output.parent))
     try:
         photos = _staged_photos(images, paths, copies, work / "photos", report, workers)
@@ -261,7 +261,9 @@ def _masks(images: Path, paths: list[Path], use: MaskUse | None) -> dict[str, Pa
     photos = [_FoundPhoto(sfm_photos.photo_name(images, path), path) for path in paths]
     found = masks_beside(photos, others=OTHER_MASK_FOLDERS)
     if not found:
-        raise InputError(f"{images}: has no masks, expected masks/IMAGE.jpg.png beside the photos or in their folder")
+        raise InputError(
+            f"{images}: has no masks, expected masks/IMAGE.jpg.png next to the photos' folder or inside it"
+        )
     warn_of_sense(found.values(), use, images)
     return found
 

@@ -87,7 +87,7 @@ class Worker:
         options.sift.max_num_features = self.task["max_features"]
         singles = [names[0] for names in self.task["groups"] if len(names) == 1]
         batches = [(names, pycolmap.CameraMode.SINGLE) for names in self.task["groups"] if len(names) > 1]
-        if singles:  # in a single call: only the photographs of one call are processed in parallel
+        if singles:  # one call for all: only the photographs of one call are processed in parallel
             batches.append((singles, pycolmap.CameraMode.PER_IMAGE))
         for names, mode in batches:
             model = self.task["camera_model"]
@@ -248,7 +248,7 @@ def renumber_by_name(database: Path) -> None:
             ("rigs", "rig_id", rigs),
             ("frames", "rig_id", rigs),
         ):
-            # in two steps, via unused numbers, as the values of these columns must be unique
+            # renumbered in two steps, via unused numbers, as the values of these columns must be unique
             far = 1 << 30
             connection.executemany(
                 f"UPDATE {table} SET {column} = ? WHERE {column} = ?",  # noqa: S608 - names from the list above

@@ -133,7 +133,8 @@ def _spread(points: Float64) -> Float64:
 
 
 def _seen(points: Float64, scene: Scene) -> tuple[int, float]:
-    """Number of points in a training photograph, and median distance from the cameras that see them."""
+    """The number of points that at least one training photograph shows, and their median distance from the cameras that
+    see them."""
     anywhere = np.zeros(len(points), np.bool_)
     distances: list[Float64] = []
     for view in scene.train_views:

@@ -100,10 +100,12 @@ def read_mask(path: Path, *, orient: bool, invert: bool) -> Float32:
 
 
 def _from_labels(path: Path, values: Float32, pixels: Float32) -> Float32:
-    """Interpret a mask whose values are all below a half. In masks of labels, 1 stays 1 and void becomes -1.
+    """Interpret a mask whose values are all below a half. In a mask of labels, label 1 becomes 1.0 and void -1.
+
+    A soft mask is returned unchanged if another mask in its folder reaches a half.
 
     pixels: the colours whose means are `values`.
-    Raises InputError for other labels. A soft mask may be dark if another mask in its folder is not.
+    Raises InputError for other labels, and for a soft mask if no other mask reaches a half.
     """
     most, exact = stored_range(path)
     levels = np.unique(np.rint(values * most)).astype(int).tolist()
@@ -132,7 +134,7 @@ def _stored(pixels: Float32, most: int) -> str:
 
 
 def _without_void(path: Path, values: Float32) -> Float32:
-    """Interpret a mask of black, white and integers that may be labels. In masks of labels, void becomes -1.
+    """Interpret a mask of black, white and integers that may be labels. In a mask of labels, void becomes -1.
 
     The integers are labels if they cover at least the area of white, in this mask or in all masks of its folder. Raises
     InputError for labels other than 0 and 1, and if the meaning is ambiguous.

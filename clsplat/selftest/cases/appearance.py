@@ -113,7 +113,7 @@ def _launch(model: ColourModel, device: Device, work: Workspace, given: Inputs) 
     lenses = _gains(device, given.lenses, given.of_lenses) if model.of_lens else None
     planes, below = planes_of(given.photograph), planes_of(given.by_image)
     below[:, given.size[1] :] = np.nan  # padding rows, which are never written
-    target = upload(device, np.concatenate([planes, planes[:1]]))  # with alpha
+    target = upload(device, np.concatenate([planes, planes[:1]]))  # the fourth plane is alpha
     image, gradient = upload(device, planes_of(given.image)), upload(device, below)
     develop(device, model, colours, lenses, given.taken, target, given.size)
     columns = entry_gradient(device, work, model, given.taken, image, gradient, given.size)
@@ -172,7 +172,7 @@ def _twin(model: ColourModel, given: Inputs, got: Arrays) -> dict[str, Expected]
     got |= {"by gains": found[:GAIN_ENTRIES], "by the rest": found[GAIN_ENTRIES:]}
     sums, sizes = terms.sum(axis=(0, 1)), np.abs(terms).sum(axis=(0, 1))
     by_entries, by_lenses = np.zeros_like(entries), np.zeros_like(lenses)
-    # from the device's sums: their error does not count again
+    # computed from the device's sums, so that their error does not count again
     by_entries[taken.photograph] = found[:count] + reference.pull(entries, start, pull)[taken.photograph]
     by_lenses[taken.lens] = found[count:]
     rates = given.rate * np.where(is_gain, 1.0, MIX_RATE_FACTOR)

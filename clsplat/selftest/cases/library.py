@@ -245,7 +245,10 @@ SH_CENTRE = np.array([0.1, 0.2, 3.3])
 
 
 def random_harmonics(rng: Generator, count: int, degree: int | None = None, *, camera: bool | None = None) -> Inputs:
-    """Random SH coefficients and directions. camera: means and a camera's centre replace directions; None: random."""
+    """Random SH coefficients and directions.
+
+    camera: True for means and a camera's centre in place of directions; None chooses at random.
+    """
     degree = int(rng.integers(MAX_SH_BASIS_DEGREE + 1)) if degree is None else degree
     shapes = ((count, 3), (count, 25 if degree == MAX_SH_BASIS_DEGREE else 16, 3), (count, 3))
     directions, sh, by = (rng.normal(size=shape).astype(np.float32) for shape in shapes)

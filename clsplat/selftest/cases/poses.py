@@ -64,7 +64,7 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
     degree = given.gaussians.sh_degree
     wanted = reference(means, quaternions, sh, given.camera, degree, by)
     got |= {"turn": got["sums"][:3], "shift": got["sums"][3:]}
-    # terms of both signs: a sum of 4000 is about 60 times a term, and off by roundings of partial sums
+    # terms have both signs: a sum of 4000 is about 60 times as large as one, with an error of roundings of partial sums
     return {"turn": Expected(wanted[:3], 2e-6), "shift": Expected(wanted[3:], 2e-6)}
 
 

@@ -266,7 +266,7 @@ def _twin_of_noise(given: Inputs, got: Arrays) -> dict[str, Expected]:
     got |= {"moves": got["means"][~stays], "means of the opaque": got["means"][stays]}
     size = np.abs(wanted) + 0.1 * np.abs(wanted).max(initial=0)
     return {
-        "means": Expected(wanted, 5e-6),  # an ulp of o changes 100 (o - dead), up to 16, by 1e-6
+        "means": Expected(wanted, 5e-6),  # 100 (o - dead), up to 16, changes by 1e-6 of itself with an ulp of o
         "moves": Expected(wanted[~stays], 1e-4, size[~stays]),
         "means of the opaque": exactly(np.zeros_like(got["means of the opaque"])),
         **{name: exactly(getattr(given, name)) for name in GEOMETRY_ARRAYS},

@@ -86,7 +86,7 @@ def _frame(keys: Keys, fps: float | None, first: float) -> float:
 
 
 def _frames(path: Path, frames: list[float], loop: float | None) -> list[int]:
-    """Whole frames to render, from the rising frames of the keys. Raises InputError."""
+    """Whole frames to render, from the frames of the keys, in increasing order. Raises InputError."""
     for before, after in pairwise(frames):
         if before == after:
             raise InputError(f"{path}: has two keys at frame {after:g}, expected one")

@@ -85,7 +85,7 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
         )
     lost = () if known or not asked else (f"camera ({asked}, which does not exist)",)
     unapplied = (*_unapplied(camera, codes), *settings.unapplied, *lost)
-    # without the end of the line, where USD prints the stage's address in memory
+    # the end of the line is cut, where USD prints the stage's address in memory
     lines = [message.commentary.split(" (instantiating")[0] for message in diagnostics.TakeUncoalescedDiagnostics()]
     warnings = tuple(f"{path}: USD says: {' '.join(line.split())}" for line in lines[:3])
     moved = [time for source in _moved(camera) for time in source.GetTimeSamples()]

@@ -125,8 +125,8 @@ class Cameras(Component):
 
     @property
     def models(self) -> int:
-        """Arrays on the device for each parameter: parameter, two moments and a view's gradient if cameras are
-        refined."""
+        """The number of arrays on the device for each parameter, if cameras are refined: the parameter, two moments,
+        and a view's gradient."""
         return REFINEMENT_ARRAYS_PER_PARAMETER if self._config.refines else 0
 
     @property

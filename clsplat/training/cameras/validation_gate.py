@@ -59,7 +59,7 @@ class Drift:
     shift: Float64
 
     def taken_along(self, camera: Camera) -> Camera:
-        """`camera`, moved to the drifted world, where it sees the same as before in the original world."""
+        """`camera` moved along with the drift, so that it shows the same part of the scene as before."""
         rotation = camera.rotation @ self.rotation.T
         position = self.scale * self.rotation @ camera.position + self.shift
         return camera.posed(rotation, -rotation @ position)

@@ -32,7 +32,11 @@ class Adaptive(Strategy):
         self.config, self.white, self.sky = config.density, config.background == "white", config.sky > 0
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
-        """Gradients while Gaussians are densified; contributions while this or a later pruning uses them."""
+        """The statistics that the rules use after `step` steps.
+
+        Gradients are needed while Gaussians are densified, and contributions while a pruning that uses them is still to
+        come.
+        """
         config = self.config
         densifies = config.every > 0 and step < config.stop
         prunes = config.min_contribution > 0 and (config.prune_every > 0 or densifies)
@@ -87,8 +91,8 @@ def plan(config: DensityConfig, model: ModelState, *, sky: bool = False) -> RowP
     """Clone small and split large Gaussians with a large mean gradient. Prune Gaussians that are transparent, oversized
     or contribute little.
 
-    sky: True if the model has sky Gaussians. The size limit then follows the extent, for all Gaussians.
-    Retained Gaussians come first, in order. Clones and halves are fresh.
+    sky: True if the model has sky Gaussians. The size limit of all Gaussians is then relative to the extent.
+    In the plan the remaining Gaussians come first, in their order. Clones and halves are marked as fresh.
     """
     # Each rule compares like NumPy: a float32 array with a Python number, in float32.
     size = SKY_RADIUS_RATIO * model.extent if sky else model.length_unit

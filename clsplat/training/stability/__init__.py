@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Non-finite values and repeated trouble: detection, repair, return to a checkpoint."""
+"""Non-finite values: detection, repair, and return to a checkpoint where they come again."""

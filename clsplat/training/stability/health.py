@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from clsplat.gaussians import PARAMETER_GROUPS
 
 MAX_TROUBLED_STEPS = 5
-"""Number of troubled steps among the last TROUBLE_WINDOW_STEPS at which training goes back to a checkpoint."""
+"""Number of steps with non-finite values, among the last TROUBLE_WINDOW_STEPS, at which training goes back to a
+checkpoint."""
 TROUBLE_WINDOW_STEPS = 100
 MAX_CHECKPOINT_RETURNS = 3
 """Maximum number of returns to a checkpoint. If one more would be needed, training ends with an error."""
@@ -99,7 +100,10 @@ class Incident:
 
 @dataclass
 class RetryBudget:
-    """Recent troubled steps, and the effects of returns to checkpoints on the training. Checkpoints contain it."""
+    """Recent steps with non-finite values, and the effects of returns to checkpoints on the training.
+
+    Checkpoints contain it.
+    """
 
     troubled: list[int] = field(default_factory=list)
     rate_factor: float = 1.0
@@ -107,7 +111,7 @@ class RetryBudget:
     lost: bool = False
 
     def note(self, step: int, *, lost: bool = False) -> None:
-        """Record trouble in a step.
+        """Record a step with non-finite values.
 
         lost: True if too much of the model is broken to continue with it.
         """

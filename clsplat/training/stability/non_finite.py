@@ -56,7 +56,7 @@ class NonFiniteMonitor:
     readback: the values that a pass reads back; the last four are `adam`'s counts (`Rasterizer.readback`).
     last: the current step, once it has its loss.
     incidents: incidents not reported yet.
-    retries: counts of troubled steps and of returns to a checkpoint.
+    retries: counts of steps with non-finite values, and of returns to a checkpoint.
     """
 
     def __init__(self, readback: DeviceArray) -> None:
@@ -69,11 +69,11 @@ class NonFiniteMonitor:
 
     @property
     def noticed(self) -> bool:
-        """True if trouble has been noticed that `examine` has not seen yet."""
+        """True if non-finite values have been reported that `examine` has not seen yet."""
         return self._noticed is not None
 
     def forget(self) -> None:
-        """Forget the last step and its trouble, because the model has been replaced."""
+        """Forget the last step and its non-finite values, because the model has been replaced."""
         self.last = self._noticed = None
         self.readback.fill(0)
 
@@ -102,9 +102,9 @@ class NonFiniteMonitor:
             self._noticed = (self.last.with_bad_loss() or self.last, "loss", 0)
 
     def examine(self, models: Mapping[str, AnyGaussians]) -> Repair | None:
-        """Repair for the noticed trouble; None without trouble.
+        """The repair of the non-finite values that `notice` recorded; None if there are none.
 
-        models: parameters, first and second moments.
+        models: arrays by kind: parameters, first and second moments.
         """
         if self._noticed is None:
             return None

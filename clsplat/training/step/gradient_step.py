@@ -141,7 +141,7 @@ class GradientStep:
         else:
             numbers, given = thinning_numbers(thinning), (source,)
             frame, result, slots, own = self.replayed(model[0], key, lambda: gradient(StepProbe()), numbers, given)
-            self.device.under_way.append(source.buffer)  # as in `target`
+            self.device.under_way.append(source.buffer)  # keeps the photograph alive, as in `target`
             frame = frame.by(camera)
             probe.forward(frame)
             probe.loss(result)
@@ -307,7 +307,7 @@ class GradientStep:
             part.update(gradient, self.rasterizer.readback)
 
     def update(self, rows: StepRows) -> None:
-        """Take Adam's step for some rows; compute the gradient of projection if that is not done yet."""
+        """Take Adam's step for some rows, after the gradient of projection if that is still missing; then add noise."""
         step, readback = self.adam_step, self.rasterizer.readback
         if rows.gradients is not None:
             parameters, first, second = rows.model

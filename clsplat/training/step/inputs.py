@@ -82,7 +82,8 @@ class ViewRows:
     """Rows [start, stop) of the model that are on the device at once: all rows if the model fits.
 
     projected: projection of these rows in the step's view.
-    screen: their screen-space gradients, valid after the rows have changed.
+    screen: their screen-space gradients. The kernel that changes the rows may write them, so that they are undefined
+        before it.
     chunks: the chunks that were projected. Then [start, stop) are rows of these.
     """
 

@@ -39,7 +39,7 @@ class LateAdam(Component):
 
     def _begin(self, last: NDArray[np.uint32], missed: MissedSteps, step: int) -> None:
         self._last, self._missed, self.step = upload(self._device, last), missed, step
-        self._tables: dict[int, Float32] = {step: missed.rounded()}  # of the steps that may have to be repeated too
+        self._tables: dict[int, Float32] = {step: missed.rounded()}  # also tables of steps that may be repeated
         self._table = allocate(self._device, self._tables[step].shape, np.float32)
 
     @property
@@ -99,7 +99,10 @@ class LateAdam(Component):
         return replace(parameters, arrays={group: upload(self._device, values) for group, values in found.items()})
 
     def rows_moved(self, listed: DeviceArray) -> None:
-        """Follow rows that have moved. Fresh rows have zero moments."""
+        """Move each row's last step along with the row.
+
+        A fresh row keeps the last step of its source: its moments are zero, so that missed steps do not move it.
+        """
         self._last = upload(self._device, self._last.get()[listed.get() & ~np.uint32(FRESH)])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -115,7 +118,10 @@ class LateAdam(Component):
         last = saved.get("last", np.full(count, step, np.uint32))
         factors = saved.get("missed", missed.factors)
         if last.shape != (count,) or last.dtype != np.uint32 or factors.shape != missed.factors.shape:
-            raise ValueError(f"late/last has shape {last.shape} of {last.dtype}, late/missed {factors.shape}")
+            raise ValueError(
+                f"late/last is {last.dtype} of shape {last.shape}, expected uint32 of shape ({count},); late/missed "
+                f"has shape {factors.shape}, expected {missed.factors.shape}"
+            )
         if not np.isfinite(factors).all() or np.any(last > step) or np.any(last + MOST_MISSED < step):
             raise ValueError(f"late/last or late/missed does not belong to step {step}")
         self._begin(last, MissedSteps(self._config, _GROUPS, factors.astype(np.float64)), step)
@@ -123,7 +129,7 @@ class LateAdam(Component):
 
 @dataclass(frozen=True, eq=False)
 class _ShownRows(ViewPart):
-    """The rows that a view shows take their missed steps."""
+    """The part of a view in which the rows that it shows take their missed steps."""
 
     late: LateAdam
 

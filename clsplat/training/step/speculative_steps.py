@@ -59,8 +59,8 @@ def by_capacity(device: Device) -> bool:
 class SpeculativeSteps:
     """A training's steps launched by capacity, at most two at a time, and the capacity of the next step.
 
-    begin: function that is called before a step is repeated, with the step's number. It first repairs the trouble that
-    `monitor` has noticed.
+    begin: function that is called before a step is repeated, with the step's number. It repairs the non-finite values
+        that `monitor` has found.
     redone: number of repeated steps.
     """
 

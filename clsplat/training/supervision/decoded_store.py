@@ -51,7 +51,7 @@ def key_of(parts: Sequence[object]) -> bytes:
 class DecodedStore:
     """A folder of decoded photographs, which several threads and processes may use at a time.
 
-    A damaged file counts as missing. If writing a file fails, no further files are written. Each kind of trouble is
+    A damaged file counts as missing. If writing a file fails, no further files are written. Each kind of failure is
     reported once, by `notes`.
     """
 

@@ -58,7 +58,8 @@ class HostPhotographs:
 
     @cached_property
     def least(self) -> int:
-        """Smallest limit in bytes: the views of a step, a view that is read ahead, and the memory to decode it."""
+        """The smallest limit in bytes that suffices for the views of a step, one view that is read ahead, and its
+        decoding."""
         return self._needed(1)
 
     @cached_property
@@ -169,7 +170,7 @@ class HostPhotographs:
             self._pending.pop(key).cancel()
 
     def _tell(self) -> None:
-        """Warn of trouble with the cache. Threads that read ahead only note it."""
+        """Warn of failures of the cache. Threads that read ahead only record them."""
         if self.decoder.store is not None:
             for text in self.decoder.store.notes():
                 warn(text)

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 class Sizes:
     """Sizes of the pictures by step.
 
-    until: pairs (last step, factor), with rising steps and falling factors. After the last of these steps the size is
-    full.
+    until: pairs (last step, factor), with increasing steps and decreasing factors. After the last of these steps the
+        size is full.
     """
 
     until: tuple[tuple[int, float], ...]

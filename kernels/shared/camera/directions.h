@@ -65,7 +65,7 @@ typedef struct {
   float p[3], q[3], d[3];
 } Moved;
 
-// Fills *m. Returns 0 if the mean is before the near plane of `after`. to: the mean after its motion.
+// Fills *m. Returns 0 if the mean is nearer than the near plane of `after`. to: the mean after its motion.
 static inline int move(__constant float *camera, __constant float *after, float x, float y, float z,
                        __global const float *to, Moved *m) {
   const InCamera here = in_camera(camera, x, y, z), there = in_camera(after, to[0], to[1], to[2]);

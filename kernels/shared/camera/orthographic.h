@@ -2,7 +2,7 @@
 #define ON_PLANE
 #define PARALLEL_RAYS
 
-// RATIO: the image position is a linear function of this. ratio_rest: its low part.
+// RATIO: the number of which the image position is a linear function. ratio_rest: its rounding error.
 #define RATIO(x, z) (x)
 #define ratio_rest(ratio, x, x_low, z, z_low) (x_low)
 

@@ -2,7 +2,7 @@
 // Equation numbers refer to docs/cameras.md.
 #define ON_PLANE
 
-// RATIO: the image position is a linear function of this. ratio_rest: its low part.
+// RATIO: the number of which the image position is a linear function. ratio_rest: its rounding error.
 #define RATIO(x, z) ((x) / (z))
 #define ratio_rest slope_rest
 
