@@ -191,7 +191,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     run.resume_command += _flags_of_machine(verb)
     if changed:
         scene_record.write(run, scene)
-    _tell_of(scene, devices)
+    _tell_of(scene, config, devices)
     _train_run(verb, services, scene, run, devices, page)
     result = json.loads(run.eval_path.read_text("utf-8")) if run.eval_path.exists() else None
     if verb.json:
@@ -234,12 +234,13 @@ def _stages(config: TrainConfig) -> tuple[str, ...]:
     )
 
 
-def _tell_of(scene: Scene, devices: Sequence[Device]) -> None:
+def _tell_of(scene: Scene, config: TrainConfig, devices: Sequence[Device]) -> None:
     """Print the numbers of pictures and points, the devices, and the reason if LPIPS will be missing."""
+    order = " in near order" if config.orders_near(len(scene.train_views)) else ""
     unit = f", lengths relative to {scene.length_unit:.4g} (extent {scene.extent:.4g})" if scene.unit_differs else ""
     on = "; ".join(f"{device.name}, {device.driver.split('  ')[0].strip()}" for device in devices)
     print(
-        f"{scene.name}: {len(scene.train_views)} training pictures, {len(scene.test_views)} held out, "
+        f"{scene.name}: {len(scene.train_views)} training pictures{order}, {len(scene.test_views)} held out, "
         f"{len(scene.points):,} points{unit}; on {on} (the first steps may take longer, while kernels are built)",
         file=sys.stderr,
     )

@@ -44,6 +44,7 @@ from clsplat.training.step.late_adam import LateAdam
 from clsplat.training.step.monitor import StepMonitor
 from clsplat.training.step.position import Mark, Position
 from clsplat.training.step.speculative_steps import SpeculativeSteps
+from clsplat.training.step.view_order import ViewOrder
 from clsplat.training.step.visible_chunks import VisibleChunks
 from clsplat.training.supervision.depth_targets import DepthTargets
 from clsplat.training.supervision.image_cache import ImageCache
@@ -65,6 +66,7 @@ class Trainer:
     further: devices in addition to the model's.
     planner: planner of the memory.
     loader: loader of the steps' photographs and cameras.
+    order: order of the views in each pass.
     background: background of the last view.
     """
 
@@ -80,6 +82,8 @@ class Trainer:
     ) -> None:
         self.scene, self.config, self.device, self._new_strategy = scene, config, device, strategy
         self.views = scene.require_training_views()
+        near = config.orders_near(len(self.views))
+        self.order = ViewOrder([view.camera for view in self.views], scene.length_unit, near=near)
         self.rasterizer = Rasterizer(device, config.rasterizer, antialiased=config.antialiased)
         self.photographs = ImageCache(device, memory.photographs(scene, config))
         self.renderer = Renderer(device, self.rasterizer)
@@ -367,7 +371,7 @@ class Trainer:
 
     def _next_view(self) -> int:
         if not self.position.queue:
-            self.position.queue = [int(index) for index in self.position.rng.permutation(len(self.views))]
+            self.position.queue = self.order.next_pass(self.position.rng)
             if self.batch is None:  # a batch may still have to count views of the last epoch
                 self._turn_epoch()
                 self._note(begun=True)

@@ -32,6 +32,7 @@ from quality.made_scenes import (
 )
 from quality.towns import towns
 from quality.trainings import Rows, picture_of, psnr_of, trained
+from quality.view_orders import orders
 
 from clsplat.camera import Camera
 from clsplat.config.cli_defaults import TEST_EVERY
@@ -433,6 +434,7 @@ EXPERIMENTS = {
     "poses": Experiment(poses, "?", 7000, {"--width": _number(WIDTH, "pixels across"), "--lens": _number(0.0)}),
     "views": Experiment(views, 1, 2000, {**RESOLUTION, **SEEDS, **TRY, "--views": _numbers([3, 6, 9, 12])}),
     "seeds": Experiment(seeds, "+", 2000, {**RESOLUTION, **WITH, **SEEDS}),
+    "orders": Experiment(orders, "+", 3000, {**RESOLUTION, **WITH, **SEEDS}),
     "towns": Experiment(towns, 0, 0, {**WITH, **TOWNS}),
     "units": Experiment(units, 1, 300, {**RESOLUTION, "--bound": _number(0.3, "dB")}),
 }

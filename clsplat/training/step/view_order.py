@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Order of the views in a pass through the training photographs. Policy only: no device.
+
+A pass shows each view once. Its order is random, or near views follow each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from clsplat.arrays import Int64
+from clsplat.camera import Camera
+
+CLUSTER_VIEWS = 16
+"""Maximum number of views in a cluster. In 15 of 16 steps the view before is then of the same cluster."""
+GAZE_UNITS = 1.5
+"""Distance, in length units, from a camera to the point on its viewing axis that stands for the view.
+
+A length unit is 1.4 times the median depth of what photographs look at, or less. The share of Gaussians that successive
+views have in common is largest with about this distance (docs/decisions/0051).
+"""
+POINT_STEP = 2.0**-16
+"""Points are rounded to multiples of this, in length units. So cameras in a row or in one place stay level with each
+other, however their coordinates were rounded."""
+
+
+class ViewOrder:
+    """Order of the views of each pass.
+
+    cameras: cameras of the training views, as given. The order does not follow refined poses.
+    unit: length unit of the scene, in world units.
+    near: True if near views follow each other; False for a random order.
+    """
+
+    def __init__(self, cameras: Sequence[Camera], unit: float, *, near: bool) -> None:
+        self._count = len(cameras)
+        self.clusters = clusters_of(gaze_points(cameras, unit)) if near else None
+
+    def next_pass(self, rng: np.random.Generator) -> list[int]:
+        """Indices of all views, in the order of the next pass."""
+        if self.clusters is None:
+            return [int(view) for view in rng.permutation(self._count)]
+        return [
+            int(view) for one in rng.permutation(len(self.clusters)) for view in rng.permutation(self.clusters[one])
+        ]
+
+
+def gaze_points(cameras: Sequence[Camera], unit: float) -> Int64:
+    """Points (n, 3) that stand for the views, relative to their middle, in multiples of `POINT_STEP`.
+
+    A panorama shows every direction, so its camera's position stands for it.
+    """
+    positions = np.array([camera.position for camera in cameras])
+    axes = np.array([camera.rotation[2] * (not camera.model.wraps) for camera in cameras])
+    points = (positions - np.median(positions, axis=0)) / unit + GAZE_UNITS * axes
+    return np.asarray(np.round(points / POINT_STEP).astype(np.int64))
+
+
+def clusters_of(points: Int64) -> list[Int64]:
+    """Views of near points (n, d), in clusters of at most `CLUSTER_VIEWS` and nearly the same size.
+
+    They are the leaves of a k-d tree, which divides along the coordinate of the widest range. Views with equal
+    coordinates are divided by their index.
+    """
+    leaves, nodes = [], [np.arange(len(points))]
+    while nodes:
+        views = nodes.pop()
+        parts = -(-len(views) // CLUSTER_VIEWS)
+        if parts == 1:
+            leaves.append(views)
+            continue
+        coordinate = int(np.argmax(np.ptp(points[views], axis=0)))
+        views = views[np.lexsort((views, points[views, coordinate]))]
+        middle = len(views) * (parts // 2) // parts
+        nodes += [views[:middle], views[middle:]]
+    return [np.sort(views) for views in leaves]
