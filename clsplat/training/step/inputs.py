@@ -18,7 +18,7 @@ from clsplat.stages.loss_terms import DepthTerm
 from clsplat.stages.project import Projected, Screen, Slots
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class ViewInputs:
     """A view of a step.
 
