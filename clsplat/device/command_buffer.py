@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from struct import Struct
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -62,7 +63,7 @@ class CommandBuffer:
 
     entries: for each command a function that puts it on the queue, and its kernel if it is a launch.
     calls: the number of calls of each kind.
-    anew: setter, argument index and type of each launch parameter, which `set` gives a new value.
+    anew: setter and argument index of each launch parameter, which `set` gives a new value.
     reads: the functions of `entries` that copy to the host.
     given: buffers of the recorded launches, in place of which each replay may use others.
 
@@ -74,11 +75,13 @@ class CommandBuffer:
     def __init__(self, given: Sequence[cl.Buffer] = ()) -> None:
         self.entries: list[tuple[Kernel | None, Callable[[], Any]]] = []
         self.calls = Calls()
-        self.anew: list[tuple[Callable[[int, Any], None], int, Callable[[float], Any]]] = []
+        self.anew: list[tuple[Callable[[int, Any], None], int]] = []
         self.reads: list[Callable[[], Any]] = []
         self._owned: list[tuple[Kernel, cl.Kernel]] = []
         self._described: list[tuple[object, ...]] = []
         self._numbers: list[float] = []
+        self._format, self._set = Struct("="), b""
+        """Layout of the launch parameters, and the bytes that they have now."""
         self._given = {buffer.int_ptr: number for number, buffer in enumerate(given)}
         self._places: list[tuple[Callable[[int, Any], None], int, int]] = []
         """Setter and argument index of each given buffer, and its number."""
@@ -114,8 +117,7 @@ class CommandBuffer:
             own.set_arg(index, typed(value))
             if isinstance(value, (LaunchParameter, LaunchParameterWord)):
                 set_bytes = getattr(own, "_set_arg_buf", own.set_arg)  # faster than set_arg: no type checks
-                kind = np.float32 if isinstance(value, float) else np.uint32
-                self.anew.append((set_bytes, index, kind))
+                self.anew.append((set_bytes, index))
                 self._numbers.append(value)
                 description.append(None)
             elif isinstance(value, cl.MemoryObjectHolder) and value.int_ptr in self._given:
@@ -128,8 +130,12 @@ class CommandBuffer:
 
     def set(self, numbers: Iterable[float], given: Sequence[cl.Buffer] = ()) -> None:
         """Set the values of the launch parameters, in order, and the buffers in place of those given at first."""
-        for (set_bytes, index, kind), number in zip(self.anew, numbers, strict=True):
-            set_bytes(index, kind(number))
+        values, old = self._format.pack(*numbers), self._set
+        if values != old:
+            for place, (set_bytes, index) in enumerate(self.anew):
+                if (value := values[4 * place : 4 * place + 4]) != old[4 * place : 4 * place + 4]:
+                    set_bytes(index, value)
+            self._set = values
         for set_buffer, index, place in self._places:
             set_buffer(index, given[place])
 
@@ -146,9 +152,11 @@ class CommandBuffer:
         assert given == made, f"numbers given to a command buffer are {list(numbers)}, launched {fresh._numbers}"
 
     def is_all_of(self, calls: Calls) -> bool:
-        """Store the numbers of calls since the recording began.
+        """End the recording. calls: numbers of calls since it began.
 
         Returns False if some of these calls were not recorded: a write, or a call for which the host waited.
         """
         self.calls = calls
+        self._format = Struct("=" + "".join("f" if isinstance(number, float) else "I" for number in self._numbers))
+        self._set = self._format.pack(*self._numbers)
         return len(self.entries) == calls.launches + calls.fills + calls.reads == calls.total

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from clsplat.config.holdout import HOLDOUT_SURFACE_FIELDS
 from clsplat.optimisation.density_rules import FRESH, UNWANTED, USELESS
@@ -167,8 +167,7 @@ DEEP_PICTURES = 16
 """Maximum number of deep pictures that are merged at once."""
 
 
-@dataclass(frozen=True)
-class SlotFields:
+class SlotFields(NamedTuple):
     """Fields of a slot in addition to the plain gradients.
 
     absolute: absolute gradients (AbsGS).

@@ -62,7 +62,7 @@ MAX_COUNTED_PASSES = 3
 """Number of passes by capacity whose counts are retained: the current pass, the one before, and a repeated pass."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class PairCapacity:
     """Capacity of a pass that is launched before its number of pairs is known: "a pass by capacity".
 
@@ -76,7 +76,7 @@ class PairCapacity:
     appends: bool = True
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class ForwardPass:
     """One forward pass: every stage's arrays, valid until the rasterizer's next forward pass.
 
@@ -94,10 +94,10 @@ class ForwardPass:
     blended: Blended
     refused: tuple[int, ...] = ()
 
-    def by(self, camera: Camera) -> ForwardPass:
+    def by(self, camera: Camera, camera_array: DeviceArray) -> ForwardPass:
         """A copy of this pass, with the same arrays, for another camera of the same model and size."""
         lists = (self.projected, self.bands, self.listed, self.blended)
-        return self if camera is self.camera else ForwardPass(camera, self.camera_array, self.background, *lists)
+        return self if camera is self.camera else ForwardPass(camera, camera_array, self.background, *lists)
 
     @property
     def inputs(self) -> ImageInputs:
@@ -131,6 +131,10 @@ class Rasterizer:
         aligned = -(-len(CAMERA) // device.row_alignment) * device.row_alignment
         self._view = allocate(device, (aligned + 3,), np.float32)
         self._camera, self._background = self._view.reshaped(len(CAMERA)), self._view.rows(aligned, aligned + 3)
+        self._kept: WeakKeyDictionary[Camera, DeviceArray] = WeakKeyDictionary()
+        self._kept_background = allocate(device, (3,), np.float32)
+        self._colours: NDArray[np.float32] | None = None
+        """The host's array that `_kept_background` was sent from."""
         self.readback = allocate(device, (len(READBACK),), np.uint32)
         self.readback.fill(0)
         self._arriving: NDArray[np.uint32] | None = None
@@ -175,6 +179,21 @@ class Rasterizer:
         self._view.send(sent)
         return self._camera, self._background
 
+    def keep(self, camera: Camera, background: NDArray[np.float32]) -> tuple[DeviceArray, DeviceArray]:
+        """Camera and background on the device, for passes by capacity.
+
+        A camera stays there as long as its object, so that a training sends each of its cameras once. The background's
+        array is always the same, and is sent again if `background` is not the object of the last call.
+        """
+        array = self._kept.get(camera)
+        if array is None:
+            array = self._kept[camera] = allocate(self.device, (len(CAMERA),), np.float32)
+            array.send(pack_camera(camera))
+        if background is not self._colours:
+            self._kept_background.send(background)
+            self._colours = background
+        return array, self._kept_background
+
     def forward(
         self,
         gaussians: AnyGaussians,
@@ -196,7 +215,7 @@ class Rasterizer:
         no effect (docs/decisions/0025-launch-by-capacity.md). None counts the pairs first.
         thinning: random dropout of the model's Gaussians in this pass.
         nearness: like `nearness` of `blend`.
-        sent: result of `send`, if camera and background are already on the device.
+        sent: result of `send` or `keep`, if camera and background are already on the device.
         chunks: the only chunks of the model that may be in view; None takes the whole model.
         """
         device, work = self.device_of(camera), self.work
@@ -232,9 +251,8 @@ class Rasterizer:
         size, how = (camera.width, camera.height), (backward, thinning is not None, nearness)
         rows = None if chunks is None else chunks.key
         key = (self.readback, device, background, *size, *how, room.pairs, room.turn, by_append, rows)
-        return ForwardPass(
-            camera, camera_array, background, *work.replayed(gaussians, key, make, thinning_numbers(thinning))
-        )
+        made = work.replayed(gaussians, key, make, thinning_numbers(thinning), (camera_array,))
+        return ForwardPass(camera, camera_array, background, *made)
 
     def _appends(self, device: Device, room: PairCapacity, tiles: tuple[int, int]) -> bool:
         """True if the lists of a pass by capacity are made by append."""

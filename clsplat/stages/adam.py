@@ -19,7 +19,7 @@ from clsplat.layouts.columns import READBACK
 from clsplat.stages.device_gaussians import DeviceGaussians
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class AdamStep:
     """A step of Adam: its constants, its number (from 1), and the learning rate of each group."""
 

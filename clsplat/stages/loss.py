@@ -68,7 +68,7 @@ def scratch_bytes(device: Device, height: int, stride: int, turns: int = 1) -> i
     return 4 * (blocks.partials + turns * blocks.sums)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Loss:
     """A loss and its gradient.
 

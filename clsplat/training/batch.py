@@ -86,7 +86,7 @@ class Losses:
         return float(value), float(squared)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _AddedView(GradientStep):
     """A view whose gradients are added to the sums over the views. Its model is the parameters and the sums.
 
@@ -128,7 +128,7 @@ class ViewOutcome:
     own: Sequence[NDArray[Any] | None] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _RemoteView(GradientStep):
     """A view on a device other than the model's. Its results go to the host."""
 

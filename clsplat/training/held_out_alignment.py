@@ -23,7 +23,7 @@ ALIGNMENT_STEPS, ALIGNMENT_REACH_DEGREES = 40, 1.0
 """Number of steps that find the pose of a held-out view, and the approximate limit of its rotation in degrees."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _FixedModel(GradientStep):
     """A step that leaves the model unchanged."""
 

@@ -6,6 +6,8 @@ from __future__ import annotations
 from clsplat.config.training import TrainConfig
 from clsplat.gaussians import PARAMETER_GROUPS
 
+_RATE_SETTINGS = {name: group.rate for name, group in PARAMETER_GROUPS.items()}
+
 
 def rates_at(config: TrainConfig, step: int, length_unit: float, factor: float) -> dict[str, float]:
     """Learning rate of each group at a step.
@@ -18,6 +20,7 @@ def rates_at(config: TrainConfig, step: int, length_unit: float, factor: float) 
     cooled = optimiser.cooldown_to ** (into / optimiser.cooldown) if into > 0 else 1.0
     fraction = min(step / optimiser.means_rate_steps, 1.0)
     means_rate = optimiser.means_rate ** (1 - fraction) * optimiser.means_rate_end**fraction
-    rates = {name: getattr(optimiser, group.rate) * cooled * factor for name, group in PARAMETER_GROUPS.items()}
+    given = vars(optimiser)
+    rates = {name: given[setting] * cooled * factor for name, setting in _RATE_SETTINGS.items()}
     rates["means"] = means_rate * length_unit * cooled * factor
     return rates

@@ -30,7 +30,7 @@ from clsplat.training.appearance.choice import appearance_of
 from clsplat.training.batch import Batch, Losses
 from clsplat.training.cameras.refinement import Cameras
 from clsplat.training.cameras.validation import ValidationViews, validate
-from clsplat.training.density import ModelState, RowPlan, Strategy
+from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
 from clsplat.training.density.choice import strategy_of
 from clsplat.training.host_memory import UNLIMITED, HostMemory
 from clsplat.training.learning_rates import rates_at
@@ -183,17 +183,18 @@ class Trainer:
         self._raise_sh_degree()
         if self._active:
             self._prepare_components(views)
-        inputs, step, factor = self._inputs(views), self._gradient_step(), self.sizes.factor(self.step)
+        needs, factor = self.strategy.needs(self.step), self.sizes.factor(self.step)
+        inputs, step = self._inputs(views), self._gradient_step(needs)
         self.loader.read_ahead(self.position)
         result: Loss | Losses
         if self.batch is None:
-            run = partial(self._run, step, inputs[0], reads_loss)
+            run = partial(self._run, step, inputs[0], needs, reads_loss)
             result = self.pending.launch(run, self._room(factor), number=self.step, reads_loss=reads_loss)
             if self.position.queue:  # upload the next step's photograph, at this resolution
                 self.photographs.ahead(self.position.queue[-1], factor)
         else:
-            gathers, model = self.strategy.needs(self.step).gradients, self.model.with_moments
-            result = self.batch.run(step(), model, inputs, factor, self._watched_in_batch, statistics=gathers)
+            of = (step(), self.model.with_moments, inputs, factor, partial(self._watched_in_batch, needs))
+            result = self.batch.run(*of, statistics=needs.gradients)
             self._after_adam()
         self.position.controlled, self.position.last_views = False, views
         self._note()
@@ -217,18 +218,26 @@ class Trainer:
             inputs = component.join(inputs, self.step, self.parameters.count)
         return inputs
 
-    def _gradient_step(self) -> StepMaker:
+    def _gradient_step(self, needs: StatisticsNeeds) -> StepMaker:
         """Maker of the step; without `turn` and `room` it has an exact count of pairs."""
         rates, count, unit = self.rates(), self.parameters.count, self.scene.length_unit
-        fields = slot_fields(self.strategy.needs(self.step), nearness=self.depths.on)
+        fields = slot_fields(needs, nearness=self.depths.on)
         explore = exploration_of(self.config, self.step, rates["means"], count, unit)
         of = (self.device, self.rasterizer, self.config, self.step, rates, fields)
         return partial(GradientStep, *of, explore=explore)
 
-    def _run(self, make: StepMaker, inputs: ViewInputs, reads_loss: bool, turn: int, room: PairCapacity | None) -> Loss:
+    def _run(
+        self,
+        make: StepMaker,
+        inputs: ViewInputs,
+        needs: StatisticsNeeds,
+        reads_loss: bool,
+        turn: int,
+        room: PairCapacity | None,
+    ) -> Loss:
         """Make a step of one view."""
         step = make(turn=turn, room=room)
-        model, probe = self.model.with_moments, self._watched(inputs, step, step.step)
+        model, probe = self.model.with_moments, self._watched(needs, inputs, step, step.step)
         result = step.run(model, inputs, probe, self._view_gradients(inputs), reads_loss=reads_loss)
         self._after_adam()
         return result
@@ -295,9 +304,8 @@ class Trainer:
         for component in self._active:
             component.after_adam(self.parameters)
 
-    def _watched(self, inputs: ViewInputs, step: GradientStep, number: int) -> StepMonitor:
+    def _watched(self, needs: StatisticsNeeds, inputs: ViewInputs, step: GradientStep, number: int) -> StepMonitor:
         """The probe that watches a view's step. number: number of views so far, this one included."""
-        needs = self.strategy.needs(number)
         return StepMonitor(
             step, number, inputs, needs, self.statistics, self.monitor, self.pending, self.tried, self._unmark
         )
@@ -305,11 +313,11 @@ class Trainer:
     def _unmark(self) -> None:
         self.mark = None
 
-    def _watched_in_batch(self, inputs: ViewInputs, step: GradientStep) -> StepProbe:
+    def _watched_in_batch(self, needs: StatisticsNeeds, inputs: ViewInputs, step: GradientStep) -> StepProbe:
         """Probe of a view in a batch. It may begin an epoch, so the statistics of earlier views must be complete."""
         if inputs.begins:
             self._turn_epoch()
-        return self._watched(inputs, step, self.step)
+        return self._watched(needs, inputs, step, self.step)
 
     def draw(self, camera: Camera) -> RenderResult:
         """Render the current model with a camera in world coordinates, over the background of evaluations."""
@@ -397,7 +405,7 @@ class Trainer:
     def _control_density(self) -> None:
         """Run the density control that is due after one of the last step's views."""
         last = range(self.step - self.position.last_views + 1, self.step + 1)
-        steps = [step for step in last if self.strategy.is_due(step)]
+        steps = list(filter(self.strategy.is_due, last))
         for step in steps if self.step > 0 else ():
             self.repair(look=True)
             if step == steps[0]:

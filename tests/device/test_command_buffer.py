@@ -105,6 +105,25 @@ def test_numbers_that_are_given_anew(made: Work) -> None:
     assert made.made == 1
 
 
+def test_only_numbers_that_have_changed_are_set(device: Device, words: Kernel) -> None:
+    """Each costs a call of the driver. Numbers are compared by their bits, so that -0 replaces 0."""
+    out, sets = allocate(device, (3,), np.uint32), []
+
+    def make() -> None:
+        for number in (0.5, 0.0):
+            arguments = (1, -7, command_buffer.LaunchParameter(number), out, cl.LocalMemory(4))
+            launch_groups(device, words, 1, 1, *arguments)
+
+    _, commands = device.record(make)
+    assert commands is not None
+    places = enumerate(commands.anew)
+    commands.anew = [(lambda _, value, place=place: sets.append((place, value)), index) for place, (_, index) in places]
+    for numbers, expected in (((0.5, 0.0), []), ((0.5, -0.0), [1]), ((0.25, -0.0), [0]), ((0.5, 0.0), [0, 1])):
+        sets.clear()
+        commands.set(numbers)
+        assert sets == [(place, np.float32(numbers[place]).tobytes()) for place in expected]
+
+
 def test_arrays_that_are_given_anew(made: Work) -> None:
     """They take the place of the array that was recorded, in each of its launches, and no other array's."""
     kept, kernel = made.work.array("kept", (3,), np.uint32), made.kernel

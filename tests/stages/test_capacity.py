@@ -4,6 +4,8 @@ and a pass with more pairs than it has room for changes nothing."""
 
 from __future__ import annotations
 
+import gc
+
 import numpy as np
 import pytest
 import scenes
@@ -18,6 +20,7 @@ from clsplat.layouts.columns import PLAIN_SLOTS, READBACK
 from clsplat.rendering.rasterizer import ForwardPass, PairCapacity, Rasterizer
 from clsplat.stages.adam import AdamStep
 from clsplat.stages.density import add_statistics, new_statistics
+from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, upload_gaussians
 from clsplat.stages.project import project_step
 from clsplat.stages.scan import MAX_SINGLE_CHUNK_ELEMENTS, Elements, scan
@@ -88,6 +91,24 @@ def by_capacity(
     assert frame.listed.counted.arriving is not None
     arrived = frame.listed.counted.arriving()
     return frame, {name: int(arrived[READBACK.index(name)]) for name in NAMES}
+
+
+def test_a_camera_is_sent_once_and_a_background_when_it_is_another(device: Device) -> None:
+    rasterizer, first, other = Rasterizer(device), scene("few")[1], scene("cloud")[1]
+    grey, red = np.full(3, 0.5, np.float32), np.array([1, 0, 0], np.float32)
+    gc.collect()  # buffers of earlier tests
+    writes, used = device.calls.writes, device.memory.used
+    camera, background = rasterizer.keep(first, grey)
+    rasterizer.keep(other, grey)
+    assert rasterizer.keep(first, grey) == (camera, background)
+    assert device.calls.writes == writes + 3
+    assert_same_bits(camera.get(), pack_camera(first))
+    assert_same_bits(background.get(), grey)
+    assert rasterizer.keep(first, red) == (camera, background)
+    assert device.calls.writes == writes + 4
+    assert_same_bits(background.get(), red)
+    del first, other, camera
+    assert device.memory.used == used, "a camera's array goes with the camera"
 
 
 @pytest.mark.slow_in_groups

@@ -68,10 +68,11 @@ def test_library(capsys: Capture) -> None:
 
 
 def test_host(scene_folder: Path, capsys: Capture) -> None:
-    """In groups: a step's launches are all replayed."""
+    """In groups: a step's launches are all replayed, and its camera is on the device."""
     flags = ["--size", WIDTH, "--steps", "20", "--shape", "1x64", "--repeat", "3"]
     result = measured(capsys, bench_host, scene_folder, *flags)
     assert 0 < result["calls"]["launches"] <= 12
+    assert result["calls"]["writes"] == 0
     assert (result["calls"]["blocking_reads"], result["calls"]["blocking_writes"]) == (0, 0)
     assert set(result["us"]) == {*bench_host.CAUSES, bench_host.REST}
     assert result["us"]["driver's calls of a replay"] > 0

@@ -51,7 +51,7 @@ CAUSES: dict[str, Sequence[tuple[type, str]]] = {
     "numbers and arrays given anew": [(CommandBuffer, "set")],
     "finding the command buffer": [(Workspace, "replayed")],
     "launches outside command buffers": [(Device, "enqueue")],
-    "sending the camera": [(Rasterizer, "send"), (DeviceArray, "send")],
+    "sending the camera": [(Rasterizer, "send"), (Rasterizer, "keep"), (DeviceArray, "send")],
     "gradient, its key": [(GradientStep, "run")],
     "Adam's key and numbers": [(GradientStep, "_change")],
     "monitor and statistics": [(StepMonitor, name) for name in ("forward", "loss", "before_rows", "after_rows")],

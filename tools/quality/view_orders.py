@@ -11,7 +11,7 @@ from quality.trainings import Rows, trained
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import upload
-from clsplat.device.context import open_device
+from clsplat.device.selection import open_device
 from clsplat.gaussians import Gaussians
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.scenes.loading import load_scene

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,7 @@ from clsplat.arrays import Float32
 from clsplat.optimisation.density_rules import MarkRules
 
 
-@dataclass(frozen=True, eq=False)
-class StatisticsNeeds:
+class StatisticsNeeds(NamedTuple):
     """Statistics that a strategy needs.
 
     gradients: True for sums of screen-space gradients, number of views, and radii.

@@ -17,7 +17,7 @@ from clsplat.training.stability import health
 from clsplat.training.stability.health import Incident, RetryBudget
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class LastStep:
     """A step that is kept, to inspect it if non-finite values are found after it.
 

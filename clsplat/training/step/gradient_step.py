@@ -14,7 +14,7 @@ from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.gaussians import group_shapes
 from clsplat.layouts.columns import SlotFields
-from clsplat.optimisation.dropout import thinning_of
+from clsplat.optimisation.dropout import Thinning, thinning_of
 from clsplat.optimisation.step_noise import NO_EXPLORATION, Exploration
 from clsplat.rendering.rasterizer import ForwardPass, PairCapacity, Rasterizer
 from clsplat.stages.adam import AdamStep, adam
@@ -68,7 +68,11 @@ class StepProbe:
         """Called after Adam on these rows was launched."""
 
 
-@dataclass(frozen=True, eq=False)
+NO_PROBE = StepProbe()
+"""An observer that does nothing."""
+
+
+@dataclass(eq=False)
 class GradientStep:
     """Forward, loss, backward and Adam of one view, on a device and in a rasterizer's memory.
 
@@ -109,40 +113,23 @@ class GradientStep:
         them. They are zero before and after. The model has the same bits with and without them.
         reads_loss: True if the loss will be read.
         """
-        work, camera = self.rasterizer.work, inputs.camera
-        sent = self.rasterizer.send(camera, inputs.background)
-        source = on_device(work, inputs.photograph)
+        camera = inputs.camera
+        place = self.rasterizer.send if self.room is None else self.rasterizer.keep
+        sent = place(camera, inputs.background)
+        source = on_device(self.rasterizer.work, inputs.photograph)
         thinning, terms = thinning_of(self.config, self.step), loss_terms(self.config, inputs)
         chunks = None if inputs.chunks is None else inputs.chunks.prepare(model, self.adam_step)
         model = model if chunks is None else chunks.model
         listed = None if chunks is None else chunks.in_model
         key = self._key(inputs, source, terms, listed)
-
-        def gradient(probe: StepProbe) -> tuple[ForwardPass, Loss, Slots, Sequence[DeviceArray | None]]:
-            forward = partial(self.rasterizer.forward, model[0], camera, sent[1], sent=sent, chunks=listed)
-            frame = forward(room=self.room, thinning=thinning, nearness=self.fields.nearness)
-            probe.forward(frame)
-            result = self._compare(model[0], inputs, source, frame, terms)
-            if reads_loss:
-                result = result.fetched()
-            probe.loss(result)
-            size = (camera.width, camera.height)
-            own = [part.gradient(work, frame.blended.image, result.gradient, size) for part in inputs.parts]
-            slots = self.replayed(
-                model[0],
-                (frame.listed, frame.background, result.gradient, self.fields),
-                lambda: self.rasterizer.pair_gradients(frame, result.gradient, fields=self.fields),
-            )
-            probe.pair_gradients(slots)
-            return frame, result, slots, own
-
+        gradient = partial(self._gradient, model[0], inputs, sent, source, thinning, terms, listed)
         if key is None or reads_loss:
-            frame, result, slots, own = gradient(probe)
+            frame, result, slots, own = gradient(probe, reads_loss=reads_loss)
         else:
-            numbers, given = thinning_numbers(thinning), (source,)
-            frame, result, slots, own = self.replayed(model[0], key, lambda: gradient(StepProbe()), numbers, given)
-            self.device.under_way.append(source.buffer)  # keeps the photograph alive, as in `target`
-            frame = frame.by(camera)
+            numbers, given = thinning_numbers(thinning), (source, sent[0])
+            frame, result, slots, own = self.replayed(model[0], key, gradient, numbers, given)
+            self.device.under_way.append(source.buffer)  # as in `target`
+            frame = frame.by(camera, sent[0])
             probe.forward(frame)
             probe.loss(result)
             probe.pair_gradients(slots)
@@ -152,6 +139,39 @@ class GradientStep:
         self.learn(inputs, own)
         return result
 
+    def _gradient(
+        self,
+        of: AnyGaussians,
+        inputs: ViewInputs,
+        sent: tuple[DeviceArray, DeviceArray],
+        source: DeviceArray,
+        thinning: Thinning | None,
+        terms: Sequence[LossTerm],
+        chunks: ChunkList | None,
+        probe: StepProbe = NO_PROBE,
+        *,
+        reads_loss: bool = False,
+    ) -> tuple[ForwardPass, Loss, Slots, Sequence[DeviceArray | None]]:
+        """The view's forward pass, its loss, the gradients of its pairs, and those for its parts' own parameters."""
+        camera = inputs.camera
+        forward = partial(self.rasterizer.forward, of, camera, sent[1], sent=sent, chunks=chunks)
+        frame = forward(room=self.room, thinning=thinning, nearness=self.fields.nearness)
+        probe.forward(frame)
+        result = self._compare(of, inputs, source, frame, terms)
+        if reads_loss:
+            result = result.fetched()
+        probe.loss(result)
+        view = (self.rasterizer.work, frame.blended.image, result.gradient, (camera.width, camera.height))
+        own = [part.gradient(*view) for part in inputs.parts]
+        slots = self.replayed(
+            of,
+            (frame.listed, frame.background, result.gradient, self.fields),
+            lambda: self.rasterizer.pair_gradients(frame, result.gradient, fields=self.fields),
+            given=sent[:1],
+        )
+        probe.pair_gradients(slots)
+        return frame, result, slots, own
+
     def _key(
         self, inputs: ViewInputs, source: DeviceArray, terms: Sequence[LossTerm], chunks: ChunkList | None
     ) -> tuple[object, ...] | None:
@@ -160,7 +180,7 @@ class GradientStep:
         keys, camera, room, fields = tuple(term.key for term in terms), inputs.camera, self.room, self.fields
         if room is None or inputs.parts or inputs.kept is not None or None in keys:
             return None
-        of_view = (self.rasterizer.device_of(camera), camera.width, camera.height, source.shape, source.dtype)
+        of_view = (self.rasterizer.device_of(camera), source.shape, source.dtype)  # the camera has the source's size
         of_step = (room.pairs, room.turn, room.appends, fields.absolute, fields.contributions, fields.nearness)
         rows = None if chunks is None else chunks.key
         return (*of_view, *of_step, self.turn, self.config.thinning > 0, keys, rows)
@@ -228,7 +248,8 @@ class GradientStep:
         rows = None if chunks is None else chunks.listed.key
         key = (slots, *map(ref, model[1:]), step.updates_sh_rest, bool(explore.weights), explore.amount != 0, rows)
         numbers = (*step_numbers(step, explore), *noise_numbers(explore), *probe.numbers)
-        self.replayed(model[0], (*key, *probe.key), change, numbers, before=probe.before_replay)
+        given = (frame.camera_array,)
+        self.replayed(model[0], (*key, *probe.key), change, numbers, given, probe.before_replay)
 
     def _rows(
         self,
@@ -307,7 +328,7 @@ class GradientStep:
             part.update(gradient, self.rasterizer.readback)
 
     def update(self, rows: StepRows) -> None:
-        """Take Adam's step for some rows, after the gradient of projection if that is still missing; then add noise."""
+        """Take Adam's step for some rows; compute the gradient of projection if that is not done yet."""
         step, readback = self.adam_step, self.rasterizer.readback
         if rows.gradients is not None:
             parameters, first, second = rows.model

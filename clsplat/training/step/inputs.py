@@ -46,7 +46,7 @@ class ChunksInView(Protocol):
         """Make the chunks ready for the step. None if the step runs over the whole model."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class ViewInputs:
     """A view of a step.
 

@@ -17,7 +17,7 @@ from clsplat.training.step.inputs import StepRows, ViewInputs, ViewRows
 from clsplat.training.step.speculative_steps import SpeculativeSteps
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class StepMonitor(StepProbe):
     """Probe that notices non-finite values, tries the kernels that change the state, and adds statistics for density
     control.

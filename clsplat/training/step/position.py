@@ -13,7 +13,7 @@ from clsplat.runs.checkpoints import Checkpoint, unusable
 from clsplat.training.stability.health import RetryBudget
 
 
-@dataclass(frozen=True)
+@dataclass
 class Mark:
     """A position at which a checkpoint is possible, with the state of the random generator."""
 

@@ -55,9 +55,10 @@ class ImageCache:
 
     def kept(self, index: int, factor: float) -> int | None:
         """Number of pixels that count in the image that `load` returns; None without a mask."""
-        if (index, factor) not in self._kept:
-            self._kept[index, factor] = kept_pixels(self.load(index, factor))
-        return self._kept[index, factor]
+        key = index, factor
+        if key not in self._kept:
+            self._kept[key] = kept_pixels(self.load(index, factor))
+        return self._kept[key]
 
     def bring(self, index: int, factor: float) -> NDArray[Any] | DeviceArray:
         """The image that `load` returns: a device array if the device has room for it, else the host's array.
