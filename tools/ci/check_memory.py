@@ -239,7 +239,9 @@ def main(arguments: list[str]) -> int:
         folder = options.keep or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         with ThreadPoolExecutor(max(options.jobs, 1)) as pool:
-            results = list(pool.map(lambda each: run(*each, driver, folder, short=options.short), asked))
+            results = list(
+                pool.map(lambda each: run(each[0], each[1], each[2], driver, folder, short=options.short), asked)
+            )
     clean = True
     builds: dict[tuple[str, str], set[str]] = {}
     for (shape, check, part), result in zip(asked, results, strict=True):
