@@ -6,9 +6,10 @@
 
 Runs `memory_workload.py` in child processes whose only device is Oclgrind's (Debian and Ubuntu: apt install oclgrind),
 once for bounds, races and API calls, and once for uninitialised values. Prints each finding with its kernel and line.
-With --short, as in CI, pictures are of one tile or two, and training's methods take one step: every kernel runs in
-every build (`-D` options) that it has without. The exit status is 0 if nothing was found, 2 without Oclgrind, and 1 if
-there are findings, if a kernel never ran, if --short would leave out a build, or if a planted fault was missed.
+With --short, as in CI, pictures are of one tile or two, training's methods take one step, and the parts of WHOLE_ONLY
+are left out: every kernel runs in every build (`-D` options) that it has without. The exit status is 0 if nothing was
+found, 2 without Oclgrind, and 1 if there are findings, if a kernel never ran, if a part that --short leaves out has a
+build of its own, or if a planted fault was missed.
 """
 
 from __future__ import annotations
