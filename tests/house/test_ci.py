@@ -8,6 +8,7 @@ import re
 import shutil
 import signal
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -57,17 +58,42 @@ def test_the_parts_have_every_step_once(tmp_path: Path) -> None:
 
 
 def test_the_first_failure_ends_the_run_with_the_table(tmp_path: Path) -> None:
-    result = ran(tmp_path, mypy="bash -c 'exit 7'")
+    result = ran(tmp_path, **{"ruff format": "bash -c 'exit 7'"})
     assert result.returncode == 1 and "all passed" not in result.stdout
-    assert rows(result.stdout) == ["environment", "ruff check", "ruff format", "mypy (failed)", "in all"]
-    assert "== FAILED: mypy (status 7 after " in result.stderr
+    assert rows(result.stdout) == ["environment", "ruff check", "ruff format (failed)", "in all"]
+    assert "== FAILED: ruff format (status 7 after " in result.stderr
+
+
+def test_a_step_beside_others_fails_where_it_is_waited_for(tmp_path: Path) -> None:
+    result = ran(tmp_path, mypy="bash -c 'echo an error; exit 7'")
+    assert result.returncode == 1 and "all passed" not in result.stdout
+    assert rows(result.stdout)[-3:] == ["newcomer: tools/demo", "mypy (failed)", "in all"]
+    assert "an error" in result.stdout.splitlines() and "== FAILED: mypy (status 7 after " in result.stderr
+
+
+def test_a_step_beside_others_ends_with_the_run(tmp_path: Path) -> None:
+    process = tmp_path.with_suffix(".process")
+    begun = f"while [ ! -s {process} ]; do sleep 0.01; done; exit 7"
+    steps = {"mypy": f"bash -c 'echo $$ >{process}; sleep 600; true'", "newcomer: clone": f"bash -c '{begun}'"}
+    result = ran(tmp_path, **steps)
+    assert result.returncode == 1 and rows(result.stdout)[-2:] == ["newcomer: clone (failed)", "in all"]
+    with pytest.raises(ProcessLookupError):
+        _wait_until_gone(int(process.read_text()))
+
+
+def _wait_until_gone(process: int, seconds: float = 10) -> None:
+    """Raises ProcessLookupError once there is no such process."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        os.kill(process, 0)
+        time.sleep(0.01)
 
 
 @pytest.mark.parametrize(("command", "status"), [("exit 0", 0), ("exit 3", 3), ("kill -TERM $$", -signal.SIGTERM)])
 def test_a_run_that_is_cut_off_says_in_which_step(tmp_path: Path, command: str, status: int) -> None:
-    result = ran(tmp_path, "full", torch=command)
+    result = ran(tmp_path, "full", browser=command)
     assert result.returncode == status and "all passed" not in result.stdout
-    assert rows(result.stdout) == ["environment", "OpenCL drivers", "torch (did not end)", "in all"]
+    assert rows(result.stdout) == ["environment", "OpenCL drivers", "browser (did not end)", "in all"]
 
 
 def test_its_processes_keep_what_python_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

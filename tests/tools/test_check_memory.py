@@ -10,9 +10,10 @@ import check_memory
 import pytest
 from calls import printed
 from check_memory import CHECKS, Finding, Result, findings, kernels, places, report, report_planted
-from memory_workload import by_elements
+from memory_workload import WHOLE_ONLY, build_of, by_elements
 
 from clsplat.config.colour_models import COLOUR_MODELS
+from clsplat.device.context import Device
 from clsplat.device.source import kernel_root, kernel_source
 
 STEMS = sorted({stem for stems in kernels().values() for stem in stems})
@@ -82,9 +83,37 @@ def test_whatever_is_logged_is_a_finding(log: str, capsys: pytest.CaptureFixture
 def test_a_kernel_that_never_ran_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     ran = " ".join(sorted(set(kernels()) - {"scan_chunks"}))
     monkeypatch.setattr(check_memory, "library", lambda: Path("driver"))
-    monkeypatch.setattr(check_memory, "run", lambda shape, check, *_: Result(f"{shape} {check}", 0, ran, "", 0.0))
+    monkeypatch.setattr(check_memory, "run", lambda shape, check, *_, **_named: Result(shape, 0, ran, "", 0.0))
     monkeypatch.setattr(check_memory, "report_planted", lambda *_: True)
     assert "never ran: scan_chunks" in printed(capsys, ["--shapes", "8x1"], status=1, call=check_memory.main).out
+
+
+@pytest.mark.parametrize("short", [True, False])
+def test_the_short_form_leaves_out_no_build(
+    short: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """A build of 1x64 that only such parts have as the short form leaves out is told by the whole check."""
+    everywhere = " ".join(f"{name}@{stems[0]}" for name, stems in kernels().items())
+
+    def run(shape: str, check: str, part: str, *_: object, **named: object) -> Result:
+        assert named == {"short": short} and not (short and part in WHOLE_ONLY)
+        alone = " blend@blend,SECRET" if (shape == "1x64") == (part in WHOLE_ONLY) else ""
+        return Result(f"{shape} {check} {part}", 0, everywhere + alone, "", 0.0)
+
+    monkeypatch.setattr(check_memory, "library", lambda: Path("driver"))
+    monkeypatch.setattr(check_memory, "run", run)
+    monkeypatch.setattr(check_memory, "report_planted", lambda *_: True)
+    arguments = [*(["--short"] if short else []), "--keep", str(tmp_path)]
+    out = printed(capsys, arguments, status=int(not short), call=check_memory.main).out
+    told = [f"{check}, the short form would leave out: 1x64 blend@blend,SECRET" for check in CHECKS]
+    assert [line for line in out.splitlines() if "leave out" in line] == ([] if short else told)
+    assert "8x1 blend@blend,SECRET" in (tmp_path / "builds.txt").read_text().splitlines()
+
+
+@pytest.mark.parametrize("shape", ["8x1", "1x64"])
+def test_a_build_is_a_word_with_its_defines(shape: str, default_device: Device) -> None:
+    kernel = default_device.with_shape(shape).kernels("target", {"MASKED": True, "ALPHA": True}).target
+    assert re.fullmatch(r"target@target,ALPHA,(FMA_BY_CONTRACTION,)?(LANES=\d+,)?MASKED", build_of(kernel))
 
 
 def test_without_oclgrind(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

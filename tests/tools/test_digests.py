@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""tools/ci/digests.py: what it calls a problem. CI runs the whole of it."""
+"""tools/ci/digests.py: what it calls a problem. CI runs its short form."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import digests
 import pytest
 from calls import python
 from compare import relative_error
-from digests import EXPECTED, Job, Row, in_turn, problems
+from digests import EXPECTED, IN_SHORT, SAME_ORDER, Job, Row, in_turn, jobs, problems
 from golden_frames import SCENES, arrays_of
 from pipeline import shaped
 from quick import quick
@@ -33,6 +33,20 @@ def test_drivers_take_turns() -> None:
     begun = [rows[number] for number in in_turn(listed)]
     assert begun[0] == ("Rusticl", "1x64")
     assert begun[1:] == [("A", "8x1"), ("B", "8x1"), ("A", "1x64"), ("B", "1x64"), ("B", "1x32")]
+
+
+def test_the_short_table_has_every_driver_and_every_shape(tmp_path: Path) -> None:
+    """That is as SAME_ORDER needs it: 1x64 on every driver, and the shapes of its order beside it on the first."""
+    (tmp_path / "whole").mkdir()
+    (tmp_path / "short").mkdir()
+    whole, short = jobs(tmp_path / "whole"), jobs(tmp_path / "short", short=True)
+    assert {(job.driver, job.shape) for job in short} <= {(job.driver, job.shape) for job in whole}
+    assert {job.driver for job in short} == {job.driver for job in whole}
+    first = {job.shape for job in whole if job.index == 0}
+    assert {job.shape for job in short if job.index == 0} == first and set(SAME_ORDER) <= first
+    for index in {job.index for job in whole} - {-1}:
+        there = {job.shape for job in whole if job.index == index}
+        assert {job.shape for job in short if job.index == index} >= there & set(IN_SHORT)
 
 
 def test_no_problem() -> None:

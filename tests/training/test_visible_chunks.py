@@ -18,7 +18,8 @@ from tiny import cameras, hidden_model, run_steps, short
 
 from clsplat.chunks.order import beside_parents, space_order
 from clsplat.config.training import OptimiserConfig, TrainConfig
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.errors import DriverError
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import CHUNK_ROWS

@@ -2,12 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every kernel under Oclgrind: reads and writes out of bounds, data races, values read before they are written.
 
-    python tools/ci/check_memory.py [--shapes 1x64,8x1] [--jobs N] [--keep FOLDER]
+    python tools/ci/check_memory.py [--short] [--shapes 1x64,8x1] [--jobs N] [--keep FOLDER]
 
 Runs `memory_workload.py` in child processes whose only device is Oclgrind's (Debian and Ubuntu: apt install oclgrind),
 once for bounds, races and API calls, and once for uninitialised values. Prints each finding with its kernel and line.
-The exit status is 0 if nothing was found, 2 without Oclgrind, and 1 if there are findings, if a kernel never ran, or if
-a planted fault was missed.
+With --short, as in CI, pictures are of one tile or two, training's methods take one step, and the parts of WHOLE_ONLY
+are left out: every kernel runs in every build (`-D` options) that it has without. The exit status is 0 if nothing was
+found, 2 without Oclgrind, and 1 if there are findings, if a kernel never ran, if a part that --short leaves out has a
+build of its own, or if a planted fault was missed.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from memory_workload import PARTS
+from memory_workload import PARTS, WHOLE_ONLY
 
 from clsplat.device.source import _INCLUDE, kernel_root, kernel_source
 
@@ -142,7 +144,7 @@ class Result:
     seconds: float
 
 
-def run(shape: str, check: str, part: str, driver: Path, folder: Path) -> Result:
+def run(shape: str, check: str, part: str, driver: Path, folder: Path, *, short: bool = False) -> Result:
     """Run a part of the workload in a child process whose only device is Oclgrind's."""
     vendors = folder / "vendors"
     vendors.mkdir(exist_ok=True)
@@ -162,7 +164,8 @@ def run(shape: str, check: str, part: str, driver: Path, folder: Path) -> Result
         "PYOPENCL_NO_CACHE": "1",  # one check must not load the builds of the other from the cache
         "PYTHONPATH": os.pathsep.join(filter(None, (str(WORKLOAD.parents[2]), os.environ.get("PYTHONPATH", "")))),
     }
-    command = [sys.executable, str(WORKLOAD), shape, part, *(["plain"] if check == "uninitialised" else [])]
+    words = [word for word, wanted in (("plain", check == "uninitialised"), ("short", short)) if wanted]
+    command = [sys.executable, str(WORKLOAD), shape, part, *words]
     start = time.monotonic()
     done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace", check=False)
     logged = log.read_text(errors="replace") if log.exists() else ""
@@ -197,12 +200,32 @@ def report_planted(result: Result, check: str) -> bool:
     return result.status == 0 and not missing
 
 
+def report_builds(builds: Mapping[tuple[str, str], set[str]], kernels: set[str]) -> bool:
+    """Print the kernels that never ran, and the builds that the short form would leave out. Returns True if there are
+    none.
+
+    builds: "SHAPE KERNEL@BUILD" of what ran, keyed by check, and by "short", or "whole" for what the short form leaves
+        out.
+    """
+    clean = True
+    for check in CHECKS:
+        short, whole = (builds.get((check, form), set()) for form in ("short", "whole"))
+        never = kernels - {each.split()[1].partition("@")[0] for each in short | whole}
+        if never:  # some kernels are built only in some shapes
+            print(f"{check}, never ran: {', '.join(sorted(never))}")
+        for build in sorted(whole - short):
+            print(f"{check}, the short form would leave out: {build}")
+        clean &= not never and whole <= short
+    return clean
+
+
 def main(arguments: list[str]) -> int:
     """Run the checks that the module describes."""
     parser = argparse.ArgumentParser(prog="check_memory", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--short", action="store_true", help="small pictures, few steps, and every build nevertheless")
     parser.add_argument("--shapes", default="1x64,8x1", help="kernel shapes, LANESxITEMS with 1 or 8 lanes")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="children at once")
-    parser.add_argument("--keep", type=Path, help="folder for Oclgrind's logs")
+    parser.add_argument("--keep", type=Path, help="folder for Oclgrind's logs and builds.txt")
     options = parser.parse_args(arguments)
     driver = library()
     if driver is None:
@@ -210,25 +233,31 @@ def main(arguments: list[str]) -> int:
         return 2
     stems = kernels()
     shapes = options.shapes.split(",")
-    asked = [(shape, check, part) for shape in shapes for check in reversed(CHECKS) for part in PARTS]
+    parts = [part for part in PARTS if not (options.short and part in WHOLE_ONLY)]
+    asked = [(shape, check, part) for shape in shapes for check in reversed(CHECKS) for part in parts]
     asked += [("planted", check, "") for check in CHECKS]  # the longest parts begin first
     with tempfile.TemporaryDirectory(prefix="clsplat-memory-") as scratch:
         folder = options.keep or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         with ThreadPoolExecutor(max(options.jobs, 1)) as pool:
-            results = list(pool.map(lambda each: run(each[0], each[1], each[2], driver, folder), asked))
-    clean, missing = True, {check: set(stems) for check in CHECKS}
-    for (shape, check, _), result in zip(asked, results, strict=True):
+            results = list(
+                pool.map(lambda each: run(each[0], each[1], each[2], driver, folder, short=options.short), asked)
+            )
+    clean = True
+    builds: dict[tuple[str, str], set[str]] = {}
+    for (shape, check, part), result in zip(asked, results, strict=True):
         if shape == "planted":
             clean &= report_planted(result, check)
             continue
         clean &= report(result, stems)
-        missing[check] -= set(result.output.split())
-    for check, names in missing.items():
-        if names:  # some kernels are built only in some shapes
-            print(f"{check}, never ran: {', '.join(sorted(names))}")
-            clean = False
-    print(f"{len(stems)} kernels in {len(shapes)} shapes: {'clean' if clean else 'NOT clean'}")
+        # with the shape, as each has builds of its own
+        ran = {f"{shape} {word}" for word in result.output.split()}
+        builds.setdefault((check, "whole" if part in WHOLE_ONLY else "short"), set()).update(ran)
+    clean &= report_builds(builds, set(stems))
+    if options.keep:
+        (folder / "builds.txt").write_text("".join(f"{line}\n" for line in sorted(set().union(*builds.values()))))
+    many = len(set().union(*builds.values()))
+    print(f"{len(stems)} kernels, {many} builds in {len(shapes)} shapes: {'clean' if clean else 'NOT clean'}")
     return int(not clean)
 
 

@@ -3,7 +3,7 @@
 """Table of drivers and kernel shapes: digests of frames, of gradients, of a trained model, and of pictures with every
 channel and camera model; or by how much they differ.
 
-    .venv/bin/python tools/ci/digests.py
+    .venv/bin/python tools/ci/digests.py [--short]
 
 Prints the tables of docs/bit-identity.md: drivers with the same digests share a row, and every channel has a digest.
 The first line names the processor.
@@ -49,6 +49,9 @@ SAME_ORDER = ("1x32", "1x64", "1x128", "1x256")
 """Shapes with one order of sums: their gradients are the same (decision 0023)."""
 TRAINED = ("8x1", "16x1", "1x1", "1x64")
 """Shapes in which a model is trained, twice. Other work-groups differ from 1x64 only where gradients show it."""
+IN_SHORT = ("8x1", "16x1", "1x1", "1x64", "1x64g", "1x64s")
+"""Shapes of every driver with --short, as in CI: one for each kernel of the gradient. The first driver has all, so that
+each shape is compared with the others there."""
 METHODS = {"loops": ("8x1", "1x64"), "cbs": ("1x64",)}
 """Values of POCL_WORK_GROUP_METHOD in addition to PoCL's default, which is loopvec, with the shapes to run."""
 UNKNOWN_METHOD = "Unknown work group generation method"
@@ -113,12 +116,13 @@ def main(arguments: list[str]) -> int:
     if arguments[:1] == ["child"]:
         child(int(arguments[1]), arguments[2], Path(arguments[3]), Path(arguments[4]) if arguments[4:] else None)
         return 0
-    if arguments:
+    short = arguments == ["--short"]
+    if arguments and not short:
         print(__doc__, file=sys.stderr)
         return 2
     start = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="clsplat-digests-") as folder:
-        rows = run_all(jobs(Path(folder)), Path(folder))
+        rows = run_all(jobs(Path(folder), short=short), Path(folder))
     print(f"{processor()}\n")
     print(table(rows))
     slowest = max(rows, key=lambda row: row.seconds)
@@ -130,8 +134,8 @@ def main(arguments: list[str]) -> int:
     return 1 if found else 0
 
 
-def jobs(folder: Path) -> list[Job]:
-    """Jobs of every driver in every shape."""
+def jobs(folder: Path, *, short: bool = False) -> list[Job]:
+    """Jobs of every driver in every shape. short: of drivers after the first, those of IN_SHORT alone."""
     from opencl_drivers import use_every_driver
 
     use_every_driver()
@@ -141,7 +145,8 @@ def jobs(folder: Path) -> list[Job]:
     listed: list[Job] = []
     names = _names()
     for index, name in enumerate(names):
-        able = [shape for shape in SHAPES if shape not in SUBGROUPED or subgroup_ways(all_devices()[index])]
+        asked = IN_SHORT if short and index else SHAPES
+        able = [shape for shape in asked if shape not in SUBGROUPED or subgroup_ways(all_devices()[index])]
         listed += [Job(name, index, shape, train=shape in TRAINED, environment={}) for shape in able]
     for index, name in enumerate(names):
         if name.startswith("PoCL"):

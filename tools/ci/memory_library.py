@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from memory_scenes import EXTENT
 
 from clsplat.device.context import Device
 from clsplat.library.harmonics import spherical_harmonics
@@ -14,13 +15,13 @@ from clsplat.library.rasterize import rasterize
 from clsplat.library.tile_list_pixels import rasterize_to_pixels
 from clsplat.library.tiles import isect_offset_encode, isect_tiles
 
-WIDTH, HEIGHT, COUNT = 20, 10, 65
-"""Image size and number of Gaussians: the last tiles extend beyond the image, and one group of 64 is not enough."""
+COUNT = 65
+"""Number of Gaussians: one group of 64 is not enough."""
 
 
 def library(device: Device) -> None:
     """Run every kernel of clsplat/library in all builds that differ. Raises SystemExit for non-finite numbers."""
-    rng = np.random.default_rng(0)
+    rng, (width, height) = np.random.default_rng(0), EXTENT.low
     means, quaternions = rng.uniform(-0.7, 0.7, (COUNT, 3)), rng.normal(size=(COUNT, 4))
     scales, opacities = rng.uniform(0.02, 0.2, (COUNT, 3)), rng.uniform(0.1, 1.0, COUNT)
     roots = rng.uniform(-0.2, 0.2, (COUNT, 3, 3))
@@ -38,19 +39,19 @@ def library(device: Device) -> None:
     )
     for index, (gaussians, values, settings) in enumerate(calls):
         cameras = slice(0, 2 if index == 0 else 1)  # a second camera adds to the gradients
-        views = (poses[cameras], lenses[cameras], WIDTH, HEIGHT)
+        views = (poses[cameras], lenses[cameras], width, height)
         result = rasterize(*gaussians, values, *views, device=device, **settings)
         gradients = result.vjp(np.ones_like(result.images), np.ones_like(result.alphas))
         check(result.images, *gradients.values())
     for degree, coefficients in ((2, sh), (4, wide)):
         directions = spherical_harmonics(degree, means, coefficients, np.arange(COUNT) % 3 > 0, device=device)
         check(directions.colors, *directions.vjp(np.ones((COUNT, 3))).values())
-    result = rasterize(*plain, colours, poses[:1], lenses[:1], WIDTH, HEIGHT, device=device)
-    tiles = (-(-WIDTH // 16), -(-HEIGHT // 16))
+    result = rasterize(*plain, colours, poses[:1], lenses[:1], width, height, device=device)
+    tiles = (-(-width // 16), -(-height // 16))
     _, ids, gaussians_listed = isect_tiles(result.means2d, result.radii, result.depths, 16, *tiles)
     offsets = isect_offset_encode(ids, 1, *tiles)
     arrays = (result.means2d, result.conics, result.colors2d, result.opacities)
-    pixels = rasterize_to_pixels(*arrays, WIDTH, HEIGHT, 16, offsets, gaussians_listed, device=device)
+    pixels = rasterize_to_pixels(*arrays, width, height, 16, offsets, gaussians_listed, device=device)
     check(pixels.colors, *pixels.vjp(np.ones_like(pixels.colors)).values())
 
 

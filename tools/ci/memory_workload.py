@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Workload of `tools/ci/check_memory.py` in a child under Oclgrind: every kernel on scenes of a few tiles.
 
-    memory_workload.py planted|LANESxITEMS [plain]
+    memory_workload.py planted|LANESxITEMS [plain] [short] [PART]
 
-Prints the name of each kernel before it runs. `plain`: with the replacements that the check of uninitialised
-reads needs with Oclgrind 21.10, see STAND_INS.
+Prints the name of each kernel and its build before it runs. `plain`: with the replacements that the check of
+uninitialised reads needs with Oclgrind 21.10, see STAND_INS. `short`: with the least pictures and steps, see Extent.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 from memory_library import library
+from memory_scenes import EXTENT, camera, cloud
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
@@ -34,7 +35,7 @@ from clsplat.device.drivers.shapes import Shape
 from clsplat.device.program import Kernel
 from clsplat.device.source import kernel_source
 from clsplat.frame.deep import Merge
-from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
+from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.images.holdouts import surfaces_of
 from clsplat.layouts.columns import POSE_ROWS, READBACK, WIDEST_SLOTS
 from clsplat.optimisation.density_rules import MarkRules
@@ -74,38 +75,17 @@ __kernel void planted_uninitialised(__global float *out, __global const float *i
 """One fault of each kind that the check is there to find; it fails where it does not."""
 
 
-def camera(width: int, height: int) -> Camera:
-    """Looks along z, a little off the centre."""
-    return Camera(width, height, 0.9 * width, 0.8 * width, 0.45 * width, 0.55 * height, np.eye(3), np.zeros(3))
-
-
-def cloud(count: int, view: Camera, seed: int = 0, degree: int = 3) -> Gaussians:
-    """Gaussians of all sizes and opacities, some beside the image, behind the camera or too faint to show."""
-    rng = np.random.default_rng(seed)
-    depth = rng.uniform(1.5, 5.0, count)
-    depth[::9] *= -1
-    at = rng.uniform(-0.2, 1.2, (count, 2)) * (view.width, view.height)
-    sides = (at - (view.cx, view.cy)) / (view.fx, view.fy) * depth[:, None]
-    sh = rng.normal(0, 0.2, (count, (degree + 1) ** 2, 3))
-    return Gaussians(
-        np.concatenate([sides, depth[:, None]], axis=1).astype(np.float32),
-        rng.normal(size=(count, 4)).astype(np.float32),
-        np.log(np.abs(depth)[:, None] / view.fx * rng.uniform(0.5, 4.0, (count, 3))).astype(np.float32),
-        rng.uniform(-6, 6, count).astype(np.float32),
-        sh.astype(np.float32),
-    )
-
-
 def image_gradient(device: Device, frame: ForwardPass) -> DeviceArray:
-    """Random planes by an image of 33 x 17, zero in its padding."""
+    """Random planes by an image of EXTENT.frame, zero in its padding."""
+    width, height = EXTENT.frame
     planes = np.zeros((4, *frame.blended.image.shape[1:]), np.float32)
-    planes[:, :17, :33] = np.random.default_rng(1).normal(size=(4, 17, 33))
+    planes[:, :height, :width] = np.random.default_rng(1).normal(size=(4, height, width))
     return upload(device, planes)
 
 
 def frames(device: Device) -> None:
     """Forward and backward: as trained, with every exact switch off, in bands, and the counting build."""
-    view = camera(33, 17)
+    view = camera(*EXTENT.frame)
     gaussians, background = cloud(40, view), upload(device, np.array([0.1, 0.2, 0.3], np.float32))
     held = upload_gaussians(device, gaussians)
     names = [each.name for each in fields(BenchSwitches) if isinstance(each.default, bool)]
@@ -114,7 +94,7 @@ def frames(device: Device) -> None:
     for config, small in ((RasterizerConfig(), False), (all_off, False), (RasterizerConfig(), True)):
         rasterizer = Rasterizer(device, config)
         if small:
-            rasterizer.capacity = 70
+            rasterizer.capacity = EXTENT.capacity
         frame = rasterizer.forward(held, view, background, nearness=True)
         if small and len(frame.bands) < 2:
             raise SystemExit("the frame in bands has one band only")
@@ -142,7 +122,7 @@ def subgroups(device: Device) -> None:
     items = opened.shape.items
     out = allocate(opened, (3, items), np.float32)
     launch.launch_groups(opened, opened.kernels("probe_subgroup").probe_subgroup, 1, items, out)
-    view = camera(33, 17)
+    view = camera(*EXTENT.frame)
     rasterizer, held = Rasterizer(opened), upload_gaussians(opened, cloud(40, view))
     frame = rasterizer.forward(held, view, upload(opened, np.zeros(3, np.float32)), nearness=True)
     slots = rasterizer.pair_gradients(frame, image_gradient(opened, frame), fields=WIDEST_SLOTS)
@@ -175,7 +155,7 @@ def check(name: str, case: Case, device: Device, given: Inputs) -> None:
 
 def rendering(device: Device) -> None:
     """Kernels that only rendering needs: fewer SH bands by Gaussian, half floats."""
-    view = camera(20, 17)
+    view = camera(*EXTENT.view)
     gaussians = cloud(27, view, 3)
     gaussians.sh[::2, 4:] = 0
     config = RasterizerConfig(sh_storage="half", sh_tolerance=0.05)
@@ -184,8 +164,9 @@ def rendering(device: Device) -> None:
 
 def pictures(device: Device) -> None:
     """Kernels that only pictures need: channels beside colour, slices by depth; cameras without an image plane."""
-    flat = camera(33, 17)
-    around = replace(flat, fx=33 / (2 * np.pi), fy=33 / (2 * np.pi), projection="equirectangular")
+    flat = camera(*EXTENT.picture)
+    radius = flat.width / (2 * np.pi)
+    around = replace(flat, fx=radius, fy=radius, projection="equirectangular")
     gaussians = cloud(30, flat, 6)
     for view in (flat, around, replace(around, fx=9.0, fy=9.0, projection="fisheye")):
         renderer = Renderer(device)
@@ -211,44 +192,49 @@ PAPER = TrainConfig(
     density=DensityConfig(every=2, start=1, stop=6, gradient_threshold=1e-7, opacity_reset_every=3),
 )
 AHEAD = replace(PAPER, iterations=3, warmup=())
-VIEW, LOW = camera(20, 17), camera(17, 7)
-"""Of four tiles, and of two: Oclgrind takes most of its time for the pixels of blending and of the loss."""
 
 
 def training(device: Device) -> None:
-    """Steps in which everything happens: SH bands are added, Gaussians cloned, split and pruned, opacities reset. Some
-    by capacity, of which one has too little."""
+    """Steps with statistics of every kind, after which Gaussians are cloned, split and pruned; and steps by capacity,
+    of which one has too little."""
     density = replace(PAPER.density, absolute_gradients=True, min_contribution=1e-3, prune_every=3, max_gaussians=60)
     wide = replace(PAPER, iterations=4, warmup=(), sh_degree=1, sh_degree_every=1, background="random")
     wide = replace(wide, optimiser=OptimiserConfig(sparse=True), density=density)
-    for config, channels, view in ((PAPER, 3, VIEW), (wide, 4, LOW), (AHEAD, 3, LOW)):
-        _train(device, config, channels, view)
+    _train(device, wide, 4, camera(*EXTENT.low))
+    _train(device, AHEAD, 3, camera(*EXTENT.low))
+
+
+def more_training(device: Device) -> None:
+    """Steps in which everything happens: SH bands are added, the resolution doubles, opacities are reset. And methods
+    by themselves whose kernels `cases` has."""
+    _train(device, PAPER, 3, camera(*EXTENT.view))
+    low, short = camera(*EXTENT.low), replace(AHEAD, iterations=EXTENT.steps)
+    _train(device, replace(short, appearance="ppisp"), 3, low)
+    _train(device, replace(short, appearance="grid"), 3, low)
+    _train(device, replace(short, masks="transparent"), 5, low)
 
 
 def methods(device: Device) -> None:
-    """Two steps of each of training's methods, and by each kind of camera."""
-    short = replace(AHEAD, iterations=2)
-    _train(device, replace(short, antialiased=True), 3, LOW)
-    _train(device, replace(short, density=replace(PAPER.density, growth="mcmc", max_gaussians=60)), 3, LOW)
-    _train(device, replace(short, appearance="exposure", masks="ignore"), 5, LOW)
+    """Steps of each of training's methods that has builds of its own, and by each kind of camera."""
+    low, short = camera(*EXTENT.low), replace(AHEAD, iterations=EXTENT.steps)
+    _train(device, replace(short, antialiased=True), 3, low)
+    _train(device, replace(short, density=replace(PAPER.density, growth="mcmc", max_gaussians=60)), 3, low)
+    _train(device, replace(short, appearance="exposure", masks="ignore"), 5, low)
     # Of so small a scene points tell no gain, and none is pulled; the last photograph's row is the array's end.
     gains = Gains.on(device, np.zeros((3, 3), np.float32), csr_array(np.ones((3, 3))))
     columns, readback = upload(device, np.ones((3, 16), np.float32)), upload(device, np.zeros(len(READBACK), np.uint32))
     step_gains(device, gains, 2, columns, 1, 1e-3, readback)
     gains.logs.get()
-    _train(device, replace(short, appearance="ppisp"), 3, LOW)
-    _train(device, replace(short, appearance="grid"), 3, LOW)
-    _train(device, replace(short, masks="transparent"), 5, LOW)
     # One view is not held; sums of more than POSE_ROWS Gaussians take two kernels.
     refined = replace(short, refine_poses=True, refine_lenses=True, iterations=3)
-    _train(device, refined, 3, LOW, views=3, count=POSE_ROWS + 1)
-    _train(device, replace(short, depth="points"), 3, LOW)
+    _train(device, refined, 3, low, views=3, count=POSE_ROWS + 1)
+    _train(device, replace(short, depth="points"), 3, low)
     long = replace(PAPER.density, growth="budget", max_gaussians=60, long_axis=True)
-    _train(device, replace(short, thinning=0.3, density=long), 3, LOW)
-    fisheye = replace(LOW, fx=9.0, fy=9.0, projection="fisheye", radial=(0.05, 0.01, 0.0, 0.0))
-    around = LOW.width / (2 * np.pi)
-    panorama = replace(LOW, fx=around, fy=around, projection="equirectangular")
-    for view in (fisheye, panorama, replace(LOW, fx=9.0, fy=9.0, projection="orthographic")):
+    _train(device, replace(short, thinning=0.3, density=long), 3, low)
+    fisheye = replace(low, fx=9.0, fy=9.0, projection="fisheye", radial=(0.05, 0.01, 0.0, 0.0))
+    around = low.width / (2 * np.pi)
+    panorama = replace(low, fx=around, fy=around, projection="equirectangular")
+    for view in (fisheye, panorama, replace(low, fx=9.0, fy=9.0, projection="orthographic")):
         _train(device, short, 3, view)
 
 
@@ -417,21 +403,31 @@ def by_elements(source: str, lanes: int) -> str:
 PARTS = {
     "training": (training,),
     "methods": (methods,),
+    "more": (more_training,),
     "library": (library,),
     "cases": (cases, sorts, lists),
     "passes": (limits, frames, subgroups, rendering, pictures, density),
 }
 """The workload in parts that take a child each, by name."""
+WHOLE_ONLY = ("more",)
+"""Parts that the short form leaves out. They may build nothing that no other part does."""
+
+
+def build_of(kernel: Kernel) -> str:
+    """NAME@STEM,DEFINE,...: what is run, as a word."""
+    variant = kernel.variant
+    defines = [option.removeprefix("-D") for option in variant.options if option.startswith("-D")]
+    return f"{kernel.name}@{','.join([variant.stem, *sorted(defines)])}"
 
 
 def note_kernels() -> None:
-    """Print the name of each kernel when it is put on the queue, and wait for it: a crash is then the last one's."""
+    """Print name and build of each kernel when it is put on the queue, and wait for it: a crash is the last one's."""
     real = launch._enqueue  # noqa: SLF001
 
     def noted(
         device: Device, kernel: Kernel, size: tuple[int, ...], local: tuple[int, ...] | None, arguments: tuple[Any, ...]
     ) -> None:
-        print(kernel.name, flush=True)
+        print(build_of(kernel), flush=True)
         real(device, kernel, size, local, arguments)
         device.finish()
 
@@ -450,6 +446,8 @@ def main(arguments: list[str]) -> int:
         if shape.lanes not in (1, 8):
             raise SystemExit(f"{shape.lanes} lanes: expected 1 or 8")
         stand_in(shape.lanes)
+    if "short" in arguments[1:]:
+        EXTENT.shorten()
     opened = Device(device, shape)
     print("probe_fma", flush=True)  # which a device runs before its first kernel, where it has lanes
     if shape.items == 1:

@@ -27,7 +27,8 @@ from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_step
 from clsplat.chunks.culling import visible
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import Workspace, upload
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device
+from clsplat.device.selection import open_device
 from clsplat.gaussians import Gaussians
 from clsplat.rotations import rotation_from_quaternion
 from clsplat.stages.device_camera import pack_camera

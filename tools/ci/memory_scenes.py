@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sizes, cameras and Gaussians of the workload of `check_memory.py`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from clsplat.camera import Camera
+from clsplat.gaussians import Gaussians
+
+
+@dataclass
+class Extent:
+    """Pictures and steps of the workload. Oclgrind takes most of its time for the pixels of blending and of the loss.
+
+    frame: of six tiles, or of two, one above the other. view: of four, or of two. low: of two, or of one. picture: of
+    six, or of one.
+    capacity: pairs of a band, of which `frame` then has several. steps: of each of training's methods.
+    """
+
+    frame: tuple[int, int] = (33, 17)
+    view: tuple[int, int] = (20, 17)
+    low: tuple[int, int] = (17, 7)
+    picture: tuple[int, int] = (33, 17)
+    capacity: int = 70
+    steps: int = 2
+
+    def shorten(self) -> None:
+        """The least with which every kernel has every build."""
+        self.frame = self.view = 9, 17
+        self.low = self.picture = 9, 7
+        self.capacity, self.steps = 40, 1
+
+
+EXTENT = Extent()
+
+
+def camera(width: int, height: int) -> Camera:
+    """Looks along z, a little off the centre."""
+    return Camera(width, height, 0.9 * width, 0.8 * width, 0.45 * width, 0.55 * height, np.eye(3), np.zeros(3))
+
+
+def cloud(count: int, view: Camera, seed: int = 0, degree: int = 3) -> Gaussians:
+    """Gaussians of all sizes and opacities, some beside the image, behind the camera or too faint to show."""
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(1.5, 5.0, count)
+    depth[::9] *= -1
+    at = rng.uniform(-0.2, 1.2, (count, 2)) * (view.width, view.height)
+    sides = (at - (view.cx, view.cy)) / (view.fx, view.fy) * depth[:, None]
+    sh = rng.normal(0, 0.2, (count, (degree + 1) ** 2, 3))
+    return Gaussians(
+        np.concatenate([sides, depth[:, None]], axis=1).astype(np.float32),
+        rng.normal(size=(count, 4)).astype(np.float32),
+        np.log(np.abs(depth)[:, None] / view.fx * rng.uniform(0.5, 4.0, (count, 3))).astype(np.float32),
+        rng.uniform(-6, 6, count).astype(np.float32),
+        sh.astype(np.float32),
+    )
