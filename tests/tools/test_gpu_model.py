@@ -18,6 +18,7 @@ from gpu_chain import ENDLESS, NEAR, Chain, chain_of
 from gpu_compilers import Built, Source
 from gpu_devices import GPUS, Gpu
 from gpu_frames import as_measured, subject_of, summary, walk_of
+from gpu_lines import lines_touched
 from gpu_loops import cost_of
 from gpu_measured import CALIBRATION, WALLS, Measured, beyond, fit_constants, read, with_inputs
 from gpu_model import (
@@ -34,7 +35,8 @@ from gpu_model import (
     works_of,
 )
 from gpu_page import measured_table, now_table
-from gpu_rules import BLOCKS, BY_PAIR, VISITS, Rule, Run, lines_touched
+from gpu_rules import BY_PAIR, Rule
+from gpu_run import BLOCKS, VISITS, Run
 
 from clsplat.device.source import kernel_root
 from clsplat.errors import ClsplatError

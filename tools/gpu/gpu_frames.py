@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import numpy as np
 from gpu_lists import OWN_BOX
 from gpu_measured import CALIBRATION
-from gpu_rules import BATCH_BACK, BLOCKS, VISITS, WARPS, together
+from gpu_run import BATCH_BACK, BLOCKS, VISITS, WARPS, together
 from gpu_scenes import subject_of
 from measuring import plain_parser, require, tool
 

@@ -14,7 +14,10 @@ from dataclasses import dataclass
 from gpu_assembly import CLASSES, Block, Instruction, Loop
 from gpu_chain import ENDLESS, NEAR, NOTHING, Chain, chain_of
 from gpu_compilers import Built
-from gpu_rules import BY_ITEM, BY_PAIR, EVERYWHERE, Rule, Run, lines_touched
+from gpu_lines import lines_touched
+from gpu_rules import BY_ITEM, BY_PAIR, EVERYWHERE, Rule
+from gpu_rules_measured import MEASURED
+from gpu_run import Run
 
 from clsplat.errors import ClsplatError
 
@@ -39,8 +42,10 @@ class Cost:
     then: Chain = NOTHING
 
 
-def rules_of(kernel: str) -> tuple[Rule, ...]:
-    """The rules of a kernel. Raises UnknownLoopError."""
+def rules_of(kernel: str, commit: str = "") -> tuple[Rule, ...]:
+    """The rules of a kernel. commit: of older code. Raises UnknownLoopError."""
+    if kernel in (measured := MEASURED.get(commit, {})):
+        return measured[kernel] + EVERYWHERE
     if kernel not in BY_PAIR and kernel not in BY_ITEM:
         raise UnknownLoopError(f"{kernel}: no kernel of BY_PAIR or BY_ITEM in tools/gpu/gpu_rules.py")
     return (BY_PAIR.get(kernel) or BY_ITEM[kernel]) + EVERYWHERE

@@ -20,7 +20,8 @@ from gpu_compilers import Built, Source
 from gpu_devices import ARCHITECTURES, Gpu, waves_at_a_time
 from gpu_lists import boxes_of, lists_of, sorting_of
 from gpu_loops import Cost, cost_of, rules_of
-from gpu_rules import BLOCKS, BY_PAIR, NUMBERS, VISITS, WARPS, Run
+from gpu_rules import BY_PAIR, NUMBERS
+from gpu_run import BLOCKS, VISITS, WARPS, Run
 
 from clsplat.layouts.columns import TILE
 
@@ -187,10 +188,12 @@ def works_of(
     None stands for a wait of the host for a number. A frame has one; a step has none (decision 0025).
     """
     works: list[Work | None] = []
-    costs = cache(lambda source, name, run: cost_of(built[source, name], source.lines, rules_of(name), run))
+    costs = cache(
+        lambda source, name, run: cost_of(built[source, name], source.lines, rules_of(name, source.commit), run)
+    )
     for launch in launches:
         if "stem" in launch:
-            kernel = built[Source(launch["stem"], tuple(launch["options"])), launch["kernel"]]
+            kernel = built[Source.of(launch), launch["kernel"]]
             works.append(_work_of(launch, kernel, frame, costs))
         elif launch["kernel"] not in COPIES:
             works.append(Work(launch["stage"], launch["bytes"], kernel=launch["kernel"]))
@@ -202,7 +205,7 @@ def works_of(
 def _work_of(
     launch: Mapping[str, Any], kernel: Built, frame: Mapping[str, Any], costs: Callable[[Source, str, Run], Cost]
 ) -> Work:
-    source, name = Source(launch["stem"], tuple(launch["options"])), launch["kernel"]
+    source, name = Source.of(launch), launch["kernel"]
     wave = ARCHITECTURES[kernel.target].wave
     run = run_of(frame, launch, source.items, wave)
     items, size = math.prod(launch["local"] or (DRIVERS_ITEMS,)), math.prod(launch["size"])

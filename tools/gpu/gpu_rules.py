@@ -8,153 +8,21 @@ that a rewritten kernel needs new rules (`gpu_loops.py`).
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from gpu_lists import Boxes, Sorting
+from gpu_run import BATCH_BACK, BLOCKS, PER_ITEM, Run
 
 from clsplat.device.launch import DEFAULT_GROUP_ITEMS
 from clsplat.layouts.columns import LOSS_PARTS, PLAIN_SLOTS
 
 if TYPE_CHECKING:
-    from gpu_assembly import Instruction, Loop
+    from gpu_assembly import Loop
 
-PER_ITEM = 16
-"""Keys per item in a tile of the radix sort: RUN in sort_radix.cl."""
-BLOCKS = 8
-"""Blocks of 4 x 8 pixels in a tile: BLOCK_COLUMNS * BLOCK_ROWS in blocks.h."""
-WARPS = (1, 2, 4, 8)
-"""Warps of a tile for which gpu_frames.json has counts."""
-BATCH_BACK = 64
-"""Pairs in a batch of blending's gradient: BATCH in blend_grad.cl."""
-VISITS = (
-    *("visits", "dense", "sparse_reached", "sparse_taken"),
-    *("turns_back", "whole_back", "others_reached", "others_taken", "rounds_back"),
-)
-"""Counts per walked pair. Those of blending are over the pairs of the batches that it fetches:
-
-- visits, dense: warps that walk a pair, and those for which it is dense (blocks.h).
-- sparse_reached, sparse_taken: in the other warps, blocks that the pair reaches, and blocks with a pixel that takes it
-  or is finished by it.
-
-Those of the gradient's walk (strips.h) are over all warps:
-
-- turns_back, whole_back: pairs of a warp's strips, and those that reach all blocks of the strip.
-- others_reached, others_taken: for the other pairs, blocks that it visits, and blocks with a pixel that takes the pair.
-- rounds_back: rounds.
-"""
-_UNEVEN = 2
+UNEVEN = 2
 """Estimated ratio of a wave's rounds to those of an average item, if neighbouring Gaussians have all sizes. A wave has
 the rounds of its longest item."""
-
-
-def together(warps: int) -> int:
-    """Pairs of a round of the gradient's walk, if this many warps share a tile: TOGETHER in strips.h."""
-    return 32 // PLAIN_SLOTS.floats if warps <= 2 else 2
-
-
-@dataclass(frozen=True)
-class Run:
-    """Numbers on which the rounds of a loop depend. `gpu_frames.py` counts those of walked pairs.
-
-    items: work-items per group.
-    wave: items that run in step.
-    subgroup: items that exchange values.
-    addends: pairs per visible Gaussian.
-    listed: pairs per tile.
-    reached, taken: blocks of a pair's tile that its ellipse reaches, and those with a pixel that takes the pair.
-    visits, dense: fractions of the tile's warps that walk a pair, and for which it is dense.
-    sparse_reached, sparse_taken: as reached and taken, only in warps that walk the pair and for which it is not dense.
-    turns_back, whole_back, rounds_back: in the gradient's walk, a warp's pairs, those of them that reach a whole strip,
-        and rounds.
-    others_reached, others_taken: in the gradient's walk, blocks of the tile that it visits for the other pairs, and
-        those with a pixel that takes the pair.
-    coefficients: SH coefficients per channel.
-    groups, elements: numbers of the launch.
-    digits: digits of a pass of the radix sort.
-    lists: number of the frame's tiles.
-    boxes, sorting: numbers for lists by append.
-    """
-
-    items: int
-    wave: int = 32
-    subgroup: int = 1
-    addends: float = 12.5
-    listed: float = math.inf
-    reached: float = BLOCKS
-    taken: float = BLOCKS
-    visits: float = 1
-    dense: float = 1
-    sparse_reached: float = 0
-    sparse_taken: float = 0
-    turns_back: float = 1
-    whole_back: float = 0
-    others_reached: float = 0
-    others_taken: float = 0
-    rounds_back: float = 1
-    coefficients: int = 16
-    groups: int = 1
-    elements: int = 1
-    digits: int = 256
-    lists: int = 1
-    boxes: Boxes = field(default_factory=Boxes)
-    sorting: Sorting = field(default_factory=Sorting)
-
-    @property
-    def waves(self) -> int:
-        """Number of waves per group."""
-        return max(self.items // self.wave, 1)
-
-    @property
-    def batch(self) -> int:
-        """Pairs in a batch of blending: BATCH in blocks.h."""
-        return max(self.items, 64)
-
-    @property
-    def batches(self) -> float:
-        """Batches per pair. A tile's last batch is half full on average."""
-        return 1 / self.batch + 0.5 / self.listed
-
-    @property
-    def fetches(self) -> float:
-        """Rounds per pair in which an item fetches a splat."""
-        return self.batches * self.batch / self.items
-
-    @property
-    def batches_back(self) -> float:
-        """Batches per pair in blending's gradient."""
-        return 1 / BATCH_BACK + 0.5 / self.listed
-
-    @property
-    def strips(self) -> int:
-        """Strips that an item walks one after the other: OWN_STRIPS in strips.h."""
-        return max(64 // self.items, 1)
-
-    @property
-    def team_waves(self) -> int:
-        """Waves that share a strip: TEAM_WARPS in strips.h."""
-        return max(self.items // 64, 1)
-
-    @property
-    def of_item(self) -> float:
-        """Elements per item."""
-        return self.elements / (self.groups * self.items)
-
-    @property
-    def tiles(self) -> float:
-        """Tiles of keys per group in the scatter of the sort."""
-        return math.ceil(self.elements / (PER_ITEM * self.items)) / self.groups
-
-    @property
-    def sums_before(self) -> float:
-        """Rounds in which a wave adds up the sums of the groups before its own."""
-        return math.ceil(self.groups / 2 / self.items)
-
-    def shared(self, count: float) -> float:
-        """Average rounds per wave of a group whose items share `count` elements."""
-        return math.ceil(count / self.wave) / self.waves
 
 
 Rounds = Callable[[Run], float]
@@ -224,7 +92,7 @@ EVERYWHERE: tuple[Rule, ...] = (
     ),
 )
 """Rules of loops in functions that kernels share."""
-_BEFORE_PAIRS = (
+BEFORE_PAIRS = (
     Rule("for (int first = last; first < end; first += ITEMS)", lambda run: 0),  # for pairs beyond the last
     Rule("RAISE_TO_GROUP_MAX(last)", lambda run: 0),  # once a tile
 )
@@ -253,7 +121,7 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
         _of_visit("const floatL power = LOG2_ALPHA(", lambda run: run.sparse_reached / BLOCKS),
     ),
     "blend_grad": (
-        *_BEFORE_PAIRS,
+        *BEFORE_PAIRS,
         Rule("atomic_max(lasts", lambda run: 0),  # once a tile: AMD's compiler loops over a wave's items
         Rule(
             "for (int batch = last",
@@ -291,7 +159,7 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
 }
 """Rules of kernels that run a group per tile: rounds per pair in each of the group's waves."""
 WALK: tuple[Rule, ...] = (
-    *_BEFORE_PAIRS,
+    *BEFORE_PAIRS,
     Rule("for (int k = ITEM; k < TILE * TILE; k += ITEMS)", lambda run: 0),  # once a tile
     Rule("for (int turn = last", lambda run: 1 / run.items),
     Rule("for (int round = 0; round < ITEMS; ++round)", lambda run: 1),
@@ -305,23 +173,23 @@ def _of_item(run: Run) -> float:
     return run.of_item
 
 
-def _bands(run: Run) -> float:
+def bands(run: Run) -> float:
     return run.coefficients - 1
 
 
 def _side(run: Run) -> float:
-    return _UNEVEN * math.sqrt(run.addends)
+    return UNEVEN * math.sqrt(run.addends)
 
 
 def _parts(run: Run) -> float:
     return LOSS_PARTS / run.items
 
 
-def _never(run: Run) -> float:  # noqa: ARG001  # one of the rounds
+def never(run: Run) -> float:  # noqa: ARG001  # one of the rounds
     return 0
 
 
-def _group_sum(rounds: Rounds) -> Rule:
+def group_sum(rounds: Rounds) -> Rule:
     return Rule("for (uint i = get_local_id(0); i < count; i += ITEMS) sum += values[i];", rounds, mark=("global", 1))
 
 
@@ -331,7 +199,7 @@ def _abreast(run: Run, width: float) -> float:
 
 
 def _adam(run: Run) -> float:
-    return sum(_abreast(run, width) for width in (3, 4, 3, 1, 3, 3 * _bands(run)))
+    return sum(_abreast(run, width) for width in (3, 4, 3, 1, 3, 3 * bands(run)))
 
 
 ABREAST = 4
@@ -358,14 +226,14 @@ def _over_list(function: str, rounds: Rounds, text: str = "k < count; k += ITEMS
 BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "project": (
         Rule("for (int ty = e->tile_y0; ty < e->tile_y1; ++ty)", _side, ends=("count += x1 - x0;",), mark=("fp32", 60)),
-        Rule("for (int k = 1; k < used; ++k, rest += 3)", _bands, mark=("global", 3)),
+        Rule("for (int k = 1; k < used; ++k, rest += 3)", bands, mark=("global", 3)),
     ),
     "visible_sums": (
         Rule("i < end; i += ITEMS) visible += shown[i] != 0;", _of_item, mark=("global", 1)),
-        _group_sum(_of_item),
+        group_sum(_of_item),
     ),
     "compact_visible": (
-        _group_sum(lambda run: run.sums_before),
+        group_sum(lambda run: run.sums_before),
         Rule("for (uint first = begin; first < end; first += ITEMS)", _of_item),
         Rule("atomic_min(extremes, least)", lambda run: run.wave),  # AMD's compiler loops over a wave's items
         Rule("atomic_max(extremes + 1, largest)", lambda run: run.wave),
@@ -415,9 +283,9 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
         Rule("for (int ty = y0; ty < y1; ++ty)", _side),
         Rule("for (int tx = x0; tx < x1; ++tx, ++pair, ++slot)", lambda run: _side(run) ** 2, mark=("global", 2)),
     ),
-    "scan_sums": (_group_sum(_of_item),),
+    "scan_sums": (group_sum(_of_item),),
     "scan_chunks": (
-        _group_sum(lambda run: run.sums_before),
+        group_sum(lambda run: run.sums_before),
         Rule("for (uint base = begin; base < end; base += ITEMS)", _of_item, ends=("running += all;",)),
     ),
     "radix_histogram": (
@@ -455,42 +323,20 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "project_step": (
         Rule(
             "for (uint k = 0; k < addends; ++k, slot +=",
-            lambda run: _UNEVEN * run.addends,
+            lambda run: UNEVEN * run.addends,
             mark=("global", PLAIN_SLOTS.floats),
         ),
-        Rule(
-            "for (uint k = own; k < whole_floats;", lambda run: _abreast(run, 3 * _bands(run) / 4), mark=("global", 4)
-        ),
-        Rule("for (uint k = whole_floats + me;", _never),  # only for the last row
-        Rule("for (uint k = any ?", lambda run: 3 * _bands(run), mark=("shared", 1)),
+        Rule("for (uint k = own; k < whole_floats;", lambda run: _abreast(run, 3 * bands(run) / 4), mark=("global", 4)),
+        Rule("for (uint k = whole_floats + me;", never),  # only for the last row
+        Rule("for (uint k = any ?", lambda run: 3 * bands(run), mark=("shared", 1)),
         Rule("for (int number = 0; number < ARRAYS; ++number)", lambda run: 6),
         ADAM,
-        Rule("for (uint k = own; left != 0;", _never),  # only for refused steps and the last row
-        Rule("for (uint i = k; (left & 1)", _never),
+        Rule("for (uint k = own; left != 0;", never),  # only for refused steps and the last row
+        Rule("for (uint i = k; (left & 1)", never),
     ),
     "density_statistics": (),
 }
 """Rules of the other kernels of a training step: rounds per item."""
-
-APART = (
-    (r"\bf\[0\]", 4 * 45),
-    (r"splat\[|rgb\[|fields\[k\]", 64),
-    (r"\+= slot\[|\[place\]|\[from\]|pair_ids\[pair_from|slots\[i\]|\[order\[|tile_counts\[i\];", 128),
-    (r"APPEND\(|atomic_inc\((counts|places)|gaussian_from_slot\[|max\(most|values\[tile\]", 128),
-    (r"GATHER\(\w+, 3|FROM_CAMERA\(means|dc\[0\]", 12),
-    (r"GATHER\(quaternions", 16),
-)
-"""Bytes between what neighbouring items access, where a line of the kernel's text matches; 128 for scattered ones."""
-
-
-def lines_touched(each: Instruction, text: str, run: Run) -> float:
-    """Cache lines of 128 bytes that an instruction's items touch. text: its line in the kernel's text."""
-    if each.kind != "global":
-        return 0
-    width = next((bits // 8 for bits in (128, 64) if f".{bits}" in each.name), 4)
-    apart = next((apart for pattern, apart in APART if re.search(pattern, text)), width)
-    return run.wave * min(apart, 128) / 128
-
 
 NUMBERS = {
     "list_offsets": ("tiles", "elements"),

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cache lines that an access to memory touches, by the line of the kernel's text that makes it."""
+
+from __future__ import annotations
+
+import re
+
+from gpu_assembly import Instruction
+from gpu_run import Run
+
+APART = (
+    (r"\bf\[0\]", 4 * 45),
+    (r"splat\[|rgb\[|fields\[k\]", 64),
+    (r"\+= slot\[|\[place\]|\[from\]|pair_ids\[pair_from|slots\[i\]|\[order\[|tile_counts\[i\];", 128),
+    (r"APPEND\(|atomic_inc\((counts|places)|gaussian_from_slot\[|max\(most|values\[tile\]", 128),
+    (r"GATHER\(\w+, 3|FROM_CAMERA\(means|dc\[0\]", 12),
+    (r"GATHER\(quaternions", 16),
+)
+"""Bytes between what neighbouring items access, where a line of the kernel's text matches; 128 for scattered ones."""
+
+
+def lines_touched(each: Instruction, text: str, run: Run) -> float:
+    """Cache lines of 128 bytes that an instruction's items touch. text: its line in the kernel's text."""
+    if each.kind != "global":
+        return 0
+    width = next((bits // 8 for bits in (128, 64) if f".{bits}" in each.name), 4)
+    apart = next((apart for pattern, apart in APART if re.search(pattern, text)), width)
+    return run.wave * min(apart, 128) / 128
