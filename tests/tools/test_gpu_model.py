@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import gpu_static
@@ -19,6 +20,7 @@ from gpu_compilers import Built, Source
 from gpu_devices import GPUS, Gpu
 from gpu_frames import as_measured, subject_of, summary, walk_of
 from gpu_lines import lines_touched
+from gpu_lists import Boxes
 from gpu_loops import cost_of
 from gpu_measured import CALIBRATION, WALLS, Measured, beyond, fit_constants, read, with_inputs
 from gpu_model import (
@@ -134,6 +136,43 @@ def test_blocks_and_pixels_that_skip_a_pair() -> None:
     assert cost.then == Chain(1 + 4 / 8 + 2 * 2 / 8 + 2)
 
 
+def branched() -> Loop:
+    """A kernel whose first block jumps past three others; the second of them may call a slow path."""
+    lines = """
+.text.walk:
+        //## File "walk.cl", line 2
+        /*0000*/                   FADD R1, R0, R0 ;                   /* 0x0000000000017221 */
+        /*0010*/              @!P0 BRA `(.L_x_9) ;                     /* 0x0000000000017221 */
+        //## File "walk.cl", line 3
+        /*0020*/                   FMUL R1, R0, R0 ;                   /* 0x0000000000017221 */
+        //## File "walk.cl", line 2
+        /*0030*/               @P1 BRA `(.L_x_8) ;                     /* 0x0000000000017221 */
+        /*0040*/                   MOV R3, R0 ;                        /* 0x0000000000017221 */
+        /*0050*/                   CALL.REL.NOINC `($__internal_0_$__cuda_sm3x_div_rn_noftz_f32_slowpath) ;
+.L_x_8:
+        /*0060*/                   FADD R1, R0, R0 ;                   /* 0x0000000000017221 */
+.L_x_9:
+        /*0070*/                   FADD R1, R0, R0 ;                   /* 0x0000000000017221 */
+        /*0080*/                   EXIT ;                              /* 0x0000000000017221 */
+"""
+    return parse_sass(lines)["walk"]
+
+
+def test_slow_paths_of_divisions_never_run() -> None:
+    built = Built("walk", "sm_90", 40, 0, 0, 0, branched())
+    cost = cost_of(built, ["walk {", "a / b", "c"], (), Run(64))
+    assert +cost.once == Counter(fp32=4, control=3), "without MOV and CALL, and with what follows them"
+
+
+@pytest.mark.parametrize(
+    ("inside", "below", "fp32"), [("", True, 2 + 2 / 4), ("", False, 3 + 1 / 4), ("for (", True, 4)]
+)
+def test_a_branch_and_what_is_only_run_after_it(inside: str, below: bool, fp32: float) -> None:
+    built = Built("walk", "sm_90", 40, 0, 0, 0, branched())
+    rule = Rule("c", lambda run: 1 / 4, part=True, below=below, inside=inside)
+    assert cost_of(built, ["walk {", "a / b", "c"], (rule,), Run(64)).once["fp32"] == fp32
+
+
 def test_a_tile_has_the_kernels_blocks() -> None:
     text = (kernel_root() / "shared/blocks.h").read_text()
     assert "#define BLOCK_W 4\n" in text
@@ -216,7 +255,15 @@ def test_the_work_of_a_launch(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(BY_PAIR, "blend", rules)
     monkeypatch.setattr(Source, "lines", ["kernel", "walk", "weight"])
     frame = {"width": 160, "height": 16, "listed": 40, "visible": 20, "walked": 30, "sh_degree": 3}
-    frame |= {"reached": 8, "taken": 4, "slowest": 9, "longer_reached": 4, "longer_taken": 3, **WALKS}
+    frame |= {
+        "reached": 8,
+        "taken": 4,
+        "slowest": 9,
+        "longer_reached": 4,
+        "longer_taken": 3,
+        **WALKS,
+        **asdict(Boxes()),
+    }
     launch = {"kernel": "blend", "stem": "blend", "options": list(source.options), "stage": "blend", "shared": 0}
     launch |= {"size": [640], "local": [64], "scalars": [], "bytes": 5e6}
     built = {(source, "blend"): Built("blend", "sm_90", 64, 0, 0, 0, whole)}

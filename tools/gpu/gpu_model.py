@@ -149,8 +149,6 @@ def run_of(frame: Mapping[str, Any], launch: Mapping[str, Any], items: int, wave
     tiles = tiles_of(frame)
     numbers = dict(zip(NUMBERS.get(launch["kernel"], ()), map(int, launch["scalars"]), strict=False))
     more: dict[str, Any] = {name: numbers[name] for name in ("elements", "digits") if name in numbers}
-    if launch["kernel"] in APPENDING:
-        more["boxes"] = boxes_of(frame, items)
     if launch["kernel"] == SORTING:
         more["sorting"] = sorting_of(lists_of(frame), items)
     return Run(
@@ -162,6 +160,7 @@ def run_of(frame: Mapping[str, Any], launch: Mapping[str, Any], items: int, wave
         coefficients=(frame["sh_degree"] + 1) ** 2,
         groups=math.prod(launch["size"]) // items,
         lists=tiles,
+        boxes=boxes_of(frame, items),
         **more,
     )
 

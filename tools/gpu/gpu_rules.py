@@ -37,6 +37,8 @@ class Rule:
     part: True for a branch that contains the line; rounds is then the fraction of its loop's rounds that take it. Of
     several such rules the first counts.
     alone: True for a branch that contains no other lines than this and `ends`.
+    below: True if the fraction is also that of the blocks that run only after the branch.
+    inside: for a branch in one loop alone, a part of the line that opens the loop; OUTSIDE for one in no loop.
     holding, lacking: a part of a line that the loop contains, or does not, if a compiler jumps from one line to the
     heads of two loops.
     mark: number of instructions of a class in a round, such as ("shared", 2). A loop with more of them is unrolled.
@@ -51,6 +53,8 @@ class Rule:
     function: str = ""
     part: bool = False
     alone: bool = False
+    below: bool = False
+    inside: str = ""
     holding: str = ""
     lacking: str = ""
     mark: tuple[str, int] | None = None
@@ -77,6 +81,8 @@ class Rule:
         return self.holding in text and not (self.lacking and self.lacking in text)
 
 
+OUTSIDE = "outside of loops"
+"""Place of a branch that is in no loop."""
 _HEADS = ("static ", "GROUP __kernel", "__kernel", "RARE ")
 """Words with which the head of a function begins."""
 
@@ -207,6 +213,9 @@ ABREAST = 4
 ADAM = Rule("for (uint k = own, bit = 1; k < count; k += stride, bit += bit)", _adam, mark=("global", 6))
 """Adam's loop in `project_step`."""
 
+REFINED = Rule("const floatL size = AS_FLOATL(AS_INTL(length)", lambda run: run.boxes.refined, part=True, below=True)
+"""`refine` in `project_gaussians`: a wave runs it where one of its items does."""
+
 _OVER_TILES = (
     Rule("for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {", lambda run: run.boxes.wave_rows),
     Rule("for (uint k = 0; k < wides; ++k) {", lambda run: run.boxes.wide),
@@ -225,6 +234,7 @@ def _over_list(function: str, rounds: Rounds, text: str = "k < count; k += ITEMS
 
 BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "project": (
+        REFINED,
         Rule("for (int ty = e->tile_y0; ty < e->tile_y1; ++ty)", _side, ends=("count += x1 - x0;",), mark=("fp32", 60)),
         Rule("for (int k = 1; k < used; ++k, rest += 3)", bands, mark=("global", 3)),
     ),
@@ -240,7 +250,7 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     ),
     "count_tiles": (
         *_OVER_TILES,
-        Rule("for (int tx = x0; tx < x1; ++tx) atomic_inc(", lambda run: run.boxes.wave_pairs, mark=("global", 1)),
+        Rule("for (int tx = x0; tx < x1; ++tx) atomic_inc(", lambda run: run.boxes.wave_tiles, mark=("global", 1)),
         Rule("for (int row = e.tile_y0 + (int)item / SIDE;", lambda run: run.boxes.shared_rows(run.items)),
         Rule(
             "for (int tx = x0 + (int)item % SIDE;",
@@ -255,7 +265,7 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     ),
     "append_pairs": (
         *_OVER_TILES,
-        Rule("for (int tx = x0; tx < x1; ++tx, ++slot)", lambda run: run.boxes.wave_pairs, mark=("global", 3)),
+        Rule("for (int tx = x0; tx < x1; ++tx, ++slot)", lambda run: run.boxes.wave_tiles, mark=("global", 3)),
         Rule("for (int row = e.tile_y0; row < e.tile_y1; ++row)", lambda run: run.boxes.wide * run.boxes.wide_rows),
         Rule(  # a wave has rows of its own
             "for (int tx = x0 + (int)item % SIDE;",
@@ -321,6 +331,7 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
         Rule("FOR_PARTS(part, PARTS) {", _parts, function=" differences("),
     ),
     "project_step": (
+        REFINED,
         Rule(
             "for (uint k = 0; k < addends; ++k, slot +=",
             lambda run: UNEVEN * run.addends,

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from gpu_rules import BEFORE_PAIRS, UNEVEN, Rounds, Rule, bands, group_sum, never
+from gpu_rules import BEFORE_PAIRS, REFINED, UNEVEN, Rounds, Rule, bands, group_sum, never
 from gpu_run import BLOCKS, Run
 
 from clsplat.layouts.columns import PLAIN_SLOTS
@@ -84,6 +84,7 @@ MEASURED: dict[str, dict[str, tuple[Rule, ...]]] = {
             Rule("FOR_VECTORS(block, 0, LINES)", _rows(0)),
         ),
         "project_step": (
+            REFINED,
             Rule(
                 "for (uint k = 0; k < addends; ++k, slot +=",
                 lambda run: UNEVEN * run.addends,

@@ -61,7 +61,8 @@ class Run:
     groups, elements: numbers of the launch.
     digits: digits of a pass of the radix sort.
     lists: number of the frame's tiles.
-    boxes, sorting: numbers for lists by append.
+    boxes: of the Gaussians.
+    sorting: numbers for the sort of lists by append.
     """
 
     items: int
