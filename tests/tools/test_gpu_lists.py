@@ -17,6 +17,8 @@ from gpu_lists import AHEAD, OWN_BOX, SIDE, SMALL_BOX, Boxes, Sorting, boxes_of,
 from gpu_measured import ATOMICS, CALIBRATION, DRAWN, Measured, fit_constants, read
 from gpu_model import Constants, Work
 from gpu_page import now_table, wanted_table
+from gpu_rules import BY_ITEM
+from gpu_run import Run
 from gpu_static import on_each_gpu
 
 from clsplat.device.source import kernel_root
@@ -88,6 +90,23 @@ def test_boxes_of_a_group() -> None:
     assert boxes.shared_rows(32) == pytest.approx(boxes.wide * 6 / 4)
     assert boxes.shared_columns == 1
     assert Boxes(wide_columns=20).shared_columns == 20 / 8
+
+
+def test_rounds_over_tiles_are_those_of_the_frames_waves() -> None:
+    """An item of `project` goes over rows that are tested alone; one of `duplicate`, over all in the order of depth."""
+    boxes = Boxes(wave_rows=4, wave_tested=1, all_tested=1.5, all_pairs=14, sorted_rows=5, sorted_tested=2)
+    run = Run(64, boxes=boxes)
+
+    def rounds(kernel: str, text: str, part: bool = False) -> set[float]:
+        return {rule.rounds(run) for rule in BY_ITEM[kernel] if rule.part is part and text in rule.text}
+
+    assert rounds("project", "for (int ty") == {1.5}
+    assert rounds("project_step", "addends") == {14}
+    assert rounds("duplicate", "for (int ty") == {5}
+    assert rounds("duplicate", "tangent", part=True) == {2 / 5}
+    for kernel in ("count_tiles", "append_pairs"):
+        assert rounds(kernel, "for (int ty") == {4}
+        assert rounds(kernel, "tangent", part=True) == rounds(kernel, "e->box <= SMALL_BOX", part=True) == {1 / 4}
 
 
 def test_sizes_are_the_kernels() -> None:

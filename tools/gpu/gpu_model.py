@@ -154,7 +154,6 @@ def run_of(frame: Mapping[str, Any], launch: Mapping[str, Any], items: int, wave
     return Run(
         items,
         wave,
-        addends=frame["listed"] / max(frame["visible"], 1),
         listed=frame["walked"] / tiles,
         **blocks_of(frame, items),
         coefficients=(frame["sh_degree"] + 1) ** 2,

@@ -20,11 +20,6 @@ from clsplat.layouts.columns import LOSS_PARTS, PLAIN_SLOTS
 if TYPE_CHECKING:
     from gpu_assembly import Loop
 
-UNEVEN = 2
-"""Estimated ratio of a wave's rounds to those of an average item, if neighbouring Gaussians have all sizes. A wave has
-the rounds of its longest item."""
-
-
 Rounds = Callable[[Run], float]
 
 
@@ -183,10 +178,6 @@ def bands(run: Run) -> float:
     return run.coefficients - 1
 
 
-def _side(run: Run) -> float:
-    return UNEVEN * math.sqrt(run.addends)
-
-
 def _parts(run: Run) -> float:
     return LOSS_PARTS / run.items
 
@@ -216,8 +207,20 @@ ADAM = Rule("for (uint k = own, bit = 1; k < count; k += stride, bit += bit)", _
 REFINED = Rule("const floatL size = AS_FLOATL(AS_INTL(length)", lambda run: run.boxes.refined, part=True, below=True)
 """`refine` in `project_gaussians`: a wave runs it where one of its items does."""
 
+
+def tested(inside: str, share: Rounds) -> tuple[Rule, ...]:
+    """Rules of `tile_span` in a loop over rows: the fraction of its rounds in which some item tests a row of a large
+    box. Some compilers name `tile_span`'s lines, others that of its first return alone."""
+    return (
+        Rule("if (e->tangent >= d0 && e->tangent <= d1)", share, part=True, below=True, inside=inside),
+        Rule("if (e->box <= SMALL_BOX) return;", share, part=True, alone=True, inside=inside),
+    )
+
+
+_ROWS = "for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {"
 _OVER_TILES = (
-    Rule("for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {", lambda run: run.boxes.wave_rows),
+    Rule(_ROWS, lambda run: run.boxes.wave_rows),
+    *tested(_ROWS, lambda run: run.boxes.wave_tested / run.boxes.wave_rows),
     Rule("for (uint k = 0; k < wides; ++k) {", lambda run: run.boxes.wide),
 )
 """Rules of kernels in which an item goes over a Gaussian's tiles, and a group over those of wide boxes."""
@@ -235,7 +238,12 @@ def _over_list(function: str, rounds: Rounds, text: str = "k < count; k += ITEMS
 BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "project": (
         REFINED,
-        Rule("for (int ty = e->tile_y0; ty < e->tile_y1; ++ty)", _side, ends=("count += x1 - x0;",), mark=("fp32", 60)),
+        Rule(
+            "for (int ty = e->tile_y0; ty < e->tile_y1; ++ty)",
+            lambda run: run.boxes.all_tested,
+            ends=("count += x1 - x0;",),
+            mark=("fp32", 60),
+        ),
         Rule("for (int k = 1; k < used; ++k, rest += 3)", bands, mark=("global", 3)),
     ),
     "visible_sums": (
@@ -290,8 +298,13 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     ),
     "order_counts": (),
     "duplicate": (
-        Rule("for (int ty = y0; ty < y1; ++ty)", _side),
-        Rule("for (int tx = x0; tx < x1; ++tx, ++pair, ++slot)", lambda run: _side(run) ** 2, mark=("global", 2)),
+        Rule("for (int ty = y0; ty < y1; ++ty)", lambda run: run.boxes.sorted_rows),
+        *tested("for (int ty = y0; ty < y1; ++ty)", lambda run: run.boxes.sorted_tested / run.boxes.sorted_rows),
+        Rule(
+            "for (int tx = x0; tx < x1; ++tx, ++pair, ++slot)",
+            lambda run: run.boxes.sorted_tiles,
+            mark=("global", 2),
+        ),
     ),
     "scan_sums": (group_sum(_of_item),),
     "scan_chunks": (
@@ -334,7 +347,7 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
         REFINED,
         Rule(
             "for (uint k = 0; k < addends; ++k, slot +=",
-            lambda run: UNEVEN * run.addends,
+            lambda run: run.boxes.all_pairs,
             mark=("global", PLAIN_SLOTS.floats),
         ),
         Rule("for (uint k = own; k < whole_floats;", lambda run: _abreast(run, 3 * bands(run) / 4), mark=("global", 4)),

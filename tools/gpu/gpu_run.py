@@ -48,7 +48,6 @@ class Run:
     items: work-items per group.
     wave: items that run in step.
     subgroup: items that exchange values.
-    addends: pairs per visible Gaussian.
     listed: pairs per tile.
     reached, taken: blocks of a pair's tile that its ellipse reaches, and those with a pixel that takes the pair.
     visits, dense: fractions of the tile's warps that walk a pair, and for which it is dense.
@@ -68,7 +67,6 @@ class Run:
     items: int
     wave: int = 32
     subgroup: int = 1
-    addends: float = 12.5
     listed: float = math.inf
     reached: float = BLOCKS
     taken: float = BLOCKS
