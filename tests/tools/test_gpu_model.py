@@ -117,7 +117,16 @@ def test_what_takes_cycles() -> None:
 )
 def test_lines_that_a_warp_touches(name: str, text: str, lines: float) -> None:
     kind = "shared" if name == "LDS" else "global"
-    assert lines_touched(Instruction(name, kind), text, Run(64)) == lines
+    assert lines_touched(Instruction(name, kind), text, Run(64), 32) == lines
+    assert lines_touched(Instruction(name, kind), text, Run(64), 2.5) == min(lines, 2.5), "of few items, each its own"
+
+
+def test_items_that_take_part_in_a_round() -> None:
+    whole = Loop([], set(), [Loop([code(("LDG.E", control(2)), source=3)], {2})])
+    built = Built("walk", "sm_90", 40, 0, 0, 0, whole)
+    for active, lines in ((None, 32), (lambda run: run.waves + 1, 3)):
+        rules = (Rule("walk", lambda run: 5, active=active),)
+        assert cost_of(built, ["", "walk {", "keys[place]"], rules, Run(64)).then.lines == 5 * lines
 
 
 def test_blocks_and_pixels_that_skip_a_pair() -> None:
@@ -254,7 +263,7 @@ def test_the_work_of_a_launch(monkeypatch: pytest.MonkeyPatch) -> None:
     rules = (Rule("walk", lambda run: 1), Rule("weight", lambda run: run.taken / BLOCKS, part=True))
     monkeypatch.setitem(BY_PAIR, "blend", rules)
     monkeypatch.setattr(Source, "lines", ["kernel", "walk", "weight"])
-    frame = {"width": 160, "height": 16, "listed": 40, "visible": 20, "walked": 30, "sh_degree": 3}
+    frame = {"width": 160, "height": 16, "gaussians": 25, "visible": 20, "listed": 40, "walked": 30, "sh_degree": 3}
     frame |= {
         "reached": 8,
         "taken": 4,

@@ -19,10 +19,14 @@ APART = (
 """Bytes between what neighbouring items access, where a line of the kernel's text matches; 128 for scattered ones."""
 
 
-def lines_touched(each: Instruction, text: str, run: Run) -> float:
-    """Cache lines of 128 bytes that an instruction's items touch. text: its line in the kernel's text."""
+def lines_touched(each: Instruction, text: str, run: Run, active: float) -> float:
+    """Cache lines of 128 bytes that an instruction's items touch.
+
+    text: its line in the kernel's text.
+    active: mean number of a wave's items that take part.
+    """
     if each.kind != "global":
         return 0
     width = next((bits // 8 for bits in (128, 64) if f".{bits}" in each.name), 4)
     apart = next((apart for pattern, apart in APART if re.search(pattern, text)), width)
-    return run.wave * min(apart, 128) / 128
+    return min(run.wave * min(apart, 128) / 128, active)

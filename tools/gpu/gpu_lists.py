@@ -54,6 +54,15 @@ class Boxes:
         """Rounds over the rows of a group's wide boxes, if its items share them."""
         return self.wide * max(self.wide_rows * SIDE / items, 1)
 
+    def rows_at_once(self, items: int) -> float:
+        """Rows of a wide box in such a round."""
+        return min(self.wide_rows, items / SIDE)
+
+    @property
+    def columns_at_once(self) -> float:
+        """Tiles of a row of a wide box in a round."""
+        return min(self.wide_columns, SIDE)
+
     @property
     def shared_columns(self) -> float:
         """Rounds over a row of a wide box."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from gpu_assembly import CLASSES, Block, Instruction, Loop
@@ -85,8 +85,8 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
         here = [rule for rule in parts if not rule.inside or rule.inside in opened]
         return list(_shares(loop, lines, here, run, used))
 
-    def lines_of(each: Instruction) -> float:
-        return lines_touched(each, lines[each.source - 1] if each.source else "", run)
+    def lines_of(active: float) -> Callable[[Instruction], float]:
+        return lambda each: lines_touched(each, lines[each.source - 1] if each.source else "", run, active)
 
     def visit(outer: Loop, outer_rounds: float) -> None:
         nonlocal then
@@ -103,7 +103,8 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
             blocks = shared(loop, matching[0].text)
             for kind, count in _counts(blocks).items():
                 rounds[kind] += factor * count  # type: ignore[assignment]
-            then += chain_of(blocks, lines_of, 2, NEAR if matching[0].near else ENDLESS).times(factor)
+            touched = lines_of(matching[0].active(run) if matching[0].active else run.wave)
+            then += chain_of(blocks, touched, 2, NEAR if matching[0].near else ENDLESS).times(factor)
             visit(loop, factor)
 
     visit(built.whole, 1)
@@ -113,7 +114,7 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
             f"than one, is for {'; '.join(unknown)}"
         )
     whole = shared(built.whole, OUTSIDE)
-    return Cost(_counts(whole), rounds, frozenset(used), chain_of(whole, lines_of, 1), then)
+    return Cost(_counts(whole), rounds, frozenset(used), chain_of(whole, lines_of(run.wave), 1), then)
 
 
 def unused_rules(used: Mapping[str, Iterable[Rule]]) -> list[str]:

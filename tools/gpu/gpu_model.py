@@ -154,6 +154,8 @@ def run_of(frame: Mapping[str, Any], launch: Mapping[str, Any], items: int, wave
     return Run(
         items,
         wave,
+        addends=frame["listed"] / max(frame["visible"], 1),
+        shown=frame["visible"] / max(frame["gaussians"], 1),
         listed=frame["walked"] / tiles,
         **blocks_of(frame, items),
         coefficients=(frame["sh_degree"] + 1) ** 2,

@@ -40,6 +40,7 @@ class Rule:
     inner: True if rounds are per round of the enclosing loop.
     copies: True if a compiler makes copies of the loop that run so often each, none of which is a remainder.
     near: True if it reads what the group's items have just read.
+    active: mean number of a wave's items that take part in a round, or that access different addresses; all if None.
     """
 
     text: str
@@ -56,6 +57,7 @@ class Rule:
     inner: bool = False
     near: bool = False
     copies: bool = False
+    active: Rounds | None = None
 
     def matches(self, number: int, lines: Sequence[str]) -> bool:
         """True if the rule matches the line with this number, counted from 1."""
@@ -217,11 +219,20 @@ def tested(inside: str, share: Rounds) -> tuple[Rule, ...]:
     )
 
 
+def _own_active(run: Run) -> float:
+    return run.boxes.own_pairs / run.boxes.wave_tiles
+
+
+def of_addends(run: Run) -> float:
+    """Items of a wave that have an addend left in a round."""
+    return run.wave * run.shown * run.addends / run.boxes.all_pairs
+
+
 _ROWS = "for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {"
 _OVER_TILES = (
     Rule(_ROWS, lambda run: run.boxes.wave_rows),
     *tested(_ROWS, lambda run: run.boxes.wave_tested / run.boxes.wave_rows),
-    Rule("for (uint k = 0; k < wides; ++k) {", lambda run: run.boxes.wide),
+    Rule("for (uint k = 0; k < wides; ++k) {", lambda run: run.boxes.wide, active=lambda run: 1),  # all read the same
 )
 """Rules of kernels in which an item goes over a Gaussian's tiles, and a group over those of wide boxes."""
 
@@ -258,11 +269,17 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     ),
     "count_tiles": (
         *_OVER_TILES,
-        Rule("for (int tx = x0; tx < x1; ++tx) atomic_inc(", lambda run: run.boxes.wave_tiles, mark=("global", 1)),
+        Rule(
+            "for (int tx = x0; tx < x1; ++tx) atomic_inc(",
+            lambda run: run.boxes.wave_tiles,
+            mark=("global", 1),
+            active=_own_active,
+        ),
         Rule("for (int row = e.tile_y0 + (int)item / SIDE;", lambda run: run.boxes.shared_rows(run.items)),
         Rule(
             "for (int tx = x0 + (int)item % SIDE;",
             lambda run: run.boxes.shared_rows(run.items) * run.boxes.shared_columns,
+            active=lambda run: run.boxes.rows_at_once(run.items) / run.waves * run.boxes.columns_at_once,
         ),
     ),
     "list_offsets": (  # its elements are the groups of count_tiles
@@ -273,11 +290,17 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     ),
     "append_pairs": (
         *_OVER_TILES,
-        Rule("for (int tx = x0; tx < x1; ++tx, ++slot)", lambda run: run.boxes.wave_tiles, mark=("global", 3)),
+        Rule(
+            "for (int tx = x0; tx < x1; ++tx, ++slot)",
+            lambda run: run.boxes.wave_tiles,
+            mark=("global", 3),
+            active=_own_active,
+        ),
         Rule("for (int row = e.tile_y0; row < e.tile_y1; ++row)", lambda run: run.boxes.wide * run.boxes.wide_rows),
         Rule(  # a wave has rows of its own
             "for (int tx = x0 + (int)item % SIDE;",
             lambda run: run.boxes.wide * run.boxes.wide_rows / run.waves * run.boxes.shared_columns,
+            active=lambda run: run.boxes.columns_at_once,
         ),
     ),
     "sort_lists": (
@@ -304,6 +327,7 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
             "for (int tx = x0; tx < x1; ++tx, ++pair, ++slot)",
             lambda run: run.boxes.sorted_tiles,
             mark=("global", 2),
+            active=lambda run: run.wave * run.addends / run.boxes.sorted_tiles,
         ),
     ),
     "scan_sums": (group_sum(_of_item),),
@@ -349,6 +373,7 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
             "for (uint k = 0; k < addends; ++k, slot +=",
             lambda run: run.boxes.all_pairs,
             mark=("global", PLAIN_SLOTS.floats),
+            active=of_addends,
         ),
         Rule("for (uint k = own; k < whole_floats;", lambda run: _abreast(run, 3 * bands(run) / 4), mark=("global", 4)),
         Rule("for (uint k = whole_floats + me;", never),  # only for the last row

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from gpu_rules import BEFORE_PAIRS, REFINED, Rounds, Rule, bands, group_sum, never
+from gpu_rules import BEFORE_PAIRS, REFINED, Rounds, Rule, bands, group_sum, never, of_addends
 from gpu_run import BLOCKS, Run
 
 from clsplat.layouts.columns import PLAIN_SLOTS
@@ -89,6 +89,7 @@ MEASURED: dict[str, dict[str, tuple[Rule, ...]]] = {
                 "for (uint k = 0; k < addends; ++k, slot +=",
                 lambda run: run.boxes.all_pairs,
                 mark=("global", PLAIN_SLOTS.floats),
+                active=of_addends,
             ),
             _stepped("means", 3),
             _stepped("quaternions", 4),

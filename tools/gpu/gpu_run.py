@@ -48,6 +48,7 @@ class Run:
     items: work-items per group.
     wave: items that run in step.
     subgroup: items that exchange values.
+    addends, shown: pairs per visible Gaussian, and the fraction of Gaussians that are visible.
     listed: pairs per tile.
     reached, taken: blocks of a pair's tile that its ellipse reaches, and those with a pixel that takes the pair.
     visits, dense: fractions of the tile's warps that walk a pair, and for which it is dense.
@@ -67,6 +68,8 @@ class Run:
     items: int
     wave: int = 32
     subgroup: int = 1
+    addends: float = 12.5
+    shown: float = 1
     listed: float = math.inf
     reached: float = BLOCKS
     taken: float = BLOCKS
