@@ -107,7 +107,12 @@ def test_what_takes_cycles() -> None:
     [
         ("LDG.E", "sum += values[i];", 1),
         ("LDG.E.128", "sum += values[i];", 4),
-        ("STG.E.64", "pair_ids[pair] = (uint2)(slot, i);", 2),
+        ("LDG.E.64", "const uint2 ids = pair_ids[pair];", 2),
+        ("STG.E.64", "pair_ids[pair] = (uint2)(slot, i);", 6),  # three pairs of 8 bytes a Gaussian
+        ("STG.E", "tile_keys[pair] = ty * tiles_x + tx - first_tile;", 3),
+        ("STG.E", "for (int tx = x0; tx < x1; ++tx, ++slot) APPEND(ty * tiles_x + tx, slot, i)", 3),
+        ("STG.E.64", "for (int tx = x0; tx < x1; ++tx, ++slot) APPEND(ty * tiles_x + tx, slot, i)", 32),
+        ("ATOMG.E.ADD", "for (int tx = x0; tx < x1; ++tx, ++slot) APPEND(ty * tiles_x + tx, slot, i)", 32),
         ("LDG.E", "e.mx = splat[SPLAT_PIXEL_X];", 16),
         ("LDG.E", "raw[0] = GATHER(quaternions, 4, 0);", 4),
         ("LDG.E", "return last ? (float4)(f[0], f[1], f[2], 0.0f)", 32),
@@ -117,8 +122,10 @@ def test_what_takes_cycles() -> None:
 )
 def test_lines_that_a_warp_touches(name: str, text: str, lines: float) -> None:
     kind = "shared" if name == "LDS" else "global"
-    assert lines_touched(Instruction(name, kind), text, Run(64), 32) == lines
-    assert lines_touched(Instruction(name, kind), text, Run(64), 2.5) == min(lines, 2.5), "of few items, each its own"
+    assert lines_touched(Instruction(name, kind), text, Run(64, addends=3), 32) == lines
+    assert lines_touched(Instruction(name, kind), text, Run(64, addends=3), 2.5) == min(lines, 2.5), (
+        "of few items, each its own"
+    )
 
 
 def test_items_that_take_part_in_a_round() -> None:
