@@ -27,6 +27,7 @@ from gpu_model import (
     FITTED,
     LAUNCH,
     LINES,
+    PASSES,
     Constants,
     Work,
     blocks_of,
@@ -207,6 +208,8 @@ def test_the_terms_of_a_launch() -> None:
     assert Work("blend", 0, groups=1e6).on(GPU, CONSTANTS).ms == 2
     lines = Work("blend", 0, waves=4, resident=8, chain=Chain(lines=1e6)).on(GPU, CONSTANTS)
     assert lines.ms == pytest.approx(4 * 1e6 / LINES / 2 * 1e-6)
+    local = Work("blend", 0, waves=4, resident=8, chain=Chain(passes=1e6)).on(GPU, CONSTANTS)
+    assert local.ms == pytest.approx(4 * 1e6 / PASSES / 2 * 1e-6)
     both = Work("blend", 1e9, instructions=8e6, groups=1e6, resident=8).on(GPU, CONSTANTS)
     assert both.ms == 2 + 2, "bytes, and then the longest of the others"
 

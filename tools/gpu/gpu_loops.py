@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from gpu_assembly import CLASSES, Block, Instruction, Loop
+from gpu_banks import passes
 from gpu_chain import ENDLESS, NEAR, NOTHING, Chain, chain_of
 from gpu_compilers import Built
 from gpu_lines import lines_touched
@@ -88,6 +89,9 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
     def lines_of(active: float) -> Callable[[Instruction], float]:
         return lambda each: lines_touched(each, lines[each.source - 1] if each.source else "", run, active)
 
+    def passes_of(each: Instruction) -> tuple[float, float]:
+        return passes(each, lines[each.source - 1] if each.source else "", run.wave)
+
     def visit(outer: Loop, outer_rounds: float) -> None:
         nonlocal then
         for loop in outer.inner:
@@ -104,7 +108,7 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
             for kind, count in _counts(blocks).items():
                 rounds[kind] += factor * count  # type: ignore[assignment]
             touched = lines_of(matching[0].active(run) if matching[0].active else run.wave)
-            then += chain_of(blocks, touched, 2, NEAR if matching[0].near else ENDLESS).times(factor)
+            then += chain_of(blocks, touched, 2, NEAR if matching[0].near else ENDLESS, passes_of).times(factor)
             visit(loop, factor)
 
     visit(built.whole, 1)
@@ -114,7 +118,9 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
             f"than one, is for {'; '.join(unknown)}"
         )
     whole = shared(built.whole, OUTSIDE)
-    return Cost(_counts(whole), rounds, frozenset(used), chain_of(whole, lines_of(run.wave), 1), then)
+    return Cost(
+        _counts(whole), rounds, frozenset(used), chain_of(whole, lines_of(run.wave), 1, passes_of=passes_of), then
+    )
 
 
 def unused_rules(used: Mapping[str, Iterable[Rule]]) -> list[str]:

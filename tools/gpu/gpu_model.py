@@ -2,9 +2,10 @@
 """Predict the milliseconds of a training step on a GPU, and fit the model's few constants to measured steps.
 
 A launch takes the time of its bytes, and after that the longest of: starting its instructions, looking up its cache
-lines, its atomics, starting its groups, and the chains of its warps (`gpu_chain.py`), as many at a time as fit, or the
-chain of the slowest tile's alone. No launch takes less than LAUNCH. Bytes are added because an H100 and an H200, which
-differ in nothing but memory, differ in each stage by the time of its bytes. Every constant is shared by all stages.
+lines, passing through the banks of local memory, its atomics, starting its groups, and the chains of its warps
+(`gpu_chain.py`), as many at a time as fit, or the chain of the slowest tile's alone. No launch takes less than LAUNCH.
+Bytes are added because an H100 and an H200, which differ in nothing but memory, differ in each stage by the time of its
+bytes. Every constant is shared by all stages.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ LAUNCH = 0.003
 """Least milliseconds of a launch: those of the shortest in docs/gpus/calibration.json."""
 LINES = 2
 """Cache lines that a unit looks up per cycle."""
+PASSES = 1
+"""Passes through the banks of local memory of a unit per cycle."""
 DRIVERS_ITEMS = 256
 """Items per group where the driver chooses."""
 APPENDING, SORTING = ("count_tiles", "append_pairs"), "sort_lists"
@@ -115,10 +118,11 @@ class Work:
         )
         issue, chain = self.instructions / gpu.issued / constants.efficiency, max(waited) / gpu.ghz * 1e-6
         lines = self.waves * self.chain.lines / LINES / gpu.units / gpu.ghz * 1e-6
+        local = self.waves * self.chain.passes / PASSES / gpu.units / gpu.ghz * 1e-6
         starts = self.groups / constants.groups / gpu.ghz * 1e-6
         counted = self.atomics * (constants.atomic + constants.counter / self.counters) * 1e-6
         memory = self.bytes / gpu.gb / constants.copy * 1e-6
-        return Stage(issue, memory, chain, max(LAUNCH, memory + max(issue, lines, starts, chain, counted)), 1)
+        return Stage(issue, memory, chain, max(LAUNCH, memory + max(issue, lines, local, starts, chain, counted)), 1)
 
 
 def blocks_of(frame: Mapping[str, Any], items: int) -> dict[str, Any]:
