@@ -210,13 +210,22 @@ REFINED = Rule("const floatL size = AS_FLOATL(AS_INTL(length)", lambda run: run.
 """`refine` in `project_gaussians`: a wave runs it where one of its items does."""
 
 
-def tested(inside: str, share: Rounds) -> tuple[Rule, ...]:
-    """Rules of `tile_span` in a loop over rows: the fraction of its rounds in which some item tests a row of a large
-    box. Some compilers name `tile_span`'s lines, others that of its first return alone."""
-    return (
-        Rule("if (e->tangent >= d0 && e->tangent <= d1)", share, part=True, below=True, inside=inside),
-        Rule("if (e->box <= SMALL_BOX) return;", share, part=True, alone=True, inside=inside),
-    )
+def _tested(inside: str, share: Rounds) -> Rule:
+    """`tile_span` in a loop over rows: the fraction of its rounds in which some item tests a row of a large box."""
+    return Rule("if (e->tangent >= d0 && e->tangent <= d1)", share, part=True, below=True, inside=inside)
+
+
+def _unnamed(inside: str, share: Rounds) -> Rule:
+    """The same, of blocks for which a compiler names the line of its first return alone."""
+    return Rule("if (e->box <= SMALL_BOX) return;", share, part=True, alone=True, inside=inside)
+
+
+def _own_tested(run: Run) -> float:
+    return run.boxes.wave_tested / run.boxes.wave_rows
+
+
+def _sorted_tested(run: Run) -> float:
+    return run.boxes.sorted_tested / run.boxes.sorted_rows
 
 
 def _own_active(run: Run) -> float:
@@ -231,7 +240,7 @@ def of_addends(run: Run) -> float:
 _ROWS = "for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {"
 _OVER_TILES = (
     Rule(_ROWS, lambda run: run.boxes.wave_rows),
-    *tested(_ROWS, lambda run: run.boxes.wave_tested / run.boxes.wave_rows),
+    _tested(_ROWS, _own_tested),
     Rule("for (uint k = 0; k < wides; ++k) {", lambda run: run.boxes.wide, active=lambda run: 1),  # all read the same
 )
 """Rules of kernels in which an item goes over a Gaussian's tiles, and a group over those of wide boxes."""
@@ -290,6 +299,7 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     ),
     "append_pairs": (
         *_OVER_TILES,
+        _unnamed(_ROWS, _own_tested),
         Rule(
             "for (int tx = x0; tx < x1; ++tx, ++slot)",
             lambda run: run.boxes.wave_tiles,
@@ -322,7 +332,8 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "order_counts": (),
     "duplicate": (
         Rule("for (int ty = y0; ty < y1; ++ty)", lambda run: run.boxes.sorted_rows),
-        *tested("for (int ty = y0; ty < y1; ++ty)", lambda run: run.boxes.sorted_tested / run.boxes.sorted_rows),
+        _tested("for (int ty = y0; ty < y1; ++ty)", _sorted_tested),
+        _unnamed("for (int ty = y0; ty < y1; ++ty)", _sorted_tested),
         Rule(
             "for (int tx = x0; tx < x1; ++tx, ++pair, ++slot)",
             lambda run: run.boxes.sorted_tiles,
