@@ -6,21 +6,22 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from dataclasses import asdict
+from dataclasses import asdict, fields
 
 import gpu_page
 import numpy as np
 import pytest
 from gpu_devices import GPUS
-from gpu_frames import boxes_in, lists_in
-from gpu_lists import AHEAD, OWN_BOX, SIDE, Boxes, Sorting, boxes_of, lists_of, sorting_of
+from gpu_frames import lists_in
+from gpu_lists import AHEAD, OWN_BOX, SIDE, SMALL_BOX, Boxes, Sorting, boxes_of, lists_of, sorting_of
 from gpu_measured import ATOMICS, CALIBRATION, DRAWN, Measured, fit_constants, read
 from gpu_model import Constants, Work
 from gpu_page import now_table, wanted_table
+from gpu_rules import BY_ITEM
+from gpu_run import Run
 from gpu_static import on_each_gpu
 
 from clsplat.device.source import kernel_root
-from clsplat.layouts.columns import SPLAT
 from clsplat.stages.append import LOCAL_PAIRS
 
 (H200,) = [each for each in GPUS if each.name == "H200"]
@@ -81,33 +82,37 @@ def test_a_sort_of_several_lists_is_their_mean() -> None:
     assert found.listed == 1
 
 
-def test_boxes_of_a_frame() -> None:
-    """Two Gaussians of 1 and 3 x 2 tiles, one of 7 x 6, which is wide, and one that is culled."""
-    splats = np.zeros((33, len(SPLAT)), np.float32)
-    column = {name: SPLAT.index(name) for name in ("PIXEL_X", "PIXEL_Y", "HALF_W", "HALF_H")}
-    for place, at in enumerate([(8, 8, 4, 4), (24, 16, 17, 4), (104, 96, 50, 47), (8, 8, 1000, 1000)]):
-        splats[place, list(column.values())] = at
-    pairs = np.zeros(33, np.int64)
-    pairs[:3] = (1, 5, 40)
-    found = boxes_in(splats, pairs, (20, 20))
-    assert found == {
-        "wave_rows": 1.0,  # 2 in the first wave, and none in the second
-        "wave_pairs": 2.5,
-        "wide": round(1 / 33, 6),
-        "wide_rows": 6.0,
-        "wide_columns": 7.0,
-    }
-    boxes = boxes_of(found, 64)
-    assert boxes.wide == pytest.approx(64 / 33, rel=1e-4)
+def test_boxes_of_a_group() -> None:
+    frame = {each.name: 1.0 for each in fields(Boxes)} | {"wide": 1 / 33, "wide_rows": 6.0}
+    boxes = boxes_of(frame, 64)
+    assert boxes.wide == pytest.approx(64 / 33)
     assert boxes.shared_rows(64) == boxes.wide, "all rows in one round"
     assert boxes.shared_rows(32) == pytest.approx(boxes.wide * 6 / 4)
     assert boxes.shared_columns == 1
     assert Boxes(wide_columns=20).shared_columns == 20 / 8
 
 
+def test_rounds_over_tiles_are_those_of_the_frames_waves() -> None:
+    """An item of `project` goes over rows that are tested alone; one of `duplicate`, over all in the order of depth."""
+    boxes = Boxes(wave_rows=4, wave_tested=1, all_tested=1.5, all_pairs=14, sorted_rows=5, sorted_tested=2)
+    run = Run(64, boxes=boxes)
+
+    def rounds(kernel: str, text: str, part: bool = False) -> set[float]:
+        return {rule.rounds(run) for rule in BY_ITEM[kernel] if rule.part is part and text in rule.text}
+
+    assert rounds("project", "for (int ty") == {1.5}
+    assert rounds("project_step", "addends") == {14}
+    assert rounds("duplicate", "for (int ty") == {5}
+    assert rounds("duplicate", "tangent", part=True) == {2 / 5}
+    for kernel in ("count_tiles", "append_pairs"):
+        assert rounds(kernel, "for (int ty") == {4}
+        assert rounds(kernel, "tangent", part=True) == {1 / 4}
+
+
 def test_sizes_are_the_kernels() -> None:
     text = (kernel_root() / "append.cl").read_text()
     assert re.findall(r"^#define OWN_BOX (\d+)$", text, re.MULTILINE) == [str(OWN_BOX)]
+    assert f"#define SMALL_BOX {SMALL_BOX}\n" in (kernel_root() / "shared/tile.h").read_text()
     assert f"#define SIDE (ITEMS < {SIDE} ? ITEMS : {SIDE})\n" in text
 
 

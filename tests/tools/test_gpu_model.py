@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import gpu_static
@@ -18,12 +19,15 @@ from gpu_chain import ENDLESS, NEAR, Chain, chain_of
 from gpu_compilers import Built, Source
 from gpu_devices import GPUS, Gpu
 from gpu_frames import as_measured, subject_of, summary, walk_of
+from gpu_lines import lines_touched
+from gpu_lists import Boxes
 from gpu_loops import cost_of
 from gpu_measured import CALIBRATION, WALLS, Measured, beyond, fit_constants, read, with_inputs
 from gpu_model import (
     FITTED,
     LAUNCH,
     LINES,
+    PASSES,
     Constants,
     Work,
     blocks_of,
@@ -34,7 +38,8 @@ from gpu_model import (
     works_of,
 )
 from gpu_page import measured_table, now_table
-from gpu_rules import BLOCKS, BY_PAIR, VISITS, Rule, Run, lines_touched
+from gpu_rules import BY_PAIR, Rule
+from gpu_run import BLOCKS, VISITS, Run
 
 from clsplat.device.source import kernel_root
 from clsplat.errors import ClsplatError
@@ -103,7 +108,12 @@ def test_what_takes_cycles() -> None:
     [
         ("LDG.E", "sum += values[i];", 1),
         ("LDG.E.128", "sum += values[i];", 4),
-        ("STG.E.64", "pair_ids[pair] = (uint2)(slot, i);", 2),
+        ("LDG.E.64", "const uint2 ids = pair_ids[pair];", 2),
+        ("STG.E.64", "pair_ids[pair] = (uint2)(slot, i);", 6),  # three pairs of 8 bytes a Gaussian
+        ("STG.E", "tile_keys[pair] = ty * tiles_x + tx - first_tile;", 3),
+        ("STG.E", "for (int tx = x0; tx < x1; ++tx, ++slot) APPEND(ty * tiles_x + tx, slot, i)", 3),
+        ("STG.E.64", "for (int tx = x0; tx < x1; ++tx, ++slot) APPEND(ty * tiles_x + tx, slot, i)", 32),
+        ("ATOMG.E.ADD", "for (int tx = x0; tx < x1; ++tx, ++slot) APPEND(ty * tiles_x + tx, slot, i)", 32),
         ("LDG.E", "e.mx = splat[SPLAT_PIXEL_X];", 16),
         ("LDG.E", "raw[0] = GATHER(quaternions, 4, 0);", 4),
         ("LDG.E", "return last ? (float4)(f[0], f[1], f[2], 0.0f)", 32),
@@ -113,7 +123,18 @@ def test_what_takes_cycles() -> None:
 )
 def test_lines_that_a_warp_touches(name: str, text: str, lines: float) -> None:
     kind = "shared" if name == "LDS" else "global"
-    assert lines_touched(Instruction(name, kind), text, Run(64)) == lines
+    assert lines_touched(Instruction(name, kind), text, Run(64, addends=3), 32) == lines
+    assert lines_touched(Instruction(name, kind), text, Run(64, addends=3), 2.5) == min(lines, 2.5), (
+        "of few items, each its own"
+    )
+
+
+def test_items_that_take_part_in_a_round() -> None:
+    whole = Loop([], set(), [Loop([code(("LDG.E", control(2)), source=3)], {2})])
+    built = Built("walk", "sm_90", 40, 0, 0, 0, whole)
+    for active, lines in ((None, 32), (lambda run: run.waves + 1, 3)):
+        rules = (Rule("walk", lambda run: 5, active=active),)
+        assert cost_of(built, ["", "walk {", "keys[place]"], rules, Run(64)).then.lines == 5 * lines
 
 
 def test_blocks_and_pixels_that_skip_a_pair() -> None:
@@ -130,6 +151,43 @@ def test_blocks_and_pixels_that_skip_a_pair() -> None:
     cost = cost_of(built, lines, rules, Run(64, reached=4, taken=2))
     assert cost.rounds["fp32"] == 1 + 4 / 8 + 2 * 2 / 8 + 2  # the mixed block has other lines, and counts in full
     assert cost.then == Chain(1 + 4 / 8 + 2 * 2 / 8 + 2)
+
+
+def branched() -> Loop:
+    """A kernel whose first block jumps past three others; the second of them may call a slow path."""
+    lines = """
+.text.walk:
+        //## File "walk.cl", line 2
+        /*0000*/                   FADD R1, R0, R0 ;                   /* 0x0000000000017221 */
+        /*0010*/              @!P0 BRA `(.L_x_9) ;                     /* 0x0000000000017221 */
+        //## File "walk.cl", line 3
+        /*0020*/                   FMUL R1, R0, R0 ;                   /* 0x0000000000017221 */
+        //## File "walk.cl", line 2
+        /*0030*/               @P1 BRA `(.L_x_8) ;                     /* 0x0000000000017221 */
+        /*0040*/                   MOV R3, R0 ;                        /* 0x0000000000017221 */
+        /*0050*/                   CALL.REL.NOINC `($__internal_0_$__cuda_sm3x_div_rn_noftz_f32_slowpath) ;
+.L_x_8:
+        /*0060*/                   FADD R1, R0, R0 ;                   /* 0x0000000000017221 */
+.L_x_9:
+        /*0070*/                   FADD R1, R0, R0 ;                   /* 0x0000000000017221 */
+        /*0080*/                   EXIT ;                              /* 0x0000000000017221 */
+"""
+    return parse_sass(lines)["walk"]
+
+
+def test_slow_paths_of_divisions_never_run() -> None:
+    built = Built("walk", "sm_90", 40, 0, 0, 0, branched())
+    cost = cost_of(built, ["walk {", "a / b", "c"], (), Run(64))
+    assert +cost.once == Counter(fp32=4, control=3), "without MOV and CALL, and with what follows them"
+
+
+@pytest.mark.parametrize(
+    ("inside", "below", "fp32"), [("", True, 2 + 2 / 4), ("", False, 3 + 1 / 4), ("for (", True, 4)]
+)
+def test_a_branch_and_what_is_only_run_after_it(inside: str, below: bool, fp32: float) -> None:
+    built = Built("walk", "sm_90", 40, 0, 0, 0, branched())
+    rule = Rule("c", lambda run: 1 / 4, part=True, below=below, inside=inside)
+    assert cost_of(built, ["walk {", "a / b", "c"], (rule,), Run(64)).once["fp32"] == fp32
 
 
 def test_a_tile_has_the_kernels_blocks() -> None:
@@ -150,6 +208,8 @@ def test_the_terms_of_a_launch() -> None:
     assert Work("blend", 0, groups=1e6).on(GPU, CONSTANTS).ms == 2
     lines = Work("blend", 0, waves=4, resident=8, chain=Chain(lines=1e6)).on(GPU, CONSTANTS)
     assert lines.ms == pytest.approx(4 * 1e6 / LINES / 2 * 1e-6)
+    local = Work("blend", 0, waves=4, resident=8, chain=Chain(passes=1e6)).on(GPU, CONSTANTS)
+    assert local.ms == pytest.approx(4 * 1e6 / PASSES / 2 * 1e-6)
     both = Work("blend", 1e9, instructions=8e6, groups=1e6, resident=8).on(GPU, CONSTANTS)
     assert both.ms == 2 + 2, "bytes, and then the longest of the others"
 
@@ -213,8 +273,16 @@ def test_the_work_of_a_launch(monkeypatch: pytest.MonkeyPatch) -> None:
     rules = (Rule("walk", lambda run: 1), Rule("weight", lambda run: run.taken / BLOCKS, part=True))
     monkeypatch.setitem(BY_PAIR, "blend", rules)
     monkeypatch.setattr(Source, "lines", ["kernel", "walk", "weight"])
-    frame = {"width": 160, "height": 16, "listed": 40, "visible": 20, "walked": 30, "sh_degree": 3}
-    frame |= {"reached": 8, "taken": 4, "slowest": 9, "longer_reached": 4, "longer_taken": 3, **WALKS}
+    frame = {"width": 160, "height": 16, "gaussians": 25, "visible": 20, "listed": 40, "walked": 30, "sh_degree": 3}
+    frame |= {
+        "reached": 8,
+        "taken": 4,
+        "slowest": 9,
+        "longer_reached": 4,
+        "longer_taken": 3,
+        **WALKS,
+        **asdict(Boxes()),
+    }
     launch = {"kernel": "blend", "stem": "blend", "options": list(source.options), "stage": "blend", "shared": 0}
     launch |= {"size": [640], "local": [64], "scalars": [], "bytes": 5e6}
     built = {(source, "blend"): Built("blend", "sm_90", 64, 0, 0, 0, whole)}

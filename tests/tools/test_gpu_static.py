@@ -16,6 +16,7 @@ import gpu_compilers
 import gpu_intel
 import gpu_page
 import gpu_rules
+import gpu_run
 import gpu_static
 import pytest
 from calls import Capture, refuses
@@ -25,7 +26,8 @@ from gpu_devices import occupancy, waves_at_a_time
 from gpu_intel import read_intel
 from gpu_loops import UnknownLoopError, cost_of, rules_of, unused_rules
 from gpu_model import Stage
-from gpu_rules import BY_ITEM, BY_PAIR, EVERYWHERE, WALK, Rule, Run
+from gpu_rules import BY_ITEM, BY_PAIR, EVERYWHERE, WALK, Rule
+from gpu_run import Run
 from gpu_static import (
     FRAMES,
     MOST_A_PAIR,
@@ -313,10 +315,10 @@ def test_rules_have_the_kernels_own_sizes(items: int) -> None:
     strips = (kernel_root() / "shared/strips.h").read_text()
     assert "#define TOGETHER (SLOT_STRIDE > 9 ? 1 : 2)\n" in strips
     assert "#define TOGETHER (BLOCK_ITEMS < SLOT_STRIDE ? 1 : BLOCK_ITEMS / SLOT_STRIDE)\n" in strips
-    assert gpu_rules.together(items // 32) == (2 if items > 64 else 32 // PLAIN_SLOTS.floats)
-    assert defined("blend_grad.cl", "BATCH") == gpu_rules.BATCH_BACK
+    assert gpu_run.together(items // 32) == (2 if items > 64 else 32 // PLAIN_SLOTS.floats)
+    assert defined("blend_grad.cl", "BATCH") == gpu_run.BATCH_BACK
     assert run.batch == defined("shared/blocks.h", "BATCH")
-    assert defined("sort_radix.cl", "RUN") == gpu_rules.PER_ITEM
+    assert defined("sort_radix.cl", "RUN") == gpu_run.PER_ITEM
     assert f"#define ABREAST {gpu_rules.ABREAST}\n" in (kernel_root() / "shared/adam.h").read_text()
 
 

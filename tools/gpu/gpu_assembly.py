@@ -40,10 +40,22 @@ class Instruction:
 
 @dataclass
 class Block:
-    """A basic block: instructions that run one after the other, and the labels of the first."""
+    """A basic block: instructions that run one after the other, and the labels of the first.
+
+    number: its place in the kernel.
+    above: numbers of its dominators, the blocks that every path to it passes, with itself.
+    """
 
     labels: set[str] = field(default_factory=set)
     body: list[Instruction] = field(default_factory=list)
+    number: int = 0
+    above: frozenset[int] = frozenset()
+
+    @property
+    def calls(self) -> bool:
+        """True if it calls a function: the slow path of a division or a square root, whose operands or results are
+        denormal, infinite or nearly so, or whose operand is zero."""
+        return any(each.name.startswith("CALL") and not each.target for each in self.body)
 
 
 @dataclass
@@ -97,6 +109,7 @@ def kernel_of(blocks: list[Block]) -> Loop:
         outer = next((each for each in reversed(nested[:place]) if head in bodies[each]), None)
         (whole if outer is None else loops[outer]).inner.append(loops[head])
     for number, each in enumerate(blocks):
+        each.number, each.above = number, frozenset(dominators[number])
         inmost = next((head for head in reversed(nested) if number in bodies[head]), None)
         if number in reached:
             (whole if inmost is None else loops[inmost]).blocks.append(each)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from gpu_assembly import Block, Instruction
 
@@ -34,18 +34,20 @@ class Chain:
     cycles: cycles of its own instructions.
     accesses: number of accesses to global memory that it waits for, one after the other.
     lines: number of cache lines of 128 bytes that its accesses touch, counted for each instruction.
+    passes: passes of its accesses through the banks of local memory.
     """
 
     cycles: float = 0.0
     accesses: float = 0.0
     lines: float = 0.0
+    passes: float = 0.0
 
     def __add__(self, other: Chain) -> Chain:
-        return Chain(self.cycles + other.cycles, self.accesses + other.accesses, self.lines + other.lines)
+        return Chain(*(getattr(self, each.name) + getattr(other, each.name) for each in fields(Chain)))
 
     def times(self, rounds: float) -> Chain:
         """The chain of this number of rounds."""
-        return Chain(self.cycles * rounds, self.accesses * rounds, self.lines * rounds)
+        return Chain(*(getattr(self, each.name) * rounds for each in fields(Chain)))
 
 
 NOTHING = Chain()
@@ -56,10 +58,13 @@ def chain_of(
     lines_of: Callable[[Instruction], float],
     rounds: int = 2,
     access: int = ENDLESS,
+    passes_of: Callable[[Instruction], tuple[float, float]] = lambda _: (0, 0),
 ) -> Chain:
     """The chain of the last of some rounds of a loop.
 
     blocks: blocks of the loop, each with the fraction of the rounds that run it.
+    lines_of: cache lines that an instruction touches.
+    passes_of: its passes through the banks of local memory, and how many of them are conflicts.
     """
     weighted = [(each, share) for block, share in blocks if share for each in block.body]
     now, ready = 0, [0] * 8
@@ -67,21 +72,25 @@ def chain_of(
     for _ in range(rounds):
         whole = Chain()
         for each, share in weighted:
-            before = now
-            now = _issued(each, now, ready, access)
+            before, (passes, conflicts) = now, passes_of(each)
+            now = _issued(each, now, ready, access, round(conflicts))
             accesses = round((now - before) / ENDLESS)
-            whole += Chain(now - before - accesses * ENDLESS, accesses, lines_of(each)).times(share)
+            whole += Chain(now - before - accesses * ENDLESS, accesses, lines_of(each), passes).times(share)
     return whole
 
 
-def _issued(each: Instruction, now: int, ready: list[int], access: int) -> int:
-    """The time at which the next instruction may begin. ready: when each scoreboard is clear; changed in place."""
+def _issued(each: Instruction, now: int, ready: list[int], access: int, conflicts: int) -> int:
+    """The time at which the next instruction may begin.
+
+    ready: when each scoreboard is clear; changed in place.
+    conflicts: cycles by which conflicts of banks delay its result.
+    """
     stall, result, operands, waits = (
         each.control >> shift & mask for shift, mask in ((0, 15), (5, 7), (8, 7), (11, 63))
     )
     start = max([now, *(ready[board] for board in range(6) if waits >> board & 1)])
     cycles = next(cycles for pattern, cycles in VARIABLE if re.match(pattern, each.name))
     ready[operands] = max(ready[operands], start + 20)
-    ready[result] = max(ready[result], start + (access if cycles is None else cycles))
+    ready[result] = max(ready[result], start + (access if cycles is None else cycles + conflicts))
     ready[7] = 0
     return start + stall + (BARRIER if each.name.startswith("BAR") else 0)

@@ -58,12 +58,27 @@ class Built:
     whole: Loop
 
 
+TEXTS: dict[tuple[str, str], str] = {}
+"""Texts of kernel files of older code, by commit and stem (`gpu_recount.py`)."""
+
+
 @dataclass(frozen=True)
 class Source:
-    """A kernel file and the options with which clsplat builds it."""
+    """A kernel file and the options with which clsplat builds it. commit: of older code, which is in TEXTS."""
 
     stem: str
     options: tuple[str, ...]
+    commit: str = ""
+
+    @classmethod
+    def of(cls, launch: Mapping[str, Any]) -> Source:
+        """The source of a launch's kernel."""
+        return cls(launch["stem"], tuple(launch["options"]), launch.get("commit", ""))
+
+    @property
+    def text(self) -> str:
+        """The whole text, with all headers."""
+        return TEXTS[self.commit, self.stem] if self.commit else text_of(self.stem)
 
     @property
     def items(self) -> int:
@@ -111,15 +126,15 @@ class Source:
     def used(self) -> Source:
         """The source without defines that its text does not use. Sources for which this is equal have the same kernels,
         as most files do in shapes that differ only in the number of items."""
-        words = set(re.findall(r"\w+", text_of(self.stem)))
+        words = set(re.findall(r"\w+", self.text))
         names = {each: each.removeprefix("-D").partition("=")[0].partition("(")[0] for each in self.options}
         kept = (each for each in self.options if not each.startswith("-D") or names[each] in words)
-        return Source(self.stem, tuple(kept))
+        return Source(self.stem, tuple(kept), self.commit)
 
     @property
     def lines(self) -> list[str]:
         """The text's lines."""
-        return text_of(self.stem).splitlines()
+        return self.text.splitlines()
 
 
 def clang() -> str:
@@ -193,7 +208,7 @@ def assembled(source: Source, target: str, builtins: Path, folder: Path) -> Path
     """Compile a kernel file to assembly in the folder. Raises ClsplatError if clang refuses it."""
     what = f"{source.label} for {target}"
     text, assembly = (folder / f"{source.stem}.{end}" for end in ("cl", "s"))
-    text.write_text(text_of(source.stem), encoding="utf-8")
+    text.write_text(source.text, encoding="utf-8")
     link = ("-Xclang", "-mlink-builtin-bitcode", "-Xclang", str(builtins))
     options = (*FLAGS, "-gline-tables-only", *target_flags(target), *source.options_for(target), *link)
     run_checked([clang(), *options, "-S", str(text), "-o", str(assembly)], what)
@@ -252,10 +267,10 @@ def read_amd(assembly: str, target: str) -> list[Built]:
     return built
 
 
-def ask_package(shape: str, frames: Sequence[Mapping[str, Any]]) -> list[Any]:
+def ask_package(shape: str, frames: Sequence[Mapping[str, Any]], folder: Path = Path(__file__).parent) -> list[Any]:
     """Launches of each frame, as recorded by `gpu_variants.py`. shape: or a variant of a trial, by its place there.
-    Raises ClsplatError."""
-    script = Path(__file__).with_name("gpu_variants.py")
+    folder: with the script, in a copy of the code. Raises ClsplatError."""
+    script = folder / "gpu_variants.py"
     command = [sys.executable, str(script), shape, *(json.dumps(frame) for frame in frames)]
     root = str(script.parents[2])
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))}

@@ -6,9 +6,9 @@
 
 PATH is a run, a model or a scene, as for `clsplat bench`; its first view is rendered. Or it is a scene of
 `gpu_scenes.py`. `listed` counts the (tile, Gaussian) pairs in the tiles' lists, `walked` those up to the last pair that
-a pixel of the tile needs; `walk_of`, `visits_of` and `summary` explain the rest. The rows of these names in
-gpu_frames.json are replaced. A row with `picture` is only rendered, not trained; one with `held_out` is only compared
-with measurements. A frame that was measured elsewhere gets the numbers that it had there (`as_measured`).
+a pixel of the tile needs; `walk_of`, `visits_of`, `summary` and `gpu_waves.py` explain the rest. The rows of these
+names in gpu_frames.json are replaced. A row with `picture` is only rendered, not trained; one with `held_out` is only
+compared with measurements. A frame that was measured elsewhere gets the numbers that it had there (`as_measured`).
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bench"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
-from gpu_lists import OWN_BOX
 from gpu_measured import CALIBRATION
-from gpu_rules import BATCH_BACK, BLOCKS, VISITS, WARPS, together
+from gpu_run import BATCH_BACK, BLOCKS, VISITS, WARPS, together
 from gpu_scenes import subject_of
+from gpu_waves import refined, waves_in
 from measuring import plain_parser, require, tool
 
 from clsplat.bench.workload import Subject
@@ -75,12 +75,8 @@ def count(name: str, subject: Subject) -> dict[str, Any]:
         "key_bits": counted.key_bits,
         **summary(np.array(walks)),
         **lists_in(np.diff(lists.ranges.get().astype(np.int64)).ravel()),
-        **boxes_in(splats, frame.projected.tile_counts.get(), (tiles.shape[1], tiles.shape[0])),
+        **waves_in(refined(subject), splats, frame.projected.tile_counts.get(), (tiles.shape[1], tiles.shape[0])),
     }
-
-
-WAVE = 32
-"""Number of neighbouring Gaussians whose items run in step."""
 
 
 def lists_in(lengths: np.ndarray) -> dict[str, Any]:
@@ -94,37 +90,6 @@ def lists_in(lengths: np.ndarray) -> dict[str, Any]:
         "longest_listed": int(lengths.max()),
         "list_tiles": np.bincount(doublings).tolist(),
         "list_pairs": np.bincount(doublings, lengths).astype(np.int64).tolist(),
-    }
-
-
-def boxes_in(splats: np.ndarray, pairs: np.ndarray, tiles: tuple[int, int]) -> dict[str, Any]:
-    """Keys of a frame's row: the fields of `gpu_lists.Boxes`, where `wide` is a fraction of all Gaussians.
-
-    splats, pairs: splat, and number of pairs, of each Gaussian.
-    tiles: number of tiles across and down.
-    """
-    field = dict(zip(SPLAT, splats.T, strict=False))
-
-    def side(mean: str, rest: str, half: str, count: int) -> np.ndarray:
-        at = field[mean] + field[rest]
-        low, high = ((at + sign * field[half]) / TILE for sign in (-1, 1))
-        return np.where(pairs > 0, np.clip(np.floor(high) + 1, 0, count) - np.clip(np.floor(low), 0, count), 0)
-
-    with np.errstate(invalid="ignore", over="ignore"):  # culled Gaussians have arbitrary values
-        columns, rows = side("PIXEL_X", "SUB_X", "HALF_W", tiles[0]), side("PIXEL_Y", "SUB_Y", "HALF_H", tiles[1])
-    is_wide = columns * rows > OWN_BOX
-    wide = max(int(is_wide.sum()), 1)
-
-    def of_waves(values: np.ndarray) -> float:
-        own = np.pad(np.where(is_wide, 0, values), (0, -len(values) % WAVE))
-        return round(float(own.reshape(-1, WAVE).max(1).mean()), 3)
-
-    return {
-        "wave_rows": of_waves(rows),
-        "wave_pairs": of_waves(pairs),
-        "wide": round(float(is_wide.mean()), 6),
-        "wide_rows": round(float(rows[is_wide].sum()) / wide, 3),
-        "wide_columns": round(float(columns[is_wide].sum()) / wide, 3),
     }
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How often the loops of append.cl run, from a frame's boxes and the lengths of its lists."""
+"""How often loops over Gaussians' tiles and over lists run, from a frame's boxes and the lengths of its lists."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from typing import Any
 
 from clsplat.stages.append import LOCAL_PAIRS
 
+SMALL_BOX = 16
+"""Tiles of the largest box that is listed whole, without a test of its rows: SMALL_BOX in tile.h."""
 OWN_BOX = 32
 """Tiles of the largest box that an item processes alone: OWN_BOX in append.cl."""
 AHEAD = 4
@@ -20,16 +22,30 @@ SIDE = 8
 
 @dataclass(frozen=True)
 class Boxes:
-    """Bounding boxes of Gaussians, in tiles.
+    """Bounding boxes of Gaussians, in tiles. Of waves, all numbers are means; a wave has 32 neighbouring Gaussians. The
+    rows of a box of more than SMALL_BOX tiles are tested.
 
-    wave_rows, wave_pairs: the largest number of rows, and of pairs, among 32 neighbouring Gaussians without wide boxes,
-        on average.
+    refined: fraction of waves with a Gaussian for which `refine` runs.
+    wave_rows, wave_tested: without wide boxes, the largest number of a wave's rows, and of rows that are tested.
+    wave_tiles: without wide boxes, rounds over tiles: for each row, those of the Gaussian with the most tiles in it.
+    own_pairs: without wide boxes, a wave's pairs.
+    all_tested, all_pairs: the largest number of rows that are tested, and of pairs, of any box.
+    sorted_rows, sorted_tested, sorted_tiles: as wave_rows, wave_tested and wave_tiles, but of any box, and of waves of
+        Gaussians that are neighbours in depth.
     wide: number of wide boxes of a group.
     wide_rows, wide_columns: mean numbers of rows and columns of a wide box.
     """
 
+    refined: float = 0
     wave_rows: float = 1
-    wave_pairs: float = 1
+    wave_tested: float = 0
+    wave_tiles: float = 1
+    own_pairs: float = 32
+    all_tested: float = 0
+    all_pairs: float = 1
+    sorted_rows: float = 1
+    sorted_tested: float = 0
+    sorted_tiles: float = 1
     wide: float = 0
     wide_rows: float = 0
     wide_columns: float = 0
@@ -37,6 +53,15 @@ class Boxes:
     def shared_rows(self, items: int) -> float:
         """Rounds over the rows of a group's wide boxes, if its items share them."""
         return self.wide * max(self.wide_rows * SIDE / items, 1)
+
+    def rows_at_once(self, items: int) -> float:
+        """Rows of a wide box in such a round."""
+        return min(self.wide_rows, items / SIDE)
+
+    @property
+    def columns_at_once(self) -> float:
+        """Tiles of a row of a wide box in a round."""
+        return min(self.wide_columns, SIDE)
 
     @property
     def shared_columns(self) -> float:

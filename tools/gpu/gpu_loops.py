@@ -8,13 +8,17 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from gpu_assembly import CLASSES, Block, Instruction, Loop
+from gpu_banks import passes
 from gpu_chain import ENDLESS, NEAR, NOTHING, Chain, chain_of
 from gpu_compilers import Built
-from gpu_rules import BY_ITEM, BY_PAIR, EVERYWHERE, Rule, Run, lines_touched
+from gpu_lines import lines_touched
+from gpu_rules import BY_ITEM, BY_PAIR, EVERYWHERE, OUTSIDE, Rule
+from gpu_rules_measured import MEASURED
+from gpu_run import Run
 
 from clsplat.errors import ClsplatError
 
@@ -39,8 +43,10 @@ class Cost:
     then: Chain = NOTHING
 
 
-def rules_of(kernel: str) -> tuple[Rule, ...]:
-    """The rules of a kernel. Raises UnknownLoopError."""
+def rules_of(kernel: str, commit: str = "") -> tuple[Rule, ...]:
+    """The rules of a kernel. commit: of older code. Raises UnknownLoopError."""
+    if kernel in (measured := MEASURED.get(commit, {})):
+        return measured[kernel] + EVERYWHERE
     if kernel not in BY_PAIR and kernel not in BY_ITEM:
         raise UnknownLoopError(f"{kernel}: no kernel of BY_PAIR or BY_ITEM in tools/gpu/gpu_rules.py")
     return (BY_PAIR.get(kernel) or BY_ITEM[kernel]) + EVERYWHERE
@@ -76,11 +82,15 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
     used: set[Rule] = set()
     then = NOTHING
 
-    def shared(loop: Loop) -> list[tuple[Block, float]]:
-        return list(_shares(loop, lines, parts, run, used))
+    def shared(loop: Loop, opened: str) -> list[tuple[Block, float]]:
+        here = [rule for rule in parts if not rule.inside or rule.inside in opened]
+        return list(_shares(loop, lines, here, run, used))
 
-    def lines_of(each: Instruction) -> float:
-        return lines_touched(each, lines[each.source - 1] if each.source else "", run)
+    def lines_of(active: float) -> Callable[[Instruction], float]:
+        return lambda each: lines_touched(each, lines[each.source - 1] if each.source else "", run, active)
+
+    def passes_of(each: Instruction) -> tuple[float, float]:
+        return passes(each, lines[each.source - 1] if each.source else "", run.wave)
 
     def visit(outer: Loop, outer_rounds: float) -> None:
         nonlocal then
@@ -94,10 +104,11 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
             times = outer_rounds if matching[0].inner else 1
             unrolled = 1 if matching[0].copies else _unrolled(loop, matching[0], twins)
             factor = times * matching[0].rounds(run) / unrolled
-            blocks = shared(loop)
+            blocks = shared(loop, matching[0].text)
             for kind, count in _counts(blocks).items():
                 rounds[kind] += factor * count  # type: ignore[assignment]
-            then += chain_of(blocks, lines_of, 2, NEAR if matching[0].near else ENDLESS).times(factor)
+            touched = lines_of(matching[0].active(run) if matching[0].active else run.wave)
+            then += chain_of(blocks, touched, 2, NEAR if matching[0].near else ENDLESS, passes_of).times(factor)
             visit(loop, factor)
 
     visit(built.whole, 1)
@@ -106,8 +117,10 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
             f"{built.kernel} for {built.target} in groups of {run.items}: no rule of tools/gpu/gpu_rules.py, or more "
             f"than one, is for {'; '.join(unknown)}"
         )
-    whole = shared(built.whole)
-    return Cost(_counts(whole), rounds, frozenset(used), chain_of(whole, lines_of, 1), then)
+    whole = shared(built.whole, OUTSIDE)
+    return Cost(
+        _counts(whole), rounds, frozenset(used), chain_of(whole, lines_of(run.wave), 1, passes_of=passes_of), then
+    )
 
 
 def unused_rules(used: Mapping[str, Iterable[Rule]]) -> list[str]:
@@ -130,11 +143,21 @@ def _title(loop: Loop, lines: Sequence[str]) -> str:
 def _shares(
     loop: Loop, lines: Sequence[str], parts: Sequence[Rule], run: Run, used: set[Rule]
 ) -> Iterator[tuple[Block, float]]:
-    """The blocks of a loop, each with the fraction of rounds that run it."""
-    for block in loop.blocks:
-        inside = [rule for rule in parts if rule.holds({each.source for each in block.body}, lines)]
-        used.update(inside)
-        yield block, inside[0].rounds(run) if inside else 1
+    """The blocks of a loop, each with the fraction of rounds that run it.
+
+    Slow paths of divisions and square roots never run, as few operands need them.
+    """
+    sources = [{each.source for each in block.body} for block in loop.blocks]
+    held = [[rule for rule in parts if rule.holds(each, lines)] for each in sources]
+    heads = {
+        rule: {block.number for block, rules in zip(loop.blocks, held, strict=True) if rule in rules}
+        for rule in parts
+        if rule.below
+    }
+    for block, here in zip(loop.blocks, held, strict=True):
+        found = [rule for rule in parts if rule in here or heads.get(rule, set()) & block.above]
+        used.update(found)
+        yield block, 0 if block.calls else found[0].rounds(run) if found else 1
 
 
 def _counts(blocks: Iterable[tuple[Block, float]]) -> Counter[str]:

@@ -4,8 +4,8 @@
 A row of the file has a device, its driver, date and commit, and scenes. Of a scene, `frame` is its name in
 gpu_frames.json, `parts_ms` or `kernels_ms` are times on the device, and `frame_ms` and `step_ms` are wall times.
 `inputs` are the model's inputs for the step's launches, from the code that was measured. So a row stays a test of the
-model when kernels change. For a new row, `gpu_static.py --inputs` writes them in a checkout of that code. Rows without
-inputs, or of a device that is not in `gpu_devices.py`, are not used.
+model when kernels change. `gpu_static.py --inputs` counts them anew after a change to the model (`gpu_recount.py`).
+Rows without inputs, or of a device that is not in `gpu_devices.py`, are not used.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -90,21 +90,28 @@ Works = Mapping[tuple[str, str], Sequence[Work | None]]
 """The work of a step's launches, by target or GPU, and by frame."""
 
 
-def with_inputs(rows: Sequence[Mapping[str, Any]], works: Works) -> str:
-    """The file's text, with inputs added to scenes that have none. works: the work of the code that was measured."""
+def inputs_of(works: Iterable[Work | None]) -> list[Any]:
+    """A step's launches as `inputs` of a scene, without the fields that have the defaults of Work."""
 
     def told(value: Any) -> Any:
         if isinstance(value, Mapping):
             return {key: told(each) for key, each in value.items()}
         return value if isinstance(value, str) else float(f"{value:.{DIGITS}g}")
 
+    usual = asdict(Work("", 0))
+    found = [work and asdict(work) for work in works]
+    return [work and told({key: each for key, each in work.items() if each != usual[key]}) for work in found]
+
+
+def with_inputs(rows: Sequence[Mapping[str, Any]], works: Works) -> str:
+    """The file's text, with inputs added to scenes that have none. works: the work of the code that was measured."""
     inputs, rows = [], deepcopy(rows)
     for row in rows:
         target = next((each.target for each in GPUS if each.name == row.get("gpu")), "")
         for scene in row["scenes"]:
             found = scene.get("inputs")
             if found is None and (target, scene.get("frame")) in works:
-                found = [work and told(asdict(work)) for work in works[target, scene["frame"]]]
+                found = inputs_of(works[target, scene["frame"]])
             if found is not None:
                 inputs.append(",\n".join(f"     {json.dumps(each)}" for each in found))
                 scene["inputs"] = f"inputs {len(inputs) - 1}"
@@ -114,7 +121,8 @@ def with_inputs(rows: Sequence[Mapping[str, Any]], works: Works) -> str:
 
 def _work(given: Mapping[str, Any] | None) -> Work | None:
     """The work of a launch from an entry of `inputs`."""
-    return None if given is None else Work(**{**given, **{name: Chain(**given[name]) for name in ("chain", "longest")}})
+    chains = {name: Chain(**given[name]) for name in ("chain", "longest") if name in given} if given else {}
+    return None if given is None else Work(**{**given, **chains})
 
 
 def read(rows: Sequence[Mapping[str, Any]], now: Works) -> tuple[list[Measured], list[str]]:

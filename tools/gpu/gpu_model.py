@@ -2,9 +2,10 @@
 """Predict the milliseconds of a training step on a GPU, and fit the model's few constants to measured steps.
 
 A launch takes the time of its bytes, and after that the longest of: starting its instructions, looking up its cache
-lines, its atomics, starting its groups, and the chains of its warps (`gpu_chain.py`), as many at a time as fit, or the
-chain of the slowest tile's alone. No launch takes less than LAUNCH. Bytes are added because an H100 and an H200, which
-differ in nothing but memory, differ in each stage by the time of its bytes. Every constant is shared by all stages.
+lines, passing through the banks of local memory, its atomics, starting its groups, and the chains of its warps
+(`gpu_chain.py`), as many at a time as fit, or the chain of the slowest tile's alone. No launch takes less than LAUNCH.
+Bytes are added because an H100 and an H200, which differ in nothing but memory, differ in each stage by the time of its
+bytes. Every constant is shared by all stages.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from gpu_compilers import Built, Source
 from gpu_devices import ARCHITECTURES, Gpu, waves_at_a_time
 from gpu_lists import boxes_of, lists_of, sorting_of
 from gpu_loops import Cost, cost_of, rules_of
-from gpu_rules import BLOCKS, BY_PAIR, NUMBERS, VISITS, WARPS, Run
+from gpu_rules import BY_PAIR, NUMBERS
+from gpu_run import BLOCKS, VISITS, WARPS, Run
 
 from clsplat.layouts.columns import TILE
 
@@ -30,6 +32,8 @@ LAUNCH = 0.003
 """Least milliseconds of a launch: those of the shortest in docs/gpus/calibration.json."""
 LINES = 2
 """Cache lines that a unit looks up per cycle."""
+PASSES = 1
+"""Passes through the banks of local memory of a unit per cycle."""
 DRIVERS_ITEMS = 256
 """Items per group where the driver chooses."""
 APPENDING, SORTING = ("count_tiles", "append_pairs"), "sort_lists"
@@ -114,10 +118,11 @@ class Work:
         )
         issue, chain = self.instructions / gpu.issued / constants.efficiency, max(waited) / gpu.ghz * 1e-6
         lines = self.waves * self.chain.lines / LINES / gpu.units / gpu.ghz * 1e-6
+        local = self.waves * self.chain.passes / PASSES / gpu.units / gpu.ghz * 1e-6
         starts = self.groups / constants.groups / gpu.ghz * 1e-6
         counted = self.atomics * (constants.atomic + constants.counter / self.counters) * 1e-6
         memory = self.bytes / gpu.gb / constants.copy * 1e-6
-        return Stage(issue, memory, chain, max(LAUNCH, memory + max(issue, lines, starts, chain, counted)), 1)
+        return Stage(issue, memory, chain, max(LAUNCH, memory + max(issue, lines, local, starts, chain, counted)), 1)
 
 
 def blocks_of(frame: Mapping[str, Any], items: int) -> dict[str, Any]:
@@ -148,19 +153,19 @@ def run_of(frame: Mapping[str, Any], launch: Mapping[str, Any], items: int, wave
     tiles = tiles_of(frame)
     numbers = dict(zip(NUMBERS.get(launch["kernel"], ()), map(int, launch["scalars"]), strict=False))
     more: dict[str, Any] = {name: numbers[name] for name in ("elements", "digits") if name in numbers}
-    if launch["kernel"] in APPENDING:
-        more["boxes"] = boxes_of(frame, items)
     if launch["kernel"] == SORTING:
         more["sorting"] = sorting_of(lists_of(frame), items)
     return Run(
         items,
         wave,
         addends=frame["listed"] / max(frame["visible"], 1),
+        shown=frame["visible"] / max(frame["gaussians"], 1),
         listed=frame["walked"] / tiles,
         **blocks_of(frame, items),
         coefficients=(frame["sh_degree"] + 1) ** 2,
         groups=math.prod(launch["size"]) // items,
         lists=tiles,
+        boxes=boxes_of(frame, items),
         **more,
     )
 
@@ -187,10 +192,12 @@ def works_of(
     None stands for a wait of the host for a number. A frame has one; a step has none (decision 0025).
     """
     works: list[Work | None] = []
-    costs = cache(lambda source, name, run: cost_of(built[source, name], source.lines, rules_of(name), run))
+    costs = cache(
+        lambda source, name, run: cost_of(built[source, name], source.lines, rules_of(name, source.commit), run)
+    )
     for launch in launches:
         if "stem" in launch:
-            kernel = built[Source(launch["stem"], tuple(launch["options"])), launch["kernel"]]
+            kernel = built[Source.of(launch), launch["kernel"]]
             works.append(_work_of(launch, kernel, frame, costs))
         elif launch["kernel"] not in COPIES:
             works.append(Work(launch["stage"], launch["bytes"], kernel=launch["kernel"]))
@@ -202,7 +209,7 @@ def works_of(
 def _work_of(
     launch: Mapping[str, Any], kernel: Built, frame: Mapping[str, Any], costs: Callable[[Source, str, Run], Cost]
 ) -> Work:
-    source, name = Source(launch["stem"], tuple(launch["options"])), launch["kernel"]
+    source, name = Source.of(launch), launch["kernel"]
     wave = ARCHITECTURES[kernel.target].wave
     run = run_of(frame, launch, source.items, wave)
     items, size = math.prod(launch["local"] or (DRIVERS_ITEMS,)), math.prod(launch["size"])

@@ -14,7 +14,7 @@ from gpu_chain import NEAR
 from gpu_devices import GPUS, occupancy
 from gpu_intel import INTEL, IntelBuilt
 from gpu_measured import PARTS, WALLS, Fit, Measured, Works, milliseconds
-from gpu_model import LAUNCH, LINES, Constants, Stage
+from gpu_model import LAUNCH, LINES, PASSES, Constants, Stage
 from plotting import plot_stacks
 
 from clsplat.errors import ClsplatError
@@ -193,6 +193,7 @@ def constant_table(constants: Constants) -> str:
         ["an integer atomic in global memory", f"{constants.atomic * 1e3:.0f} ps", "H100, 3.4 M of them"],
         ["the next one on the same counter", f"{constants.counter:.0f} ns", "H100, 3.4 M on 1450 and 6700 counters"],
         ["lines looked up a cycle and unit", f"{LINES}", "assumed; `project` agrees"],
+        ["passes through 32 banks of local memory, a cycle and unit", f"{PASSES}", "programming guides"],
     ]
     return markdown(lines)
 

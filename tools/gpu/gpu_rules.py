@@ -8,154 +8,17 @@ that a rewritten kernel needs new rules (`gpu_loops.py`).
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from gpu_lists import Boxes, Sorting
+from gpu_run import BATCH_BACK, BLOCKS, PER_ITEM, Run
 
 from clsplat.device.launch import DEFAULT_GROUP_ITEMS
 from clsplat.layouts.columns import LOSS_PARTS, PLAIN_SLOTS
 
 if TYPE_CHECKING:
-    from gpu_assembly import Instruction, Loop
-
-PER_ITEM = 16
-"""Keys per item in a tile of the radix sort: RUN in sort_radix.cl."""
-BLOCKS = 8
-"""Blocks of 4 x 8 pixels in a tile: BLOCK_COLUMNS * BLOCK_ROWS in blocks.h."""
-WARPS = (1, 2, 4, 8)
-"""Warps of a tile for which gpu_frames.json has counts."""
-BATCH_BACK = 64
-"""Pairs in a batch of blending's gradient: BATCH in blend_grad.cl."""
-VISITS = (
-    *("visits", "dense", "sparse_reached", "sparse_taken"),
-    *("turns_back", "whole_back", "others_reached", "others_taken", "rounds_back"),
-)
-"""Counts per walked pair. Those of blending are over the pairs of the batches that it fetches:
-
-- visits, dense: warps that walk a pair, and those for which it is dense (blocks.h).
-- sparse_reached, sparse_taken: in the other warps, blocks that the pair reaches, and blocks with a pixel that takes it
-  or is finished by it.
-
-Those of the gradient's walk (strips.h) are over all warps:
-
-- turns_back, whole_back: pairs of a warp's strips, and those that reach all blocks of the strip.
-- others_reached, others_taken: for the other pairs, blocks that it visits, and blocks with a pixel that takes the pair.
-- rounds_back: rounds.
-"""
-_UNEVEN = 2
-"""Estimated ratio of a wave's rounds to those of an average item, if neighbouring Gaussians have all sizes. A wave has
-the rounds of its longest item."""
-
-
-def together(warps: int) -> int:
-    """Pairs of a round of the gradient's walk, if this many warps share a tile: TOGETHER in strips.h."""
-    return 32 // PLAIN_SLOTS.floats if warps <= 2 else 2
-
-
-@dataclass(frozen=True)
-class Run:
-    """Numbers on which the rounds of a loop depend. `gpu_frames.py` counts those of walked pairs.
-
-    items: work-items per group.
-    wave: items that run in step.
-    subgroup: items that exchange values.
-    addends: pairs per visible Gaussian.
-    listed: pairs per tile.
-    reached, taken: blocks of a pair's tile that its ellipse reaches, and those with a pixel that takes the pair.
-    visits, dense: fractions of the tile's warps that walk a pair, and for which it is dense.
-    sparse_reached, sparse_taken: as reached and taken, only in warps that walk the pair and for which it is not dense.
-    turns_back, whole_back, rounds_back: in the gradient's walk, a warp's pairs, those of them that reach a whole strip,
-        and rounds.
-    others_reached, others_taken: in the gradient's walk, blocks of the tile that it visits for the other pairs, and
-        those with a pixel that takes the pair.
-    coefficients: SH coefficients per channel.
-    groups, elements: numbers of the launch.
-    digits: digits of a pass of the radix sort.
-    lists: number of the frame's tiles.
-    boxes, sorting: numbers for lists by append.
-    """
-
-    items: int
-    wave: int = 32
-    subgroup: int = 1
-    addends: float = 12.5
-    listed: float = math.inf
-    reached: float = BLOCKS
-    taken: float = BLOCKS
-    visits: float = 1
-    dense: float = 1
-    sparse_reached: float = 0
-    sparse_taken: float = 0
-    turns_back: float = 1
-    whole_back: float = 0
-    others_reached: float = 0
-    others_taken: float = 0
-    rounds_back: float = 1
-    coefficients: int = 16
-    groups: int = 1
-    elements: int = 1
-    digits: int = 256
-    lists: int = 1
-    boxes: Boxes = field(default_factory=Boxes)
-    sorting: Sorting = field(default_factory=Sorting)
-
-    @property
-    def waves(self) -> int:
-        """Number of waves per group."""
-        return max(self.items // self.wave, 1)
-
-    @property
-    def batch(self) -> int:
-        """Pairs in a batch of blending: BATCH in blocks.h."""
-        return max(self.items, 64)
-
-    @property
-    def batches(self) -> float:
-        """Batches per pair. A tile's last batch is half full on average."""
-        return 1 / self.batch + 0.5 / self.listed
-
-    @property
-    def fetches(self) -> float:
-        """Rounds per pair in which an item fetches a splat."""
-        return self.batches * self.batch / self.items
-
-    @property
-    def batches_back(self) -> float:
-        """Batches per pair in blending's gradient."""
-        return 1 / BATCH_BACK + 0.5 / self.listed
-
-    @property
-    def strips(self) -> int:
-        """Strips that an item walks one after the other: OWN_STRIPS in strips.h."""
-        return max(64 // self.items, 1)
-
-    @property
-    def team_waves(self) -> int:
-        """Waves that share a strip: TEAM_WARPS in strips.h."""
-        return max(self.items // 64, 1)
-
-    @property
-    def of_item(self) -> float:
-        """Elements per item."""
-        return self.elements / (self.groups * self.items)
-
-    @property
-    def tiles(self) -> float:
-        """Tiles of keys per group in the scatter of the sort."""
-        return math.ceil(self.elements / (PER_ITEM * self.items)) / self.groups
-
-    @property
-    def sums_before(self) -> float:
-        """Rounds in which a wave adds up the sums of the groups before its own."""
-        return math.ceil(self.groups / 2 / self.items)
-
-    def shared(self, count: float) -> float:
-        """Average rounds per wave of a group whose items share `count` elements."""
-        return math.ceil(count / self.wave) / self.waves
-
+    from gpu_assembly import Loop
 
 Rounds = Callable[[Run], float]
 
@@ -169,12 +32,15 @@ class Rule:
     part: True for a branch that contains the line; rounds is then the fraction of its loop's rounds that take it. Of
     several such rules the first counts.
     alone: True for a branch that contains no other lines than this and `ends`.
+    below: True if the fraction is also that of the blocks that run only after the branch.
+    inside: for a branch in one loop alone, a part of the line that opens the loop; OUTSIDE for one in no loop.
     holding, lacking: a part of a line that the loop contains, or does not, if a compiler jumps from one line to the
     heads of two loops.
     mark: number of instructions of a class in a round, such as ("shared", 2). A loop with more of them is unrolled.
     inner: True if rounds are per round of the enclosing loop.
     copies: True if a compiler makes copies of the loop that run so often each, none of which is a remainder.
     near: True if it reads what the group's items have just read.
+    active: mean number of a wave's items that take part in a round, or that access different addresses; all if None.
     """
 
     text: str
@@ -183,12 +49,15 @@ class Rule:
     function: str = ""
     part: bool = False
     alone: bool = False
+    below: bool = False
+    inside: str = ""
     holding: str = ""
     lacking: str = ""
     mark: tuple[str, int] | None = None
     inner: bool = False
     near: bool = False
     copies: bool = False
+    active: Rounds | None = None
 
     def matches(self, number: int, lines: Sequence[str]) -> bool:
         """True if the rule matches the line with this number, counted from 1."""
@@ -209,6 +78,8 @@ class Rule:
         return self.holding in text and not (self.lacking and self.lacking in text)
 
 
+OUTSIDE = "outside of loops"
+"""Place of a branch that is in no loop."""
 _HEADS = ("static ", "GROUP __kernel", "__kernel", "RARE ")
 """Words with which the head of a function begins."""
 
@@ -224,7 +95,7 @@ EVERYWHERE: tuple[Rule, ...] = (
     ),
 )
 """Rules of loops in functions that kernels share."""
-_BEFORE_PAIRS = (
+BEFORE_PAIRS = (
     Rule("for (int first = last; first < end; first += ITEMS)", lambda run: 0),  # for pairs beyond the last
     Rule("RAISE_TO_GROUP_MAX(last)", lambda run: 0),  # once a tile
 )
@@ -253,7 +124,7 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
         _of_visit("const floatL power = LOG2_ALPHA(", lambda run: run.sparse_reached / BLOCKS),
     ),
     "blend_grad": (
-        *_BEFORE_PAIRS,
+        *BEFORE_PAIRS,
         Rule("atomic_max(lasts", lambda run: 0),  # once a tile: AMD's compiler loops over a wave's items
         Rule(
             "for (int batch = last",
@@ -291,7 +162,7 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
 }
 """Rules of kernels that run a group per tile: rounds per pair in each of the group's waves."""
 WALK: tuple[Rule, ...] = (
-    *_BEFORE_PAIRS,
+    *BEFORE_PAIRS,
     Rule("for (int k = ITEM; k < TILE * TILE; k += ITEMS)", lambda run: 0),  # once a tile
     Rule("for (int turn = last", lambda run: 1 / run.items),
     Rule("for (int round = 0; round < ITEMS; ++round)", lambda run: 1),
@@ -305,23 +176,19 @@ def _of_item(run: Run) -> float:
     return run.of_item
 
 
-def _bands(run: Run) -> float:
+def bands(run: Run) -> float:
     return run.coefficients - 1
-
-
-def _side(run: Run) -> float:
-    return _UNEVEN * math.sqrt(run.addends)
 
 
 def _parts(run: Run) -> float:
     return LOSS_PARTS / run.items
 
 
-def _never(run: Run) -> float:  # noqa: ARG001  # one of the rounds
+def never(run: Run) -> float:  # noqa: ARG001  # one of the rounds
     return 0
 
 
-def _group_sum(rounds: Rounds) -> Rule:
+def group_sum(rounds: Rounds) -> Rule:
     return Rule("for (uint i = get_local_id(0); i < count; i += ITEMS) sum += values[i];", rounds, mark=("global", 1))
 
 
@@ -331,7 +198,7 @@ def _abreast(run: Run, width: float) -> float:
 
 
 def _adam(run: Run) -> float:
-    return sum(_abreast(run, width) for width in (3, 4, 3, 1, 3, 3 * _bands(run)))
+    return sum(_abreast(run, width) for width in (3, 4, 3, 1, 3, 3 * bands(run)))
 
 
 ABREAST = 4
@@ -339,9 +206,42 @@ ABREAST = 4
 ADAM = Rule("for (uint k = own, bit = 1; k < count; k += stride, bit += bit)", _adam, mark=("global", 6))
 """Adam's loop in `project_step`."""
 
+REFINED = Rule("const floatL size = AS_FLOATL(AS_INTL(length)", lambda run: run.boxes.refined, part=True, below=True)
+"""`refine` in `project_gaussians`: a wave runs it where one of its items does."""
+
+
+def _tested(inside: str, share: Rounds) -> Rule:
+    """`tile_span` in a loop over rows: the fraction of its rounds in which some item tests a row of a large box."""
+    return Rule("if (e->tangent >= d0 && e->tangent <= d1)", share, part=True, below=True, inside=inside)
+
+
+def _unnamed(inside: str, share: Rounds) -> Rule:
+    """The same, of blocks for which a compiler names the line of its first return alone."""
+    return Rule("if (e->box <= SMALL_BOX) return;", share, part=True, alone=True, inside=inside)
+
+
+def _own_tested(run: Run) -> float:
+    return run.boxes.wave_tested / run.boxes.wave_rows
+
+
+def _sorted_tested(run: Run) -> float:
+    return run.boxes.sorted_tested / run.boxes.sorted_rows
+
+
+def _own_active(run: Run) -> float:
+    return run.boxes.own_pairs / run.boxes.wave_tiles
+
+
+def of_addends(run: Run) -> float:
+    """Items of a wave that have an addend left in a round."""
+    return run.wave * run.shown * run.addends / run.boxes.all_pairs
+
+
+_ROWS = "for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {"
 _OVER_TILES = (
-    Rule("for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {", lambda run: run.boxes.wave_rows),
-    Rule("for (uint k = 0; k < wides; ++k) {", lambda run: run.boxes.wide),
+    Rule(_ROWS, lambda run: run.boxes.wave_rows),
+    _tested(_ROWS, _own_tested),
+    Rule("for (uint k = 0; k < wides; ++k) {", lambda run: run.boxes.wide, active=lambda run: 1),  # all read the same
 )
 """Rules of kernels in which an item goes over a Gaussian's tiles, and a group over those of wide boxes."""
 
@@ -357,26 +257,38 @@ def _over_list(function: str, rounds: Rounds, text: str = "k < count; k += ITEMS
 
 BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "project": (
-        Rule("for (int ty = e->tile_y0; ty < e->tile_y1; ++ty)", _side, ends=("count += x1 - x0;",), mark=("fp32", 60)),
-        Rule("for (int k = 1; k < used; ++k, rest += 3)", _bands, mark=("global", 3)),
+        REFINED,
+        Rule(
+            "for (int ty = e->tile_y0; ty < e->tile_y1; ++ty)",
+            lambda run: run.boxes.all_tested,
+            ends=("count += x1 - x0;",),
+            mark=("fp32", 60),
+        ),
+        Rule("for (int k = 1; k < used; ++k, rest += 3)", bands, mark=("global", 3)),
     ),
     "visible_sums": (
         Rule("i < end; i += ITEMS) visible += shown[i] != 0;", _of_item, mark=("global", 1)),
-        _group_sum(_of_item),
+        group_sum(_of_item),
     ),
     "compact_visible": (
-        _group_sum(lambda run: run.sums_before),
+        group_sum(lambda run: run.sums_before),
         Rule("for (uint first = begin; first < end; first += ITEMS)", _of_item),
         Rule("atomic_min(extremes, least)", lambda run: run.wave),  # AMD's compiler loops over a wave's items
         Rule("atomic_max(extremes + 1, largest)", lambda run: run.wave),
     ),
     "count_tiles": (
         *_OVER_TILES,
-        Rule("for (int tx = x0; tx < x1; ++tx) atomic_inc(", lambda run: run.boxes.wave_pairs, mark=("global", 1)),
+        Rule(
+            "for (int tx = x0; tx < x1; ++tx) atomic_inc(",
+            lambda run: run.boxes.wave_tiles,
+            mark=("global", 1),
+            active=_own_active,
+        ),
         Rule("for (int row = e.tile_y0 + (int)item / SIDE;", lambda run: run.boxes.shared_rows(run.items)),
         Rule(
             "for (int tx = x0 + (int)item % SIDE;",
             lambda run: run.boxes.shared_rows(run.items) * run.boxes.shared_columns,
+            active=lambda run: run.boxes.rows_at_once(run.items) / run.waves * run.boxes.columns_at_once,
         ),
     ),
     "list_offsets": (  # its elements are the groups of count_tiles
@@ -387,11 +299,18 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     ),
     "append_pairs": (
         *_OVER_TILES,
-        Rule("for (int tx = x0; tx < x1; ++tx, ++slot)", lambda run: run.boxes.wave_pairs, mark=("global", 3)),
+        _unnamed(_ROWS, _own_tested),
+        Rule(
+            "for (int tx = x0; tx < x1; ++tx, ++slot)",
+            lambda run: run.boxes.wave_tiles,
+            mark=("global", 3),
+            active=_own_active,
+        ),
         Rule("for (int row = e.tile_y0; row < e.tile_y1; ++row)", lambda run: run.boxes.wide * run.boxes.wide_rows),
         Rule(  # a wave has rows of its own
             "for (int tx = x0 + (int)item % SIDE;",
             lambda run: run.boxes.wide * run.boxes.wide_rows / run.waves * run.boxes.shared_columns,
+            active=lambda run: run.boxes.columns_at_once,
         ),
     ),
     "sort_lists": (
@@ -412,12 +331,19 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     ),
     "order_counts": (),
     "duplicate": (
-        Rule("for (int ty = y0; ty < y1; ++ty)", _side),
-        Rule("for (int tx = x0; tx < x1; ++tx, ++pair, ++slot)", lambda run: _side(run) ** 2, mark=("global", 2)),
+        Rule("for (int ty = y0; ty < y1; ++ty)", lambda run: run.boxes.sorted_rows),
+        _tested("for (int ty = y0; ty < y1; ++ty)", _sorted_tested),
+        _unnamed("for (int ty = y0; ty < y1; ++ty)", _sorted_tested),
+        Rule(
+            "for (int tx = x0; tx < x1; ++tx, ++pair, ++slot)",
+            lambda run: run.boxes.sorted_tiles,
+            mark=("global", 2),
+            active=lambda run: run.wave * run.addends / run.boxes.sorted_tiles,
+        ),
     ),
-    "scan_sums": (_group_sum(_of_item),),
+    "scan_sums": (group_sum(_of_item),),
     "scan_chunks": (
-        _group_sum(lambda run: run.sums_before),
+        group_sum(lambda run: run.sums_before),
         Rule("for (uint base = begin; base < end; base += ITEMS)", _of_item, ends=("running += all;",)),
     ),
     "radix_histogram": (
@@ -453,44 +379,24 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
         Rule("FOR_PARTS(part, PARTS) {", _parts, function=" differences("),
     ),
     "project_step": (
+        REFINED,
         Rule(
             "for (uint k = 0; k < addends; ++k, slot +=",
-            lambda run: _UNEVEN * run.addends,
+            lambda run: run.boxes.all_pairs,
             mark=("global", PLAIN_SLOTS.floats),
+            active=of_addends,
         ),
-        Rule(
-            "for (uint k = own; k < whole_floats;", lambda run: _abreast(run, 3 * _bands(run) / 4), mark=("global", 4)
-        ),
-        Rule("for (uint k = whole_floats + me;", _never),  # only for the last row
-        Rule("for (uint k = any ?", lambda run: 3 * _bands(run), mark=("shared", 1)),
+        Rule("for (uint k = own; k < whole_floats;", lambda run: _abreast(run, 3 * bands(run) / 4), mark=("global", 4)),
+        Rule("for (uint k = whole_floats + me;", never),  # only for the last row
+        Rule("for (uint k = any ?", lambda run: 3 * bands(run), mark=("shared", 1)),
         Rule("for (int number = 0; number < ARRAYS; ++number)", lambda run: 6),
         ADAM,
-        Rule("for (uint k = own; left != 0;", _never),  # only for refused steps and the last row
-        Rule("for (uint i = k; (left & 1)", _never),
+        Rule("for (uint k = own; left != 0;", never),  # only for refused steps and the last row
+        Rule("for (uint i = k; (left & 1)", never),
     ),
     "density_statistics": (),
 }
 """Rules of the other kernels of a training step: rounds per item."""
-
-APART = (
-    (r"\bf\[0\]", 4 * 45),
-    (r"splat\[|rgb\[|fields\[k\]", 64),
-    (r"\+= slot\[|\[place\]|\[from\]|pair_ids\[pair_from|slots\[i\]|\[order\[|tile_counts\[i\];", 128),
-    (r"APPEND\(|atomic_inc\((counts|places)|gaussian_from_slot\[|max\(most|values\[tile\]", 128),
-    (r"GATHER\(\w+, 3|FROM_CAMERA\(means|dc\[0\]", 12),
-    (r"GATHER\(quaternions", 16),
-)
-"""Bytes between what neighbouring items access, where a line of the kernel's text matches; 128 for scattered ones."""
-
-
-def lines_touched(each: Instruction, text: str, run: Run) -> float:
-    """Cache lines of 128 bytes that an instruction's items touch. text: its line in the kernel's text."""
-    if each.kind != "global":
-        return 0
-    width = next((bits // 8 for bits in (128, 64) if f".{bits}" in each.name), 4)
-    apart = next((apart for pattern, apart in APART if re.search(pattern, text)), width)
-    return run.wave * min(apart, 128) / 128
-
 
 NUMBERS = {
     "list_offsets": ("tiles", "elements"),

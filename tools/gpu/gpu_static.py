@@ -19,7 +19,8 @@ tests the ceilings below, the page's goals, and the predictions against what was
 current kernels. The exit status is 0 if all is as expected, 2 if a compiler is missing, and 1 if a ceiling is exceeded,
 a goal is missed, a prediction is too far off, the page is out of date, a loop or rule lacks the other, or a compiler
 refuses a kernel.
---inputs completes the new rows of docs/gpus/calibration.json, in a checkout of the code that was measured.
+--inputs counts anew the inputs in docs/gpus/calibration.json, in the code that was measured, from the repository's
+history.
 """
 
 from __future__ import annotations
@@ -45,10 +46,12 @@ from gpu_compilers import TARGETS, Built, Source, ask_package, build_builtins, c
 from gpu_devices import ARCHITECTURES, GPUS, occupancy
 from gpu_intel import IntelBuilt, compiled_for_intel, ocloc
 from gpu_loops import UnknownLoopError, by_pair, cost_of, loop_table, rules_of, unused_rules
-from gpu_measured import CALIBRATION, DRAWN, Fit, Works, beyond, fit_constants, read, with_inputs
+from gpu_measured import CALIBRATION, DRAWN, Fit, Works, beyond, fit_constants, inputs_of, read, with_inputs
 from gpu_model import blocks_of, stages_of, tiles_of, works_of
 from gpu_page import PAGE, SHAPE, Predictions, missed_goals, stale_tables, tables_of, trained_and_picture, write_page
-from gpu_rules import ABREAST, ADAM, BY_PAIR, WALK, Rule, Run
+from gpu_recount import recount
+from gpu_rules import ABREAST, ADAM, BY_PAIR, WALK, Rule
+from gpu_run import Run
 from measuring import plain_parser, require, tool
 
 from clsplat.files.atomic import atomic_write
@@ -150,7 +153,7 @@ def sources_of(launches: Iterable[Mapping[str, Any]]) -> dict[Source, dict[str, 
     found: dict[Source, dict[str, tuple[int, int]]] = {}
     for launch in launches:
         if "stem" in launch:
-            kernels = found.setdefault(Source(launch["stem"], tuple(launch["options"])), {})
+            kernels = found.setdefault(Source.of(launch), {})
             if "kernel" in launch:
                 items = 1
                 for side in launch["local"] or (64,):
@@ -194,7 +197,9 @@ def row_of(source: Source, built: Built, launch: tuple[int, int] | None, frame: 
         wave = ARCHITECTURES[built.target].wave
         run = Run(source.items, wave, source.subgroup, **blocks_of(frame, source.items))
         try:
-            cost = cost_of(built, source.lines, WALK if source.by_gaussian else rules_of(built.kernel), run)
+            cost = cost_of(
+                built, source.lines, WALK if source.by_gaussian else rules_of(built.kernel, source.commit), run
+            )
             rules, pair = cost.rules, by_pair(cost, run) if built.kernel in BY_PAIR else None
             a_wave = (cost.once + cost.rounds).total()
         except UnknownLoopError as error:
@@ -325,7 +330,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--check", action="store_true", help="hold the ceilings, the goals and the page")
     parser.add_argument("--page", action="store_true", help="write the tables and the plot of docs/gpu-static.md")
-    parser.add_argument("--inputs", action="store_true", help="write the model's inputs of newly measured steps")
+    parser.add_argument("--inputs", action="store_true", help="count measured steps anew, after a change to the model")
     parser.add_argument("--intel", action="store_true", help="Intel's GPUs in place of --targets")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="compilers at once")
     options = parser.parse_args(arguments)
@@ -334,9 +339,7 @@ def main(arguments: Sequence[str]) -> int:
     if options.page:
         return make_page(frames, options.jobs)
     if options.inputs:
-        _, works = works_in(SHAPE, frames, options.jobs)
-        atomic_write(CALIBRATION, with_inputs(json.loads(CALIBRATION.read_text()), works).encode())
-        return 0
+        return make_inputs(frames, options.jobs)
     if options.check:
         return check(frames, options.jobs)
     shapes = options.shapes.split(",")
@@ -391,6 +394,19 @@ def make_page(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
     write_page(tables_of(rows, predictions, frames, compilers(), fit, intel), predictions, frames)
     for each in beyond(fit[0], fit[1]):
         note(each)
+    return 0
+
+
+def make_inputs(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
+    """Count the measured steps of calibration.json in their own code, and write it."""
+
+    def count(step: Sequence[Mapping[str, Any]], target: str, frame: Mapping[str, Any]) -> list[Any]:
+        rows = compiled(sources_of(step), (target,), jobs, note, frame)
+        return inputs_of(works_of(step, {(row.source, row.built.kernel): row.built for row in rows}, frame))
+
+    measured = json.loads(CALIBRATION.read_text())
+    recount(measured, frames, count)
+    atomic_write(CALIBRATION, with_inputs(measured, {}).encode())
     return 0
 
 
