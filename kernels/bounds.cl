@@ -5,6 +5,7 @@
 // Buffers: `chunks`: numbers of chunks; means, log_scales (model_rows, 3) -> bounds, 8 floats for each entry: the least
 //   and the greatest coordinates of the means, the greatest log scale, and 0. NaN counts as no value, because no view
 //   shows a Gaussian that has one. A chunk without values has an empty box, from INFINITY to -INFINITY.
+// Equations: none.
 #include "shared/math.h"
 
 #define BOUNDS 7

@@ -56,8 +56,8 @@ class Missed:
 
 
 class VisibleChunks(Component):
-    """What a training knows of its model's chunks: bounds, how far Gaussians may have moved since they were measured,
-    and the last step that each chunk has taken.
+    """The chunks of a training's model: bounds, the movement of Gaussians since these were measured, and the last step
+    that each chunk has taken.
 
     A chunk that a step leaves out has no Gaussian that the view shows. Before a view shows it again, it takes the steps
     that it has missed, with the bits that it would have. So no bit of a result depends on the bounds.
