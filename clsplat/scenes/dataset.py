@@ -303,7 +303,8 @@ def in_pixels(lens: Lens) -> tuple[Lens, bool]:
     if all(params[index] < MIN_FOCAL_PER_SIDE * max(sides) for index in focal):
         given = [params[index] for index in focal]
         alike = len(given) == 2 and abs(given[0] / given[1] - 1) < abs(given[0] * sides[0] / given[1] / sides[1] - 1)
-        by = (sides[0],) * 2 if alike else sides  # if alike: both are fractions of the width, as pixels are square
+        # alike focal lengths are both fractions of the width, as pixels are square
+        by = (sides[0],) * 2 if alike else sides
         for index, side in zip(focal, by if len(focal) == 2 else (max(sides),), strict=True):
             params[index] *= side
     for index, side in zip(centre, sides, strict=True):

@@ -155,7 +155,7 @@ def _attributes(prim: Any) -> list[Any]:
 
 
 def _sample_times(prim: Any) -> list[float]:
-    """Rising time codes at which the prim's arrays have samples; empty if the arrays do not change."""
+    """Time codes, in increasing order, at which the prim's arrays have samples; empty if the arrays do not change."""
     changing = [attribute for attribute in _attributes(prim) if attribute.ValueMightBeTimeVarying()]
     return sorted({float(time) for attribute in changing for time in attribute.GetTimeSamples()})
 

@@ -303,7 +303,7 @@ def _first_three(block: Bytes) -> Float32:
 
 
 def _smallest_three(block: Bytes) -> Float32:
-    """Version 3 and later: bytes (n, 4) -> quaternions w x y z (n, 4)."""
+    """Convert bytes (n, 4), as version 3 and later store them, to quaternions w x y z (n, 4)."""
     packed = np.ascontiguousarray(block).view("<u4")[:, 0]
     fields = packed[:, None] >> np.array([20, 10, 0], np.uint32)
     three = (fields & 511).astype(np.float32) * np.float32(SQRT_HALF / 511)
@@ -428,7 +428,7 @@ def _to_fixed(steps: Float64) -> Bytes:
 
 
 def _to_first_three(unit: Float32) -> Bytes:
-    """Unit quaternions w x y z (n, 4) -> bytes (n, 3), version 2."""
+    """Convert unit quaternions w x y z (n, 4) to bytes (n, 3), as version 2 stores them."""
     unit = np.where(unit[:, :1] < 0, -unit, unit)
     return _to_byte(unit[:, 1:] * np.float32(127.5) + np.float32(127.5))
 

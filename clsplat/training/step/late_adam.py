@@ -82,8 +82,8 @@ class LateAdam(Component):
         settle(self._device, self._config, model, step, last, self._table, readback, tile_counts)
 
     def completed(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> AnyGaussians:
-        """The parameters with all rows settled, a copy if rows have missed steps: a model that is looked at keeps its
-        bits."""
+        """The parameters with all rows settled. They are a copy if rows have missed steps, so that a look at a model in
+        training changes no bit."""
         missed = self.step - self._last.get()
         if not missed.any():
             return parameters
