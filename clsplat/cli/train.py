@@ -217,6 +217,7 @@ def _stages(config: TrainConfig) -> tuple[str, ...]:
     """Stages of the self-test that training with these settings needs."""
     from clsplat.selftest.result import (
         APPEARANCE_STAGES,
+        CHUNK_STAGES,
         DEPTH_STAGES,
         LENS_STAGES,
         MASK_STAGES,
@@ -226,6 +227,7 @@ def _stages(config: TrainConfig) -> tuple[str, ...]:
 
     return (
         *TRAINING_STAGES,
+        *CHUNK_STAGES,
         *(() if config.mask_use == NO_MASKS else MASK_STAGES),
         *(() if config.appearance == "none" else APPEARANCE_STAGES),
         *(DEPTH_STAGES if config.depth_use else ()),
