@@ -48,7 +48,7 @@ class ChunksInView(Protocol):
 
 @dataclass(eq=False)
 class ViewInputs:
-    """A view of a step.
+    """A view of a step. It is not frozen, as one is made in each step (docs/decisions/0025-launch-by-capacity.md).
 
     view: the view's index among the training views.
     photograph: (H, W, 3 to 5): colours, then alpha and mask.
