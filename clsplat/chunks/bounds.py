@@ -55,8 +55,9 @@ class ChunkBounds:
     @cached_property
     def finite(self) -> Bool:
         """True (B,) for chunks with finite bounds."""
-        every = np.column_stack([self.lowest, self.highest, self.largest])
-        return np.asarray(np.isfinite(every).all(axis=1))
+        sums = (array[:, axis] for array in (self.lowest, self.highest) for axis in range(3))
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.asarray(np.isfinite(sum(sums, self.largest)))
 
     @cached_property
     def terms(self) -> Float64:
@@ -79,7 +80,8 @@ class ChunkBounds:
         updates: number of updates of a parameter in this time, each of which rounds it to float32.
         """
         with np.errstate(invalid="ignore", over="ignore"):
-            size = np.maximum(np.abs(self.lowest), np.abs(self.highest)).max(axis=1)
+            x, y, z = np.maximum(np.abs(self.lowest), np.abs(self.highest)).T
+            size = np.maximum(np.maximum(x, y), z)
             by = _with_rounding(mean_step, size, updates)[:, None]
             larger = _with_rounding(log_scale_step, np.abs(self.largest), updates)
             return ChunkBounds(self.lowest - by, self.highest + by, self.largest + larger)

@@ -134,7 +134,8 @@ def _beyond_planes(bounds: ChunkBounds, picture: _PictureBorders, *, square: boo
     normals[4:, 2], offsets[4:] = [1.0, -1.0], [-picture.depths[0], picture.depths[1]]
     in_world, lengths, sums = normals @ camera.rotation, np.linalg.norm(normals, axis=1), np.abs(normals).sum(axis=1)
     along = np.column_stack([picture.reach * picture.stretch * slopes, _CANCELLED * sums])
-    farthest_corner = np.hstack([in_world, np.abs(in_world), along]) @ bounds.terms
+    # einsum and not @: BLAS takes threads even for so small a product, and they spin while they wait
+    farthest_corner = np.einsum("pk,kb->pb", np.hstack([in_world, np.abs(in_world), along]), bounds.terms)
     constant = normals @ camera.translation + offsets
     pixels = np.where(np.arange(6) < 4, picture.slack.max(), 0.0)
     constant += _ROUNDING * np.abs(offsets) + _CANCELLED * sums * np.abs(camera.translation).sum()

@@ -174,6 +174,21 @@ def test_steps_that_are_repeated(
     assert_same(got, wanted)
 
 
+@pytest.mark.parametrize("capacity", ["0", "1"])
+def test_a_model_that_grows_into_chunks(
+    scene: Scene, default_device: Device, shares: list[float], monkeypatch: pytest.MonkeyPatch, capacity: str
+) -> None:
+    """The first chunks come in the middle of a training, and are caught up from there."""
+    monkeypatch.setenv(BY_CAPACITY_VARIABLE, capacity)
+    for module in (visible_chunks, trained_model):
+        monkeypatch.setattr(module, "ORDERED_ROWS", ROWS + 20)
+    wanted, _ = trained(scene, CONFIG, default_device, 32, whole=True)
+    got, trainer = trained(scene, CONFIG, default_device, 32)
+    assert_same(got, wanted)
+    assert trainer.parameters.count > ROWS + 20
+    assert 0 < len(shares) <= 17, "from density control after step 15 on"
+
+
 def test_chunks_are_caught_up_in_time(scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted, _ = trained(scene, SETTINGS["dense"], default_device, 32, whole=True)
     for most, measured in ((5, 1), (3, 7), (1, 16)):

@@ -79,14 +79,19 @@ class VisibleChunks(Component):
         self._means_moved, self._scales_moved = np.zeros(chunks), np.zeros(chunks)
         self._since: int | None = None
         """Steps since the last measurement; None if there is none."""
-        self.step, self._last = step, np.full(chunks, step, np.uint32)
-        self._first_step = step + 1
+        self._last = np.full(chunks, step, np.uint32)
         most = 2 * (MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)  # twice, so that the table is seldom moved
         self._table = np.zeros((most, 2 + len(PARAMETER_GROUPS)), np.float32)
         """The steps from `_first_step` on, of which chunks may have missed some (`stages.catch_up.step_table`)."""
+        self._begin_table(step)
         self._before: dict[int, NDArray[np.uint32]] = {}
         """By number, `_last` as it was before the latest steps, which may be repeated."""
         self._caught: DeviceArray | None = None
+
+    def _begin_table(self, step: int) -> None:
+        """Begin with the next step, as all chunks have taken or take step number `step`."""
+        self.step, self._first_step = step, step + 1
+        self._last = np.full(self._last.shape, step, np.uint32)
 
     @property
     def on(self) -> bool:
@@ -132,6 +137,7 @@ class VisibleChunks(Component):
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:
         """The view, with the chunks that it may show."""
         if count <= ORDERED_ROWS or self._since is None:
+            self._begin_table(step)  # all chunks take the step
             return inputs
         (of_view,) = inputs
         shown = self._shown(of_view, step)
@@ -216,8 +222,12 @@ class VisibleChunks(Component):
 
     def step_back(self, step: int) -> None:
         """Return to the state after step number `step`. Chunks that were caught up after it are marked as such."""
-        if step < self.step:
+        if step >= self.step:
+            return
+        if step + 1 in self._before:
             self._last, self.step = self._before[step + 1], step
+        else:
+            self._begin_table(step)
 
     def complete(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
         """Catch up all chunks."""
