@@ -72,7 +72,7 @@ def test_rules_of_the_kernels_that_were_measured() -> None:
     assert rules_of("blend", commit) == MEASURED[commit]["blend"] + EVERYWHERE
     assert rules_of("ranges", commit) == BY_ITEM["ranges"] + EVERYWHERE, "as in the present kernels"
     counted = {row.get("counted", row["commit"]) for row in json.loads(CALIBRATION.read_text())}
-    assert counted == set(MEASURED), "rules of kernels that no row has are to go"
+    assert set(MEASURED) <= counted, "rules of kernels that no row has are to go"
 
 
 def test_defaults_are_left_out_of_a_row() -> None:

@@ -100,7 +100,8 @@ def widths(splats: NDArray[Any], rows: NDArray[Any], boxes: NDArray[Any], tiles:
         dy = np.where(tangent < d0, d0, d1)
         rest = np.maximum(budget - (f["L22"] * dy) ** 2, 0)
         inside = (tangent >= d0) & (tangent <= d1)
-        return np.where(inside, f["HALF_W"], (-f["L12"] * dy + np.sqrt(rest)) / f["L11"])
+        right: NDArray[Any] = np.where(inside, f["HALF_W"], (-f["L12"] * dy + np.sqrt(rest)) / f["L11"])
+        return right
 
     found = np.zeros((len(splats), int(rows.max(initial=0))), np.int32)
     whole = boxes // np.maximum(rows, 1)
