@@ -15,12 +15,29 @@ def rates_at(config: TrainConfig, step: int, length_unit: float, factor: float) 
     The means' rate falls exponentially, and is relative to the scene's length unit. All rates fall in the cooldown.
     factor: factor on all rates, which falls with each return to a checkpoint.
     """
-    optimiser = config.optimiser
-    into = optimiser.cooldown - max(config.iterations - step, 0)
-    cooled = optimiser.cooldown_to ** (into / optimiser.cooldown) if into > 0 else 1.0
-    fraction = min(step / optimiser.means_rate_steps, 1.0)
-    means_rate = optimiser.means_rate ** (1 - fraction) * optimiser.means_rate_end**fraction
-    given = vars(optimiser)
+    cooled, given = _cooled(config, step), vars(config.optimiser)
     rates = {name: given[setting] * cooled * factor for name, setting in _RATE_SETTINGS.items()}
-    rates["means"] = means_rate * length_unit * cooled * factor
+    rates["means"] = _means_rate(config, step) * length_unit * cooled * factor
     return rates
+
+
+def largest_rates(config: TrainConfig, steps: range, length_unit: float) -> dict[str, float]:
+    """Upper limit of each group's learning rate in these steps: the cooldown of the first, and the larger of the means'
+    rates at both ends, between which it rises or falls all the way."""
+    rates, cooled = rates_at(config, steps[0], length_unit, 1.0), _cooled(config, steps[0])
+    rates["means"] = max(rates["means"], _means_rate(config, steps[-1]) * length_unit * cooled)
+    return rates
+
+
+def _cooled(config: TrainConfig, step: int) -> float:
+    """Factor of the cooldown on every learning rate."""
+    cooldown = config.optimiser.cooldown
+    into = cooldown - max(config.iterations - step, 0)
+    return config.optimiser.cooldown_to ** (into / cooldown) if into > 0 else 1.0
+
+
+def _means_rate(config: TrainConfig, step: int) -> float:
+    """The means' learning rate in a scene of length unit 1, before the cooldown."""
+    optimiser = config.optimiser
+    fraction = min(step / optimiser.means_rate_steps, 1.0)
+    return float(optimiser.means_rate ** (1 - fraction) * optimiser.means_rate_end**fraction)

@@ -199,6 +199,7 @@ class Trainer:
         self.position.controlled, self.position.last_views = False, views
         self._note()
         if self._looks_at_steps:
+            self._catch_up_exactly()
             self._rearrange(self.strategy.after_gradient(self._state()))
         return result
 

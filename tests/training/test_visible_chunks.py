@@ -16,6 +16,8 @@ from quick import quick
 from same_bytes import State, make_too_small, outcome, stopped
 from tiny import cameras, hidden_model, run_steps, short
 
+from clsplat.camera import Camera
+from clsplat.chunks.bounds import ChunkBounds
 from clsplat.chunks.order import beside_parents, space_order
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
@@ -25,6 +27,8 @@ from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.scenes.scene import Scene
 from clsplat.training import trained_model
+from clsplat.training.density import ModelState, RowPlan
+from clsplat.training.density.adaptive import Adaptive
 from clsplat.training.step import gradient_step, visible_chunks
 from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
 from clsplat.training.step.visible_chunks import Missed, VisibleChunks
@@ -35,6 +39,9 @@ CONFIG = short(iterations=40, report=False, warmup=(), density={"max_gaussians":
 LITTLE = 7 << 20
 """Bytes of device memory with which `wide_model` is streamed."""
 SPARSE = replace(CONFIG, optimiser=OptimiserConfig(sparse=True))
+
+UNCHANGED_ROWS = short(iterations=40, report=False, warmup=(), density={"every": 0})
+COOLED = replace(UNCHANGED_ROWS, optimiser=OptimiserConfig(cooldown=36, cooldown_to=1e-6))
 
 
 def wide_model(rows: int = ROWS, *, around: bool = True) -> Gaussians:
@@ -261,6 +268,96 @@ def test_a_step_that_fails_leaves_the_state_before_it(
 
 def fail(*_: object, **__: object) -> None:
     raise DriverError("the loss failed")
+
+
+def test_a_model_that_becomes_large(
+    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, shares: list[float]
+) -> None:
+    """The steps before ran over all rows. They are more than the table of missed steps holds."""
+    monkeypatch.setattr(visible_chunks, "MOST_MISSED_STEPS", 1)
+    monkeypatch.setattr(visible_chunks, "STEPS_PER_MEASUREMENT", 1)
+    monkeypatch.setattr(trained_model, "ORDERED_ROWS", ROWS)
+    wanted, _ = trained(scene, CONFIG, default_device, 32, whole=True)
+    monkeypatch.setattr(visible_chunks, "ORDERED_ROWS", ROWS)
+    got, trainer = trained(scene, CONFIG, default_device, 32)
+    assert trainer.parameters.count > ROWS
+    assert 0 < len(shares) < 32
+    assert_same(got, wanted)
+
+
+def bounds_of(trainer: Trainer) -> ChunkBounds:
+    return ChunkBounds.measured(*(trainer.parameters[group].get() for group in ("means", "log_scales")))
+
+
+def moving(scene: Scene, config: TrainConfig, device: Device) -> Trainer:
+    """A trainer of a model that moves by its first moments, as much as these could be after many steps."""
+    trainer = Trainer(scene, config, device, wide_model())
+    for group in ("means", "log_scales"):
+        trainer.model.first[group].fill(-7e-3)
+        trainer.model.second[group].fill(1e-6)
+    return trainer
+
+
+@pytest.mark.parametrize("share", [0.1, 0.6])
+@pytest.mark.parametrize("measured", [1, 8])
+@pytest.mark.parametrize("config", [UNCHANGED_ROWS, COOLED], ids=["constant rates", "cooldown"])
+def test_bounds_hold(
+    scene: Scene,
+    default_device: Device,
+    monkeypatch: pytest.MonkeyPatch,
+    config: TrainConfig,
+    measured: int,
+    share: float,
+) -> None:
+    """Gaussians of a training over the whole model are in the bounds that a step over chunks reckons with, after steps
+    over all chunks, looks at the model, and steps with larger rates."""
+    monkeypatch.setattr(visible_chunks, "MAX_SHARE_IN_VIEW", share)
+    monkeypatch.setattr(visible_chunks, "STEPS_PER_MEASUREMENT", measured)
+    wanted: list[ChunkBounds] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(visible_chunks, "ORDERED_ROWS", 1 << 30)
+        trainer = moving(scene, config, default_device)
+        for _ in range(40):
+            wanted.append(bounds_of(trainer))
+            trainer.train_step()
+    given: list[ChunkBounds] = []
+    real = visible_chunks.visible
+
+    def visible(bounds: ChunkBounds, camera: Camera, *rest: Any) -> Any:
+        given.append(bounds)
+        return real(bounds, camera, *rest)
+
+    monkeypatch.setattr(visible_chunks, "visible", visible)
+    trainer = moving(scene, config, default_device)
+    for step in range(40):
+        if step % 9 == 4:
+            trainer.draw(cameras()[0])
+        trainer.train_step()
+    assert len(given) == len(wanted)
+    for inside, outside in zip(wanted, given, strict=True):
+        assert (outside.lowest <= inside.lowest).all()
+        assert (inside.highest <= outside.highest).all()
+        assert (inside.largest <= outside.largest).all()
+
+
+class Dims(Adaptive):
+    """A strategy that looks at the model after each step, and changes Gaussians by what it sees."""
+
+    def after_gradient(self, model: ModelState) -> RowPlan:
+        """Move a Gaussian of each chunk."""
+        rows = np.arange(0, model.count, CHUNK_ROWS)
+        return RowPlan(values={"sh_dc": (rows, 0.9 * model.parameters["sh_dc"].get()[rows])})
+
+
+def test_a_strategy_that_looks_at_each_step(scene: Scene, default_device: Device) -> None:
+    found = []
+    for most in (1 << 30, 2 * CHUNK_ROWS):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(visible_chunks, "ORDERED_ROWS", most)
+            trainer = Trainer(scene, CONFIG, default_device, wide_model(), strategy=Dims)
+            run_steps(20, trainer)
+            found.append(state(trainer))
+    assert_same(*found)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from clsplat.stages.adam import AdamStep
 from clsplat.stages.bounds import bounds, send_chunks
 from clsplat.stages.catch_up import catch_up, step_table
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians, upload_chunks
-from clsplat.training.learning_rates import rates_at
+from clsplat.training.learning_rates import largest_rates
 from clsplat.training.step.component import Component, Named
 from clsplat.training.step.inputs import ChunksInView, PlacedChunks, ViewInputs
 
@@ -140,30 +140,46 @@ class VisibleChunks(Component):
             self._begin_table(step)  # all chunks take the step
             return inputs
         (of_view,) = inputs
+        if self.step < step - 1:  # the steps between ran over all rows of a model that was small or streamed
+            self.step, self._first_step = step - 1, step
+            self._last = np.full_like(self._last, step - 1)
         shown = self._shown(of_view, step)
         whole = int(np.count_nonzero(shown)) > MAX_SHARE_IN_VIEW * len(shown)
         self._since += 1
         if whole:
             shown[:] = True
+        self._note_movement(shown, step, takes_step=True)
         numbers = np.flatnonzero(shown).astype(np.uint32)
         missed = self._missed(shown, step - 1)
         return [replace(of_view, chunks=_ChunksInView(self, numbers, missed, self._found, whole=whole))]
 
     def _shown(self, of_view: ViewInputs, step: int) -> Bool:
-        """The chunks that the view may show, whose Gaussians may then move."""
+        """The chunks that the view may show."""
         thinning = thinning_of(self._config, step)
         factor = 1.0 if thinning is None else thinning.factor
-        rates = rates_at(self._config, step, self._unit, 1.0)
-        hidden = np.minimum(self._step_limit * (step - 1 - self._last), self._hidden_limit)
         measured = ChunkBounds(self._found[:, :3], self._found[:, 3:6], self._found[:, 6])
-        moved = [self._means_moved + hidden * rates["means"], self._scales_moved + hidden * rates["log_scales"]]
+        means, scales = self._hidden_movement(step)
+        moved = [self._means_moved + means, self._scales_moved + scales]
         now = measured.widened(moved[0], moved[1], MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
-        shown = visible(now, of_view.camera, self._config.rasterizer, factor)
-        steps = self._step_limit + hidden[shown]
-        self._means_moved[shown] += steps * rates["means"]
-        self._scales_moved[shown] += steps * rates["log_scales"]
-        self._unmeasured |= shown
-        return shown
+        return visible(now, of_view.camera, self._config.rasterizer, factor)
+
+    def _hidden_movement(self, step: int) -> tuple[Float64, Float64]:
+        """The most by which means and log scales of each chunk move in the steps before number `step` that it has
+        missed."""
+        oldest = min(int(self._last.min(initial=step)), step - 1)
+        rates = largest_rates(self._config, range(oldest + 1, step + 1), self._unit)
+        path = np.minimum(self._step_limit * (step - 1 - self._last), self._hidden_limit)
+        return path * rates["means"], path * rates["log_scales"]
+
+    def _note_movement(self, chunks: Bool, step: int, *, takes_step: bool) -> None:
+        """Note that these chunks take the steps before number `step` that they have missed, and, if `takes_step`, that
+        step too."""
+        means, scales = self._hidden_movement(step)
+        own = largest_rates(self._config, range(step, step + 1), self._unit)
+        path = self._step_limit if takes_step else 0.0
+        self._means_moved[chunks] += means[chunks] + path * own["means"]
+        self._scales_moved[chunks] += scales[chunks] + path * own["log_scales"]
+        self._unmeasured |= chunks
 
     def _missed(self, chunks: Bool, step: int) -> Missed | None:
         """The steps up to `step` that these chunks have missed; None if there is none."""
@@ -200,7 +216,8 @@ class VisibleChunks(Component):
         if self._config.optimiser.sparse:
             return
         if step.number - self._first_step >= len(self._table):
-            past = int(self._last.min()) + 1 - self._first_step
+            oldest = min(int(last.min()) for last in (self._last, *self._before.values()))  # a step may be repeated
+            past = oldest + 1 - self._first_step
             self._table[:-past] = self._table[past:].copy()
             self._first_step += past
         self._table[step.number - self._first_step] = step_table([step])[0]
@@ -244,8 +261,8 @@ class VisibleChunks(Component):
         if missed is None:
             return
         self._catch_up(_on_device((parameters, first, second)), missed)
+        self._note_movement(self._last < missed.step, missed.step + 1, takes_step=False)
         self._last[missed.numbers] = missed.step
-        self._unmeasured[missed.numbers] = True
 
     def rows_changed(self) -> None:
         """Measure all bounds again."""
