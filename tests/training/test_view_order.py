@@ -18,7 +18,6 @@ from tiny import short, write_scene
 
 from clsplat.camera import Camera
 from clsplat.cli.main import main
-from clsplat.config import training
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.runs.run import Run
@@ -228,32 +227,28 @@ def test_one_photograph(folder: Path, default_device: Device, tmp_path: Path) ->
 # The setting
 
 
-def test_the_default_follows_the_number_of_photographs() -> None:
-    assert [TrainConfig().orders_near(count) for count in (1, 999, 1000, 20_000)] == [False, False, True, True]
-    assert [TrainConfig(view_order="near").orders_near(count) for count in (1, 999)] == [True, True]
-    assert not TrainConfig(view_order="random").orders_near(20_000)
+def test_the_default_is_random() -> None:
+    """The near order costs up to 0.2 dB (docs/decisions/0051-view-order.md), so no number of photographs changes it."""
+    assert TrainConfig().view_order == "random"
 
 
-@pytest.mark.parametrize("photographs", [8, 9])
-def test_train_says_that_the_order_is_near(
-    photographs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
-) -> None:
-    monkeypatch.setattr(training, "MANY_NEAR_PHOTOGRAPHS", photographs)
-    scene = write_scene(tmp_path / "scene")
-    assert main(["train", str(scene), "-o", str(tmp_path / "run"), "--iterations", "1", "--no-report"]) == 0
-    said = "8 training pictures in near order, 2 held out" if photographs == 8 else "8 training pictures, 2 held out"
+@pytest.mark.parametrize("order", ["random", "near"])
+def test_train_says_that_the_order_is_near(order: str, tmp_path: Path, capsys: Capture) -> None:
+    words = ["train", str(write_scene(tmp_path / "scene")), "-o", str(tmp_path / "run"), "--iterations", "1"]
+    assert main([*words, "--no-report", "--view-order", order]) == 0
+    said = f"8 training pictures{' in near order' if order == 'near' else ''}, 2 held out"
     assert said in capsys.readouterr().err
 
 
 def test_an_order_that_is_none(tmp_path: Path, capsys: Capture) -> None:
-    refuses(r"^--view-order nearby: expected one of auto, random, near$", replace(PLAIN, view_order="nearby").check)
+    refuses(r"^--view-order nearby: expected one of random, near$", replace(PLAIN, view_order="nearby").check)
     said = rejected(capsys, ["train", tmp_path, "-o", tmp_path / "run", "--view-order", "nearby"])
-    assert "invalid choice 'nearby' for argument '--view-order'. Expected one of ('auto', 'random', 'near')" in said
+    assert "invalid choice 'nearby' for argument '--view-order'. Expected one of ('random', 'near')" in said
     path = tmp_path / "config.toml"
     refuses(r"train\.view_order is 'nearby', expected one of", parse_config, '[train]\nview_order = "nearby"\n', path)
 
 
-@pytest.mark.parametrize("order", ["auto", "random", "near"])
+@pytest.mark.parametrize("order", ["random", "near"])
 def test_a_run_keeps_its_order(order: str, tmp_path: Path) -> None:
     path = tmp_path / "run"
     assert Run.open(Run.create(path, replace(PLAIN, view_order=order)).path).config.view_order == order
