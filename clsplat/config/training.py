@@ -260,9 +260,9 @@ class TrainConfig:
     1/255, which takes a quarter of the memory. Photographs with values outside 0 to 1 (HDR) stay exact. auto: exact for
     fewer than 300 training photographs, else 8bit."""
     view_order: ViewOrderKind = "random"
-    """Order of the photographs in each pass through all of them. near: a few clusters of photographs that show the same
-    things at a time, by their positions and viewing directions. Then more Gaussians of a step have been in view
-    shortly before."""
+    """Order of the photographs in each pass through all of them. near: clusters of photographs that show the same
+    things, by their positions and viewing directions; four clusters take turns. Then more Gaussians of a step were in
+    view shortly before. It may cost some PSNR."""
     test_every: int = TEST_EVERY
     """Every n-th view by name is held out, including the first; 0 holds out none. A data set's own split takes
     precedence."""

@@ -96,7 +96,7 @@ def test_clusters_have_nearly_the_same_size(count: int) -> None:
     assert max(sizes) - min(sizes) <= 1 + count // 100, "each division rounds once"
 
 
-def test_a_few_clusters_take_turns_and_are_shuffled_inside_and_out() -> None:
+def test_four_clusters_take_turns_and_are_shuffled_inside_and_out() -> None:
     cameras, rng = scattered(210), np.random.default_rng(1)
     found, order = clusters(cameras), ViewOrder(cameras, 1.0, near=True)
     assert [len(views) for views in found] == [15] * 14
@@ -228,7 +228,7 @@ def test_one_photograph(folder: Path, default_device: Device, tmp_path: Path) ->
 
 
 def test_the_default_is_random() -> None:
-    """The near order costs up to 0.2 dB (docs/decisions/0051-view-order.md), so no number of photographs changes it."""
+    """The near order has a price (docs/decisions/0051-view-order.md), so no number of photographs changes it."""
     assert TrainConfig().view_order == "random"
 
 

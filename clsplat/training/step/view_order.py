@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Order of the views in a pass through the training photographs. Policy only: no device.
 
-A pass shows each view once. Its order is random, or it goes through a few clusters of near views at a time.
+A pass shows each view once. Its order is random, or it goes through four clusters of near views at a time.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from clsplat.camera import Camera
 CLUSTER_VIEWS = 16
 """Maximum number of views in a cluster."""
 CLUSTERS_AT_ONCE = 4
-"""Number of clusters whose views take turns. One after another would be nearer, but costs 0.3 dB: the model then fits
-the cluster of the last steps at the expense of the others (docs/decisions/0051)."""
+"""Number of clusters whose views take turns. One after another would be nearer, but costs 0.3 dB on bonsai: the model
+then fits the cluster of the last steps at the expense of the others (docs/decisions/0051)."""
 GAZE_UNITS = 1.5
 """Distance, in length units, from a camera to the point on its viewing axis that stands for the view.
 
