@@ -238,7 +238,7 @@ def _stages(config: TrainConfig) -> tuple[str, ...]:
 
 def _tell_of(scene: Scene, config: TrainConfig, devices: Sequence[Device]) -> None:
     """Print the numbers of pictures and points, the devices, and the reason if LPIPS will be missing."""
-    order = " in near order" if config.orders_near(len(scene.train_views)) else ""
+    order = " in near order" if config.view_order == "near" else ""
     unit = f", lengths relative to {scene.length_unit:.4g} (extent {scene.extent:.4g})" if scene.unit_differs else ""
     on = "; ".join(f"{device.name}, {device.driver.split('  ')[0].strip()}" for device in devices)
     print(

@@ -26,13 +26,10 @@ Perspective = Literal["auto", "plane", "rays"]
 Growth = Literal["paper", "budget", "mcmc"]
 AppearanceKind = Literal["none", "exposure", "ppisp", "grid"]
 Photos = Literal["auto", "exact", "8bit"]
-ViewOrderKind = Literal["auto", "random", "near"]
+ViewOrderKind = Literal["random", "near"]
 
 MANY_PHOTOGRAPHS = 300
 """With this many training photographs or more, auto keeps them with 8 bits, and decodes them while training runs."""
-
-MANY_NEAR_PHOTOGRAPHS = 1000
-"""With this many training photographs or more, the order auto is that of near photographs."""
 
 
 @dataclass(frozen=True)
@@ -262,10 +259,10 @@ class TrainConfig:
     """Precision of the photographs' pixels at the training resolution. exact: as resized. 8bit: rounded to levels of
     1/255, which takes a quarter of the memory. Photographs with values outside 0 to 1 (HDR) stay exact. auto: exact for
     fewer than 300 training photographs, else 8bit."""
-    view_order: ViewOrderKind = "auto"
-    """Order of the photographs in each pass through all of them. near: photographs that show the same things follow
-    each other, by their positions and viewing directions, so that a step has more Gaussians in common with the one
-    before. auto: random for fewer than 1000 training photographs, else near."""
+    view_order: ViewOrderKind = "random"
+    """Order of the photographs in each pass through all of them. near: clusters of photographs that show the same
+    things, by their positions and viewing directions; four clusters take turns. Then more Gaussians of a step were in
+    view shortly before. It may cost some PSNR."""
     test_every: int = TEST_EVERY
     """Every n-th view by name is held out, including the first; 0 holds out none. A data set's own split takes
     precedence."""
@@ -436,10 +433,6 @@ class TrainConfig:
     def mask_use(self) -> MaskUse:
         """Use of the scene's masks and alpha channels."""
         return MaskUse(self.masks, self.alpha, self.invert_masks)
-
-    def orders_near(self, photographs: int) -> bool:
-        """True if near views follow each other, in a scene with `photographs` training photographs."""
-        return self.view_order == "near" or (self.view_order == "auto" and photographs >= MANY_NEAR_PHOTOGRAPHS)
 
     def rounds_photos(self, photographs: int) -> bool:
         """True if pixels are rounded to 8 bits, in a scene with `photographs` training photographs."""

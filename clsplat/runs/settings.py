@@ -52,7 +52,6 @@ RETIRED_SETTINGS |= {
 _ADDED_SETTINGS: dict[str, tuple[str, Any]] = {
     "train.test_most": ("test_every", 0),
     "train.photos": ("test_every", "exact"),
-    "train.view_order": ("test_every", "random"),
 }
 """Settings that config.toml files of earlier versions lack, each with a setting that those files have, and the value
 that keeps the behaviour of those versions."""

@@ -82,8 +82,8 @@ class Trainer:
     ) -> None:
         self.scene, self.config, self.device, self._new_strategy = scene, config, device, strategy
         self.views = scene.require_training_views()
-        near = config.orders_near(len(self.views))
-        self.order = ViewOrder([view.camera for view in self.views], scene.length_unit, near=near)
+        cameras = [view.camera for view in self.views]
+        self.order = ViewOrder(cameras, scene.length_unit, near=config.view_order == "near")
         self.rasterizer = Rasterizer(device, config.rasterizer, antialiased=config.antialiased)
         self.photographs = ImageCache(device, memory.photographs(scene, config))
         self.renderer = Renderer(device, self.rasterizer)

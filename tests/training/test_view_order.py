@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Order of the training views: a permutation in each pass, random or by clusters of near views."""
+"""Order of the training views: a permutation in each pass, random or through clusters of near views."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,6 @@ from tiny import short, write_scene
 
 from clsplat.camera import Camera
 from clsplat.cli.main import main
-from clsplat.config import training
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.runs.run import Run
@@ -25,7 +25,7 @@ from clsplat.runs.settings import config_text, parse_config
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.training.step import view_order
-from clsplat.training.step.view_order import CLUSTER_VIEWS, ViewOrder
+from clsplat.training.step.view_order import CLUSTER_VIEWS, CLUSTERS_AT_ONCE, ViewOrder
 from clsplat.training.trainer import Trainer
 
 COUNTS = (1, 2, CLUSTER_VIEWS, CLUSTER_VIEWS + 1, 33, 210, 1001)
@@ -58,10 +58,10 @@ def clusters(cameras: list[Camera], unit: float = 1.0) -> list[list[int]]:
     return sorted(list(map(int, views)) for views in found)
 
 
-def runs_of(order: list[int], of: list[list[int]]) -> list[int]:
-    """The clusters that an order goes through, one entry for each change of the cluster."""
-    homes = [next(place for place, views in enumerate(of) if view in views) for view in order]
-    return [home for place, home in enumerate(homes) if place == 0 or home != homes[place - 1]]
+def homes_of(order: list[int], of: list[list[int]]) -> list[int]:
+    """The cluster of each view of an order."""
+    homes = {view: place for place, views in enumerate(of) for view in views}
+    return [homes[view] for view in order]
 
 
 @pytest.mark.parametrize("near", [False, True])
@@ -86,14 +86,6 @@ def test_the_random_order_is_that_of_the_generator(count: int) -> None:
     assert rng.bit_generator.state == plain.bit_generator.state
 
 
-def test_few_views_have_the_random_order() -> None:
-    """They are one cluster, and drawing its place among one draws nothing."""
-    cameras = scattered(CLUSTER_VIEWS)
-    orders = [(ViewOrder(cameras, 1.0, near=near), np.random.default_rng(5)) for near in (False, True)]
-    (a, b), (c, d) = ([order.next_pass(rng) for _ in range(2)] for order, rng in orders)
-    assert (a, b) == (c, d)
-
-
 @pytest.mark.parametrize("count", COUNTS)
 def test_clusters_have_nearly_the_same_size(count: int) -> None:
     found = clusters(scattered(count))
@@ -104,16 +96,34 @@ def test_clusters_have_nearly_the_same_size(count: int) -> None:
     assert max(sizes) - min(sizes) <= 1 + count // 100, "each division rounds once"
 
 
-def test_a_pass_goes_through_clusters_one_by_one_and_shuffles_both() -> None:
+def test_four_clusters_take_turns_and_are_shuffled_inside_and_out() -> None:
     cameras, rng = scattered(210), np.random.default_rng(1)
     found, order = clusters(cameras), ViewOrder(cameras, 1.0, near=True)
-    assert len(found) == 14
-    first, second = order.next_pass(rng), order.next_pass(rng)
-    visited = [runs_of(each, found) for each in (first, second)]
-    assert all(sorted(each) == list(range(14)) for each in visited), "no cluster is left and entered again"
-    assert visited[0] != visited[1]
-    inside = [[view for view in each if view in found[0]] for each in (first, second)]
+    assert [len(views) for views in found] == [15] * 14
+    passes = [order.next_pass(rng) for _ in range(2)]
+    homes = [homes_of(each, found) for each in passes]
+    for each in homes:
+        fours = np.array(each[: 3 * 15 * CLUSTERS_AT_ONCE]).reshape(3, 15, CLUSTERS_AT_ONCE)
+        np.testing.assert_array_equal(fours, fours[:, :1].repeat(15, axis=1), "four take turns until they are through")
+        assert each[180:] == each[180:182] * 15, "the last two of fourteen"
+        assert len({*fours[:, 0].ravel(), *each[180:182]}) == 14
+    assert homes[0] != homes[1]
+    inside = [[view for view in each if view in found[0]] for each in passes]
     assert inside[0] != inside[1] and sorted(inside[0]) == sorted(inside[1]) == found[0]
+
+
+@pytest.mark.parametrize("count", [33, 100, 1001])
+def test_clusters_of_different_sizes_are_finished_before_others_begin(count: int) -> None:
+    cameras = scattered(count)
+    found, order = clusters(cameras), ViewOrder(cameras, 1.0, near=True)
+    assert len(set(map(len, found))) > 1 or count == 33
+    left, begun = dict(enumerate(map(len, found))), set[int]()
+    for home in homes_of(order.next_pass(np.random.default_rng(0)), found):
+        begun.add(home)
+        assert len(begun) <= CLUSTERS_AT_ONCE
+        left[home] -= 1
+        begun -= {home} if left[home] == 0 else set()
+    assert not begun
 
 
 def test_cameras_in_two_places_are_two_clusters() -> None:
@@ -162,8 +172,9 @@ def test_the_size_and_the_place_of_the_scene_do_not_count(count: int, scale: flo
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Clusters of two or three of the eight training views, of which one cluster would have all."""
+    """Clusters of two or three of the eight training views, one after another; one cluster would have all."""
     monkeypatch.setattr(view_order, "CLUSTER_VIEWS", 3)
+    monkeypatch.setattr(view_order, "CLUSTERS_AT_ONCE", 1)
 
 
 @pytest.fixture(scope="module")
@@ -184,7 +195,7 @@ def test_steps_follow_the_order(scene: Scene, default_device: Device) -> None:
     for _ in range(3):
         views = [trainer._next_view() for _ in range(8)]
         assert sorted(views) == list(range(8))
-        assert len(runs_of(views, found)) == 3
+        assert sum(a != b for a, b in pairwise(homes_of(views, found))) == 2
     trainer.close()
 
 
@@ -216,32 +227,28 @@ def test_one_photograph(folder: Path, default_device: Device, tmp_path: Path) ->
 # The setting
 
 
-def test_the_default_follows_the_number_of_photographs() -> None:
-    assert [TrainConfig().orders_near(count) for count in (1, 999, 1000, 20_000)] == [False, False, True, True]
-    assert [TrainConfig(view_order="near").orders_near(count) for count in (1, 999)] == [True, True]
-    assert not TrainConfig(view_order="random").orders_near(20_000)
+def test_the_default_is_random() -> None:
+    """The near order has a price (docs/decisions/0050-view-order.md), so no number of photographs changes it."""
+    assert TrainConfig().view_order == "random"
 
 
-@pytest.mark.parametrize("photographs", [8, 9])
-def test_train_says_that_the_order_is_near(
-    photographs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
-) -> None:
-    monkeypatch.setattr(training, "MANY_NEAR_PHOTOGRAPHS", photographs)
-    scene = write_scene(tmp_path / "scene")
-    assert main(["train", str(scene), "-o", str(tmp_path / "run"), "--iterations", "1", "--no-report"]) == 0
-    said = "8 training pictures in near order, 2 held out" if photographs == 8 else "8 training pictures, 2 held out"
+@pytest.mark.parametrize("order", ["random", "near"])
+def test_train_says_that_the_order_is_near(order: str, tmp_path: Path, capsys: Capture) -> None:
+    words = ["train", str(write_scene(tmp_path / "scene")), "-o", str(tmp_path / "run"), "--iterations", "1"]
+    assert main([*words, "--no-report", "--view-order", order]) == 0
+    said = f"8 training pictures{' in near order' if order == 'near' else ''}, 2 held out"
     assert said in capsys.readouterr().err
 
 
 def test_an_order_that_is_none(tmp_path: Path, capsys: Capture) -> None:
-    refuses(r"^--view-order nearby: expected one of auto, random, near$", replace(PLAIN, view_order="nearby").check)
+    refuses(r"^--view-order nearby: expected one of random, near$", replace(PLAIN, view_order="nearby").check)
     said = rejected(capsys, ["train", tmp_path, "-o", tmp_path / "run", "--view-order", "nearby"])
-    assert "invalid choice 'nearby' for argument '--view-order'. Expected one of ('auto', 'random', 'near')" in said
+    assert "invalid choice 'nearby' for argument '--view-order'. Expected one of ('random', 'near')" in said
     path = tmp_path / "config.toml"
     refuses(r"train\.view_order is 'nearby', expected one of", parse_config, '[train]\nview_order = "nearby"\n', path)
 
 
-@pytest.mark.parametrize("order", ["auto", "random", "near"])
+@pytest.mark.parametrize("order", ["random", "near"])
 def test_a_run_keeps_its_order(order: str, tmp_path: Path) -> None:
     path = tmp_path / "run"
     assert Run.open(Run.create(path, replace(PLAIN, view_order=order)).path).config.view_order == order

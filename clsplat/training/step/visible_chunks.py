@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A step of a large model runs over the chunks that its view may show (docs/decisions/0052-chunks.md)."""
+"""A step of a large model runs over the chunks that its view may show (docs/decisions/0051-chunks.md)."""
 
 from __future__ import annotations
 
@@ -137,12 +137,10 @@ class VisibleChunks(Component):
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:
         """The view, with the chunks that it may show."""
         if count <= ORDERED_ROWS or self._since is None:
-            self._begin_table(step)  # all chunks take the step
             return inputs
         (of_view,) = inputs
         if self.step < step - 1:  # the steps between ran over all rows of a model that was small or streamed
-            self.step, self._first_step = step - 1, step
-            self._last = np.full_like(self._last, step - 1)
+            self._begin_table(step - 1)
         shown = self._shown(of_view, step)
         whole = int(np.count_nonzero(shown)) > MAX_SHARE_IN_VIEW * len(shown)
         self._since += 1
