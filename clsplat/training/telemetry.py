@@ -98,10 +98,11 @@ def largest_contributions(trainer: Trainer, seconds: float = CONTRIBUTION_SECOND
     CapacityError.
     """
     rasterizer, views, looked = trainer.rasterizer, trainer.views, 0
-    largest: NDArray[np.float32] = np.zeros(trainer.parameters.count, np.float32)
+    parameters = trainer.complete_parameters
+    largest: NDArray[np.float32] = np.zeros(parameters.count, np.float32)
     start = time.perf_counter()
     for index in _spread(len(views)):
-        frame = rasterizer.forward(trainer.parameters, trainer.local(views[index].camera), trainer.background)
+        frame = rasterizer.forward(parameters, trainer.local(views[index].camera), trainer.background)
         np.maximum(largest, sums_of_weights(rasterizer, frame), out=largest)
         looked += 1
         if looked == 1:

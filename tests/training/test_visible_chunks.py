@@ -32,6 +32,7 @@ from clsplat.training.density.adaptive import Adaptive
 from clsplat.training.step import gradient_step, visible_chunks
 from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
 from clsplat.training.step.visible_chunks import Missed, VisibleChunks
+from clsplat.training.telemetry import largest_contributions
 from clsplat.training.trainer import Trainer
 
 ROWS = 11 * CHUNK_ROWS + 100
@@ -338,6 +339,18 @@ def test_bounds_hold(
         assert (outside.lowest <= inside.lowest).all()
         assert (inside.highest <= outside.highest).all()
         assert (inside.largest <= outside.largest).all()
+
+
+def test_largest_contributions_are_of_the_whole_model(
+    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = []
+    for most in (1 << 30, 2 * CHUNK_ROWS):
+        monkeypatch.setattr(visible_chunks, "ORDERED_ROWS", most)
+        trainer = moving(scene, CONFIG, default_device)
+        run_steps(8, trainer)
+        found.append(largest_contributions(trainer, seconds=100)[0])
+    np.testing.assert_array_equal(*found)
 
 
 class Dims(Adaptive):
