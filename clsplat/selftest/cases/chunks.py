@@ -158,9 +158,12 @@ def _launch_step(device: Device, work: Workspace, given: Inputs) -> Read:
     camera_array = upload(device, pack_camera(given.camera))
     read_whole = _launch_whole(device, given, held, camera_array)
     some = project(device, work, held, given.camera, camera_array, chunks=chunks)
-    contributions = np.zeros(chunks.rows, np.float32)
+    counts, contributions = some.tile_counts.get(), np.zeros(chunks.rows, np.float32)
     contributions[: len(rows)] = given.contributions[rows]
     by_row = upload(device, contributions)
+    past = counts[len(rows) :].copy()
+    counts[len(rows) :] = 0  # if a broken kernel shows rows past the model, statistics would be written past its end
+    some = Projected(some.splats, upload(device, counts))
     screen = Screen(upload(device, np.zeros((chunks.rows, 2), np.float32)), by_row)
     view = (camera_array, some, _slots(device, some, given.slots[rows]), screen)
     step = AdamStep(OptimiserConfig(sparse=given.sparse), STEP, ADAM_RATES)
@@ -171,18 +174,14 @@ def _launch_step(device: Device, work: Workspace, given: Inputs) -> Read:
     add_statistics(device, statistics, given.camera, some, screen, chunks)
     add_contributions(device, statistics, some, by_row, AREA, chunks)
 
-    def read() -> Arrays:
-        counts = some.tile_counts.get()
-        return {
-            **{name: _flat(each) for name, each in zip(("parameters", *MOMENTS), model, strict=True)},
-            **{name: array.get() for name, array in statistics.named().items()},
-            "counts": counts[: len(rows)],
-            "counts past the model": counts[len(rows) :],
-            "splats": some.splats.get()[: len(rows)],
-            **read_whole(),
-        }
-
-    return read
+    return lambda: {
+        **{name: _flat(each) for name, each in zip(("parameters", *MOMENTS), model, strict=True)},
+        **{name: array.get() for name, array in statistics.named().items()},
+        "counts": counts[: len(rows)],
+        "counts past the model": past,
+        "splats": some.splats.get()[: len(rows)],
+        **read_whole(),
+    }
 
 
 def _launch_whole(device: Device, given: Inputs, held: DeviceGaussians, camera_array: DeviceArray) -> Read:
