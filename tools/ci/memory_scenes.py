@@ -9,6 +9,7 @@ import numpy as np
 
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
+from clsplat.layouts.columns import CHUNK_ROWS
 
 
 @dataclass
@@ -57,3 +58,13 @@ def cloud(count: int, view: Camera, seed: int = 0, degree: int = 3) -> Gaussians
         rng.uniform(-6, 6, count).astype(np.float32),
         sh.astype(np.float32),
     )
+
+
+def mostly_behind(view: Camera) -> Gaussians:
+    """A model of three chunks: the last one, of 18 Gaussians, is in front of the camera, and the others are behind it,
+    beside its axis."""
+    gaussians = cloud(2 * CHUNK_ROWS + 18, camera(view.width, view.height), 5, degree=0)
+    gaussians.means[:, 2] = np.abs(gaussians.means[:, 2])
+    gaussians.means[18:] += np.array([60, 0, -50], np.float32)
+    gaussians.log_scales[18:] = -5
+    return gaussians

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 from memory_library import library
-from memory_scenes import EXTENT, camera, cloud
+from memory_scenes import EXTENT, camera, cloud, mostly_behind
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
@@ -35,9 +35,9 @@ from clsplat.device.drivers.shapes import Shape
 from clsplat.device.program import Kernel
 from clsplat.device.source import kernel_source
 from clsplat.frame.deep import Merge
-from clsplat.gaussians import PARAMETER_GROUPS
+from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
 from clsplat.images.holdouts import surfaces_of
-from clsplat.layouts.columns import POSE_ROWS, READBACK, WIDEST_SLOTS
+from clsplat.layouts.columns import CHUNK_ROWS, POSE_ROWS, READBACK, WIDEST_SLOTS
 from clsplat.optimisation.density_rules import MarkRules
 from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.rendering.renderer import Renderer
@@ -55,6 +55,9 @@ from clsplat.stages.density import DeviceMarker, carry, gather, new_statistics
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, host_gaussians, upload_gaussians
 from clsplat.stages.peak import _splats
 from clsplat.stages.probe_atomics import atomics_fault
+from clsplat.training import trained_model
+from clsplat.training.step import visible_chunks
+from clsplat.training.step.visible_chunks import VisibleChunks
 from clsplat.training.trainer import Trainer
 
 STAND_INS = (
@@ -134,12 +137,15 @@ def cases(device: Device) -> None:
     """Cases of stages by themselves, on a few rows or pixels, some of them twice for their builds that differ."""
     for name, case in CASES.items():
         size = (17, 7) if isinstance(case.sizes[0], tuple) else 9
-        for draw in range({"adam": 3, "marks": 2, "harmonics": 2, "settle": 2, "catch_up": 2}.get(name, 1)):
+        twice = ("marks", "harmonics", "settle", "chunks", "catch_up")
+        for draw in range({"adam": 3, **dict.fromkeys(twice, 2)}.get(name, 1)):
             given = case.random(np.random.default_rng([draw, *name.encode()]), size)
             if name == "adam":
                 given.rows = ("all", "sparse", "late")[draw]
             if name == "settle":
                 given.all_rows = draw == 1
+            if name == "chunks":
+                given.sparse = draw == 1
             check(f"{name}, {size}", case, device, given)
     gradients, sums = (allocate_gaussians(device, 9, 4, zero=True) for _ in range(2))
     shown = upload(device, np.arange(9, dtype=np.uint32) % 3)
@@ -238,7 +244,36 @@ def methods(device: Device) -> None:
         _train(device, short, 3, view)
 
 
-def _train(device: Device, config: TrainConfig, channels: int, view: Camera, views: int = 1, count: int = 18) -> None:
+def chunks(device: Device) -> None:
+    """Steps over the chunk in view of a model that has two others, which then take the steps that they missed."""
+    usual = visible_chunks.ORDERED_ROWS
+    visible_chunks.ORDERED_ROWS = trained_model.ORDERED_ROWS = CHUNK_ROWS
+    low, short = camera(*EXTENT.low), replace(AHEAD, iterations=EXTENT.steps)
+    every = replace(PAPER.density, start=3, absolute_gradients=True, min_contribution=1e-3)
+    sparse = OptimiserConfig(sparse=True)
+    for config, view in (
+        (replace(short, density=every), low),
+        (replace(short, thinning=0.3, optimiser=sparse), low),
+        (replace(short, density=every, thinning=0.3), replace(low, fx=20.0, fy=20.0, projection="fisheye")),
+    ):
+        trainer = _train(device, config, 3, view, initial=mostly_behind(view))
+        (component,) = (each for each in trainer.components if isinstance(each, VisibleChunks))
+        if component._last.tolist() != [0, 0, config.iterations]:  # noqa: SLF001
+            raise SystemExit(f"last steps of the chunks: {component._last.tolist()}")  # noqa: SLF001
+        trainer.catch_up()
+        trainer.parameters["means"].get()
+    visible_chunks.ORDERED_ROWS = trained_model.ORDERED_ROWS = usual
+
+
+def _train(
+    device: Device,
+    config: TrainConfig,
+    channels: int,
+    view: Camera,
+    views: int = 1,
+    count: int = 18,
+    initial: Gaussians | None = None,
+) -> Trainer:
     pixels = np.random.default_rng(2).random((view.height, view.width, channels), np.float32)
     if channels == 3:
         pixels = (np.rint(255 * pixels) / np.float32(255)).astype(np.float32)  # which goes to the device as bytes
@@ -246,7 +281,7 @@ def _train(device: Device, config: TrainConfig, channels: int, view: Camera, vie
         pixels[:, :, 4] = pixels[:, :, 4] > 0.3
     gaussians = cloud(count, camera(view.width, view.height), 5, degree=0)
     gaussians.opacity_logits[18:] = -9  # as rows they count, and blending them would take most of the time
-    trainer = Trainer(scene_of(view, pixels, views), config, device, gaussians)
+    trainer = Trainer(scene_of(view, pixels, views), config, device, initial or gaussians)
     trainer.pending.on = config is AHEAD
     if config is AHEAD:
         rooms = iter((0, 2000, 1))
@@ -256,6 +291,7 @@ def _train(device: Device, config: TrainConfig, channels: int, view: Camera, vie
         raise SystemExit(f"{trainer.pending.redone} steps were made again")
     if not np.isfinite(losses).all():
         raise SystemExit(f"the training went wrong: losses {losses}")
+    return trainer
 
 
 def scene_of(view: Camera, pixels: NDArray[np.float32], views: int = 1) -> Scene:
@@ -403,6 +439,7 @@ def by_elements(source: str, lanes: int) -> str:
 PARTS = {
     "training": (training,),
     "methods": (methods,),
+    "chunks": (chunks,),
     "more": (more_training,),
     "library": (library,),
     "cases": (cases, sorts, lists),

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from clsplat.selftest.case import Case
 from clsplat.selftest.cases.appearance import COLOUR_CASES
 from clsplat.selftest.cases.catch_up import CATCH_UP_CASE
+from clsplat.selftest.cases.chunks import BOUNDS_CASE, CHUNKS_CASE
 from clsplat.selftest.cases.core import CORE_STAGES
 from clsplat.selftest.cases.density import MARKS_CASE, STATISTICS_CASE, of_statistics
 from clsplat.selftest.cases.depth import of_depth
@@ -32,6 +33,8 @@ CASES: dict[str, Case] = {
     "penalties": PENALTIES_CASE,
     "adam": ADAM_CASE,
     "settle": SETTLE_CASE,
+    "bounds": BOUNDS_CASE,
+    "chunks": CHUNKS_CASE,
     "catch_up": CATCH_UP_CASE,
     "noise": NOISE_CASE,
     **COLOUR_CASES,
