@@ -13,9 +13,11 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pyopencl as cl
@@ -246,8 +248,13 @@ def methods(device: Device) -> None:
 
 def chunks(device: Device) -> None:
     """Steps over the chunk in view of a model that has two others, which then take the steps that they missed."""
-    usual = visible_chunks.ORDERED_ROWS
-    visible_chunks.ORDERED_ROWS = trained_model.ORDERED_ROWS = CHUNK_ROWS
+    with ExitStack() as changes:
+        for module in (visible_chunks, trained_model):
+            changes.enter_context(patch.object(module, "ORDERED_ROWS", CHUNK_ROWS))
+        _train_over_chunks(device)
+
+
+def _train_over_chunks(device: Device) -> None:
     low, short = camera(*EXTENT.low), replace(AHEAD, iterations=EXTENT.steps)
     every = replace(PAPER.density, start=3, absolute_gradients=True, min_contribution=1e-3)
     sparse = OptimiserConfig(sparse=True)
@@ -262,7 +269,6 @@ def chunks(device: Device) -> None:
             raise SystemExit(f"last steps of the chunks: {component._last.tolist()}")  # noqa: SLF001
         trainer.catch_up()
         trainer.parameters["means"].get()
-    visible_chunks.ORDERED_ROWS = trained_model.ORDERED_ROWS = usual
 
 
 def _train(
