@@ -161,7 +161,7 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
     def reproduced(models: dict[str, HostGaussians]) -> bool:
         return bool(first_trouble(replay(Bundle(record, trainer.config, inputs, models), device)))
 
-    trainer.settle()
+    trainer.catch_up_exactly()
     models, alone = {}, False
     if len(incident.gaussians.get("parameters/means", ())):
         models = _unmarked({kind: host_model(incident.gaussians, kind) for kind in _MODEL_KINDS})

@@ -199,7 +199,7 @@ class Trainer:
         self.position.controlled, self.position.last_views = False, views
         self._note()
         if self._looks_at_steps:
-            self._catch_up_exactly()
+            self.catch_up_exactly()
             self._rearrange(self.strategy.after_gradient(self._state()))
         return result
 
@@ -269,7 +269,7 @@ class Trainer:
         for component in self.components:
             component.complete(*self.model.with_moments)
 
-    def _catch_up_exactly(self) -> None:
+    def catch_up_exactly(self) -> None:
         """Make the postponed changes to Gaussians that change no bit of a result, after all launched steps are done."""
         self.settle()
         for component in self.components:
@@ -363,7 +363,7 @@ class Trainer:
             self.settle()
             self.monitor.look()
         if self.monitor.noticed:
-            self._catch_up_exactly()
+            self.catch_up_exactly()
         self._apply(self.monitor.examine(self.model.kinds()))
 
     def _apply(self, repair: Repair | None) -> None:
@@ -468,7 +468,7 @@ class Trainer:
         The whole model is finite, unless `monitor.retries.lost`.
         """
         self.repair(look=True)
-        self._catch_up_exactly()
+        self.catch_up_exactly()
         arrays = self._arrays()
         if (
             repair := self.monitor.examine_all(arrays)
