@@ -26,6 +26,7 @@ from scipy.sparse import csr_array
 
 from clsplat.bench.stages import _Picture
 from clsplat.camera import Camera
+from clsplat.chunks.order import ORDERED_ROWS
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device import buffers, launch, program
@@ -246,8 +247,8 @@ def methods(device: Device) -> None:
 
 def chunks(device: Device) -> None:
     """Steps over the chunk in view of a model that has two others, which then take the steps that they missed."""
-    usual = visible_chunks.ORDERED_ROWS
-    visible_chunks.ORDERED_ROWS = trained_model.ORDERED_ROWS = CHUNK_ROWS
+    for module in (visible_chunks, trained_model):
+        vars(module)["ORDERED_ROWS"] = CHUNK_ROWS
     low, short = camera(*EXTENT.low), replace(AHEAD, iterations=EXTENT.steps)
     every = replace(PAPER.density, start=3, absolute_gradients=True, min_contribution=1e-3)
     sparse = OptimiserConfig(sparse=True)
@@ -262,7 +263,8 @@ def chunks(device: Device) -> None:
             raise SystemExit(f"last steps of the chunks: {component._last.tolist()}")  # noqa: SLF001
         trainer.catch_up()
         trainer.parameters["means"].get()
-    visible_chunks.ORDERED_ROWS = trained_model.ORDERED_ROWS = usual
+    for module in (visible_chunks, trained_model):
+        vars(module)["ORDERED_ROWS"] = ORDERED_ROWS
 
 
 def _train(
