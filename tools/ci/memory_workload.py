@@ -251,10 +251,9 @@ def chunks(device: Device) -> None:
         vars(module)["ORDERED_ROWS"] = CHUNK_ROWS
     low, short = camera(*EXTENT.low), replace(AHEAD, iterations=EXTENT.steps)
     every = replace(PAPER.density, start=3, absolute_gradients=True, min_contribution=1e-3)
-    sparse = OptimiserConfig(sparse=True)
     for config, view in (
         (replace(short, density=every), low),
-        (replace(short, thinning=0.3, optimiser=sparse), low),
+        (replace(short, thinning=0.3, optimiser=OptimiserConfig(sparse=True)), low),
         (replace(short, density=every, thinning=0.3), replace(low, fx=20.0, fy=20.0, projection="fisheye")),
     ):
         trainer = _train(device, config, 3, view, initial=mostly_behind(view))
