@@ -5,10 +5,11 @@
 // Launch: LANES > 1: groups of one item, CHUNK_ROWS / ROWS for each entry of `chunks`. Otherwise groups of ITEMS items,
 //   PIECES for each float of a row, for each entry of `chunks`.
 // Buffers: chunks (entries), last (entries): numbers of chunks, or NO_CHUNK, and the last step that each has taken with
-//   its gradients; caught (chunks of the model): the last step up to which each has been caught up; table (steps, TABLE_NUMBERS): for each step from number `first_step` on the two roots of Step and the rates of the
-//   six parameter groups, root 0 where a step leaves `sh_rest` alone; parameters and both moments of the model's
-//   model_rows rows, updated up to step `step`; readback (READBACK_SIZE) counts refusals. Other scalars are those of
-//   Step. After a stopped pass (duplicate.cl) nothing changes.
+//   its gradients; caught (chunks of the model): the last step up to which each has been caught up; table (steps,
+//   TABLE_NUMBERS): for each step from number `first_step` on the two roots of Step and the rates of the six parameter
+//   groups, root 0 where a step leaves `sh_rest` alone; parameters and both moments of the model's model_rows rows,
+//   updated up to step `step`; readback (READBACK_SIZE) counts refusals. Other scalars are those of Step. After a
+//   stopped pass (duplicate.cl) nothing changes.
 // Equations: docs/gradients.md, (42), and (193) for the steps that only the moments take.
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -111,16 +112,16 @@ __attribute__((always_inline)) static inline void catch_up_vector(size_t i, Miss
   EACH(5, sh_rest, sh_width, TABLE_ROOT_SH_REST, limit2_sh)
 
 __kernel void catch_up(__global const uint *chunks, const uint model_rows, __global const uint *last,
-                       __global const uint *caught, const uint step, __global const float *table, const uint first_step, const uint sh_width, const float beta1,
-                       const float beta2, const float epsilon, const float limit2, const float limit2_sh,
-                       __global uint *readback, __global float *means, __global float *quaternions,
-                       __global float *log_scales, __global float *opacity_logits, __global float *sh_dc,
-                       __global float *sh_rest, __global float *first_means, __global float *first_quaternions,
-                       __global float *first_log_scales, __global float *first_opacity_logits,
-                       __global float *first_sh_dc, __global float *first_sh_rest, __global float *second_means,
-                       __global float *second_quaternions, __global float *second_log_scales,
-                       __global float *second_opacity_logits, __global float *second_sh_dc,
-                       __global float *second_sh_rest) {
+                       __global const uint *caught, const uint step, __global const float *table, const uint first_step,
+                       const uint sh_width, const float beta1, const float beta2, const float epsilon,
+                       const float limit2, const float limit2_sh, __global uint *readback, __global float *means,
+                       __global float *quaternions, __global float *log_scales, __global float *opacity_logits,
+                       __global float *sh_dc, __global float *sh_rest, __global float *first_means,
+                       __global float *first_quaternions, __global float *first_log_scales,
+                       __global float *first_opacity_logits, __global float *first_sh_dc, __global float *first_sh_rest,
+                       __global float *second_means, __global float *second_quaternions,
+                       __global float *second_log_scales, __global float *second_opacity_logits,
+                       __global float *second_sh_dc, __global float *second_sh_rest) {
 #if LANES > 1
   const uint pieces = CHUNK_ROWS / ROWS;
 #else
@@ -131,7 +132,7 @@ __kernel void catch_up(__global const uint *chunks, const uint model_rows, __glo
   const size_t chunk_row = (size_t)CHUNK_ROWS * chunks[place];
   if (chunk_row >= model_rows || readback[READBACK_STOPPED]) return;
   const uint taken = max(last[place], caught[chunks[place]]);
-  if (taken >= step) return;
+  if (taken >= step || taken + 1 < first_step) return; // the latter in a trial, where all arrays are zero
   const uint rows = min((size_t)CHUNK_ROWS, model_rows - chunk_row), steps = step - taken;
   __global const float *from = table + (size_t)TABLE_NUMBERS * (taken + 1 - first_step);
 #if LANES > 1

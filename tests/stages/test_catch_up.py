@@ -256,6 +256,12 @@ def test_nothing_changes_after_a_stopped_pass_or_without_missed_steps(device: De
     assert_alike(caught_up(device, arrays, steps, {})[0], arrays)
 
 
+def test_a_trial_on_zeros_reads_no_table(device: Device) -> None:
+    """All arrays of a trial are zero, and its numbers are the launch's: chunk 0 has taken step 0, before the table."""
+    arrays, steps = trained(5, 4), steps_of(DENSE, 1_000_000_000, 5)
+    assert_alike(caught_up(device, arrays, steps, {0: 0})[0], arrays)
+
+
 def test_a_table_that_ends_too_early_is_refused(default_device: Device) -> None:
     model = tuple(uploaded_groups(default_device, trained(3, 1)))
     chunks = ChunkList(upload(default_device, np.zeros(1, np.uint32)), 3)

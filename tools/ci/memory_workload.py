@@ -13,11 +13,9 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pyopencl as cl
@@ -28,6 +26,7 @@ from scipy.sparse import csr_array
 
 from clsplat.bench.stages import _Picture
 from clsplat.camera import Camera
+from clsplat.chunks.order import ORDERED_ROWS
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device import buffers, launch, program
@@ -248,19 +247,13 @@ def methods(device: Device) -> None:
 
 def chunks(device: Device) -> None:
     """Steps over the chunk in view of a model that has two others, which then take the steps that they missed."""
-    with ExitStack() as changes:
-        for module in (visible_chunks, trained_model):
-            changes.enter_context(patch.object(module, "ORDERED_ROWS", CHUNK_ROWS))
-        _train_over_chunks(device)
-
-
-def _train_over_chunks(device: Device) -> None:
+    for module in (visible_chunks, trained_model):
+        vars(module)["ORDERED_ROWS"] = CHUNK_ROWS
     low, short = camera(*EXTENT.low), replace(AHEAD, iterations=EXTENT.steps)
     every = replace(PAPER.density, start=3, absolute_gradients=True, min_contribution=1e-3)
-    sparse = OptimiserConfig(sparse=True)
     for config, view in (
         (replace(short, density=every), low),
-        (replace(short, thinning=0.3, optimiser=sparse), low),
+        (replace(short, thinning=0.3, optimiser=OptimiserConfig(sparse=True)), low),
         (replace(short, density=every, thinning=0.3), replace(low, fx=20.0, fy=20.0, projection="fisheye")),
     ):
         trainer = _train(device, config, 3, view, initial=mostly_behind(view))
@@ -269,6 +262,8 @@ def _train_over_chunks(device: Device) -> None:
             raise SystemExit(f"last steps of the chunks: {component._last.tolist()}")  # noqa: SLF001
         trainer.catch_up()
         trainer.parameters["means"].get()
+    for module in (visible_chunks, trained_model):
+        vars(module)["ORDERED_ROWS"] = ORDERED_ROWS
 
 
 def _train(

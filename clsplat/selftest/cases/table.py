@@ -7,8 +7,7 @@ from collections.abc import Callable
 
 from clsplat.selftest.case import Case
 from clsplat.selftest.cases.appearance import COLOUR_CASES
-from clsplat.selftest.cases.catch_up import CATCH_UP_CASE
-from clsplat.selftest.cases.chunks import BOUNDS_CASE, CHUNKS_CASE
+from clsplat.selftest.cases.chunks import BOUNDS_CASE, CATCH_UP_CASE, CHUNKS_CASE
 from clsplat.selftest.cases.core import CORE_STAGES
 from clsplat.selftest.cases.density import MARKS_CASE, STATISTICS_CASE, of_statistics
 from clsplat.selftest.cases.depth import of_depth
