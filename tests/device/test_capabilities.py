@@ -16,6 +16,7 @@ from clsplat.errors import DeviceError
 from clsplat.gaussians import Gaussians
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
+from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
 from clsplat.training.trainer import Trainer
 
 
@@ -39,6 +40,7 @@ def opened(monkeypatch: pytest.MonkeyPatch, device: Device, pretended: str, shap
 
 def test_a_gpu(scene: Scene, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """Kernels in groups, photographs that are copied, and a driver that chooses the groups of an image's kernels."""
+    monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")  # so that both send each camera once
     usual = opened(monkeypatch, device, "", "1x64")
     gpu = opened(monkeypatch, device, "gpu")
     assert (gpu.kind, gpu.shares_memory, gpu.shape.label) == ("gpu", False, "1x64")

@@ -144,11 +144,11 @@ def test_what_is_half_changed_is_not_kept(
     """A launch that fails although its trial did not, behind the first that changes rows."""
     run = Run.create(tmp_path / "run", WITHOUT, scene=scene)
 
-    def fail(step, _statistics, _rows):
+    def fail(step, _rows):
         if step.number == 5 and step.changes.__self__.mark is None:
             raise DriverError("it failed")
 
-    noted(monkeypatch, monitor.StepMonitor, "add_statistics", fail)
+    noted(monkeypatch, monitor.StepMonitor, "_add_rows", fail)
     with pytest.raises(DriverError) as raised:
         train_on(load_scene(scene), WITHOUT, device=default_device, run=run)
     assert str(raised.value) == "it failed"
