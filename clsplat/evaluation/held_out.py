@@ -82,7 +82,8 @@ def evaluate(
 ) -> Evaluation:
     """Measure the render of every view against its photograph. Returns the content of eval.json.
 
-    render: function that returns a view's float image (H, W, 3) over `background` (3,), at the size of `view.load()`.
+    render: function that returns a view's float image (H, W, 3) over `background` (3,), at the size of `view.load()`,
+        with the view's appearance (`runs/appearance.py`: `held_out_looks`).
     save_dir: folder for the renders, which are written as sRGB PNG with the views' names.
     model: description of the model, which is copied to the result.
     space: colour space of renders and photographs. They are compared in this space.

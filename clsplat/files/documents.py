@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading of files: checks that they exist, digests, text, JSON."""
+"""Reading of files: existence checks, digests, text and JSON."""
 
 from __future__ import annotations
 

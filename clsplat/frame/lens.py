@@ -62,9 +62,10 @@ class ByMap:
 
 @dataclass(frozen=True, eq=False)
 class ByLens:
-    """The mapping of a photograph's lens. The warped picture has the photograph's pixels.
+    """The mapping of a photograph's lens.
 
-    The straight frame belongs to the camera of `Lens.bare`, at any size.
+    The straight frame is that of the camera of `Lens.bare`, at any size. The warped picture is the photograph's view,
+    with its distortion, at the same size.
     """
 
     lens: Lens

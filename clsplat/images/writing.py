@@ -26,7 +26,7 @@ def write_image(path: Path, image: NDArray[Any]) -> None:
     """Write an image, atomically: 8-bit PNG or float EXR, by the extension.
 
     image: (H, W) or (H, W, C), C = 1, 3 or 4, with straight alpha; uint8 or floats. For a PNG, floats are clipped to
-      [0, 1] and rounded.
+      [0, 1] and rounded. Values are written as they are; `images/colour.py` converts colours.
     Raises InputError for another extension or a missing folder, ClsplatError if writing fails, as on a full disk. After
     a failure an earlier file is intact, and no temporary file is left.
     """

@@ -33,7 +33,11 @@ class Deep:
 
 
 class _Cut:
-    """State of the loop (73) over layers. slack: the slack s of each pixel. whole: the light in front of all layers."""
+    """State of the loop over layers that cuts them by (73) of docs/pictures.md.
+
+    slack: s of each pixel.
+    whole: transmittance before the first layer.
+    """
 
     def __init__(self, slack: Float64, whole: Float64) -> None:
         self.slack, self.count = slack, np.ones(slack.shape, np.int64)

@@ -188,8 +188,8 @@ def _blind(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
         return ""
     names = examples(name for (name, _), none in zip(views, blind, strict=True) if none)
     return (
-        f"{blind.sum():,} of {len(views):,} pictures show almost none of the points, while the others show about "
-        f"{100 * usual:.0f} % ({names}): their poses are doubtful; correct them, or leave out these pictures"
+        f"{blind.sum():,} of {len(views):,} pictures ({names}) show almost none of the points, while the others show "
+        f"about {100 * usual:.0f} %: the poses of the former are doubtful; correct them, or leave out these pictures"
     )
 
 

@@ -137,7 +137,7 @@ class GivenTensors:
 
 
 def _check_colors(colors: Any, batch: tuple[int, ...], cameras: int, count: int, sh_degree: int | None) -> None:
-    """Raise InputError unless colors are colours, or enough SH coefficients for the degree."""
+    """Raise InputError unless `colors` has channels, or, with `sh_degree`, enough SH coefficients for it."""
     if sh_degree is None:
         check_shape("colors", colors, (*batch, count, "D"), (*batch, cameras, count, "D"))
         if colors.shape[-1] == 0:

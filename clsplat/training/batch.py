@@ -204,8 +204,8 @@ class Replica:
 
         place: the view's number among this device's views.
         factor: divisor of the photographs' resolution.
-        values: values of its parts, for this device.
-        splats: True if density control uses its gradients.
+        values: parameters of each of `inputs.parts`, for this device.
+        splats: True to return splats and screen-space gradients too, which density control uses.
         """
         parameters, photograph = self.parameters, self.photographs.bring(inputs.view, factor)
         assert parameters is not None, "taken before the view"

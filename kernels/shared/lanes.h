@@ -158,8 +158,8 @@ static inline float8 sums8(floatS x0, floatS x1, floatS x2, floatS x3, floatS x4
 // dependent instructions.
 //
 // An instruction of a GPU can contain one constant. NVIDIA's compiler loads a second constant into a register before
-// each use, unless it depends on a variable. `zero` is such a variable, always 0; it is 0 itself where speed does not
-// matter.
+// each use, unless it depends on a variable. `zero` is such a variable: always 0, but the compiler does not know that.
+// Callers for which speed does not matter pass the literal 0.
 #define IN_REGISTER(constant) ((floatL)(as_float(as_int(constant) + zero)))
 static inline floatL exp2_by(floatL x, int zero) {
   const floatL t = x + 12582912.0f;

@@ -234,7 +234,10 @@ class _Meta:
         return array
 
     def picture(self, section: str, index: int, channels: int, *, least: int | None = None) -> Bytes:
-        """Bytes (height, width, channels) of an image with at least `least` pixels; None for a pixel per Gaussian."""
+        """Bytes (height, width, channels) of an image.
+
+        least: required number of pixels; None requires one for each Gaussian.
+        """
         names = self.section(section).get("files")
         if not isinstance(names, list) or len(names) <= index or not isinstance(names[index], str):
             raise InputError(f"{self.path}: {section} in {SOG_META_FILE} has no file {index}")

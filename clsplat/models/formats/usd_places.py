@@ -275,7 +275,8 @@ class _StageFindings:
                 self.places.append(UsdPlacement(prim, own, instance))
                 if len(self.places) > MAX_PLACED_PRIMS:
                     raise InputError(
-                        f"{self.where}: places over {MAX_PLACED_PRIMS:,} prims of Gaussians, expected fewer"
+                        f"{self.where}: has more than {MAX_PLACED_PRIMS:,} placed prims of Gaussians, expected at most "
+                        "that many"
                     )
             elif _is_visible_shape(prim):
                 self.shapes[str(path)] = f"{path} ({prim.GetTypeName()})"

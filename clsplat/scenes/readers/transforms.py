@@ -234,7 +234,7 @@ def _warn_of_contradictions(path: Path, readers: list[Keys], images: list[PosedI
         contradictions = []
         for keys, image in zip(readers, images, strict=True):
             used, other = keys.number(focal), keys.get(angle)
-            # compare only values of one level: the file's value belongs to frames without a value of their own
+            # compare only if both are the frame's own or both the file's, which is for frames without their own
             alike = (keys.frame.get(focal) is None) == (keys.frame.get(angle) is None)
             if used and alike and isinstance(other, int | float) and 0 < other < math.pi:
                 size = image.lens.width if axis == "x" else image.lens.height
