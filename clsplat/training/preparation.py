@@ -128,8 +128,8 @@ def late_settings(config: TrainConfig) -> Iterator[str]:
     if density.every and density.fills and density.stop > last:
         yield (
             f"--density.growth {density.growth}: --density.max-gaussians {density.max_gaussians:,} is reached at "
-            f"--density.stop {density.stop}, but {ends}; expected a --density.stop of at most {last}, such as "
-            f"{5 * last // 7}"
+            f"--density.stop {density.stop}, but {ends}; expected a --density.stop of at most --iterations "
+            f"{last}, such as {5 * last // 7}"
         )
     optimiser = config.optimiser
     if optimiser.cooldown > last:

@@ -193,7 +193,7 @@ LATE = {
         {"density": {"every": 1, "growth": "mcmc", "max_gaussians": 2000, "stop": 9}},
         (
             "--density.growth mcmc: --density.max-gaussians 2,000 is reached at --density.stop 9, but training ends "
-            "at step 3; expected a --density.stop of at most 3, such as 2"
+            "at step 3; expected a --density.stop of at most --iterations 3, such as 2"
         ),
     ),
     "warmup": (

@@ -20,7 +20,7 @@ from clsplat.stages.grid import GRID_SHAPE, Grids, apply_grid, centre_grids, gri
 
 GRID_PHOTOGRAPH = 1
 MIN_LEVEL_DISTANCE = 1e-4
-"""If a luminance is closer than this to a level, rounding decides which two levels are interpolated."""
+"""Distance of a luminance from a level: rounding decides which two levels are interpolated if it is less than this."""
 
 
 def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
