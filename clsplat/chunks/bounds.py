@@ -130,15 +130,32 @@ def largest_step(config: OptimiserConfig) -> float:
     return limit * max(first, 1.0) * max(second, 1.0) * (1 + _SLACK)
 
 
-def hidden_path(config: OptimiserConfig) -> float:
+def largest_resumed_step(config: OptimiserConfig, ratio: float, step: int) -> float:
+    """`largest_step` after step number `step`, for moments that other decays may have made.
+
+    Let c be the limit in `largest_step`, so that (1 - b1)^2 / (1 - b2) = (1 - r) c^2. If |m| <= d sqrt(v) with d >= c,
+    Cauchy and Schwarz give for the next moments
+
+        |b1 m + (1 - b1) g| <= sqrt(r d^2 + (1 - r) c^2) sqrt(b2 v + (1 - b2) g^2) <= d sqrt(v of the next step).
+
+    So d stays a bound. The correction of a later step is at most 1 / (1 - b1^t).
+
+    ratio: the largest |m| / sqrt(v).
+    """
+    return max(largest_step(config), ratio / (1 - config.beta1 ** (step + 1)) * (1 + _SLACK))
+
+
+def hidden_path(config: OptimiserConfig, step: float | None = None) -> float:
     """The most by which all later steps with gradient 0 move a parameter, as a multiple of their largest learning rate.
 
     It is 66 by default. In the k-th such step, the first moment has fallen to b1^k and the root of the second to
     b2^(k / 2) of its value. So by the argument of `largest_step` the step is at most (b1 / sqrt(b2))^k times its bound,
     and the sum over k = 1, 2, ... is a geometric series. With sparse Adam, which takes no such step, it is not needed.
+
+    step: bound of a step; None takes `largest_step`.
     """
     _, _, root = _decays(config)
-    step = largest_step(config)
+    step = largest_step(config) if step is None else step
     return step * root / (1 - root) if math.isfinite(step) else math.inf
 
 

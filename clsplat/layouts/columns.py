@@ -93,9 +93,6 @@ EWA_GRADIENT = _TRANSFORM
 SUM_ROWS = 64
 """Number of adjacent numbers that a work-item of `kernels/sums.cl` adds."""
 
-CHUNK_ROWS = 1024
-"""Number of rows of a model in a chunk; its last chunk may have fewer."""
-
 NO_CHUNK = 0x3FFFFF
 """Entry of a list of chunks that stands for no chunk. All its rows are past the end of every model."""
 

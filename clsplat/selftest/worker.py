@@ -26,6 +26,7 @@ from clsplat.selftest.result import INDEX_STAGES, SELFTEST_STAGES, STAGE_BOUNDS_
 from clsplat.selftest.scenes import scenes
 from clsplat.stages.blend import tile_items
 from clsplat.stages.channels import FEATURE_WIDTHS, Features
+from clsplat.stages.project import CPU_STEP_ROWS
 
 DIGESTS_PATH = Path(__file__).with_name("digests.json")
 _FEATURE_DEFINES = Features.of(FEATURE_WIDTHS).defines
@@ -37,6 +38,7 @@ DEFAULT_DEFINES: dict[str, dict[str, object]] = {
     "grid": {"LANES": 1},
     "noise": {"LANES": 1},
     "settle": {"LANES": 1},
+    "catch_up": {"ROWS": CPU_STEP_ROWS},
     "pose": {"LANES": 1},
     "probe_atomics": {"PROBED": 1},
     "project_rays": {"LANES": 1, **next(model.defines for model in CAMERA_MODELS if model.along_rays)},

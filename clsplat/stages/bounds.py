@@ -54,10 +54,10 @@ CHUNKS_DEFINE: dict[str, object] = {"CHUNKS": True}
 def padded_chunks(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
     """The numbers of chunks, then NO_CHUNK, in one of few lengths, so that arrays and command buffers are reused.
 
-    The length is at most an eighth more than needed, or 1.
+    The length is at most a quarter more than needed, or 1.
     """
     wanted = max(len(numbers), 1)
-    unit = 1 << max(wanted.bit_length() - 4, 0)
+    unit = 1 << max(wanted.bit_length() - 3, 0)
     padded = np.full(-(-wanted // unit) * unit, NO_CHUNK, np.uint32)
     padded[: len(numbers)] = numbers
     return padded

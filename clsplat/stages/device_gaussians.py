@@ -147,20 +147,19 @@ def upload_chunks(
     Returns the models, valid until the next call, and a function that copies their changes back to the host.
     """
     rows = [slice(CHUNK_ROWS * int(number), CHUNK_ROWS * (int(number) + 1)) for number in numbers]
-    uploaded, copies = [], []
+    uploaded, wholes = [], []
     for index, model in enumerate(models):
         arrays = {}
         for name, whole in model.arrays.items():
             some = np.concatenate([whole.values[each] for each in rows])
             arrays[name] = work.array(f"part{index}_{name}", some.shape, some.dtype)
             arrays[name].set(some)
-            copies.append((arrays[name], some, whole.values))
+            wholes.append((arrays[name], whole.values))
         uploaded.append(DeviceGaussians(arrays["means"].shape[0], model.coefficients, arrays))
 
     def copy_back() -> None:
-        for array, some, whole in copies:
-            array.read_into(some)
-            begin = 0
+        for array, whole in wholes:
+            some, begin = array.get(), 0
             for each in rows:
                 end = begin + len(whole[each])
                 whole[each] = some[begin:end]

@@ -160,16 +160,20 @@ class TrainedModel:
         listed = plan.listed
         if plan.rows is not None:
             listed = list_rows(self._device, plan.rows, plan.fresh)
+        moved: DeviceArray | None = None
+        places: NDArray[np.int64] | slice = slice(None)
+        """Place in the model of each row of the plan."""
         if listed is not None:
             assert isinstance(listed, DeviceRowList)
-            self._move(listed.rows, changes, new_statistics=plan.new_statistics)
+            moved, order = listed.rows, self._order(listed)
+            if order is not None:
+                moved, places = upload(self._device, listed.rows.get()[order]), np.argsort(order)
+            self._move(moved, changes, new_statistics=plan.new_statistics)
             if listed.halves and plan.halves is not None:
-                self._halve(listed, plan.halves, plan.halved)
+                self._halve(listed, places, plan.halves, plan.halved)
         changes()
         for group, (rows, values) in plan.values.items():
-            changed = self.parameters[group].get()
-            changed[rows] = values
-            self.parameters[group].set(changed)
+            self._set_rows(group, np.arange(self.parameters.count)[places][rows], values)
         for group, change in plan.changes.items():
             self.parameters[group].set(change(self.parameters[group].get()))
         for group in plan.restarted:
@@ -177,7 +181,7 @@ class TrainedModel:
             self.second[group].fill(0.0)
         if plan.forget_contributions:
             self.statistics.forget_contributions()
-        return None if listed is None else self._in_order(listed.rows)
+        return moved
 
     def _zeros(self, count: int, coefficients: int) -> AnyGaussians:
         if isinstance(self.parameters, HostGaussians):
@@ -194,32 +198,45 @@ class TrainedModel:
             return replace(model, rows=self.plan.rows) if self.plan.streamed else to_device(self._device, model)
         return model
 
-    def _in_order(self, listed: DeviceArray) -> DeviceArray:
-        """Put the new rows of a large model behind the rows that they come from, after `listed` has been carried out.
-
-        Returns the list that gives this order at once.
-        """
-        if listed.shape[0] <= ORDERED_ROWS:
-            return listed
-        entries = listed.get()
-        order = beside_parents(entries & ~FRESH)
-        if (order[1:] > order[:-1]).all():
-            return listed
-        self._move(list_rows(self._device, order, None).rows, lambda: None, new_statistics=False)
-        return upload(self._device, entries[order])
+    def _order(self, listed: DeviceRowList) -> NDArray[np.uint32] | None:
+        """The order of a large model's rows: new rows stand behind those that they come from. When a model becomes
+        large, its rows are put in order of their places in space. None keeps the order of the list."""
+        if listed.count <= ORDERED_ROWS:
+            return None
+        sources = listed.rows.get() & ~FRESH
+        if self.parameters.count > ORDERED_ROWS:
+            order = beside_parents(sources)
+        else:
+            order = space_order(self.parameters["means"].get()[sources])
+        return None if (order[1:] > order[:-1]).all() else order
 
     def _halve(
         self,
         listed: DeviceRowList,
+        places: NDArray[np.int64] | slice,
         halves: Callable[[Mapping[str, Float32]], Mapping[str, Float32]],
         halved: Sequence[str],
     ) -> None:
-        """Replace the last rows, which are copies of split Gaussians, with their halves, computed from the groups
-        `halved`."""
+        """Replace the last rows of a list, which are copies of split Gaussians, with their halves, computed from the
+        groups `halved`.
+
+        places: place in the model of each row of the list.
+        """
         count, half = listed.count, listed.halves // 2
-        split = {group: self.parameters[group].get_rows(count - half, count) for group in halved}
+        if isinstance(places, slice):
+            split = {group: self.parameters[group].get_rows(count - half, count) for group in halved}
+            for group, values in halves(split).items():
+                self.parameters[group].set_rows(count - listed.halves, values)
+            return
+        split = {group: self.parameters[group].get()[places[count - half :]] for group in halved}
         for group, values in halves(split).items():
-            self.parameters[group].set_rows(count - listed.halves, values)
+            self._set_rows(group, places[count - listed.halves :], values)
+
+    def _set_rows(self, group: str, rows: NDArray[Any], values: Float32) -> None:
+        """Set rows of a parameter group."""
+        changed = self.parameters[group].get()
+        changed[rows] = values
+        self.parameters[group].set(changed)
 
     def _move(self, listed: DeviceArray, changes: Callable[[], None], *, new_statistics: bool) -> None:
         """Move all arrays, so that row j becomes the old row listed[j], with zero moments if it is FRESH."""

@@ -278,7 +278,7 @@ class Trainer:
     @property
     def complete_parameters(self) -> AnyGaussians:
         """Parameters as `catch_up` would leave them. They may be a copy, so that looking changes no bit."""
-        self.settle()
+        self.catch_up_exactly()
         parameters = self.parameters
         for component in self.components:
             parameters = component.completed(parameters, *self.model.with_moments[1:])
@@ -359,11 +359,10 @@ class Trainer:
 
         look: True to read `adam`'s counts first.
         """
-        if look:
-            self.settle()
-            self.monitor.look()
-        if self.monitor.noticed:
+        if look or self.monitor.noticed:
             self.catch_up_exactly()
+        if look:
+            self.monitor.look()
         self._apply(self.monitor.examine(self.model.kinds()))
 
     def _apply(self, repair: Repair | None) -> None:

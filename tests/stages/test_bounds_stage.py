@@ -79,10 +79,10 @@ def test_lists_have_few_lengths(device: Device) -> None:
     for count in range(1, 1025):
         chunks = chunk_list(work, np.arange(count), 1 << 20)
         length = chunks.numbers.shape[0]
-        assert count <= length <= max(count * 9 / 8, count)
+        assert count <= length <= count * 5 / 4
         assert chunks.rows == CHUNK_ROWS * length
         lengths.add(length)
-    assert len(lengths) <= 15 + 8 * 7
+    assert len(lengths) <= 8 + 4 * 8
 
 
 @pytest.mark.slow_in_groups

@@ -75,6 +75,7 @@ class Component:
 
     def complete(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
         """Make all changes to the parameters and their moments that are postponed, because all rows are now needed."""
+        self.complete_exactly(parameters, first, second)
 
     def completed(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> AnyGaussians:  # noqa: ARG002
         """The parameters as `complete` would leave them, without changing any array."""

@@ -69,9 +69,10 @@ class StepMonitor(StepProbe):
         """Try in the sandbox every kernel that changes the state, before the first row changes: a driver may fail in
         any of them."""
         step, parameters = self.step, rows.parameters
-        size = (parameters.count if rows.chunks is None else 0, parameters.coefficients)
+        size = (rows.stop - rows.start, parameters.coefficients)
         build = (step.adam_step.updates_sh_rest, step.fields, rows.slots.first_slots is None, self.needs.gradients)
-        key = (*size, *build, rows.chunks is None, *self.inputs.camera.model.defines.items())
+        in_chunks = rows.chunks is not None and rows.chunks.in_model is not None
+        key = (*size, *build, in_chunks, *self.inputs.camera.model.defines.items())
         if key not in self.tried:
             with only_tried(step.device), only_tried(step.rasterizer.device), only_tried(rows.device):
                 step.change(rows, self.inputs)

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Bool, Float32, Float64
-from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_step
+from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_resumed_step, largest_step
 from clsplat.chunks.culling import visible
 from clsplat.chunks.order import ORDERED_ROWS
 from clsplat.config.training import TrainConfig
@@ -67,9 +68,13 @@ class VisibleChunks(Component):
 
     def __init__(self, config: TrainConfig, rasterizer: Rasterizer, unit: float, count: int) -> None:
         self._config, self._rasterizer, self._unit = config, rasterizer, unit
-        self._step_limit = largest_step(config.optimiser)
-        self._hidden_limit = 0.0 if config.optimiser.sparse else hidden_path(config.optimiser)
+        self._limit_movement(largest_step(config.optimiser))
         self._begin(count, 0)
+
+    def _limit_movement(self, step: float) -> None:
+        """Set the most by which a step moves a parameter, as a multiple of the learning rate."""
+        self._step_limit = step
+        self._hidden_limit = 0.0 if self._config.optimiser.sparse else hidden_path(self._config.optimiser, step)
 
     def _begin(self, count: int, step: int) -> None:
         """Forget all bounds, of a model of `count` Gaussians that have all taken step number `step`."""
@@ -99,7 +104,8 @@ class VisibleChunks(Component):
         config = self._config
         by_adam_only = config.density.growth != "mcmc" and not config.antialiased and not config.optimiser.late
         one_view = config.batch == 1 and not config.refines
-        return by_adam_only and one_view and self._rasterizer.device.max_group >= DEFAULT_GROUP_ITEMS
+        groups = self._rasterizer.device.max_group >= DEFAULT_GROUP_ITEMS
+        return by_adam_only and one_view and groups and isfinite(self._step_limit)
 
     def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002
         """True if bounds must be measured before the next step."""
@@ -195,7 +201,8 @@ class VisibleChunks(Component):
             chunks = _ChunksInView(self, np.arange(len(self._last), dtype=np.uint32), None, self._found, whole=True)
         if chunks.missed is not None:
             self._catch_up(_on_device(model), chunks.missed)
-        self._before = {step.number: self._last, **dict(list(self._before.items())[: MAX_COUNTED_PASSES - 1])}
+        older = {number: last for number, last in self._before.items() if number >= step.number - MAX_COUNTED_PASSES}
+        self._before = {**older, step.number: self._last}
         self._last, self.step = self._last.copy(), step.number
         self._last[chunks.numbers] = step.number
         self._note(step)
@@ -239,19 +246,7 @@ class VisibleChunks(Component):
         """Return to the state after step number `step`. Chunks that were caught up after it are marked as such."""
         if step >= self.step:
             return
-        if step + 1 in self._before:
-            self._last, self.step = self._before[step + 1], step
-        else:
-            self._begin_table(step)
-
-    def complete(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
-        """Catch up all chunks."""
-        self.complete_exactly(parameters, first, second)
-
-    def completed(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> AnyGaussians:
-        """The parameters, after all chunks are caught up, in place: chunks have the same bits whenever that is."""
-        self.complete_exactly(parameters, first, second)
-        return parameters
+        self._last, self.step = self._before[step + 1], step
 
     def complete_exactly(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
         """Catch up all chunks."""
@@ -270,9 +265,19 @@ class VisibleChunks(Component):
         """Measure all bounds again."""
         self._begin(listed.shape[0], self.step)
 
-    def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002
-        """Measure all bounds of the checkpoint's Gaussians."""
+    def load(self, named: Named, step: int, count: int) -> None:
+        """Measure all bounds of the checkpoint's Gaussians, whose moments other decays may have made."""
+        first, second = named("first/"), named("second/")
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratios = [np.abs(first[group]) / np.sqrt(second[group]) for group in ("means", "log_scales")]
+        ratio = max(float(np.max(each, initial=0.0, where=~np.isnan(each))) for each in ratios)  # NaN: both are 0
+        self._limit_movement(largest_resumed_step(self._config.optimiser, ratio, step))
         self._begin(count, step)
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes per Gaussian: those of a chunk in lists, bounds and missed steps, rounded up."""
+        return 1 if self.on else 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,5 +300,5 @@ class _ChunksInView(ChunksInView):
 
 
 def _on_device(model: Sequence[AnyGaussians]) -> tuple[DeviceGaussians, ...]:
-    assert all(isinstance(each, DeviceGaussians) for each in model), "a streamed model has no chunks in view"
+    assert all(isinstance(each, DeviceGaussians) for each in model), "a streamed model has nothing to catch up"
     return tuple(each for each in model if isinstance(each, DeviceGaussians))
