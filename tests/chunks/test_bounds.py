@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from stress_culling import paths
 
-from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_step
+from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_resumed_step, largest_step
 from clsplat.config.training import OptimiserConfig
 from clsplat.layouts.columns import CHUNK_ROWS
 
@@ -115,6 +115,30 @@ def test_a_hidden_row_moves_no_farther(beta1: float, beta2: float, shown: int) -
     assert tail <= hidden_path(config)
     if (shown, beta1, beta2) == (400, 0.9, 0.999):  # the tight gradients need some hundred steps
         assert tail > 0.55 * hidden_path(config)
+
+
+@pytest.mark.parametrize(("beta1", "beta2"), [(0.9, 0.9), (0.5, 0.6), (0.9, 0.999), (0.8, 0.95)])
+@pytest.mark.parametrize("ratio", [0.0, 3.0, 7.28, 40.0])
+@pytest.mark.parametrize("begun", [1, 20, 5000])
+def test_no_step_is_larger_after_other_decays(beta1: float, beta2: float, ratio: float, begun: int) -> None:
+    """In float64, from moments of this ratio on, with gradients of all sizes; and hidden after each step."""
+    config, rng, count = replace(DEFAULT, beta1=beta1, beta2=beta2), np.random.default_rng(begun), 256
+    bound = largest_resumed_step(config, ratio, begun)
+    v = 10 ** rng.uniform(-6, 2, count)
+    m = ratio * np.sqrt(v)
+    largest = 0.0
+    for step in range(begun + 1, begun + 40):
+        moved = np.zeros(count)
+        tail_m, tail_v = m, v
+        for later in range(step, step + 60):
+            tail_m, tail_v = beta1 * tail_m, beta2 * tail_v
+            moved += tail_m / (1 - beta1**later) / np.sqrt(tail_v / (1 - beta2**later))
+        assert moved.max() <= hidden_path(config, bound)
+        g = np.where(rng.random(count) < 0.5, np.sqrt(v) * 10 ** rng.uniform(-1, 1, count), 0.0)
+        m, v = beta1 * m + (1 - beta1) * g, beta2 * v + (1 - beta2) * g * g
+        largest = max(largest, float((np.abs(m) / (1 - beta1**step) / np.sqrt(v / (1 - beta2**step))).max()))
+    assert largest <= bound
+    assert begun < 5000 or largest > 0.2 * bound, "without the corrections, the bound is not far from what happens"
 
 
 @pytest.mark.parametrize(

@@ -74,11 +74,24 @@ def test_a_limit_that_is_passed_at_a_densification(
     assert (run / "model.ply").exists()
 
 
+@pytest.mark.parametrize("large", [False, True], ids=["small", "large"])
 @pytest.mark.parametrize("on_host", [False, True], ids=["gathered by the device", "gathered by the host"])
 def test_a_buffer_that_the_driver_refuses_while_rows_move(
-    on_host: bool, folder: Path, whole: bytes, default_device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    on_host: bool,
+    large: bool,
+    folder: Path,
+    whole: bytes,
+    default_device: Device,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Another program may have taken memory that the plan counted on. The third group of the new rows finds none."""
+    """Another program may have taken memory that the plan counted on. The third group of the new rows finds none.
+
+    large: the model's new rows are put behind those that they come from.
+    """
+    if large:
+        monkeypatch.setattr(trained_model, "ORDERED_ROWS", 100)
+        whole = model_bytes(load_scene(folder), GROWING, default_device, tmp_path / "whole")
     run, arrays = Run.create(tmp_path / "run", GROWING, scene=folder), 0
 
     def moves(*_: object, **__: object) -> None:

@@ -192,8 +192,11 @@ def test_a_model_that_grows_into_chunks(
     for module in (visible_chunks, trained_model):
         monkeypatch.setattr(module, "ORDERED_ROWS", ROWS + 20)
     wanted, _ = trained(scene, CONFIG, default_device, 32, whole=True)
+    sorted_means: list[np.ndarray[Any, Any]] = []
+    noted(monkeypatch, trained_model, "space_order", sorted_means.append)
     got, trainer = trained(scene, CONFIG, default_device, 32)
     assert_same(got, wanted)
+    assert [len(means) > ROWS + 20 for means in sorted_means] == [True], "its rows are put in order once"
     assert trainer.parameters.count > ROWS + 20
     assert 0 < len(shares) <= 17, "from density control after step 15 on"
 
