@@ -130,8 +130,9 @@ __kernel void catch_up(__global const uint *chunks, const uint model_rows, __glo
 #endif
   const uint place = get_group_id(0) / pieces, piece = get_group_id(0) % pieces;
   const size_t chunk_row = (size_t)CHUNK_ROWS * chunks[place];
+  // Intel's compiler moves a load of all items before the return, so it must not be of a chunk that is not there.
+  const uint taken = max(last[place], caught[chunk_row < model_rows ? chunks[place] : 0]);
   if (chunk_row >= model_rows || readback[READBACK_STOPPED]) return;
-  const uint taken = max(last[place], caught[chunks[place]]);
   if (taken >= step || taken + 1 < first_step) return; // the latter in a trial, where all arrays are zero
   const uint rows = min((size_t)CHUNK_ROWS, model_rows - chunk_row), steps = step - taken;
   __global const float *from = table + (size_t)TABLE_NUMBERS * (taken + 1 - first_step);

@@ -35,6 +35,7 @@ from clsplat.device.drivers.shapes import Shape
 from clsplat.device.program import variant_of
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import COUNTED, READBACK
+from clsplat.training.step.visible_chunks import VisibleChunks
 
 MEMORY = 64 << 30
 """Bytes of memory of the simulated device: enough to allocate a step's arrays whole."""
@@ -183,6 +184,10 @@ def _step(rehearsed: Rehearsed, whole: VariedDevice, frame: Mapping[str, Any]) -
     # By capacity, of as many pairs as there are: launches then have exactly the items with work, for bytes and times.
     trainer.pending.room = lambda *_: frame["listed"]  # type: ignore[method-assign]
     trainer.rasterizer.work.tight = False
+    # A rehearsal has no bounds of chunks to read, and the frames show most of their Gaussians.
+    trainer._active = [  # noqa: SLF001
+        each for each in trainer.components if each.on and not isinstance(each, VisibleChunks)
+    ]
     device.atomics_faults.append("")
 
     def forward() -> None:
