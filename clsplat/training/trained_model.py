@@ -160,20 +160,16 @@ class TrainedModel:
         listed = plan.listed
         if plan.rows is not None:
             listed = list_rows(self._device, plan.rows, plan.fresh)
-        moved: DeviceArray | None = None
-        places: NDArray[np.int64] | slice = slice(None)
-        """Place in the model of each row of the plan."""
+        moved, places = None, None
         if listed is not None:
             assert isinstance(listed, DeviceRowList)
-            moved, order = listed.rows, self._order(listed)
-            if order is not None:
-                moved, places = upload(self._device, listed.rows.get()[order]), np.argsort(order)
+            moved, places = self._ordered(listed)
             self._move(moved, changes, new_statistics=plan.new_statistics)
             if listed.halves and plan.halves is not None:
                 self._halve(listed, places, plan.halves, plan.halved)
         changes()
         for group, (rows, values) in plan.values.items():
-            self._set_rows(group, np.arange(self.parameters.count)[places][rows], values)
+            self._set_rows(group, rows if places is None else places[rows], values)
         for group, change in plan.changes.items():
             self.parameters[group].set(change(self.parameters[group].get()))
         for group in plan.restarted:
@@ -198,39 +194,44 @@ class TrainedModel:
             return replace(model, rows=self.plan.rows) if self.plan.streamed else to_device(self._device, model)
         return model
 
-    def _order(self, listed: DeviceRowList) -> NDArray[np.uint32] | None:
-        """The order of a large model's rows: new rows stand behind those that they come from. When a model becomes
-        large, its rows are put in order of their places in space. None keeps the order of the list."""
+    def _ordered(self, listed: DeviceRowList) -> tuple[DeviceArray, NDArray[np.int64] | None]:
+        """The rows of a list in the model's order, and the place there of each row of the list; None if they are the
+        same.
+
+        In a large model new rows stand behind those that they come from. When a model becomes large, its rows are put
+        in order of their places in space.
+        """
         if listed.count <= ORDERED_ROWS:
-            return None
-        sources = listed.rows.get() & ~FRESH
+            return listed.rows, None
+        entries = listed.rows.get()
+        sources = entries & ~FRESH
         if self.parameters.count > ORDERED_ROWS:
             order = beside_parents(sources)
         else:
             order = space_order(self.parameters["means"].get()[sources])
-        return None if (order[1:] > order[:-1]).all() else order
+        return upload(self._device, entries[order]), np.argsort(order)
 
     def _halve(
         self,
         listed: DeviceRowList,
-        places: NDArray[np.int64] | slice,
+        places: NDArray[np.int64] | None,
         halves: Callable[[Mapping[str, Float32]], Mapping[str, Float32]],
         halved: Sequence[str],
     ) -> None:
         """Replace the last rows of a list, which are copies of split Gaussians, with their halves, computed from the
         groups `halved`.
 
-        places: place in the model of each row of the list.
+        places: place in the model of each row of the list. With None, only rows of the halves are copied to the host.
         """
-        count, half = listed.count, listed.halves // 2
-        if isinstance(places, slice):
-            split = {group: self.parameters[group].get_rows(count - half, count) for group in halved}
+        begin, middle = listed.count - listed.halves, listed.count - listed.halves // 2
+        if places is None:
+            split = {group: self.parameters[group].get_rows(middle, listed.count) for group in halved}
             for group, values in halves(split).items():
-                self.parameters[group].set_rows(count - listed.halves, values)
+                self.parameters[group].set_rows(begin, values)
             return
-        split = {group: self.parameters[group].get()[places[count - half :]] for group in halved}
+        split = {group: self.parameters[group].get()[places[middle:]] for group in halved}
         for group, values in halves(split).items():
-            self._set_rows(group, places[count - listed.halves :], values)
+            self._set_rows(group, places[begin:], values)
 
     def _set_rows(self, group: str, rows: NDArray[Any], values: Float32) -> None:
         """Set rows of a parameter group."""
