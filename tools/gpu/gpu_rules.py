@@ -237,6 +237,15 @@ def of_addends(run: Run) -> float:
     return run.wave * run.shown * run.addends / run.boxes.all_pairs
 
 
+ADDENDS = Rule(
+    "for (uint k = 0; k < addends; ++k, slot +=",
+    lambda run: run.boxes.all_pairs,
+    mark=("global", PLAIN_SLOTS.floats),
+    active=of_addends,
+)
+"""The sum of a Gaussian's slots in `project_step`."""
+
+
 _ROWS = "for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {"
 _OVER_TILES = (
     Rule(_ROWS, lambda run: run.boxes.wave_rows),
@@ -380,12 +389,7 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     ),
     "project_step": (
         REFINED,
-        Rule(
-            "for (uint k = 0; k < addends; ++k, slot +=",
-            lambda run: run.boxes.all_pairs,
-            mark=("global", PLAIN_SLOTS.floats),
-            active=of_addends,
-        ),
+        ADDENDS,
         Rule("for (uint k = own; k < whole_floats;", lambda run: _abreast(run, 3 * bands(run) / 4), mark=("global", 4)),
         Rule("for (uint k = whole_floats + me;", never),  # only for the last row
         Rule("for (uint k = any ?", lambda run: 3 * bands(run), mark=("shared", 1)),

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from gpu_rules import BEFORE_PAIRS, REFINED, Rounds, Rule, bands, group_sum, never, of_addends
+from gpu_rules import ADDENDS, BEFORE_PAIRS, REFINED, Rounds, Rule, bands, group_sum, never
 from gpu_run import BLOCKS, Run
 
 from clsplat.layouts.columns import PLAIN_SLOTS
@@ -85,12 +85,7 @@ MEASURED: dict[str, dict[str, tuple[Rule, ...]]] = {
         ),
         "project_step": (
             REFINED,
-            Rule(
-                "for (uint k = 0; k < addends; ++k, slot +=",
-                lambda run: run.boxes.all_pairs,
-                mark=("global", PLAIN_SLOTS.floats),
-                active=of_addends,
-            ),
+            ADDENDS,
             _stepped("means", 3),
             _stepped("quaternions", 4),
             _stepped("log_scales", 3),
