@@ -19,7 +19,7 @@ from clsplat.layouts.columns import CHUNK_ROWS
 _HALF_ULP = 2.0**-24
 """Largest rounding error of a float32, relative to its value."""
 _ROUNDING = 1e-6
-"""Relative growth, by float32 rounding, of what a step of Adam keeps of a moment: eight roundings and more."""
+"""Relative slack of the root of r, for the rounding of a step's moments. It is more than eight roundings of float32."""
 _SLACK = 1e-3
 """Relative slack of the bounds. It covers the rounding of a step, and second moments that underflow."""
 _LEAST_EPSILON = 1e-15
@@ -160,7 +160,7 @@ def hidden_path(config: OptimiserConfig, step: float | None = None) -> float:
 
 
 def _decays(config: OptimiserConfig) -> tuple[float, float, float]:
-    """The decays of the kernel's moments, and the root of r: b1 / sqrt(b2), grown by rounding."""
+    """The decays of the kernel's moments, and the root of r, b1 / sqrt(b2), with its slack."""
     beta1, beta2 = float(np.float32(config.beta1)), float(np.float32(config.beta2))
     root = beta1 / math.sqrt(beta2) * (1 + _ROUNDING) if beta2 > 0 else math.inf
     return beta1, beta2, root

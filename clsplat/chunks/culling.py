@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chunks that a camera may see: all but those of which no row can reach a tile of the picture.
+"""Chunks that a camera may see. A chunk is left out only if none of its rows can reach a tile of the picture.
 
-The bounds are of what kernels/project.cl and project_rays.cl compute, so a chunk is left out only if they would count
-no tile for each of its rows. Opacities count as 1, and rotations of Gaussians as unknown.
+Rows are bounded as kernels/project.cl and project_rays.cl compute them: these kernels would count no tile for any row
+of a chunk that is left out. Opacities count as 1, and rotations of Gaussians as unknown.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ kernels do so from 0.999."""
 
 @dataclass(frozen=True, eq=False)
 class _PictureBorders:
-    """A picture's borders, and the limits of what its camera shows.
+    """Borders of a picture, and limits of depth.
 
     reach: standard deviations at which a Gaussian ends.
     stretch: the most by which the camera's matrix makes a length longer: more than 1 if it is not quite a rotation.

@@ -167,10 +167,10 @@ class FramePipeline:
         return drawn
 
     def draw_deep(self, bins: int, frame: FrameRequest) -> tuple[DrawDeep, Convert, Callable[[Camera], int]]:
-        """Prepare a deep frame, like `draw` a flat one.
+        """Prepare a deep frame, as `draw` prepares a flat one.
 
-        Returns the function that renders it, the function that converts its colours to those of the file, and a
-        function from a camera to the number of rows of a strip.
+        Returns three functions: one renders the frame, one converts its colours to the file's colour space, and one
+        gives the number of rows of a strip for a camera.
         """
         sampling, colours, device = self._sampling(frame), self.colours, self._renderer.device
         space = colours.light if self._in_light(frame) else colours.model

@@ -337,7 +337,7 @@ def _of_prototypes() -> Any:
 
 
 def _of_classes() -> Any:
-    """USD predicate for the prims of `_of_prototypes`, and for those of classes, which are never drawn."""
+    """USD predicate like `_of_prototypes`, but also for prims of classes, which are never drawn."""
     from pxr import Usd
 
     return Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)

@@ -17,12 +17,12 @@ CLUSTER_VIEWS = 16
 """Maximum number of views in a cluster."""
 CLUSTERS_AT_ONCE = 4
 """Number of clusters whose views take turns. One after another would be nearer, but costs 0.3 dB on bonsai: the model
-then fits the cluster of the last steps at the expense of the others (docs/decisions/0051)."""
+then fits the cluster of the last steps at the expense of the others (docs/decisions/0050)."""
 GAZE_UNITS = 1.5
 """Distance, in length units, from a camera to the point on its viewing axis that stands for the view.
 
 A length unit is 1.4 times the median depth of what photographs look at, or less. With about this distance the views of
-a cluster have the most Gaussians in common (docs/decisions/0051).
+a cluster have the most Gaussians in common (docs/decisions/0050).
 """
 POINT_STEP = 2.0**-16
 """Points are rounded to multiples of this, in length units. So cameras in a row or in one place stay level with each
