@@ -1,10 +1,10 @@
 // Bounds of a model's chunks: the box of a chunk's means, and its largest scale.
 //
-// Owner: A group owns a chunk. Each item takes every ITEMS-th row; the first item then combines their bounds.
+// Owner: A group owns a chunk. Each item takes every ITEMS-th row; the first BOUNDS items then combine what all found.
 // Launch: Groups of ITEMS items, one for each entry of `chunks`.
-// Buffers: `chunks`: numbers of chunks; means, log_scales (model_rows, 3) -> bounds, 8 floats for each entry: the least
-//   and the greatest coordinates of the means, the greatest log scale, and 0. NaN counts as no value, because no view
-//   shows a Gaussian that has one. A chunk without values has an empty box, from INFINITY to -INFINITY.
+// Buffers: `chunks`: numbers of chunks; means, log_scales (model_rows, 3) -> bounds (entries, BOUNDS): least and
+//   greatest coordinates of the means, and the greatest log scale. NaN counts as no value, because no view shows a
+//   Gaussian that has one. A chunk without values has an empty box, from INFINITY to -INFINITY.
 // Equations: none.
 #include "shared/math.h"
 
@@ -33,11 +33,9 @@ __kernel void bounds(__global const uint *chunks, const uint model_rows, __globa
     float one = by_item[me * ITEMS];
     for (uint i = 1; i < ITEMS; ++i)
       one = me < 3 ? fmin(one, by_item[me * ITEMS + i]) : fmax(one, by_item[me * ITEMS + i]);
-    bounds[8 * (size_t)place + me] = one;
+    bounds[BOUNDS * (size_t)place + me] = one;
   }
-  if (me == BOUNDS) bounds[8 * (size_t)place + BOUNDS] = 0.0f;
 #else
-  for (int k = 0; k < BOUNDS; ++k) bounds[8 * (size_t)place + k] = found[k];
-  bounds[8 * (size_t)place + BOUNDS] = 0.0f;
+  for (int k = 0; k < BOUNDS; ++k) bounds[BOUNDS * (size_t)place + k] = found[k];
 #endif
 }

@@ -198,33 +198,32 @@ class Rasterizer:
         self,
         gaussians: AnyGaussians,
         camera: Camera,
-        background: NDArray[np.float32] | DeviceArray,
+        background: NDArray[np.float32] | DeviceArray | tuple[DeviceArray, DeviceArray],
         *,
         backward: bool = True,
         room: PairCapacity | None = None,
         thinning: Thinning | None = None,
         nearness: bool = False,
-        sent: tuple[DeviceArray, DeviceArray] | None = None,
         chunks: ChunkList | None = None,
     ) -> ForwardPass:
         """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2).
 
-        background: (3,) float32, on the host or the device.
+        background: (3,) float32, on the host or the device, or what `send` or `keep` of camera and background returned.
         backward: True if a gradient will follow. If False, the work that only a gradient needs is left out.
         room: capacity with which to run without waiting for the number of pairs. If there are more pairs, the pass has
         no effect (docs/decisions/0025-launch-by-capacity.md). None counts the pairs first.
         thinning: random dropout of the model's Gaussians in this pass.
         nearness: like `nearness` of `blend`.
-        sent: result of `send` or `keep`, if camera and background are already on the device.
         chunks: the only chunks of the model that may be in view; None takes the whole model.
         """
         device, work = self.device_of(camera), self.work
-        camera_array, background = sent or self.send(camera, background)
+        sent = background if isinstance(background, tuple) else self.send(camera, background)
+        camera_array, colours = sent
         by_append = room is not None and self._appends(device, room, tiles_of(camera))
 
         def make() -> tuple[Projected, tuple[Band, ...], ListedBand, Blended, tuple[int, ...]]:
             projected = project(device, work, gaussians, camera, camera_array, thinning, chunks)
-            inputs = ImageInputs(projected.splats, background, camera.width, camera.height, camera_array)
+            inputs = ImageInputs(projected.splats, colours, camera.width, camera.height, camera_array)
             if by_append:
                 assert room is not None
                 numbers = (self.readback, room.pairs, self._host(room.turn))
@@ -247,12 +246,12 @@ class Rasterizer:
             return projected, bands, listed, blended, counted.refused
 
         if room is None:
-            return ForwardPass(camera, camera_array, background, *make())
+            return ForwardPass(camera, camera_array, colours, *make())
         size, how = (camera.width, camera.height), (backward, thinning is not None, nearness)
         rows = None if chunks is None else chunks.key
-        key = (self.readback, device, background, *size, *how, room.pairs, room.turn, by_append, rows)
+        key = (self.readback, device, colours, *size, *how, room.pairs, room.turn, by_append, rows)
         made = work.replayed(gaussians, key, make, thinning_numbers(thinning), (camera_array,))
-        return ForwardPass(camera, camera_array, background, *made)
+        return ForwardPass(camera, camera_array, colours, *made)
 
     def _appends(self, device: Device, room: PairCapacity, tiles: tuple[int, int]) -> bool:
         """True if the lists of a pass by capacity are made by append."""

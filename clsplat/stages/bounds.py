@@ -16,8 +16,8 @@ from clsplat.device.profile import stage
 from clsplat.layouts.columns import CHUNK_ROWS, NO_CHUNK
 from clsplat.stages.device_gaussians import DeviceGaussians
 
-_BOUNDS_FLOATS = 8
-"""Floats for each chunk's bounds: least and greatest coordinates, greatest log scale, and 0."""
+BOUNDS_FLOATS = 7
+"""Floats for each chunk's bounds: least and greatest coordinates of the means, greatest log scale."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,10 +47,6 @@ class ChunkList:
         return self.numbers, self.model_rows
 
 
-CHUNKS_DEFINE: dict[str, object] = {"CHUNKS": True}
-"""Define of kernels that run over a `ChunkList`."""
-
-
 def padded_chunks(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
     """The numbers of chunks, then NO_CHUNK, in one of few lengths, so that arrays and command buffers are reused.
 
@@ -73,13 +69,13 @@ def send_chunks(work: Workspace, name: str, numbers: NDArray[np.uint32], model_r
 
 @stage("bounds")
 def bounds(device: Device, work: Workspace, gaussians: DeviceGaussians, chunks: ChunkList) -> Float32:
-    """The bounds (chunks, 7) of these chunks: least and greatest coordinates of the means, greatest log scale.
+    """The bounds (chunks, BOUNDS_FLOATS) of these chunks.
 
     Bounds of NO_CHUNK are empty: from infinity to -infinity.
     """
     count = chunks.numbers.shape[0]
     items = 1 if device.shape.lanes > 1 or device.max_group < DEFAULT_GROUP_ITEMS else DEFAULT_GROUP_ITEMS
-    found = work.array("chunk_bounds", (count, _BOUNDS_FLOATS))
+    found = work.array("chunk_bounds", (count, BOUNDS_FLOATS))
     kernel = device.kernels("bounds", {"ITEMS": items}).bounds
     launch_groups(device, kernel, count, items, *chunks.arguments, gaussians["means"], gaussians["log_scales"], found)
-    return found.get()[:, :-1]
+    return found.get()

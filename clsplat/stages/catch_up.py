@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from math import prod
 
 import numpy as np
@@ -33,6 +34,23 @@ def step_table(steps: Iterable[AdamStep]) -> Float32:
     return np.array([step_numbers(step, NO_EXPLORATION) for step in steps], np.float32).reshape(-1, _TABLE_NUMBERS)
 
 
+@dataclass(frozen=True, eq=False)
+class StepTable:
+    """Steps of Adam in sequence.
+
+    numbers: (steps, numbers), `step_table`.
+    first_step: number of the first one.
+    """
+
+    numbers: DeviceArray
+    first_step: int
+
+    @property
+    def last_step(self) -> int:
+        """Number of the last step."""
+        return self.first_step + self.numbers.shape[0] - 1
+
+
 @stage("catch_up", catch_up=18)
 def catch_up(
     device: Device,
@@ -42,8 +60,7 @@ def catch_up(
     last: DeviceArray,
     caught: DeviceArray,
     step: int,
-    table: DeviceArray,
-    first_step: int,
+    table: StepTable,
     readback: DeviceArray,
 ) -> None:
     """Take the missed steps of these chunks up to step `step`, with gradient zero, to the bits of steps over all rows.
@@ -54,11 +71,11 @@ def catch_up(
     last: (entries of chunks,) uint32, the last step that each chunk has taken with its gradients.
     caught: (chunks of the model,) uint32, the last step up to which each has been caught up; `step` is written for
     these chunks. So a second call for one step, which is repeated, changes nothing.
-    table: (steps, numbers), `step_table` of step number `first_step` and those after it. It has all missed steps.
+    table: has all missed steps.
     readback: (READBACK_SIZE,) uint32. Its last four entries count refused updates of elements, one for each step.
     """
-    if step >= first_step + table.shape[0]:
-        raise ValueError(f"table: has steps {first_step} to {first_step + table.shape[0] - 1}, expected up to {step}")
+    if step > table.last_step:
+        raise ValueError(f"table: has steps {table.first_step} to {table.last_step}, expected up to {step}")
     entries, coefficients = chunks.numbers.shape[0], model[0].coefficients
     sh_width = 3 * (coefficients - 1)
     if device.shape.lanes > 1:
@@ -78,8 +95,8 @@ def catch_up(
         last,
         caught,
         np.uint32(step),
-        table,
-        np.uint32(first_step),
+        table.numbers,
+        np.uint32(table.first_step),
         np.uint32(sh_width),
         *(config.beta1, config.beta2, config.epsilon),
         *(PARAMETER_GROUPS["means"].limit ** 2, PARAMETER_GROUPS["sh_dc"].limit ** 2),

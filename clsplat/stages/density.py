@@ -19,7 +19,6 @@ from clsplat.device.profile import stage
 from clsplat.gaussians import group_shapes
 from clsplat.layouts.columns import SPLAT
 from clsplat.optimisation.density_rules import FRESH, MarkRules
-from clsplat.stages.bounds import CHUNKS_DEFINE, ChunkList
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostArray, HostGaussians, parts
 from clsplat.stages.project import Projected, Screen
 from clsplat.stages.scan import scan
@@ -116,47 +115,34 @@ def add_statistics(
     camera: Camera,
     projected: Projected,
     screen: Screen,
-    chunks: ChunkList | None = None,
 ) -> None:
     """Add a view to the statistics. Gradient norms are with respect to means in NDC, as is the paper's threshold.
 
-    chunks: the chunks that were projected; None if the view has all rows of the statistics.
+    projected: all rows of the statistics, or those of its `chunks`.
     """
     n = projected.tile_counts.shape[0]
     rays = camera.model.along_rays
-    kernels = device.kernels("density", {**({"RAYS": True} if rays else {}), **_chunks_define(chunks)})
+    kernels = device.kernels("density", projected.chunk_defines | ({"RAYS": True} if rays else {}))
     to_ndc = (0.5 * camera.width, 0.5 * camera.height)
     view, sums = (projected.tile_counts, screen.gradients), (statistics.gradient_sums, statistics.seen)
     sizes = (*to_ndc, *(LaunchParameter(number) for number in statistics_numbers(camera)))
-    last = () if chunks is None else chunks.arguments
-    launch_items(
-        device, kernels.density_statistics, n, n, *sizes, *view, projected.splats, *sums, statistics.radii, *last
-    )
-
-
-def _chunks_define(chunks: ChunkList | None) -> dict[str, object]:
-    return {} if chunks is None else CHUNKS_DEFINE
+    arrays = (*view, projected.splats, *sums, statistics.radii)
+    launch_items(device, kernels.density_statistics, n, n, *sizes, *arrays, *projected.chunk_arguments)
 
 
 @stage("statistics", contribution_statistics=2)
 def add_contributions(
-    device: Device,
-    statistics: DensityStatistics,
-    projected: Projected,
-    contributions: DeviceArray,
-    area: float,
-    chunks: ChunkList | None = None,
+    device: Device, statistics: DensityStatistics, projected: Projected, contributions: DeviceArray, area: float
 ) -> None:
     """Add the contributions (n,) that the Gaussians make to a view to the statistics of the current epoch.
 
+    projected: as for `add_statistics`.
     area: number of full-resolution pixels per pixel of a reduced image; contributions are multiplied by it.
-    chunks: as for `add_statistics`.
     """
     n = projected.tile_counts.shape[0]
-    kernel = device.kernels("density", _chunks_define(chunks)).contribution_statistics
-    view, sums = (projected.tile_counts, contributions), (statistics.current_totals, statistics.current_largest)
-    last = () if chunks is None else chunks.arguments
-    launch_items(device, kernel, n, n, LaunchParameter(area), *view, *sums, *last)
+    kernel, view = device.kernels("density", projected.chunk_defines).contribution_statistics, projected.tile_counts
+    arrays = (view, contributions, statistics.current_totals, statistics.current_largest)
+    launch_items(device, kernel, n, n, LaunchParameter(area), *arrays, *projected.chunk_arguments)
 
 
 @dataclass(frozen=True, eq=False)

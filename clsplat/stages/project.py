@@ -20,7 +20,7 @@ from clsplat.layouts.columns import PLAIN_SLOTS, SPLAT, SlotFields
 from clsplat.optimisation.dropout import Thinning
 from clsplat.optimisation.step_noise import NO_EXPLORATION, Exploration
 from clsplat.stages.adam import AdamStep
-from clsplat.stages.bounds import CHUNKS_DEFINE, ChunkList
+from clsplat.stages.bounds import ChunkList
 from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
 
@@ -48,11 +48,26 @@ class Projected:
     splats: (n, SPLAT).
     tile_counts: (n), 0 where culled.
     shown: with culling switched off, (n), 0 for Gaussians without a splat. Otherwise None: their tile_counts are 0.
+    chunks: the chunks of the model whose Gaussians were projected; None for the whole model.
     """
 
     splats: DeviceArray
     tile_counts: DeviceArray
     shown: DeviceArray | None = None
+    chunks: ChunkList | None = None
+
+    @property
+    def chunk_defines(self) -> dict[str, object]:
+        """Defines of kernels that read arrays of the model by these rows."""
+        return {} if self.chunks is None else {"CHUNKS": True}
+
+    @property
+    def chunk_arguments(self) -> tuple[object, ...]:
+        """The last arguments of such kernels, CHUNK_PARAMETERS of `kernels/shared/chunks.h`.
+
+        The list is a buffer and not an array, so that the profile takes the arrays before it as those that are updated.
+        """
+        return () if self.chunks is None else (self.chunks.numbers.buffer, self.chunks.model_rows)
 
     def rows(self, start: int, stop: int) -> Projected:
         """The projected Gaussians [start, stop)."""
@@ -88,18 +103,17 @@ def project(
     tile_counts = work.array("tile_counts", (n,), np.uint32)
     rays = device.switched("RAYS")
     keeps_culled = not rays and device.switched("NO_FRUSTUM_CULL")
-    projected = Projected(splats, tile_counts, work.array("shown", (n,), np.uint32) if keeps_culled else None)
+    shown = work.array("shown", (n,), np.uint32) if keeps_culled else None
+    projected = Projected(splats, tile_counts, shown, chunks)
     for start, stop, (part,) in parts(work, gaussians):
         out = projected if chunks is not None else projected.rows(start, stop)
-        defines: dict[str, object] = {"SH_DEGREES": True} if "sh_degrees" in part.arrays else {}
+        defines = {**out.chunk_defines, **({"SH_DEGREES": True} if "sh_degrees" in part.arrays else {})}
         if part["sh_rest"].dtype == np.float16:
             defines["SH_HALF"] = True
         thinned: tuple[float, ...] = ()
         if thinning is not None:
             defines["THINNED"] = True
             thinned = (start, *thinning_numbers(thinning))
-        if chunks is not None:
-            defines |= CHUNKS_DEFINE
         rows = out.tile_counts.shape[0]
         if rays:
             kernel, lanes = device.kernels("project_rays", {"LANES": 1, **defines}).project_rays, 1
@@ -119,7 +133,7 @@ def project(
             *(() if out.shown is None else (out.shown,)),
             *([part["sh_degrees"]] if "sh_degrees" in part.arrays else []),
             *thinned,
-            *(() if chunks is None else chunks.arguments),
+            *out.chunk_arguments,
         )
     return projected
 
@@ -237,17 +251,15 @@ def project_step(
     readback: DeviceArray,
     *,
     explore: Exploration = NO_EXPLORATION,
-    chunks: ChunkList | None = None,
 ) -> None:
     """`project_grad` and `stages.adam.adam` in one kernel, which keeps no gradients in memory.
 
-    model: parameters, first and second moments.
-    chunks: the chunks that were projected; no other Gaussian takes the step.
+    model: parameters, first and second moments. If only some chunks were projected, no other Gaussian takes the step.
     The other arguments are passed on to the two functions.
     """
     parameters, config = model[0], step.config
-    n = parameters.count if chunks is None else chunks.rows
-    defines = {**_defines(parameters, slots, sh_rest=step.updates_sh_rest), "ADAM": True}
+    n = projected.tile_counts.shape[0]
+    defines = {**_defines(parameters, slots, sh_rest=step.updates_sh_rest), "ADAM": True, **projected.chunk_defines}
     if config.sparse:
         defines["SPARSE"] = True
     if config.late:
@@ -267,10 +279,10 @@ def project_step(
         *(PARAMETER_GROUPS["means"].limit ** 2, PARAMETER_GROUPS["sh_dc"].limit ** 2),
         readback.buffer,  # not the array, so that the profile counts no traffic: it is written only on a fault
         *(arrays[group] for arrays in model for group in PARAMETER_GROUPS),
-        *(() if chunks is None else chunks.arguments),
+        *projected.chunk_arguments,
     )
     build = _build(device)
-    defines |= {**build.defines, **({} if chunks is None else CHUNKS_DEFINE)}
+    defines |= build.defines
     if build.lanes > 1:
         kernel = device.kernels("project_grad", {"ROWS": CPU_STEP_ROWS, **defines}).project_step
         launch_groups(device, kernel, -(-n // CPU_STEP_ROWS), 1, *arguments)

@@ -64,7 +64,6 @@ class Trainer:
     pending: steps that have been launched but may have to be repeated.
     mark: state that `step_back` restores; None once the arrays no longer have that state.
     further: devices in addition to the model's.
-    planner: planner of the memory.
     loader: loader of the steps' photographs and cameras.
     order: order of the views in each pass.
     background: background of the last view.
@@ -181,8 +180,7 @@ class Trainer:
         views = self.views_ahead
         self.position.step += views
         self._raise_sh_degree()
-        if self._active:
-            self._prepare_components(views)
+        self._prepare_components(views)
         needs, factor = self.strategy.needs(self.step), self.sizes.factor(self.step)
         inputs, step = self._inputs(views), self._gradient_step(needs)
         self.loader.read_ahead(self.position)
@@ -206,9 +204,7 @@ class Trainer:
     def _prepare_components(self, views: int) -> None:
         """Let the components do the work that is due before a step of `views` views."""
         if due := [component for component in self._active if component.is_due(self.step, views)]:
-            if any(component.reads_all_rows for component in due):
-                self.catch_up()
-            self.settle()
+            (self.catch_up if any(component.reads_all_rows for component in due) else self.settle)()
             for component in due:
                 component.before_step(self.parameters)
 
@@ -467,11 +463,9 @@ class Trainer:
         The whole model is finite, unless `monitor.retries.lost`.
         """
         self.repair(look=True)
-        self.catch_up_exactly()
         arrays = self._arrays()
-        if (
-            repair := self.monitor.examine_all(arrays)
-        ) is not None:  # finds non-finite values in Gaussians that no step has visited
+        repair = self.monitor.examine_all(arrays)  # finds non-finite values in Gaussians that no step has visited
+        if repair is not None:
             self._apply(repair)
             arrays = self._arrays()
         return arrays, self.position.state(self.monitor.retries)

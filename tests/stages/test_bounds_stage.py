@@ -133,12 +133,12 @@ def test_a_step_over_the_chunks_in_view(shaped_device: Device, optimiser: Optimi
         readback = upload(shaped_device, np.zeros(len(READBACK), np.uint32))
         step = AdamStep(optimiser, 6, {group: 10.0**-index for index, group in enumerate(PARAMETER_GROUPS, 1)})
         view = (frame.camera_array, frame.projected, slots, screen, readback)
-        project_step(shaped_device, step, model, *view, chunks=chunks)
+        project_step(shaped_device, step, model, *view)
         statistics = new_statistics(shaped_device, len(gaussians), contributions=True)
         statistics.current_totals.fill(1.0)
         statistics.current_largest.fill(0.0)
-        add_statistics(shaped_device, statistics, camera, frame.projected, screen, chunks)
-        add_contributions(shaped_device, statistics, frame.projected, screen.contributions, 2.0, chunks)
+        add_statistics(shaped_device, statistics, camera, frame.projected, screen)
+        add_contributions(shaped_device, statistics, frame.projected, screen.contributions, 2.0)
         arrays = {f"{k} {group}": each[group].get() for k, each in enumerate(model) for group in PARAMETER_GROUPS}
         arrays |= {name: array.get() for name, array in statistics.named().items()}
         results.append({**arrays, "image": frame.blended.image.get(), "readback": readback.get()})

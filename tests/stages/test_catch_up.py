@@ -21,7 +21,7 @@ from clsplat.selftest.case import fresh_readback
 from clsplat.selftest.cases.steps import uploaded_groups
 from clsplat.stages.adam import AdamStep, adam
 from clsplat.stages.bounds import ChunkList
-from clsplat.stages.catch_up import catch_up, step_table
+from clsplat.stages.catch_up import StepTable, catch_up, step_table
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import DeviceGaussians
 from clsplat.stages.project import Projected, Screen, Slots, project_step
@@ -105,8 +105,8 @@ def caught_up(
     numbers = upload(device, np.array([*last, NO_CHUNK, NO_CHUNK], np.uint32))
     caught = upload(device, np.zeros(-(-model[0].count // CHUNK_ROWS), np.uint32))
     given = (upload(device, np.array([*last.values(), 0, 0], np.uint32)), caught, steps[-1].number)
-    table = (upload(device, step_table(steps)), steps[0].number)
-    catch_up(device, steps[0].config, model, ChunkList(numbers, model[0].count), *given, *table, readback)
+    table = StepTable(upload(device, step_table(steps)), steps[0].number)
+    catch_up(device, steps[0].config, model, ChunkList(numbers, model[0].count), *given, table, readback)
     return read(model), readback.get()
 
 
@@ -270,7 +270,8 @@ def test_a_table_that_ends_too_early_is_refused(default_device: Device) -> None:
         upload(default_device, step_table(steps_of(DENSE, 1, 4))),
     )
     with pytest.raises(ValueError, match="has steps 1 to 4, expected up to 5"):
-        catch_up(default_device, DENSE, model, chunks, last, last, 5, table, 1, fresh_readback(default_device))
+        steps = (last, last, 5, StepTable(table, 1))
+        catch_up(default_device, DENSE, model, chunks, *steps, fresh_readback(default_device))
 
 
 @pytest.mark.slow_in_groups

@@ -23,7 +23,7 @@ from clsplat.selftest.harness import Array, CaseBench
 from clsplat.selftest.scenes import evenly
 from clsplat.stages.adam import AdamStep
 from clsplat.stages.bounds import ChunkList, bounds, padded_chunks
-from clsplat.stages.catch_up import catch_up, step_table
+from clsplat.stages.catch_up import StepTable, catch_up, step_table
 from clsplat.stages.density import add_contributions, add_statistics, new_statistics
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, host_gaussians, upload_gaussians
@@ -166,16 +166,16 @@ def _launch_step(device: Device, work: Workspace, given: Inputs) -> Read:
     by_row = upload(device, contributions)
     past = counts[len(rows) :].copy()
     counts[len(rows) :] = 0  # if a broken kernel shows rows past the model, statistics would be written past its end
-    some = Projected(some.splats, upload(device, counts))
+    some = Projected(some.splats, upload(device, counts), chunks=chunks)
     screen = Screen(upload(device, np.zeros((chunks.rows, 2), np.float32)), by_row)
     view = (camera_array, some, _slots(device, some, given.slots[rows]), screen)
     step = AdamStep(OptimiserConfig(sparse=given.sparse), STEP, ADAM_RATES)
     model = (held, *uploaded_groups(device, given.moments))
-    project_step(device, step, model, *view, fresh_readback(device), chunks=chunks)
+    project_step(device, step, model, *view, fresh_readback(device))
     statistics = new_statistics(device, held.count, contributions=True)
     statistics.load({name: np.full(held.count, BEGIN, np.float32) for name in CURRENT})
-    add_statistics(device, statistics, given.camera, some, screen, chunks)
-    add_contributions(device, statistics, some, by_row, AREA, chunks)
+    add_statistics(device, statistics, given.camera, some, screen)
+    add_contributions(device, statistics, some, by_row, AREA)
 
     return lambda: {
         **{name: _flat(each) for name, each in zip(("parameters", *MOMENTS), model, strict=True)},
@@ -294,7 +294,7 @@ def _launch_catch_up(device: Device, _: Workspace, given: Inputs) -> Read:
     table = step_table(AdamStep(config, number, rates) for number, rates in given.rates.items())
     chunks, step = ChunkList(upload(device, numbers), models[0].count), max(given.rates)
     caught = upload(device, np.zeros(-(-models[0].count // CHUNK_ROWS), np.uint32))
-    uploaded = upload(device, last), caught, step, upload(device, table), given.first_step
+    uploaded = upload(device, last), caught, step, StepTable(upload(device, table), given.first_step)
     catch_up(device, config, tuple(models), chunks, *uploaded, readback)
     by_name = dict(zip(given.arrays, models, strict=True))
     return lambda: {

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import TypeVar
 from weakref import ref
 
@@ -26,7 +26,7 @@ from clsplat.stages.noise import noise, noise_numbers
 from clsplat.stages.project import Slots, project_grad, project_step, step_numbers, thinning_numbers
 from clsplat.stages.target import is_photograph, on_device, target
 from clsplat.training.density import StatisticsNeeds
-from clsplat.training.step.inputs import PlacedChunks, StepRows, ViewInputs, ViewRows
+from clsplat.training.step.inputs import StepRows, ViewInputs, ViewRows
 from clsplat.training.step.loss_terms import loss_terms
 
 R = TypeVar("R")
@@ -93,6 +93,11 @@ class GradientStep:
     room: PairCapacity | None = None
     explore: Exploration = NO_EXPLORATION
 
+    @cached_property
+    def thinning(self) -> Thinning | None:
+        """Thinning of the model in the step's pass."""
+        return thinning_of(self.config, self.step)
+
     @property
     def adam_step(self) -> AdamStep:
         """Constants, number and learning rates of Adam's step."""
@@ -117,25 +122,24 @@ class GradientStep:
         place = self.rasterizer.send if self.room is None else self.rasterizer.keep
         sent = place(camera, inputs.background)
         source = on_device(self.rasterizer.work, inputs.photograph)
-        thinning, terms = thinning_of(self.config, self.step), loss_terms(self.config, inputs)
-        chunks = None if inputs.chunks is None else inputs.chunks.prepare(model, self.adam_step)
-        model = model if chunks is None else chunks.model
-        listed = None if chunks is None else chunks.in_model
-        key = self._key(inputs, source, terms, listed)
-        gradient = partial(self._gradient, model[0], inputs, sent, source, thinning, terms, listed)
+        terms = loss_terms(self.config, inputs)
+        placed = None if inputs.chunks is None else inputs.chunks.prepare(model, self.adam_step)
+        model, chunks = (model, None) if placed is None else (placed.model, placed.in_model)
+        key = self._key(inputs, source, terms, chunks)
+        gradient = partial(self._gradient, model[0], inputs, sent, source, terms, chunks)
         if key is None or reads_loss:
             frame, result, slots, own = gradient(probe, reads_loss=reads_loss)
         else:
-            numbers, given = thinning_numbers(thinning), (source, sent[0])
+            numbers, given = thinning_numbers(self.thinning), (source, sent[0])
             frame, result, slots, own = self.replayed(model[0], key, gradient, numbers, given)
             self.device.under_way.append(source.buffer)  # as in `target`
             frame = frame.by(camera, sent[0])
             probe.forward(frame)
             probe.loss(result)
             probe.pair_gradients(slots)
-        self._change(model, inputs, frame, slots, gradients, probe, chunks)
-        if chunks is not None and chunks.finish is not None:
-            chunks.finish()
+        self._change(model, inputs, frame, slots, gradients, probe, None if placed is None else placed.listed)
+        if placed is not None and placed.finish is not None:
+            placed.finish()
         self.learn(inputs, own)
         return result
 
@@ -145,7 +149,6 @@ class GradientStep:
         inputs: ViewInputs,
         sent: tuple[DeviceArray, DeviceArray],
         source: DeviceArray,
-        thinning: Thinning | None,
         terms: Sequence[LossTerm],
         chunks: ChunkList | None,
         probe: StepProbe = NO_PROBE,
@@ -154,8 +157,8 @@ class GradientStep:
     ) -> tuple[ForwardPass, Loss, Slots, Sequence[DeviceArray | None]]:
         """The view's forward pass, its loss, the gradients of its pairs, and those for its parts' own parameters."""
         camera = inputs.camera
-        forward = partial(self.rasterizer.forward, of, camera, sent[1], sent=sent, chunks=chunks)
-        frame = forward(room=self.room, thinning=thinning, nearness=self.fields.nearness)
+        forward = partial(self.rasterizer.forward, of, camera, sent, room=self.room, thinning=self.thinning)
+        frame = forward(nearness=self.fields.nearness, chunks=chunks)
         probe.forward(frame)
         result = self._compare(of, inputs, source, frame, terms)
         if reads_loss:
@@ -232,7 +235,7 @@ class GradientStep:
         slots: Slots,
         gradients: DeviceGaussians | None,
         probe: StepProbe,
-        chunks: PlacedChunks | None,
+        chunks: ChunkList | None,
     ) -> None:
         """Take Adam's step for the model, part by part, or for some of its chunks."""
 
@@ -245,7 +248,7 @@ class GradientStep:
             change()
             return
         step, explore = self.adam_step, self.explore
-        rows = None if chunks is None else chunks.listed.key
+        rows = None if chunks is None else chunks.key
         key = (slots, *map(ref, model[1:]), step.updates_sh_rest, bool(explore.weights), explore.amount != 0, rows)
         numbers = (*step_numbers(step, explore), *noise_numbers(explore), *probe.numbers)
         given = (frame.camera_array,)
@@ -260,7 +263,7 @@ class GradientStep:
         frame: ForwardPass,
         slots: Slots,
         gradients: DeviceGaussians | None,
-        chunks: PlacedChunks | None,
+        chunks: ChunkList | None,
     ) -> StepRows:
         """Rows [start, stop) of the model or of `chunks`, with arrays for their gradients."""
         by_lens = (part.lens_gradients(stop - start) for part in inputs.parts)
@@ -336,8 +339,7 @@ class GradientStep:
             adam(self.device, step, *models, rows.projected.tile_counts, readback)
         else:
             view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
-            chunks = None if rows.chunks is None else rows.chunks.in_model
-            project_step(rows.device, step, rows.model, *view, explore=self.explore, chunks=chunks)
+            project_step(rows.device, step, rows.model, *view, explore=self.explore)
         noise(self.device, self.explore, rows.parameters, rows.start, readback)
 
 

@@ -84,14 +84,14 @@ class ViewRows:
     projected: projection of these rows in the step's view.
     screen: their screen-space gradients. The kernel that changes the rows may write them, so that they are undefined
         before it.
-    chunks: the chunks that were projected. Then [start, stop) are rows of these.
+    chunks: the model's chunks that were projected. Then [start, stop) are rows of these.
     """
 
     start: int
     stop: int
     projected: Projected
     screen: Screen
-    chunks: PlacedChunks | None = field(default=None, kw_only=True)
+    chunks: ChunkList | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)

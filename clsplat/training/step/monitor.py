@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from clsplat.device.launch import only_tried
 from clsplat.rendering.rasterizer import ForwardPass
@@ -71,8 +71,7 @@ class StepMonitor(StepProbe):
         step, parameters = self.step, rows.parameters
         size = (rows.stop - rows.start, parameters.coefficients)
         build = (step.adam_step.updates_sh_rest, step.fields, rows.slots.first_slots is None, self.needs.gradients)
-        in_chunks = rows.chunks is not None and rows.chunks.in_model is not None
-        key = (*size, *build, in_chunks, *self.inputs.camera.model.defines.items())
+        key = (*size, *build, rows.projected.chunks is None, *self.inputs.camera.model.defines.items())
         if key not in self.tried:
             with only_tried(step.device), only_tried(step.rasterizer.device), only_tried(rows.device):
                 step.change(rows, self.inputs)
@@ -87,9 +86,12 @@ class StepMonitor(StepProbe):
     def _add_rows(self, rows: ViewRows) -> None:
         """Add the view to the statistics that density control needs of these rows."""
         device, camera, screen = self.step.device, self.inputs.camera, rows.screen
-        chunks = None if rows.chunks is None else rows.chunks.listed
-        statistics = self.statistics.rows(rows.start, rows.stop) if chunks is None else self.statistics
+        statistics, projected = self.statistics, rows.projected
+        if rows.chunks is None:
+            statistics = statistics.rows(rows.start, rows.stop)
+        else:  # of a streamed model only these chunks were projected, but statistics are of the whole model
+            projected = replace(projected, chunks=rows.chunks)
         if self.needs.gradients:
-            add_statistics(device, statistics, camera, rows.projected, screen, chunks)
+            add_statistics(device, statistics, camera, projected, screen)
         if screen.contributions is not None and statistics.current_totals is not None:
-            add_contributions(device, statistics, rows.projected, screen.contributions, self.inputs.area, chunks)
+            add_contributions(device, statistics, projected, screen.contributions, self.inputs.area)

@@ -22,8 +22,8 @@ from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.optimisation.dropout import thinning_of
 from clsplat.rendering.rasterizer import MAX_COUNTED_PASSES, Rasterizer
 from clsplat.stages.adam import AdamStep
-from clsplat.stages.bounds import bounds, send_chunks
-from clsplat.stages.catch_up import catch_up, step_table
+from clsplat.stages.bounds import BOUNDS_FLOATS, bounds, send_chunks
+from clsplat.stages.catch_up import StepTable, catch_up, step_table
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians, upload_chunks
 from clsplat.training.learning_rates import largest_rates
 from clsplat.training.step.component import Component, Named
@@ -79,24 +79,24 @@ class VisibleChunks(Component):
     def _begin(self, count: int, step: int) -> None:
         """Forget all bounds, of a model of `count` Gaussians that have all taken step number `step`."""
         chunks = -(-count // CHUNK_ROWS)
-        self._count, self._found = count, np.full((chunks, 7), np.nan)  # bounds that are not finite leave nothing out
+        self._count = count
+        self._found = np.full((chunks, BOUNDS_FLOATS), np.nan)  # bounds that are not finite leave nothing out
         self._unmeasured = np.ones(chunks, np.bool_)
         self._means_moved, self._scales_moved = np.zeros(chunks), np.zeros(chunks)
         self._since: int | None = None
         """Steps since the last measurement; None if there is none."""
-        self._last = np.full(chunks, step, np.uint32)
         most = 2 * (MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)  # twice, so that the table is seldom moved
         self._table = np.zeros((most, 2 + len(PARAMETER_GROUPS)), np.float32)
         """The steps from `_first_step` on, of which chunks may have missed some (`stages.catch_up.step_table`)."""
-        self._begin_table(step)
+        self._begin_table(step, chunks)
         self._before: dict[int, NDArray[np.uint32]] = {}
         """By number, `_last` as it was before the latest steps, which may be repeated."""
         self._caught: DeviceArray | None = None
 
-    def _begin_table(self, step: int) -> None:
-        """Begin with the next step, as all chunks have taken or take step number `step`."""
+    def _begin_table(self, step: int, chunks: int) -> None:
+        """Begin with the next step, as all chunks have taken step number `step`."""
         self.step, self._first_step = step, step + 1
-        self._last = np.full(self._last.shape, step, np.uint32)
+        self._last = np.full(chunks, step, np.uint32)
 
     @property
     def on(self) -> bool:
@@ -130,7 +130,7 @@ class VisibleChunks(Component):
         self._means_moved[numbers] = self._scales_moved[numbers] = 0.0
 
     def _measured(self, gaussians: AnyGaussians, numbers: NDArray[np.uint32]) -> Float32:
-        """Bounds (chunks, 7) of these chunks."""
+        """Bounds (chunks, BOUNDS_FLOATS) of these chunks."""
         if isinstance(gaussians, DeviceGaussians):
             work = self._rasterizer.work
             chunks = send_chunks(work, "chunks", numbers, gaussians.count)
@@ -146,25 +146,28 @@ class VisibleChunks(Component):
             return inputs
         (of_view,) = inputs
         if self.step < step - 1:  # the steps between ran over all rows of a model that was small or streamed
-            self._begin_table(step - 1)
-        shown = self._shown(of_view, step)
+            self._begin_table(step - 1, len(self._last))
+        hidden = self._hidden_movement(step)
+        shown = self._shown(of_view, step, hidden)
         whole = int(np.count_nonzero(shown)) > MAX_SHARE_IN_VIEW * len(shown)
         self._since += 1
         if whole:
             shown[:] = True
-        self._note_movement(shown, step, takes_step=True)
+        self._note_movement(shown, hidden)
+        rates = largest_rates(self._config, range(step, step + 1), self._unit)
+        self._means_moved[shown] += self._step_limit * rates["means"]
+        self._scales_moved[shown] += self._step_limit * rates["log_scales"]
         numbers = np.flatnonzero(shown).astype(np.uint32)
         missed = self._missed(shown, step - 1)
         return [replace(of_view, chunks=_ChunksInView(self, numbers, missed, self._found, whole=whole))]
 
-    def _shown(self, of_view: ViewInputs, step: int) -> Bool:
-        """The chunks that the view may show."""
+    def _shown(self, of_view: ViewInputs, step: int, hidden: tuple[Float64, Float64]) -> Bool:
+        """The chunks that the view may show. hidden: result of `_hidden_movement`."""
         thinning = thinning_of(self._config, step)
         factor = 1.0 if thinning is None else thinning.factor
         measured = ChunkBounds(self._found[:, :3], self._found[:, 3:6], self._found[:, 6])
-        means, scales = self._hidden_movement(step)
-        moved = [self._means_moved + means, self._scales_moved + scales]
-        now = measured.widened(moved[0], moved[1], MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
+        moved = (self._means_moved + hidden[0], self._scales_moved + hidden[1])
+        now = measured.widened(*moved, MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
         return visible(now, of_view.camera, self._config.rasterizer, factor)
 
     def _hidden_movement(self, step: int) -> tuple[Float64, Float64]:
@@ -175,14 +178,10 @@ class VisibleChunks(Component):
         path = np.minimum(self._step_limit * (step - 1 - self._last), self._hidden_limit)
         return path * rates["means"], path * rates["log_scales"]
 
-    def _note_movement(self, chunks: Bool, step: int, *, takes_step: bool) -> None:
-        """Note that these chunks take the steps before number `step` that they have missed, and, if `takes_step`, that
-        step too."""
-        means, scales = self._hidden_movement(step)
-        own = largest_rates(self._config, range(step, step + 1), self._unit)
-        path = self._step_limit if takes_step else 0.0
-        self._means_moved[chunks] += means[chunks] + path * own["means"]
-        self._scales_moved[chunks] += scales[chunks] + path * own["log_scales"]
+    def _note_movement(self, chunks: Bool, hidden: tuple[Float64, Float64]) -> None:
+        """Note that these chunks take the steps that they have missed. hidden: result of `_hidden_movement`."""
+        self._means_moved[chunks] += hidden[0][chunks]
+        self._scales_moved[chunks] += hidden[1][chunks]
         self._unmeasured |= chunks
 
     def _missed(self, chunks: Bool, step: int) -> Missed | None:
@@ -239,7 +238,7 @@ class VisibleChunks(Component):
         last.send(padded)
         table = work.array("missed_steps", missed.table.shape)
         table.send(missed.table)
-        steps = (last, self._caught, missed.step, table, missed.first_step)
+        steps = (last, self._caught, missed.step, StepTable(table, missed.first_step))
         catch_up(device, self._config.optimiser, model, chunks, *steps, readback)
 
     def step_back(self, step: int) -> None:
@@ -254,7 +253,7 @@ class VisibleChunks(Component):
         if missed is None:
             return
         self._catch_up(_on_device((parameters, first, second)), missed)
-        self._note_movement(self._last < missed.step, missed.step + 1, takes_step=False)
+        self._note_movement(self._last < missed.step, self._hidden_movement(missed.step + 1))
         self._last[missed.numbers] = missed.step
 
     def rows_changed(self) -> None:
