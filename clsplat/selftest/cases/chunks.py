@@ -136,9 +136,18 @@ def _frozen_steps(bench: CaseBench) -> list[Inputs]:
     slots = evenly(111, (count, SLOT_PLAIN), -1.0, 1.0).astype(np.float32)
     contributions = evenly(112, (count,), 0.0, 1.0).astype(np.float32)
     numbers = np.array([0, *range(2, -(-count // CHUNK_ROWS))], np.uint32)  # all but one
-    of_view: dict[str, object] = {"gaussians": gaussians, "camera": bench.camera, "moments": made}
-    of_view |= {"slots": slots, "contributions": contributions, "numbers": numbers}
-    return [Inputs(**of_view, sparse=sparse) for sparse in (False, True)]
+    return [
+        Inputs(
+            gaussians=gaussians,
+            camera=bench.camera,
+            moments=made,
+            slots=slots,
+            contributions=contributions,
+            numbers=numbers,
+            sparse=sparse,
+        )
+        for sparse in (False, True)
+    ]
 
 
 def _rows(given: Inputs) -> NDArray[np.int64]:
