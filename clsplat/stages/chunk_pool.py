@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches chunk_records.cl: the chunks of a streamed model that are on the device, and their way there and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import prod
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.chunks.residency import Residency
+from clsplat.chunks.store import ChunkStore
+from clsplat.device.buffers import DeviceArray, Workspace, allocate
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_items
+from clsplat.device.profile import stage
+from clsplat.layouts.columns import CHUNK_ROWS
+
+_VECTOR = 4
+"""Words that an item of the kernel copies."""
+_CHUNKS_AT_ONCE = 32
+"""Most chunks whose records cross at once. More would need more memory, and gain nothing."""
+
+
+@stage("chunk_records")
+def copy_chunks(
+    device: Device,
+    slots: DeviceArray,
+    records: DeviceArray,
+    record: np.dtype[Any],
+    arrays: Mapping[str, DeviceArray],
+    *,
+    to_records: bool,
+) -> None:
+    """Copy fields of records from or to slots.
+
+    slots: (k,) uint32, the slot of each record.
+    records: (k, words of a record) uint32.
+    record: `chunks.store.record_type`.
+    arrays: by field, (slots x CHUNK_ROWS, ...) float32.
+    """
+    kernel = device.kernels("chunk_records", {"TO_RECORDS": True} if to_records else {}).copy_chunks
+    for name in record.names or ():
+        kind, offset = record.fields[name][:2]  # type: ignore[index]  # it has fields
+        words = (record.itemsize // 4, offset // 4, prod(kind.shape))
+        items = slots.shape[0] * words[2] // _VECTOR
+        launch_items(device, kernel, items, *map(np.uint64, (items, *words)), slots, records, arrays[name])
+
+
+class ChunkPool:
+    """The chunks of a streamed model that are on the device: parameters and moments, with room for `rows` Gaussians.
+
+    store: records of all chunks. Those on the device may be newer there, until `write_back`.
+    arrays: by field, the rows of the slots.
+    caught: (slots,) uint32, as `stages.catch_up.catch_up` has them of chunks.
+    """
+
+    def __init__(self, device: Device, work: Workspace, store: ChunkStore, rows: int) -> None:
+        self._device, self._work, self.store = device, work, store
+        self.slots = min(rows // CHUNK_ROWS, store.chunks)
+        self.arrays = {
+            name: allocate(device, (CHUNK_ROWS * self.slots, *shape), np.float32)
+            for name, shape in store.fields.items()
+        }
+        self.caught = allocate(device, (self.slots,), np.uint32)
+        self.caught.fill(0)
+        self._caught = np.zeros(store.chunks, np.uint32)
+        """By chunk, `caught` of those that are not on the device."""
+        self._residency = Residency(self.slots, store.chunks)
+        self._changed = np.zeros(self.slots, np.bool_)
+        self.moved_bytes = 0
+        """Bytes of the records that have been fetched or written back."""
+
+    @property
+    def rows(self) -> int:
+        """Rows of all slots."""
+        return CHUNK_ROWS * self.slots
+
+    def place(self, numbers: NDArray[np.integer[Any]], *, changes: bool) -> NDArray[np.uint32]:
+        """Bring these chunks to the device. Returns the slot of each.
+
+        changes: True if the device will change them.
+        Raises ValueError for more chunks than slots.
+        """
+        moves = self._residency.place(numbers)
+        if len(moves.fetched):
+            changed = self._changed[moves.evicted_from]
+            self._write(moves.evicted[changed], moves.evicted_from[changed])
+            self._exchange_caught(moves.evicted, moves.evicted_from, moves.fetched, moves.fetched_to)
+            self._fetch(moves.fetched, moves.fetched_to)
+            self._changed[moves.fetched_to] = False
+        if changes:
+            self._changed[moves.slots] = True
+        return moves.slots
+
+    def place_run(self, first: int, count: int, *, changes: bool) -> None:
+        """Bring chunks that follow each other to the first slots, in order."""
+        numbers = np.arange(first, first + count)
+        if (self._residency.slots_of(numbers) != np.arange(count)).any():
+            self.release()
+        self.place(numbers, changes=changes)
+
+    def write_back(self) -> None:
+        """Write the chunks that the device has changed to the store."""
+        numbers, slots = self._residency.held()
+        changed = self._changed[slots]
+        self._write(numbers[changed], slots[changed])
+        self._changed[:] = False
+
+    def release(self) -> None:
+        """Write back, and forget what is on the device: the store is going to change, or other chunks are wanted."""
+        self.write_back()
+        nothing = np.zeros(0, np.int64)
+        self._exchange_caught(*self._residency.held(), nothing, nothing.astype(np.uint32))
+        self._residency.clear()
+
+    def held(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
+        """The slot of each chunk, -1 if it is not on the device."""
+        return self._residency.slots_of(numbers)
+
+    def _exchange_caught(
+        self,
+        leaving: NDArray[np.int64],
+        leaving_from: NDArray[np.uint32],
+        coming: NDArray[np.int64],
+        coming_to: NDArray[np.uint32],
+    ) -> None:
+        caught = self.caught.get()
+        self._caught[leaving] = caught[leaving_from]
+        caught[coming_to] = self._caught[coming]
+        self.caught.set(caught)
+
+    def _fetch(self, numbers: NDArray[np.int64], slots: NDArray[np.uint32]) -> None:
+        for some in _groups(len(numbers)):
+            on_device, records = self._crossing(slots[some])
+            values = np.ascontiguousarray(self.store.read(numbers[some]))
+            records.set(values.view(np.uint32).reshape(records.shape))
+            copy_chunks(self._device, on_device, records, self.store.record, self.arrays, to_records=False)
+            self.moved_bytes += values.nbytes
+
+    def _write(self, numbers: NDArray[np.int64], slots: NDArray[np.uint32]) -> None:
+        for some in _groups(len(numbers)):
+            on_device, records = self._crossing(slots[some])
+            copy_chunks(self._device, on_device, records, self.store.record, self.arrays, to_records=True)
+            values = records.get()
+            self.store.write(numbers[some], values.view(self.store.record).reshape(-1))
+            self.moved_bytes += values.nbytes
+
+    def _crossing(self, slots: NDArray[np.uint32]) -> tuple[DeviceArray, DeviceArray]:
+        """Slots on the device, and memory there for their records."""
+        on_device = self._work.array("crossing_slots", slots.shape, np.uint32)
+        on_device.set(slots)
+        return on_device, self._work.array("crossing", (len(slots), self.store.record.itemsize // 4), np.uint32)
+
+
+def _groups(count: int) -> list[slice]:
+    return [slice(begin, begin + _CHUNKS_AT_ONCE) for begin in range(0, count, _CHUNKS_AT_ONCE)]
+
+
+@dataclass(frozen=True, eq=False)
+class StoredArray:
+    """A field of a streamed model, with the interface of a DeviceArray."""
+
+    pool: ChunkPool
+    field: str
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.pool.store.count, *self.pool.store.fields[self.field]
+
+    def get(self) -> NDArray[np.float32]:
+        """A copy of all rows."""
+        return self.get_rows(0, self.pool.store.count)
+
+    def set(self, values: NDArray[np.float32]) -> None:
+        """Replace all rows."""
+        self.set_rows(0, values)
+
+    def get_rows(self, start: int, stop: int) -> NDArray[np.float32]:
+        """A copy of the rows [start, stop)."""
+        self.pool.write_back()
+        return self.pool.store.get_rows(self.field, start, stop)
+
+    def set_rows(self, start: int, values: NDArray[np.float32]) -> None:
+        """Replace the rows that begin at `start`."""
+        self.pool.release()
+        self.pool.store.set_rows(self.field, start, values)
+
+    def fill(self, value: float) -> None:
+        """Set every element."""
+        self.pool.release()
+        self.pool.store.fill(self.field, value)
