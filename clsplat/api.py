@@ -44,6 +44,7 @@ def train(
     max_device_mem: str | int | None = None,
     max_host_mem: str | int | None = None,
     cache: str | Path | None = None,
+    scratch: str | Path | None = None,
     run: Run | None = None,
     resume: bool = False,
     on_step: Callable[[StepReport], None] | None = None,
@@ -69,6 +70,8 @@ def train(
     cache : str or Path, optional
         Folder for decoded photographs, which stays and may be shared by trainings, or "none". None means the run's
         folder until the training has finished if `max_host_mem` is given, else no cache.
+    scratch : str or Path, optional
+        Folder for the Gaussians that `max_host_mem` leaves no room for, until the end. None means the run's folder.
     run : Run, optional
         A folder for metrics, checkpoints, held-out renders and the model. With None nothing is written.
     resume : bool
@@ -105,7 +108,8 @@ def train(
     with nullcontext() if run is None else locked(run.path, "train"):
         first, *further = _opened(device, parse_bytes(max_device_mem))
         config = config.on_devices(1 + len(further), explicit=resume)
-        memory = HostMemory.chosen(max_host_mem, cache, run)
+        memory = HostMemory.chosen(max_host_mem, cache, run, scratch)
+        memory.remove_scratch()
         trainer = Trainer(begin(scene, config, run, resume=resume), config, first, further=further, memory=memory)
         with closing(trainer):
             session = TrainingSession(trainer, run, on_step, on_plan)

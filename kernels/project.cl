@@ -46,7 +46,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   const uint first = get_global_id(0) * LANES;
   if (first >= n) return;
   for (uint lane = 0; lane < LANES; ++lane) tile_counts[first + lane] = 0; // whole chunks, so whole vectors
-  const size_t ahead = rows_ahead(chunks, first);
+  const long ahead = rows_ahead(chunks, first);
   const uint end = end_of_rows(first, n, ahead, model_rows);
   MOVE_ROWS(ahead, )
 #else

@@ -75,7 +75,7 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
   if (i >= n) return;
   tile_counts[i] = 0;
 #ifdef CHUNKS
-  const size_t ahead = rows_ahead(chunks, i);
+  const long ahead = rows_ahead(chunks, i);
   if (i + ahead >= model_rows) return;
   MOVE_ROWS(ahead, )
 #endif

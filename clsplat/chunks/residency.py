@@ -69,7 +69,8 @@ class Residency:
 
     def slots_of(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
         """The slot of each chunk, -1 if it is not on the device."""
-        return self._slot_of[numbers]
+        slots: NDArray[np.int64] = self._slot_of[numbers]
+        return slots
 
     def clear(self) -> None:
         """Forget all chunks."""

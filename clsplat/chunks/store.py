@@ -83,8 +83,10 @@ class ChunkStore:
 
         Raises ScratchError if the file has not what was written.
         """
+        records: NDArray[Any]
         if self._memory is not None:
-            return self._memory[numbers]
+            records = self._memory[numbers]
+            return records
         records = np.empty(len(numbers), self.record)
         for begin, first, length in runs(numbers):
             self._read_at(first * self.record.itemsize, records[begin : begin + length])
@@ -143,8 +145,10 @@ class ChunkStore:
 
     def _field(self, number: int, field: str) -> NDArray[np.float32]:
         """A field (CHUNK_ROWS, ...) of a chunk's record."""
+        rows: NDArray[np.float32]
         if self._memory is not None:
-            return self._memory[field][number]
+            rows = self._memory[field][number]
+            return rows
         kind, offset = self.record.fields[field][:2]  # type: ignore[index]  # it has fields
         rows = np.zeros(kind.shape, np.float32)
         if self._written[number]:
@@ -155,7 +159,7 @@ class ChunkStore:
     def _set_field(self, number: int, field: str, rows: NDArray[np.float32]) -> None:
         if not self._written[number]:
             self.write(np.array([number]), np.zeros(1, self.record))
-        self._checksums[number, self._names.index(field)] = zlib.crc32(rows)
+        self._checksums[number, self._names.index(field)] = zlib.crc32(rows.data)
         self._write_at(number * self.record.itemsize + self.record.fields[field][1], rows)  # type: ignore[index]
 
     def _check(self, number: int, names: Sequence[str], record: Any) -> None:
@@ -166,7 +170,7 @@ class ChunkStore:
 
     def _read_at(self, offset: int, into: NDArray[Any]) -> None:
         """Read an array. What is behind the file's end is left as it is: its checksum tells."""
-        left = memoryview(into.view(np.uint8).reshape(-1))
+        left = into.view(np.uint8).reshape(-1).data
         try:
             self._file.seek(offset)
             while left and (count := self._file.readinto(left)):
@@ -175,13 +179,13 @@ class ChunkStore:
             raise ScratchError(f"{self.path} cannot be read ({reason_of(error)})") from None
 
     def _write_at(self, offset: int, values: NDArray[Any]) -> None:
-        left = memoryview(np.ascontiguousarray(values).view(np.uint8).reshape(-1))
+        left = np.ascontiguousarray(values).view(np.uint8).reshape(-1).data
         try:
             self._file.seek(offset)
             while left:
                 left = left[self._file.write(left) :]
         except OSError as error:
-            raise write_error(self._path, error, needs=self.nbytes) from None
+            raise write_error(str(self.path), error, needs=self.nbytes) from None
 
 
 def runs(numbers: NDArray[np.integer[Any]]) -> Iterator[tuple[int, int, int]]:

@@ -61,6 +61,9 @@ class TrainVerb(Verb):
     cache: Annotated[str | None, arg(metavar="DIR|none")] = None
     """Folder for decoded photographs. It stays after the training, and several trainings may share it. none: no cache.
     If not given: with --max-host-mem cache/ in the run's folder until the training has finished, else none."""
+    scratch: Annotated[str | None, arg(metavar="DIR")] = None
+    """Folder, on a local disk, for the Gaussians that --max-host-mem leaves no room for. Its files are removed at the
+    end. If not given: scratch/ in the run's folder."""
     auto: Flag = False
     """Adapt settings to findings on the scene, such as --appearance exposure if the photographs' exposures differ.
     Settings given as flags stay. The findings are printed even without --auto."""
@@ -184,7 +187,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     )
     stages = _stages(config)
     devices = [services.require(device, stages) for device in devices]
-    HostMemory.chosen(verb.max_host_mem, verb.cache, None).check(scene, config, devices[0])
+    HostMemory.chosen(verb.max_host_mem, verb.cache, None, verb.scratch).check(scene, config, devices[0])
     verb.output.mkdir(parents=True, exist_ok=True)
     locks.enter_context(locked(verb.output, "train"))
     run = Run.create(verb.output, config, scene=source, resume=verb.resume, overwrite=verb.overwrite)
@@ -209,6 +212,7 @@ def _flags_of_machine(verb: TrainVerb) -> str:
         "--max-device-mem": verb.device.max_device_mem,
         "--max-host-mem": verb.max_host_mem,
         "--cache": verb.cache,
+        "--scratch": verb.scratch,
     }
     return "".join(f" {flag} {shlex.quote(str(value))}" for flag, value in given.items() if value is not None)
 
@@ -280,6 +284,7 @@ def _train_run(
                 device=devices,
                 max_host_mem=verb.max_host_mem,
                 cache=verb.cache,
+                scratch=verb.scratch,
                 run=run,
                 resume=run.resuming,
                 on_plan=print_plan,

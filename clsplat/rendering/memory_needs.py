@@ -37,6 +37,8 @@ class StepMemory:
     masks: True if photographs have masks, or there is an alpha loss.
     row_bytes: bytes per Gaussian of the training's components.
     pixel_bytes: bytes per pixel of the training's components.
+    by_chunk: True if a step may run over the chunks in view.
+    pool: as in `Need`.
     """
 
     fields: SlotFields
@@ -45,6 +47,8 @@ class StepMemory:
     masks: bool = False
     row_bytes: int = 0
     pixel_bytes: int = 0
+    by_chunk: bool = False
+    pool: int | None = None
 
 
 def plan_frame(
@@ -104,6 +108,8 @@ def plan_step(
         photographs=0
         if device.shares_memory
         else (target.SOURCE_PIXEL_BYTES + step.masks * target.MASK_PIXEL_BYTES) * step.photographs,
+        held=statistics + step.row_bytes if step.by_chunk else None,
+        pool=step.pool,
     )
     return _plan(device, need)
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from clsplat.errors import CapacityError, amount
+from clsplat.layouts.columns import CHUNK_ROWS
 
 
 def mebibytes(nbytes: int) -> str:
@@ -27,6 +28,8 @@ class Need:
     planes: bytes of all arrays that are as large as the image.
     scratch: bytes of all other arrays.
     photographs: bytes of the photographs, which the device keeps between steps if it has room.
+    held: those of `row` that a step over the chunks in view needs of all Gaussians too; None if steps cannot run so.
+    pool: bytes for parameters and moments of the Gaussians on the device; None leaves it to the plan.
     """
 
     gaussians: int
@@ -39,6 +42,8 @@ class Need:
     planes: int
     scratch: int
     photographs: int = 0
+    held: int | None = None
+    pool: int | None = None
 
     @property
     def pairs(self) -> int:
@@ -58,6 +63,9 @@ class Need:
 
 ESTIMATED_PAIRS_PER_GAUSSIAN = 8
 """Estimated number of tiles that a Gaussian reaches. Trained scenes have 3 to 8."""
+PAIRS_IN_VIEW = 4
+"""Pairs for each Gaussian on the device for which a plan by chunks leaves room. A chunk also has Gaussians that are not
+in view."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +132,10 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
 
     whole = made(need.gaussians, streamed=False)
     enough = min(need.pairs // 8, need.gaussians) + 1
-    if need.gaussians * need.widest <= max_allocation and whole.pairs >= enough:
+    if need.pool is None and need.gaussians * need.widest <= max_allocation and whole.pairs >= enough:
         return whole
+    if need.held is not None:
+        return _plan_by_chunk(need, need.held, budget, max_allocation)
     for_rows = min(room // 4, room - need.gaussians * need.pair)  # a tile may contain all Gaussians
     rows = max(min(for_rows // need.model, max_allocation // need.widest, need.gaussians), alignment)
     rows -= rows % alignment
@@ -138,3 +148,25 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
             "more (--max-device-mem), or use a smaller resolution or fewer Gaussians"
         )
     return streamed
+
+
+def _plan_by_chunk(need: Need, held: int, budget: int, max_allocation: int) -> Plan:
+    """Plan for steps over the chunks in view. A view may show all Gaussians that are on the device at once.
+
+    Raises CapacityError if not even one chunk fits.
+    """
+    room = budget - need.planes - need.scratch - need.gaussians * held
+    in_view = need.model + need.row - held + need.banded
+    rows = room // (in_view + PAIRS_IN_VIEW * need.pair)
+    if need.pool is not None:
+        rows = min(rows, need.pool // need.model)
+    rows = min(rows, max_allocation // need.widest, need.gaussians + CHUNK_ROWS - 1) // CHUNK_ROWS * CHUNK_ROWS
+    if rows < CHUNK_ROWS:
+        least = budget - room + CHUNK_ROWS * (in_view + PAIRS_IN_VIEW * need.pair)
+        raise CapacityError(
+            f"{need.gaussians:,} Gaussians at this size of image need at least about {mebibytes(least)} of device "
+            f"memory, or {mebibytes(need.total)} to be processed at once, but {mebibytes(budget)} are allowed: allow "
+            "more (--max-device-mem), or use a smaller resolution or fewer Gaussians"
+        )
+    pairs = min((room - rows * in_view) // need.pair, need.most_pairs)
+    return Plan(need, rows, streamed=True, pairs=pairs, gathers=False, allowed=budget, bands=1)

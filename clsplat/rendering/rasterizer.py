@@ -21,11 +21,12 @@ from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.memory_plan import Plan
 from clsplat.stages.append import MAX_MEAN_PAIRS, append, appends
 from clsplat.stages.blend import Blended, ImageInputs, blend, blend_grad
-from clsplat.stages.bounds import ChunkList
+from clsplat.stages.bounds import ChunkList, send_chunks
 from clsplat.stages.channels import Channels, Features, Floats, Motion, channels, features
+from clsplat.stages.chunk_pool import ChunkPool
 from clsplat.stages.deep import deep
 from clsplat.stages.device_camera import pack_camera, tiles_of
-from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians
 from clsplat.stages.duplicate import (
     MAX_PAIRS_PER_BAND,
     Band,
@@ -214,9 +215,12 @@ class Rasterizer:
         no effect (docs/decisions/0025-launch-by-capacity.md). None counts the pairs first.
         thinning: random dropout of the model's Gaussians in this pass.
         nearness: like `nearness` of `blend`.
-        chunks: the only chunks of the model that may be in view; None takes the whole model.
+        chunks: the only chunks of the model that may be in view; None takes the whole model, or, of a streamed model
+            whose pool knows it, the chunks in view.
         """
         device, work = self.device_of(camera), self.work
+        if chunks is None and isinstance(gaussians, HostGaussians) and gaussians.pool is not None:
+            gaussians, chunks = self._in_view(gaussians, gaussians.pool, camera)
         sent = background if isinstance(background, tuple) else self.send(camera, background)
         camera_array, colours = sent
         by_append = room is not None and self._appends(device, room, tiles_of(camera))
@@ -252,6 +256,17 @@ class Rasterizer:
         key = (self.readback, device, colours, *size, *how, room.pairs, room.turn, by_append, rows)
         made = work.replayed(gaussians, key, make, thinning_numbers(thinning), (camera_array,))
         return ForwardPass(camera, camera_array, colours, *made)
+
+    def _in_view(
+        self, gaussians: HostGaussians, pool: ChunkPool, camera: Camera
+    ) -> tuple[AnyGaussians, ChunkList | None]:
+        """The rows of a pool, and the slots that the camera may show; the whole model if that is not known, or if they
+        are too many."""
+        numbers = None if pool.cull is None else pool.cull(camera)
+        if numbers is None or len(numbers) > pool.slots:
+            return gaussians, None
+        slots = send_chunks(self.work, "chunk_slots", pool.place(numbers, changes=False), pool.rows)
+        return gaussians.in_pool, slots
 
     def _appends(self, device: Device, room: PairCapacity, tiles: tuple[int, int]) -> bool:
         """True if the lists of a pass by capacity are made by append."""

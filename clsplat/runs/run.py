@@ -53,6 +53,7 @@ class Run:
         self.checkpoints_path = path / "checkpoints"
         self.test_path = path / "test"
         self.cache_path = path / "cache"
+        self.scratch_path = path / "scratch"
         self.resume_command = shlex.join(["clsplat", "train", "-o", str(path), "--resume"])
 
     @classmethod

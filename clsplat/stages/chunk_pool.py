@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import prod
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.camera import Camera
 from clsplat.chunks.residency import Residency
 from clsplat.chunks.store import ChunkStore
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
@@ -19,6 +20,8 @@ from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
 from clsplat.layouts.columns import CHUNK_ROWS
 
+INVISIBLE_LOGIT = -1e30
+"""Opacity logit of a row that is not of the model."""
 _VECTOR = 4
 """Words that an item of the kernel copies."""
 _CHUNKS_AT_ONCE = 32
@@ -71,8 +74,15 @@ class ChunkPool:
         """By chunk, `caught` of those that are not on the device."""
         self._residency = Residency(self.slots, store.chunks)
         self._changed = np.zeros(self.slots, np.bool_)
+        self.cull: Callable[[Camera], NDArray[np.integer[Any]]] | None = None
+        """The chunks that a camera may show; None if that is not known."""
         self.moved_bytes = 0
         """Bytes of the records that have been fetched or written back."""
+
+    def close(self) -> None:
+        """Free the device's memory, and remove the store's file."""
+        self.arrays.clear()
+        self.store.close()
 
     @property
     def rows(self) -> int:
@@ -137,9 +147,19 @@ class ChunkPool:
         for some in _groups(len(numbers)):
             on_device, records = self._crossing(slots[some])
             values = np.ascontiguousarray(self.store.read(numbers[some]))
+            self._close_last(numbers[some], values)
             records.set(values.view(np.uint32).reshape(records.shape))
             copy_chunks(self._device, on_device, records, self.store.record, self.arrays, to_records=False)
             self.moved_bytes += values.nbytes
+
+    def _close_last(self, numbers: NDArray[np.int64], records: NDArray[Any]) -> None:
+        """Let the rows behind the model's last one be copies of it that no view shows and no step moves."""
+        rows = self.store.count % CHUNK_ROWS
+        for place in np.flatnonzero(numbers == self.store.chunks - 1) if rows else ():
+            for name in self.store.record.names or ():
+                values = records[name][place]
+                values[rows:] = values[rows - 1] if name.startswith("parameters/") else 0.0
+            records["parameters/opacity_logits"][place, rows:] = INVISIBLE_LOGIT
 
     def _write(self, numbers: NDArray[np.int64], slots: NDArray[np.uint32]) -> None:
         for some in _groups(len(numbers)):

@@ -255,10 +255,11 @@ def gather(
             _gather_array(device, rows, source[name], arrays[name], 0.0 if renews else None)
         return DeviceGaussians(count, source.coefficients, arrays)
     assert isinstance(source, HostGaussians)
-    host = {name: array.values[rows & ~FRESH] for name, array in source.arrays.items()}
+    host = {name: whole.get()[rows & ~FRESH] for name, whole in source.arrays.items()}
     for values in host.values() if renews else ():
         values[rows >= FRESH] = 0.0
-    return replace(source, count=count, arrays={name: HostArray(values) for name, values in host.items()})
+    gathered = {name: HostArray(values) for name, values in host.items()}
+    return HostGaussians(count, source.coefficients, gathered, source.rows)
 
 
 @stage("density")

@@ -3,18 +3,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
+from clsplat.chunks.store import ChunkStore, chunks_of
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, floats_of, group_shapes
 from clsplat.layouts.columns import CHUNK_ROWS
+from clsplat.stages.chunk_pool import ChunkPool, StoredArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +52,7 @@ class _ByGroup(Generic[A]):
 
     count: int
     coefficients: int
-    arrays: dict[str, A]
+    arrays: Mapping[str, A]
 
     def __getitem__(self, group: str) -> A:
         return self.arrays[group]
@@ -98,13 +102,32 @@ class HostArray:
 
 
 @dataclass(frozen=True, eq=False)
-class HostGaussians(_ByGroup[HostArray]):
-    """Gaussians on the host; `parts` uploads `rows` of them at a time."""
+class HostGaussians(_ByGroup[HostArray | StoredArray]):
+    """Gaussians on the host; `parts` uploads `rows` of them at a time.
+
+    pool: the chunks that are on the device, if the arrays are fields `kind`/GROUP of its store.
+    """
 
     rows: int
+    pool: ChunkPool | None = None
+    kind: str = ""
+
+    @cached_property
+    def in_pool(self) -> DeviceGaussians:
+        """The rows of the pool's slots."""
+        assert self.pool is not None
+        return self.first_in_pool(self.pool.rows)
+
+    def first_in_pool(self, rows: int) -> DeviceGaussians:
+        """The first rows of the pool's slots."""
+        assert self.pool is not None
+        arrays = {name: self.pool.arrays[f"{self.kind}/{name}"].rows(0, rows) for name in self.arrays}
+        return DeviceGaussians(rows, self.coefficients, arrays)
 
 
 AnyGaussians = DeviceGaussians | HostGaussians
+KINDS = ("parameters", "first", "second")
+"""Kinds of arrays of a model in training, as a checkpoint and a store of chunks name them."""
 
 
 def parts(
@@ -121,51 +144,61 @@ def parts(
         yield 0, models[0].count, on_device
         return
     streamed = [model for model in models if isinstance(model, HostGaussians)]
-    count, rows = streamed[0].count, streamed[0].rows
+    count, pool = streamed[0].count, next((model.pool for model in streamed if model.pool is not None), None)
+    rows = streamed[0].rows if pool is None else pool.rows
     for start in range(0, count, rows):
         stop = min(start + rows, count)
+        if pool is not None:
+            pool.place_run(start // CHUNK_ROWS, chunks_of(stop - start), changes=keep)
         uploaded = []
         for index, model in enumerate(streamed):
+            if model.pool is not None:
+                uploaded.append(model.first_in_pool(stop - start))
+                continue
             arrays = {}
             for name, whole in model.arrays.items():
-                values = whole.values[start:stop]
+                values = whole.get_rows(start, stop)
                 arrays[name] = work.array(f"part{index}_{name}", values.shape, values.dtype)
                 arrays[name].set(values)
             uploaded.append(DeviceGaussians(stop - start, model.coefficients, arrays))
         yield start, stop, tuple(uploaded)
-        if keep:
-            for model, part in zip(streamed, uploaded, strict=True):
-                for name, array in part.arrays.items():
-                    array.read_into(model[name].values[start:stop])
+        for model, part in zip(streamed, uploaded, strict=True):
+            for name, array in part.arrays.items() if keep and model.pool is None else ():
+                model[name].set_rows(start, array.get())
 
 
-def upload_chunks(
-    work: Workspace, numbers: NDArray[np.uint32], *models: HostGaussians
-) -> tuple[tuple[DeviceGaussians, ...], Callable[[], None]]:
-    """Upload the rows of these chunks, in rising order, one after the other.
+def store_of(models: Sequence[AnyGaussians | None], path: Path | None) -> ChunkStore:
+    """A store of parameters, first and second moments. Moments that are None are zero. Raises WriteError."""
+    parameters = models[0]
+    assert parameters is not None
+    shapes = group_shapes(parameters.count, parameters.coefficients)
+    fields = {f"{kind}/{name}": shape[1:] for kind in KINDS for name, shape in shapes.items()}
+    store = ChunkStore(parameters.count, fields, path)
+    given = {kind: model for kind, model in zip(KINDS, models, strict=True) if model is not None}
+    for numbers in store.blocks():
+        records = np.zeros(len(numbers), store.record)
+        begin = CHUNK_ROWS * int(numbers[0])
+        end = min(begin + CHUNK_ROWS * len(numbers), store.count)
+        for kind, model in given.items():
+            for name in PARAMETER_GROUPS if model is not None else ():
+                values = model[name].get_rows(begin, end)
+                for place in range(len(numbers)) if values.size else ():
+                    rows = values[CHUNK_ROWS * place : CHUNK_ROWS * (place + 1)]
+                    records[f"{kind}/{name}"][place, : len(rows)] = rows
+        store.write(numbers, records)
+    return store
 
-    Returns the models, valid until the next call, and a function that copies their changes back to the host.
-    """
-    rows = [slice(CHUNK_ROWS * int(number), CHUNK_ROWS * (int(number) + 1)) for number in numbers]
-    uploaded, wholes = [], []
-    for index, model in enumerate(models):
-        arrays = {}
-        for name, whole in model.arrays.items():
-            some = np.concatenate([whole.values[each] for each in rows])
-            arrays[name] = work.array(f"part{index}_{name}", some.shape, some.dtype)
-            arrays[name].set(some)
-            wholes.append((arrays[name], whole.values))
-        uploaded.append(DeviceGaussians(arrays["means"].shape[0], model.coefficients, arrays))
 
-    def copy_back() -> None:
-        for array, whole in wholes:
-            some, begin = array.get(), 0
-            for each in rows:
-                end = begin + len(whole[each])
-                whole[each] = some[begin:end]
-                begin = end
+def pooled(pool: ChunkPool, coefficients: int) -> tuple[HostGaussians, HostGaussians, HostGaussians]:
+    """Parameters, first and second moments of a pool's store."""
 
-    return tuple(uploaded), copy_back
+    def of(kind: str) -> HostGaussians:
+        arrays: dict[str, HostArray | StoredArray] = {
+            name: StoredArray(pool, f"{kind}/{name}") for name in PARAMETER_GROUPS
+        }
+        return HostGaussians(pool.store.count, coefficients, arrays, pool.rows, pool, kind)
+
+    return of("parameters"), of("first"), of("second")
 
 
 def allocate_gaussians(device: Device, count: int, coefficients: int, *, zero: bool = False) -> DeviceGaussians:
@@ -209,13 +242,13 @@ def host_model(arrays: Mapping[str, NDArray[Any]], kind: str) -> HostGaussians:
     wrong name, shape or dtype."""
     if missing := [group for group in PARAMETER_GROUPS if f"{kind}/{group}" not in arrays]:
         raise ValueError(f"has no {kind}/{missing[0]}")
-    host = {group: HostArray(arrays[f"{kind}/{group}"]) for group in PARAMETER_GROUPS}
-    count, coefficients = len(host["means"].values), host["sh_rest"].shape[1] + 1
+    host = {group: arrays[f"{kind}/{group}"] for group in PARAMETER_GROUPS}
+    count, coefficients = len(host["means"]), host["sh_rest"].shape[1] + 1
     for group, shape in group_shapes(count, coefficients).items():
-        values = host[group].values
+        values = host[group]
         if values.shape != shape or values.dtype != np.float32 or count == 0:
             raise ValueError(f"{kind}/{group} has shape {values.shape} of {values.dtype}, expected {shape} of float32")
-    return HostGaussians(count, coefficients, host, count)
+    return HostGaussians(count, coefficients, {group: HostArray(values) for group, values in host.items()}, count)
 
 
 def host_zeros(count: int, coefficients: int, rows: int) -> HostGaussians:
@@ -225,17 +258,26 @@ def host_zeros(count: int, coefficients: int, rows: int) -> HostGaussians:
     return HostGaussians(count, coefficients, arrays, rows)
 
 
+def in_memory(gaussians: HostGaussians, rows: int) -> HostGaussians:
+    """The same Gaussians in main memory, of which `rows` at a time are uploaded. Arrays that are there already stay."""
+    if gaussians.pool is None:
+        return replace(gaussians, rows=rows)
+    return replace(to_host(gaussians), rows=rows)
+
+
 def to_host(gaussians: AnyGaussians) -> HostGaussians:
-    """A host copy of Gaussians on the device; host Gaussians are returned unchanged."""
-    if isinstance(gaussians, HostGaussians):
+    """A copy in main memory of Gaussians on the device or in a store; those in main memory are returned unchanged."""
+    if isinstance(gaussians, HostGaussians) and gaussians.pool is None:
         return gaussians
-    arrays = {name: HostArray(array.get()) for name, array in gaussians.arrays.items()}
+    arrays: dict[str, HostArray | StoredArray] = {
+        name: HostArray(array.get()) for name, array in gaussians.arrays.items()
+    }
     return HostGaussians(gaussians.count, gaussians.coefficients, arrays, gaussians.count)
 
 
 def to_device(device: Device, gaussians: HostGaussians) -> DeviceGaussians:
     """A device copy of host Gaussians."""
-    arrays = {name: upload(device, array.values) for name, array in gaussians.arrays.items()}
+    arrays = {name: upload(device, array.get_rows(0, gaussians.count)) for name, array in gaussians.arrays.items()}
     return DeviceGaussians(gaussians.count, gaussians.coefficients, arrays)
 
 

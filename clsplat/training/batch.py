@@ -30,6 +30,7 @@ from clsplat.stages.adam import adam, add_view
 from clsplat.stages.device_gaussians import (
     AnyGaussians,
     DeviceGaussians,
+    HostArray,
     HostGaussians,
     allocate_gaussians,
     host_zeros,
@@ -352,7 +353,7 @@ class Batch:
     def _on_host(self, group: str, parameters: AnyGaussians) -> NDArray[np.float32]:
         array = parameters[group]
         if not isinstance(array, DeviceArray):
-            return array.values
+            return array.values if isinstance(array, HostArray) else array.get()
         held = self._room.get(group)
         if held is None or held.shape != array.shape:
             held = self._room[group] = np.empty(array.shape, np.float32)

@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+import os
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,11 +14,13 @@ from clsplat.config.checks import parse_bytes
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError, amount
+from clsplat.files.atomic import machine_mark, remove
 from clsplat.gaussians import floats_of
 from clsplat.rendering.memory_needs import MODELS
 from clsplat.runs.run import Run
 from clsplat.stages.density import gaussian_bytes
 from clsplat.training.batch import OWNER_ARRAYS_PER_PARAMETER
+from clsplat.training.step.visible_chunks import streams_by_chunk
 from clsplat.training.supervision.decoded_store import DecodedStore, remove_decoded
 from clsplat.training.supervision.decoding import Decoder
 from clsplat.training.supervision.host_photographs import HostPhotographs
@@ -25,6 +30,11 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
 
 NO_CACHE = "none"
+SCRATCH_SUFFIX = ".chunks"
+OWNER_DIGITS = 12
+POOL_QUARTERS = 3
+"""Quarters of the main memory beside what a step cannot do without that the model's chunks get. The photographs get the
+rest."""
 
 
 def model_bytes(config: TrainConfig) -> int:
@@ -40,19 +50,40 @@ class HostMemory:
     limit: maximum number of bytes for photographs and Gaussians; None for no limit.
     cache: folder of the cache of decoded photographs; None for no cache.
     keeps_cache: True if the user named that folder, which then stays.
+    scratch: folder of the files of chunks; None for none.
+    owner: name of this training's files there.
     """
 
     limit: int | None = None
     cache: Path | None = None
     keeps_cache: bool = False
+    scratch: Path | None = None
+    owner: str = ""
 
     @classmethod
-    def chosen(cls, max_host_mem: str | int | None, cache: str | Path | None, run: Run | None) -> HostMemory:
+    def chosen(
+        cls,
+        max_host_mem: str | int | None,
+        cache: str | Path | None,
+        run: Run | None,
+        scratch: str | Path | None = None,
+    ) -> HostMemory:
         """Main memory as the arguments of `clsplat.train` set it. Raises InputError.
 
         cache: a folder, "none", or None for the run's folder if there is a limit.
+        scratch: a folder, or None for the run's.
         """
         limit = parse_bytes(max_host_mem, "--max-host-mem")
+        memory = cls._with_cache(limit, cache, run)
+        if scratch is not None and (not str(scratch) or Path(scratch).is_file()):
+            raise InputError(f"--scratch {scratch}: expected a folder")
+        place = Path(scratch) if scratch is not None else (run.scratch_path if run is not None else None)
+        of = str(run.path.resolve()) if run is not None else f"{machine_mark()} {os.getpid()}"
+        owner = hashlib.sha256(of.encode("utf-8", "surrogatepass")).hexdigest()[:OWNER_DIGITS]
+        return replace(memory, scratch=place, owner=owner)
+
+    @classmethod
+    def _with_cache(cls, limit: int | None, cache: str | Path | None, run: Run | None) -> HostMemory:
         if cache is not None and str(cache) != NO_CACHE and (not str(cache) or Path(cache).is_file()):
             raise InputError(f"--cache {cache}: expected a folder, or none")
         if cache is None:
@@ -72,8 +103,44 @@ class HostMemory:
         """Raise InputError if the limit is too small for the first step. Writes nothing."""
         if self.limit is not None:
             count = len(scene.points) or config.random_points
-            taken = count * model_bytes(config) if device.shares_memory else 0
+            by_chunk = streams_by_chunk(config, device, count)
+            each = gaussian_bytes(contributions=False) if by_chunk else model_bytes(config)
+            taken = count * each if device.shares_memory else 0
             self.share(self._photographs(scene, config), count, taken, begins=True)
+
+    def pool(self, photographs: HostPhotographs, count: int, model: int, held: int) -> int | None:
+        """Bytes for the chunks of a model that are on a device in main memory; None if all of them fit.
+
+        model: bytes per Gaussian of parameters and moments.
+        held: other bytes per Gaussian.
+        """
+        if self.limit is None or self.limit >= count * (model + held) + photographs.least:
+            return None
+        return max((self.limit - photographs.least - count * held) * POOL_QUARTERS // 4, 0)
+
+    def scratch_file(self, nbytes: int, photographs: HostPhotographs) -> Path | None:
+        """A new file for so many bytes of chunks; None if main memory has room for them. Raises InputError if there is
+        no folder for it."""
+        if self.limit is None or self.limit >= nbytes + photographs.least:
+            return None
+        if self.scratch is None:
+            raise InputError(
+                f"--max-host-mem {amount(self.limit)} leaves {amount(nbytes)} of Gaussians to files: name a folder for "
+                "them (--scratch DIR), or a run's folder (-o)"
+            )
+        return next(path for path in self._files() if not path.exists())
+
+    def remove_scratch(self) -> None:
+        """Remove this training's files of chunks, which may be of a process that was killed."""
+        for path in self._files() if self.scratch is not None else ():
+            with suppress(OSError):
+                remove(path)
+
+    def _files(self) -> tuple[Path, Path]:
+        """While a model is rewritten there are two."""
+        assert self.scratch is not None
+        first, second = (self.scratch / f"{self.owner}-{number}{SCRATCH_SUFFIX}" for number in (1, 2))
+        return first, second
 
     def share(self, photographs: HostPhotographs, count: int, taken: int, *, begins: bool) -> bool:
         """Give the photographs the memory that the Gaussians leave. Returns False if that is too little.

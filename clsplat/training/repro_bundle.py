@@ -170,7 +170,7 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
         models = _unmarked({kind: to_host(model) for kind, model in trainer.model.kinds().items()})
     record["of"] = models["parameters"].count, trainer.parameters.count
     record["reproduced"] = alone or reproduced(models)
-    arrays = {f"{kind}/{g}": array.values for kind, model in models.items() for g, array in model.arrays.items()}
+    arrays = {f"{kind}/{g}": array.get() for kind, model in models.items() for g, array in model.arrays.items()}
     path = folder / f"trouble-step-{incident.step:07d}.npz"
     write_checkpoint(path, incident.step, {**pixels, **pose, **arrays}, record)
     return path
@@ -180,7 +180,7 @@ def _unmarked(models: dict[str, HostGaussians]) -> dict[str, HostGaussians]:
     """The models with zeros in place of moments that are not finite. Such a moment may mark a step that `adam`
     refused."""
     for kind in ("first", "second"):
-        arrays = {g: HostArray(finite_or_zero(array.values)) for g, array in models[kind].arrays.items()}
+        arrays = {g: HostArray(finite_or_zero(array.get())) for g, array in models[kind].arrays.items()}
         models[kind] = replace(models[kind], arrays=arrays)
     return models
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,11 +17,13 @@ from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
 from clsplat.errors import CapacityError
-from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
+from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, floats_of
 from clsplat.models.edit import take
 from clsplat.optimisation.density_rules import FRESH
+from clsplat.rendering.memory_needs import MODELS
 from clsplat.rendering.memory_plan import Plan
 from clsplat.runs.checkpoints import Checkpoint, unusable
+from clsplat.stages.chunk_pool import ChunkPool
 from clsplat.stages.density import (
     DensityStatistics,
     DeviceMarker,
@@ -40,6 +42,9 @@ from clsplat.stages.device_gaussians import (
     host_gaussians,
     host_model,
     host_zeros,
+    in_memory,
+    pooled,
+    store_of,
     to_device,
     to_host,
     upload_gaussians,
@@ -51,6 +56,7 @@ class TrainedModel:
     """Parameters, first and second moments and statistics, on the device or streamed from the host.
 
     make_plan: function that plans the device's memory for a number of Gaussians.
+    scratch: function that names a new file for so many bytes of chunks, or returns None to keep them in main memory.
     sh_degree: final SH degree.
     counts_contributions: True if the statistics have contributions.
     """
@@ -66,11 +72,13 @@ class TrainedModel:
         device: Device,
         work: Workspace,
         make_plan: Callable[[int], Plan],
+        scratch: Callable[[int], Path | None],
         *,
         sh_degree: int,
         counts_contributions: bool,
     ) -> None:
-        self._device, self._work, self._make_plan = device, work, make_plan
+        self._device, self._work, self._make_plan, self._scratch = device, work, make_plan, scratch
+        self._pool: ChunkPool | None = None
         self._sh_degree, self._counts_contributions = sh_degree, counts_contributions
 
     def begin(self, initial: Gaussians) -> None:
@@ -78,8 +86,9 @@ class TrainedModel:
         if len(initial) > ORDERED_ROWS:
             initial = take(initial, space_order(initial.means).astype(np.int64))
         self.plan = self._make_plan(len(initial))
-        if self.plan.streamed:
-            self.set(host_gaussians(copy.deepcopy(initial), self.plan.rows))
+        if self.plan.streamed:  # a store of chunks is a copy already
+            initial = initial if len(initial) > ORDERED_ROWS else copy.deepcopy(initial)
+            self.set(host_gaussians(initial, self.plan.rows))
         else:
             self.set(upload_gaussians(self._device, initial))
 
@@ -102,7 +111,7 @@ class TrainedModel:
         """
         self.free()
         self.plan = self._make_plan(models[0].count)
-        self.set(*(self._placed(model) for model in models))
+        self.set(*models)
         statistics = checkpoint.named("statistics/")
         for name, array in self.statistics.named().items():
             if name in statistics and (statistics[name].shape, statistics[name].dtype) != (array.shape, array.dtype):
@@ -116,12 +125,10 @@ class TrainedModel:
     def set(
         self, parameters: AnyGaussians, first: AnyGaussians | None = None, second: AnyGaussians | None = None
     ) -> None:
-        """Set the arrays, with new statistics. Moments that are not given start from zero."""
-        count, coefficients = parameters.count, parameters.coefficients
-        self.parameters = parameters
-        self.first = first or self._zeros(count, coefficients)
-        self.second = second or self._zeros(count, coefficients)
-        self.statistics = new_statistics(self._device, count, contributions=self._counts_contributions)
+        """Set the arrays, where the plan assigns them, with new statistics. Moments that are not given start from
+        zero."""
+        self._place(parameters, first, second)
+        self.statistics = new_statistics(self._device, parameters.count, contributions=self._counts_contributions)
 
     def kinds(self) -> dict[str, AnyGaussians]:
         """Parameters, first and second moments, by their names in a checkpoint."""
@@ -146,9 +153,7 @@ class TrainedModel:
         """Make room for more SH coefficients, which start from zero."""
         if not self.plan.gathers:
             self._take_down()
-        self.parameters, self.first, self.second = (
-            self._placed(widen(self._device, model, coefficients)) for model in self.with_moments
-        )
+        self._place(*(widen(self._device, model, coefficients) for model in self.with_moments))
 
     def rearrange(self, plan: RowPlan, changes: Callable[[], None]) -> DeviceArray | None:
         """Carry out a plan of density control, or of a repair. Returns the list of rows if rows have moved.
@@ -179,6 +184,26 @@ class TrainedModel:
             self.statistics.forget_contributions()
         return moved
 
+    def _place(self, parameters: AnyGaussians, first: AnyGaussians | None, second: AnyGaussians | None) -> None:
+        """Put the arrays where the plan assigns them. The rows of a large streamed model are in a store of chunks."""
+        count, coefficients = parameters.count, parameters.coefficients
+        if self.plan.streamed and count > ORDERED_ROWS:
+            store = store_of((parameters, first, second), self._scratch(MODELS * 4 * floats_of(coefficients) * count))
+            self.close()
+            pool = self._pool = ChunkPool(self._device, self._work, store, self.plan.rows)
+            self.parameters, self.first, self.second = pooled(pool, coefficients)
+            return
+        models = [self._placed(model) for model in (parameters, first, second) if model is not None]
+        self.close()
+        self.parameters, *moments = models
+        self.first, self.second = moments or (self._zeros(count, coefficients), self._zeros(count, coefficients))
+
+    def close(self) -> None:
+        """Remove the scratch file of a streamed model. The model cannot be used any longer."""
+        if self._pool is not None:
+            self._pool.close()
+            self._pool = None
+
     def _zeros(self, count: int, coefficients: int) -> AnyGaussians:
         if isinstance(self.parameters, HostGaussians):
             return host_zeros(count, coefficients, self.parameters.rows)
@@ -191,7 +216,7 @@ class TrainedModel:
     def _placed(self, model: AnyGaussians) -> AnyGaussians:
         """The model on the device or on the host, as the plan assigns; it is moved there if necessary."""
         if isinstance(model, HostGaussians):
-            return replace(model, rows=self.plan.rows) if self.plan.streamed else to_device(self._device, model)
+            return in_memory(model, self.plan.rows) if self.plan.streamed else to_device(self._device, model)
         return model
 
     def _ordered(self, listed: DeviceRowList) -> tuple[DeviceArray, NDArray[np.int64] | None]:

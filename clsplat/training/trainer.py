@@ -124,6 +124,7 @@ class Trainer:
             self.device,
             self.rasterizer.work,
             self._make_plan,
+            self.planner.scratch_file,
             sh_degree=self.config.sh_degree,
             counts_contributions=self.strategy.needs().contributions,
         )
@@ -439,8 +440,9 @@ class Trainer:
         self._rearrange(self.strategy.at_end(self._state()))
 
     def close(self) -> None:
-        """End the threads of a batch, and those that read photographs."""
+        """End the threads of a batch, and those that read photographs; remove files of chunks."""
         self.photographs.host.close()
+        self.model.close()
         if self.batch is not None:
             self.batch.close()
 

@@ -138,8 +138,6 @@ class GradientStep:
             probe.loss(result)
             probe.pair_gradients(slots)
         self._change(model, inputs, frame, slots, gradients, probe, None if placed is None else placed.listed)
-        if placed is not None and placed.finish is not None:
-            placed.finish()
         self.learn(inputs, own)
         return result
 

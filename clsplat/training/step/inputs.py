@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -25,18 +24,13 @@ class PlacedChunks:
     """Chunks that are ready for a step.
 
     listed: their numbers in the model.
-    model: the model that the kernels get: the whole model, or, if it is streamed, the rows of these chunks alone.
-    finish: function that copies the changes back to a streamed model.
+    model: the model that the kernels get: the whole model, or, if it is streamed, the rows of the pool's slots.
+    in_model: the chunks for kernels that read `model`.
     """
 
     listed: ChunkList
     model: tuple[AnyGaussians, ...]
-    finish: Callable[[], None] | None = None
-
-    @property
-    def in_model(self) -> ChunkList | None:
-        """The chunks for kernels that read `model`; None if it has no other rows."""
-        return None if self.finish else self.listed
+    in_model: ChunkList
 
 
 class ChunksInView(Protocol):

@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Bool, Float32, Float64
+from clsplat.camera import Camera
 from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_resumed_step, largest_step
 from clsplat.chunks.culling import visible
 from clsplat.chunks.order import ORDERED_ROWS
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, allocate
+from clsplat.device.context import Device
 from clsplat.device.launch import DEFAULT_GROUP_ITEMS
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.layouts.columns import CHUNK_ROWS
@@ -24,7 +26,8 @@ from clsplat.rendering.rasterizer import MAX_COUNTED_PASSES, Rasterizer
 from clsplat.stages.adam import AdamStep
 from clsplat.stages.bounds import BOUNDS_FLOATS, bounds, send_chunks
 from clsplat.stages.catch_up import StepTable, catch_up, step_table
-from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians, upload_chunks
+from clsplat.stages.chunk_pool import ChunkPool
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians
 from clsplat.training.learning_rates import largest_rates
 from clsplat.training.step.component import Component, Named
 from clsplat.training.step.inputs import ChunksInView, PlacedChunks, ViewInputs
@@ -37,6 +40,20 @@ MAX_SHARE_IN_VIEW = 0.6
 take 0.89 of the time of steps over the whole; with 0.78 of bonsai, 1.01."""
 MOST_MISSED_STEPS = 1024
 """Steps after which a chunk is caught up even if no view shows it."""
+
+
+def runs_by_chunk(config: TrainConfig, device: Device) -> bool:
+    """True if a step may run over the chunks in view: it changes hidden Gaussians at most by Adam, and reads gradients
+    of none of them."""
+    by_adam_only = config.density.growth != "mcmc" and not config.antialiased and not config.optimiser.late
+    one_view = config.batch == 1 and not config.refines
+    return by_adam_only and one_view and device.max_group >= DEFAULT_GROUP_ITEMS
+
+
+def streams_by_chunk(config: TrainConfig, device: Device, count: int) -> bool:
+    """True if a model of `count` Gaussians may be streamed by chunks. Thinning draws its random numbers by the row of
+    the launch, which is not the model's then."""
+    return count > ORDERED_ROWS and config.thinning == 0 and runs_by_chunk(config, device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,11 +118,7 @@ class VisibleChunks(Component):
     @property
     def on(self) -> bool:
         """True if a step changes hidden Gaussians at most by Adam, and reads gradients of none of them."""
-        config = self._config
-        by_adam_only = config.density.growth != "mcmc" and not config.antialiased and not config.optimiser.late
-        one_view = config.batch == 1 and not config.refines
-        groups = self._rasterizer.device.max_group >= DEFAULT_GROUP_ITEMS
-        return by_adam_only and one_view and groups and isfinite(self._step_limit)
+        return runs_by_chunk(self._config, self._rasterizer.device) and isfinite(self._step_limit)
 
     def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002
         """True if bounds must be measured before the next step."""
@@ -118,9 +131,12 @@ class VisibleChunks(Component):
 
     def before_step(self, gaussians: AnyGaussians) -> None:
         """Measure the bounds of chunks whose Gaussians may have moved."""
-        streams = isinstance(gaussians, HostGaussians)
-        if streams and not (self._config.optimiser.sparse and self._config.thinning == 0):
-            return  # neither the missed steps nor the random numbers are those of a part of the model
+        pool = gaussians.pool if isinstance(gaussians, HostGaussians) else None
+        if isinstance(gaussians, HostGaussians) and (pool is None or self._config.thinning > 0):
+            return  # thinning draws its random numbers by the row of the launch
+        self._slots = len(self._last) if pool is None else pool.slots
+        if pool is not None:
+            pool.cull = self.in_view
         self._since = 0
         numbers = np.flatnonzero(self._unmeasured).astype(np.uint32)
         if len(numbers) == 0:
@@ -132,13 +148,23 @@ class VisibleChunks(Component):
     def _measured(self, gaussians: AnyGaussians, numbers: NDArray[np.uint32]) -> Float32:
         """Bounds (chunks, BOUNDS_FLOATS) of these chunks."""
         if isinstance(gaussians, DeviceGaussians):
-            work = self._rasterizer.work
-            chunks = send_chunks(work, "chunks", numbers, gaussians.count)
-            return bounds(self._rasterizer.device, work, gaussians, chunks)[: len(numbers)]
-        rows = (CHUNK_ROWS * numbers.astype(np.int64)[:, None] + np.arange(CHUNK_ROWS)).ravel()
-        rows = rows[rows < gaussians.count]
-        found = ChunkBounds.measured(*(gaussians[group].values[rows] for group in ("means", "log_scales")))
-        return np.hstack([found.lowest, found.highest, found.largest[:, None]]).astype(np.float32)
+            return self._measured_on_device(gaussians, numbers)
+        assert gaussians.pool is not None
+        slots = gaussians.pool.held(numbers)
+        found, there = np.empty((len(numbers), BOUNDS_FLOATS), np.float32), slots >= 0
+        if there.any():
+            found[there] = self._measured_on_device(gaussians.in_pool, slots[there].astype(np.uint32))
+        for place in np.flatnonzero(~there):
+            begin = CHUNK_ROWS * int(numbers[place])
+            rows = (begin, min(begin + CHUNK_ROWS, gaussians.count))
+            one = ChunkBounds.measured(*(gaussians[group].get_rows(*rows) for group in ("means", "log_scales")))
+            found[place] = np.concatenate([one.lowest[0], one.highest[0], one.largest])
+        return found
+
+    def _measured_on_device(self, gaussians: DeviceGaussians, numbers: NDArray[np.uint32]) -> Float32:
+        work = self._rasterizer.work
+        chunks = send_chunks(work, "chunks", numbers, gaussians.count)
+        return bounds(self._rasterizer.device, work, gaussians, chunks)[: len(numbers)]
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:
         """The view, with the chunks that it may show."""
@@ -149,7 +175,7 @@ class VisibleChunks(Component):
             self._begin_table(step - 1, len(self._last))
         hidden = self._hidden_movement(step)
         shown = self._shown(of_view, step, hidden)
-        whole = int(np.count_nonzero(shown)) > MAX_SHARE_IN_VIEW * len(shown)
+        whole = int(np.count_nonzero(shown)) > min(MAX_SHARE_IN_VIEW * len(shown), self._slots)
         self._since += 1
         if whole:
             shown[:] = True
@@ -161,14 +187,22 @@ class VisibleChunks(Component):
         missed = self._missed(shown, step - 1)
         return [replace(of_view, chunks=_ChunksInView(self, numbers, missed, self._found, whole=whole))]
 
+    def in_view(self, camera: Camera) -> NDArray[np.int64]:
+        """The chunks that a camera may show, as they are after the last step."""
+        shown = self._shown_by(camera, 1.0, self._hidden_movement(self.step + 1))
+        return np.flatnonzero(shown)
+
     def _shown(self, of_view: ViewInputs, step: int, hidden: tuple[Float64, Float64]) -> Bool:
         """The chunks that the view may show. hidden: result of `_hidden_movement`."""
         thinning = thinning_of(self._config, step)
-        factor = 1.0 if thinning is None else thinning.factor
+        return self._shown_by(of_view.camera, 1.0 if thinning is None else thinning.factor, hidden)
+
+    def _shown_by(self, camera: Camera, factor: float, hidden: tuple[Float64, Float64]) -> Bool:
+        """The chunks that a camera may show, with opacities times a factor. hidden: result of `_hidden_movement`."""
         measured = ChunkBounds(self._found[:, :3], self._found[:, 3:6], self._found[:, 6])
         moved = (self._means_moved + hidden[0], self._scales_moved + hidden[1])
         now = measured.widened(*moved, MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
-        return visible(now, of_view.camera, self._config.rasterizer, factor)
+        return visible(now, camera, self._config.rasterizer, factor)
 
     def _hidden_movement(self, step: int) -> tuple[Float64, Float64]:
         """The most by which means and log scales of each chunk move in the steps before number `step` that it has
@@ -199,21 +233,21 @@ class VisibleChunks(Component):
         if chunks.of_rows is not self._found:  # rows have moved since, and all have taken every step
             chunks = _ChunksInView(self, np.arange(len(self._last), dtype=np.uint32), None, self._found, whole=True)
         if chunks.missed is not None:
-            self._catch_up(_on_device(model), chunks.missed)
+            self._catch_up(model, chunks.missed)
         older = {number: last for number, last in self._before.items() if number >= step.number - MAX_COUNTED_PASSES}
         self._before = {**older, step.number: self._last}
         self._last, self.step = self._last.copy(), step.number
         self._last[chunks.numbers] = step.number
         self._note(step)
-        streamed = [each for each in model if isinstance(each, HostGaussians)]
-        if chunks.whole or (streamed and CHUNK_ROWS * len(chunks.numbers) > streamed[0].rows):
+        if chunks.whole:
             return None
         work = self._rasterizer.work
         listed = send_chunks(work, "chunks", chunks.numbers, model[0].count)
-        if not streamed:
-            return PlacedChunks(listed, model)
-        numbers = chunks.numbers if len(chunks.numbers) else np.zeros(1, np.uint32)  # a model has a row
-        return PlacedChunks(listed, *upload_chunks(work, numbers, *streamed))
+        pool = _pool_of(model)
+        if pool is None:
+            return PlacedChunks(listed, model, listed)
+        slots = send_chunks(work, "chunk_slots", pool.place(chunks.numbers, changes=True), pool.rows)
+        return PlacedChunks(listed, _in_pool(model), slots)
 
     def _note(self, step: AdamStep) -> None:
         """Put a step into the table, from which steps go that all chunks have taken."""
@@ -226,20 +260,39 @@ class VisibleChunks(Component):
             self._first_step += past
         self._table[step.number - self._first_step] = step_table([step])[0]
 
-    def _catch_up(self, model: tuple[DeviceGaussians, ...], missed: Missed) -> None:
-        device, work, readback = self._rasterizer.device, self._rasterizer.work, self._rasterizer.readback
-        if self._caught is None:
-            self._caught = allocate(device, self._last.shape, np.uint32)
-            self._caught.fill(0)
-        chunks = send_chunks(work, "chunks_behind", missed.numbers, model[0].count)
-        last = work.array("last_steps", chunks.numbers.shape, np.uint32)
-        padded = np.full(last.shape, missed.step, np.uint32)
-        padded[: len(missed.last)] = missed.last
-        last.send(padded)
+    def _catch_up(self, model: tuple[AnyGaussians, ...], missed: Missed) -> None:
+        pool, work = _pool_of(model), self._rasterizer.work
         table = work.array("missed_steps", missed.table.shape)
         table.send(missed.table)
-        steps = (last, self._caught, missed.step, StepTable(table, missed.first_step))
-        catch_up(device, self._config.optimiser, model, chunks, *steps, readback)
+        steps = StepTable(table, missed.first_step)
+        if pool is None:
+            if self._caught is None:
+                self._caught = allocate(self._rasterizer.device, self._last.shape, np.uint32)
+                self._caught.fill(0)
+            self._catch_up_rows(_on_device(model), missed.numbers, missed.last, self._caught, missed.step, steps)
+            return
+        for begin in range(0, len(missed.numbers), pool.slots):
+            some = slice(begin, begin + pool.slots)
+            slots = pool.place(missed.numbers[some], changes=True)
+            self._catch_up_rows(_in_pool(model), slots, missed.last[some], pool.caught, missed.step, steps)
+
+    def _catch_up_rows(
+        self,
+        model: tuple[DeviceGaussians, ...],
+        numbers: NDArray[np.uint32],
+        last: NDArray[np.uint32],
+        caught: DeviceArray,
+        step: int,
+        table: StepTable,
+    ) -> None:
+        """Catch up chunks or slots of a model on the device to a step. Arguments as those of `catch_up`."""
+        device, work, readback = self._rasterizer.device, self._rasterizer.work, self._rasterizer.readback
+        chunks = send_chunks(work, "chunks_behind", numbers, model[0].count)
+        on_device = work.array("last_steps", chunks.numbers.shape, np.uint32)
+        padded = np.full(on_device.shape, step, np.uint32)
+        padded[: len(last)] = last
+        on_device.send(padded)
+        catch_up(device, self._config.optimiser, model, chunks, on_device, caught, step, table, readback)
 
     def step_back(self, step: int) -> None:
         """Return to the state after step number `step`. Chunks that were caught up after it are marked as such."""
@@ -252,7 +305,7 @@ class VisibleChunks(Component):
         missed = self._missed(np.ones(len(self._last), np.bool_), self.step)
         if missed is None:
             return
-        self._catch_up(_on_device((parameters, first, second)), missed)
+        self._catch_up((parameters, first, second), missed)
         self._note_movement(self._last < missed.step, self._hidden_movement(missed.step + 1))
         self._last[missed.numbers] = missed.step
 
@@ -298,6 +351,13 @@ class _ChunksInView(ChunksInView):
         return self.of.prepare(model, step, self)
 
 
+def _pool_of(model: Sequence[AnyGaussians]) -> ChunkPool | None:
+    return model[0].pool if isinstance(model[0], HostGaussians) else None
+
+
+def _in_pool(model: Sequence[AnyGaussians]) -> tuple[DeviceGaussians, ...]:
+    return tuple(each.in_pool for each in model if isinstance(each, HostGaussians))
+
+
 def _on_device(model: Sequence[AnyGaussians]) -> tuple[DeviceGaussians, ...]:
-    assert all(isinstance(each, DeviceGaussians) for each in model), "a streamed model has nothing to catch up"
     return tuple(each for each in model if isinstance(each, DeviceGaussians))
