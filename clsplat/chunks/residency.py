@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+CROSSING_SHARE = 8
+"""One in this many slots, and at least one, may cross the bus at once: memory for as many records is set aside."""
 _NOTHING = -1
 """Number of the chunk in a free slot, and slot of a chunk that is not on the device."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from clsplat.chunks.residency import CROSSING_SHARE
 from clsplat.errors import CapacityError, amount
 from clsplat.layouts.columns import CHUNK_ROWS
 
@@ -155,8 +156,8 @@ def _plan_by_chunk(need: Need, held: int, budget: int, max_allocation: int) -> P
 
     Raises CapacityError if not even one chunk fits.
     """
-    room = budget - need.planes - need.scratch - need.gaussians * held
-    in_view = need.model + need.row - held + need.banded
+    room = budget - need.planes - need.scratch - need.gaussians * held - CHUNK_ROWS * need.model
+    in_view = need.model + need.model // CROSSING_SHARE + need.row - held + need.banded
     rows = room // (in_view + PAIRS_IN_VIEW * need.pair)
     if need.pool is not None:
         rows = min(rows, need.pool // need.model)

@@ -260,11 +260,10 @@ class Rasterizer:
     def _in_view(
         self, gaussians: HostGaussians, pool: ChunkPool, camera: Camera
     ) -> tuple[AnyGaussians, ChunkList | None]:
-        """The rows of a pool, and the slots that the camera may show; the whole model if that is not known, or if they
-        are too many."""
-        numbers = None if pool.cull is None else pool.cull(camera)
-        if numbers is None or len(numbers) > pool.slots:
+        """The rows of a pool, and the slots that the camera may show; the whole model if that is not known."""
+        if pool.cull is None:
             return gaussians, None
+        numbers = pool.cull(camera)
         slots = send_chunks(self.work, "chunk_slots", pool.place(numbers, changes=False), pool.rows)
         return gaussians.in_pool, slots
 

@@ -12,20 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.chunks.residency import Residency
+from clsplat.chunks.residency import CROSSING_SHARE, Residency
 from clsplat.chunks.store import ChunkStore
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
+from clsplat.errors import CapacityError
 from clsplat.layouts.columns import CHUNK_ROWS
 
 INVISIBLE_LOGIT = -1e30
 """Opacity logit of a row that is not of the model."""
 _VECTOR = 4
 """Words that an item of the kernel copies."""
-_CHUNKS_AT_ONCE = 32
-"""Most chunks whose records cross at once. More would need more memory, and gain nothing."""
+_MAX_CROSSING = 32
+"""Most chunks whose records cross at once. More gain nothing."""
 
 
 @stage("chunk_records")
@@ -93,8 +94,13 @@ class ChunkPool:
         """Bring these chunks to the device. Returns the slot of each.
 
         changes: True if the device will change them.
-        Raises ValueError for more chunks than slots.
+        Raises CapacityError for more chunks than slots.
         """
+        if len(numbers) > self.slots:
+            raise CapacityError(
+                f"a view may show {CHUNK_ROWS * len(numbers):,} Gaussians, but there is memory for {self.rows:,}: "
+                "allow more (--max-host-mem, --max-device-mem)"
+            )
         moves = self._residency.place(numbers)
         if len(moves.fetched):
             changed = self._changed[moves.evicted_from]
@@ -144,7 +150,7 @@ class ChunkPool:
         self.caught.set(caught)
 
     def _fetch(self, numbers: NDArray[np.int64], slots: NDArray[np.uint32]) -> None:
-        for some in _groups(len(numbers)):
+        for some in self._groups(len(numbers)):
             on_device, records = self._crossing(slots[some])
             values = np.ascontiguousarray(self.store.read(numbers[some]))
             self._close_last(numbers[some], values)
@@ -162,22 +168,23 @@ class ChunkPool:
             records["parameters/opacity_logits"][place, rows:] = INVISIBLE_LOGIT
 
     def _write(self, numbers: NDArray[np.int64], slots: NDArray[np.uint32]) -> None:
-        for some in _groups(len(numbers)):
+        for some in self._groups(len(numbers)):
             on_device, records = self._crossing(slots[some])
             copy_chunks(self._device, on_device, records, self.store.record, self.arrays, to_records=True)
             values = records.get()
             self.store.write(numbers[some], values.view(self.store.record).reshape(-1))
             self.moved_bytes += values.nbytes
 
+    def _groups(self, count: int) -> list[slice]:
+        """Parts of `count` chunks that cross one after the other."""
+        most = min(max(self.slots // CROSSING_SHARE, 1), _MAX_CROSSING)
+        return [slice(begin, begin + most) for begin in range(0, count, most)]
+
     def _crossing(self, slots: NDArray[np.uint32]) -> tuple[DeviceArray, DeviceArray]:
         """Slots on the device, and memory there for their records."""
         on_device = self._work.array("crossing_slots", slots.shape, np.uint32)
         on_device.set(slots)
         return on_device, self._work.array("crossing", (len(slots), self.store.record.itemsize // 4), np.uint32)
-
-
-def _groups(count: int) -> list[slice]:
-    return [slice(begin, begin + _CHUNKS_AT_ONCE) for begin in range(0, count, _CHUNKS_AT_ONCE)]
 
 
 @dataclass(frozen=True, eq=False)

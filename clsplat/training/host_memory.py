@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import secrets
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -128,19 +129,13 @@ class HostMemory:
                 f"--max-host-mem {amount(self.limit)} leaves {amount(nbytes)} of Gaussians to files: name a folder for "
                 "them (--scratch DIR), or a run's folder (-o)"
             )
-        return next(path for path in self._files() if not path.exists())
+        return self.scratch / f"{self.owner}-{secrets.token_hex(4)}{SCRATCH_SUFFIX}"
 
     def remove_scratch(self) -> None:
         """Remove this training's files of chunks, which may be of a process that was killed."""
-        for path in self._files() if self.scratch is not None else ():
+        for path in self.scratch.glob(f"{self.owner}-*{SCRATCH_SUFFIX}") if self.scratch is not None else ():
             with suppress(OSError):
                 remove(path)
-
-    def _files(self) -> tuple[Path, Path]:
-        """While a model is rewritten there are two."""
-        assert self.scratch is not None
-        first, second = (self.scratch / f"{self.owner}-{number}{SCRATCH_SUFFIX}" for number in (1, 2))
-        return first, second
 
     def share(self, photographs: HostPhotographs, count: int, taken: int, *, begins: bool) -> bool:
         """Give the photographs the memory that the Gaussians leave. Returns False if that is too little.

@@ -134,7 +134,7 @@ class VisibleChunks(Component):
         pool = gaussians.pool if isinstance(gaussians, HostGaussians) else None
         if isinstance(gaussians, HostGaussians) and (pool is None or self._config.thinning > 0):
             return  # thinning draws its random numbers by the row of the launch
-        self._slots = len(self._last) if pool is None else pool.slots
+        self._streamed = pool is not None
         if pool is not None:
             pool.cull = self.in_view
         self._since = 0
@@ -175,7 +175,7 @@ class VisibleChunks(Component):
             self._begin_table(step - 1, len(self._last))
         hidden = self._hidden_movement(step)
         shown = self._shown(of_view, step, hidden)
-        whole = int(np.count_nonzero(shown)) > min(MAX_SHARE_IN_VIEW * len(shown), self._slots)
+        whole = not self._streamed and int(np.count_nonzero(shown)) > MAX_SHARE_IN_VIEW * len(shown)
         self._since += 1
         if whole:
             shown[:] = True
