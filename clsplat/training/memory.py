@@ -1,28 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The limit of main memory for photographs and Gaussians, and the cache of decoded photographs."""
+"""Memory of a training: the plans of the devices', the limit of main memory, and the cache of decoded photographs."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from clsplat.config.checks import parse_bytes
+from clsplat.config.masks import NO_MASKS
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
-from clsplat.errors import InputError, amount
+from clsplat.errors import InputError, amount, warn
 from clsplat.gaussians import floats_of
-from clsplat.rendering.memory_needs import MODELS
+from clsplat.rendering.memory_needs import MODELS, StepMemory, plan_step
+from clsplat.rendering.memory_plan import Plan
+from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene
 from clsplat.stages.density import gaussian_bytes
-from clsplat.training.batch import OWNER_ARRAYS_PER_PARAMETER
+from clsplat.training.batch import OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PER_PARAMETER, Batch
+from clsplat.training.density import StatisticsNeeds
+from clsplat.training.step.component import Component
+from clsplat.training.step.gradient_step import slot_fields
 from clsplat.training.supervision.decoded_store import DecodedStore, remove_decoded
 from clsplat.training.supervision.decoding import Decoder
 from clsplat.training.supervision.host_photographs import HostPhotographs
+from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.supervision.resolution import by_doubling
-
-if TYPE_CHECKING:
-    from clsplat.scenes.scene import Scene
 
 NO_CACHE = "none"
 
@@ -104,3 +109,68 @@ class HostMemory:
 
 
 UNLIMITED = HostMemory()
+
+
+class MemoryPlanner:
+    """Plans the memory of a training, and gives its parts what the plans allow them.
+
+    begins: True until the first step. Too little main memory is an error until then, and a warning later.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        config: TrainConfig,
+        rasterizer: Rasterizer,
+        photographs: ImageCache,
+        memory: HostMemory,
+        batch: Batch | None,
+    ) -> None:
+        self._scene, self._config, self._rasterizer = scene, config, rasterizer
+        self._photographs, self._memory, self._batch = photographs, memory, batch
+        self.begins, self._warned = True, False
+
+    def plan(self, count: int, needs: StatisticsNeeds, components: Sequence[Component], turns: int) -> Plan:
+        """Plan the memory for `count` Gaussians with their final number of SH coefficients.
+
+        needs: statistics of density control.
+        turns: number of arrays for the loss's sums (`stages.loss.loss`).
+        Raises CapacityError, or InputError for too little main memory.
+        """
+        memory = StepMemory(
+            fields=slot_fields(needs, nearness=bool(self._config.depth_use)),
+            photographs=sum(view.camera.width * view.camera.height for view in self._scene.train_views),
+            turns=turns,
+            masks=self._config.mask_use != NO_MASKS,
+            row_bytes=sum(component.row_bytes for component in components),
+            pixel_bytes=sum(component.pixel_bytes for component in components),
+        )
+        models = max(component.models for component in components)
+        usual = MODELS if self._batch is None else OWNER_ARRAYS_PER_PARAMETER
+        made = self._plan(self._rasterizer.device, count, memory, models or usual)
+        self._rasterizer.follow(made)
+        self._photographs.follow(made.photographs)
+        self._share_host(made, count, gaussian_bytes(contributions=needs.contributions))
+        if self._batch is not None:
+            replicas = [replica.device for replica in self._batch.replicas]
+            self._batch.follow([self._plan(each, count, memory, REPLICA_ARRAYS_PER_PARAMETER) for each in replicas])
+        return made
+
+    def _plan(self, device: Device, count: int, memory: StepMemory, models: int) -> Plan:
+        cameras, coefficients = [view.camera for view in self._scene.views], (self._config.sh_degree + 1) ** 2
+        return plan_step(device, count, coefficients, cameras, self._config.rasterizer, memory, models=models)
+
+    def _share_host(self, plan: Plan, count: int, statistics: int) -> None:
+        """Give the photographs the main memory that the Gaussians leave.
+
+        statistics: bytes of statistics per Gaussian.
+        """
+        on_host = self._rasterizer.device.shares_memory or plan.streamed
+        taken = count * (plan.need.model + statistics) if on_host else 0
+        enough = self._memory.share(self._photographs.host, count, taken, begins=self.begins)
+        if not enough and not self._warned:
+            self._warned = True
+            warn(
+                f"--max-host-mem is exceeded from here on: {count:,} Gaussians leave too little of it for photographs; "
+                "--density.max-gaussians limits the number of Gaussians"
+            )
