@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from clsplat.config.checks import parse_bytes
@@ -67,9 +67,6 @@ class HostMemory:
     def photographs(self, scene: Scene, config: TrainConfig) -> HostPhotographs:
         """Training photographs of a scene."""
         store = DecodedStore(self.cache) if self.cache is not None else None
-        return self._photographs(scene, config, store)
-
-    def _photographs(self, scene: Scene, config: TrainConfig, store: DecodedStore | None = None) -> HostPhotographs:
         views, factors = scene.require_training_views(), by_doubling(config.warmup).factors
         return HostPhotographs(Decoder(views, config.rounds_photos(len(views)), factors, store), config.batch)
 
@@ -78,7 +75,8 @@ class HostMemory:
         if self.limit is not None:
             count = len(scene.points) or config.random_points
             taken = count * model_bytes(config) if device.shares_memory else 0
-            self.share(self._photographs(scene, config), count, taken, begins=True)
+            photographs = replace(self, cache=None).photographs(scene, config)  # the cache would make its folder
+            self.share(photographs, count, taken, begins=True)
 
     def share(self, photographs: HostPhotographs, count: int, taken: int, *, begins: bool) -> bool:
         """Give the photographs the memory that the Gaussians leave. Returns False if that is too little.

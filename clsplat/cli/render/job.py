@@ -30,8 +30,7 @@ from clsplat.progress import FrameProgress
 from clsplat.runs.appearance import gains_of
 from clsplat.sequence import finished_frames, workers
 from clsplat.sequence.frame_renderer import DevicePlan
-from clsplat.sequence.job_models import JobModels, load_job_models
-from clsplat.sequence.mattes import mattes_of, names_of
+from clsplat.sequence.job_models import JobModels, load_job_models, names_of
 from clsplat.sequence.numbered import is_sequence
 from clsplat.sequence.shot_tasks import held_out, make_views
 from clsplat.sequence.task import Record, RenderOptions, Task, digest_of, picture_camera, sampling_of, warp_of
@@ -77,7 +76,8 @@ def job_of(request: Request) -> Job:
         warn(text)
     job_models = models()
     gains = gains_of(flags.model, flags.appearance) if flags.appearance is not None else ()
-    tasks, mattes = job_models.seen(tasks, pictures, channels), mattes_of(job_models, channels, flags.ids_from or "")
+    tasks = job_models.seen(tasks, pictures, channels)
+    mattes = job_models.mattes(channels, flags.ids_from or "")
     colours = Colours(pictures.colour, job_models.space)
     colours.check_file(flags.output)
     options = RenderOptions(
