@@ -198,6 +198,11 @@ class TrainedModel:
         self.parameters, *moments = models
         self.first, self.second = moments or (self._zeros(count, coefficients), self._zeros(count, coefficients))
 
+    @property
+    def in_file(self) -> bool:
+        """True if main memory has no room for the whole model."""
+        return self._pool is not None and self._pool.store.path is not None
+
     def close(self) -> None:
         """Remove the scratch file of a streamed model. The model cannot be used any longer."""
         if self._pool is not None:
