@@ -29,7 +29,7 @@ POSE_STAGES = ("pose",)
 """Further stages for training with pose refinement."""
 LENS_STAGES = ("lens",)
 """Further stages for training with lens refinement."""
-CHUNK_STAGES = ("bounds", "chunks", "catch_up")
+CHUNK_STAGES = ("bounds", "chunks", "catch_up", "chunk_records")
 """Further stages for training of models of several chunks."""
 LIBRARY_STAGES = ("ewa", "harmonics", "splats", "values")
 """Further stages for the library's calls."""
@@ -73,6 +73,7 @@ STAGE_BOUNDS_ULP: dict[str, tuple[float, str]] = {
     "bounds": (0, "minima and maxima"),
     "chunks": (512, "211 measured, in second moments: beta2 in float32 is off by 1.3e-5 of 1 - beta2, up to 216 ulp"),
     "catch_up": (64, "8 measured, in first moments: beta1 in float32 is off by 2.6e-8 in each of 20 steps"),
+    "chunk_records": (0, "copies of words"),
     "ewa": (1024, "95 measured, in the gradient of quaternions, whose terms cancel; else as project_grad"),
     "harmonics": (64, "10 measured; one root and one division"),
     "splats": (64, "2 measured; a root and two quotients"),

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cases of chunks: their bounds, a step over some chunks of a model, and chunks that catch up on the steps of Adam that
-they missed."""
+"""Cases of chunks: their bounds, a step over some chunks of a model, chunks that catch up on the steps of Adam that they
+missed, and copies of chunks to and from the slots of a pool."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from clsplat.chunks.store import record_type
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
@@ -16,6 +19,7 @@ from clsplat.layouts.columns import CHUNK_ROWS, SLOT_PLAIN, SPLAT
 from clsplat.models.edit import take
 from clsplat.reference.bounds import bounds as bounds_twin
 from clsplat.reference.catch_up import catch_up as catch_up_twin
+from clsplat.reference.chunk_records import to_records, to_slots
 from clsplat.selftest.case import Arrays, Case, Expected, Inputs, Read, exactly, fresh_readback, read_of
 from clsplat.selftest.cases.density import STATISTICS_CASE
 from clsplat.selftest.cases.steps import ADAM_CASE, ADAM_ENDS, ADAM_RATES, random_scene, uploaded_groups
@@ -25,6 +29,7 @@ from clsplat.stages.adam import AdamStep
 from clsplat.stages.bounds import bounds
 from clsplat.stages.catch_up import StepTable, catch_up, step_table
 from clsplat.stages.chunk_lists import ChunkList, padded_chunks
+from clsplat.stages.chunk_pool import copy_chunks
 from clsplat.stages.density import add_contributions, add_statistics, new_statistics
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, host_gaussians, upload_gaussians
@@ -345,4 +350,77 @@ CATCH_UP_CASE = Case(
     twin=_twin_of_catch_up,
     frozen=_frozen_missed,
     digested=STATE,
+)
+
+
+SPARE_SLOTS = 2
+"""Slots of a pool that no copy uses."""
+
+
+def _records_of(words: NDArray[np.uint32], slots: NDArray[np.int64], coefficients: int) -> Inputs:
+    """A pool whose slots have some words each, and as many records.
+
+    slots: the slots that are copied.
+    words: fills the records, then the pool.
+    """
+    fields: dict[str, tuple[int, ...]] = {"logit": (), "mean": (3,), "rest": (coefficients - 1, 3)}
+    record = record_type(fields)
+    count, of_pool, width = len(slots), len(slots) + SPARE_SLOTS, record.itemsize // 4
+    held = np.resize(words, (of_pool, width)).view(record).reshape(-1)
+    return Inputs(
+        record=record,
+        slots=slots.astype(np.uint32),
+        records=np.resize(words[::-1], (count, width)),
+        pool={name: np.ascontiguousarray(held[name]) for name in record.names or ()},
+    )
+
+
+def _random_records(rng: Generator, count: int) -> Inputs:
+    """Records of any bits, those of NaN among them. The slots are in any order."""
+    words = rng.integers(0, 1 << 32, 4096, dtype=np.uint32)
+    words[::3] |= 0x7F800000  # NaN with any payload
+    slots = rng.permutation(count + SPARE_SLOTS)[:count]
+    return _records_of(words, slots, int(rng.choice([1, 4, 16])))
+
+
+def _frozen_records(bench: CaseBench) -> list[Inputs]:
+    words = np.arange(1, 5000, dtype=np.uint32) * np.uint32(2654435761)
+    return [_records_of(words, np.array([3, 0, 4]), bench.model.coefficients)]
+
+
+def _words_of(fields: Mapping[str, Array]) -> dict[str, NDArray[np.uint32]]:
+    return {name: values.view(np.uint32).reshape(len(values), -1) for name, values in fields.items()}
+
+
+def _launch_records(device: Device, _: Workspace, given: Inputs) -> Read:
+    """Copies from the slots, then to them."""
+    slots, read = upload(device, given.slots), upload(device, np.zeros_like(given.records))
+    arrays = {name: upload(device, values) for name, values in given.pool.items()}
+    copy_chunks(device, slots, read, given.record, arrays, to_records=True)
+    copy_chunks(device, slots, upload(device, given.records), given.record, arrays, to_records=False)
+
+    def after() -> Arrays:
+        words = _words_of({name: array.get() for name, array in arrays.items()})
+        return {"records": read.get(), "pool": np.hstack(list(words.values()))}
+
+    return after
+
+
+def _twin_of_records(given: Inputs, _: Arrays) -> dict[str, Expected]:
+    before = _words_of(given.pool)
+    after = to_slots(given.slots, given.records, before)
+    return {
+        "records": exactly(to_records(given.slots, before)),
+        "pool": exactly(np.hstack(list(after.values()))),
+    }
+
+
+CHUNK_RECORDS_CASE = Case(
+    sizes=(1, 33, 2, 9),
+    random=_random_records,
+    launch=_launch_records,
+    twin=_twin_of_records,
+    frozen=_frozen_records,
+    digested=("records", "pool"),
+    by_shape=False,
 )

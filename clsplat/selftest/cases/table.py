@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from clsplat.selftest.case import Case
 from clsplat.selftest.cases.appearance import COLOUR_CASES
-from clsplat.selftest.cases.chunks import BOUNDS_CASE, CATCH_UP_CASE, CHUNKS_CASE
+from clsplat.selftest.cases.chunks import BOUNDS_CASE, CATCH_UP_CASE, CHUNK_RECORDS_CASE, CHUNKS_CASE
 from clsplat.selftest.cases.core import CORE_STAGES
 from clsplat.selftest.cases.density import MARKS_CASE, STATISTICS_CASE, of_statistics
 from clsplat.selftest.cases.depth import of_depth
@@ -35,6 +35,7 @@ CASES: dict[str, Case] = {
     "bounds": BOUNDS_CASE,
     "chunks": CHUNKS_CASE,
     "catch_up": CATCH_UP_CASE,
+    "chunk_records": CHUNK_RECORDS_CASE,
     "noise": NOISE_CASE,
     **COLOUR_CASES,
     "grid": GRID_CASE,
