@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which chunks of a model are on the device: the latest that steps have used."""
+"""Which chunks of a model are on the device: those that were used last."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ CROSSING_SHARE = 8
 """One in this many slots, and at least one, may cross the bus at once: memory for as many records is set aside."""
 _NOTHING = -1
 """Number of the chunk in a free slot, and slot of a chunk that is not on the device."""
+_NEVER = 0
+"""Number of the last use of a free slot."""
 
 
 @dataclass(frozen=True, eq=False)
 class Moves:
-    """What must move before a step can use some chunks.
+    """What must move before some chunks can be used.
 
-    slots: (k,) uint32, the slot of each of these chunks.
-    fetched, fetched_to: the chunks among them that are not on the device yet, and their slots.
-    evicted, evicted_from: the chunks that have been in these slots, and their slots.
+    slots: (k,) uint32, the slot that each of these chunks has or gets.
+    fetched, fetched_to: the chunks among them that are not on the device yet, and the slots that they get.
+    evicted, evicted_from: the chunks that are in these slots until then, and their slots.
     """
 
     slots: NDArray[np.uint32]
@@ -41,28 +43,38 @@ class Residency:
         self.slots = slots
         self._slot_of = np.full(chunks, _NOTHING, np.int64)
         self._chunk_in = np.full(slots, _NOTHING, np.int64)
-        self._used = np.full(slots, -1, np.int64)
-        """By slot, the number of the use at which it was last wanted."""
+        self._used = np.full(slots, _NEVER, np.int64)
+        """By slot, the number of its chunk's last use, counted from 1."""
         self._uses = 0
 
-    def place(self, numbers: NDArray[np.integer[Any]]) -> Moves:
-        """Give each of these chunks a slot; those that have not been used for longest make room.
+    def plan(self, numbers: NDArray[np.integer[Any]]) -> Moves:
+        """What must move before these chunks can be used; those that have not been used for longest make room.
 
+        Nothing changes until `evict` and `use`, so that a move that fails leaves a true record of what is where.
         Raises ValueError for more chunks than slots.
         """
         if len(numbers) > self.slots:
             raise ValueError(f"numbers: {len(numbers)} chunks, expected at most {self.slots}")
-        self._uses += 1
-        held = self._slot_of[numbers]
-        self._used[held[held != _NOTHING]] = self._uses
-        fetched = np.asarray(numbers, np.int64)[held == _NOTHING]
-        to = np.sort(np.argsort(self._used, kind="stable")[: len(fetched)])
+        slots, used = self._slot_of[numbers], self._used.copy()
+        missing = slots == _NOTHING
+        used[slots[~missing]] = self._uses + 1  # none of these makes room
+        to = np.sort(np.argsort(used, kind="stable")[: np.count_nonzero(missing)])
+        slots[missing] = to
         leaving = to[self._chunk_in[to] != _NOTHING]
-        evicted = self._chunk_in[leaving]
-        self._slot_of[evicted] = _NOTHING
-        self._slot_of[fetched], self._chunk_in[to], self._used[to] = to, fetched, self._uses
-        slots = self._slot_of[numbers].astype(np.uint32)
-        return Moves(slots, fetched, to.astype(np.uint32), evicted, leaving.astype(np.uint32))
+        fetched = np.asarray(numbers, np.int64)[missing]
+        by_slot = [each.astype(np.uint32) for each in (slots, to, leaving)]
+        return Moves(by_slot[0], fetched, by_slot[1], self._chunk_in[leaving], by_slot[2])
+
+    def evict(self, moves: Moves) -> None:
+        """Note that the evicted chunks have left: their slots are free."""
+        self._slot_of[moves.evicted] = self._chunk_in[moves.evicted_from] = _NOTHING
+        self._used[moves.evicted_from] = _NEVER
+
+    def use(self, moves: Moves) -> None:
+        """Note that the fetched chunks have come, and that all chunks of the plan are used."""
+        self._uses += 1
+        self._slot_of[moves.fetched], self._chunk_in[moves.fetched_to] = moves.fetched_to, moves.fetched
+        self._used[moves.slots] = self._uses
 
     def held(self) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:
         """The chunks on the device, in rising order, and their slots."""
@@ -77,4 +89,4 @@ class Residency:
     def clear(self) -> None:
         """Forget all chunks."""
         self._slot_of[:] = self._chunk_in[:] = _NOTHING
-        self._used[:] = -1
+        self._used[:] = _NEVER

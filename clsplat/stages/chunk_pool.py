@@ -18,7 +18,6 @@ from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
-from clsplat.errors import CapacityError
 from clsplat.layouts.columns import CHUNK_ROWS
 
 INVISIBLE_LOGIT = -1e9
@@ -59,7 +58,7 @@ class ChunkPool:
 
     store: records of all chunks. Those on the device may be newer there, until `write_back`.
     arrays: by field, the rows of the slots.
-    caught: (slots,) uint32, as `stages.catch_up.catch_up` has them of chunks.
+    caught: (slots,) uint32, the last step up to which the chunk in each slot has been caught up (`stages.catch_up`).
     """
 
     def __init__(self, device: Device, work: Workspace, store: ChunkStore, rows: int) -> None:
@@ -94,20 +93,18 @@ class ChunkPool:
         """Bring these chunks to the device. Returns the slot of each.
 
         changes: True if the device will change them.
-        Raises CapacityError for more chunks than slots.
+        Raises ValueError for more chunks than slots, WriteError, and ScratchError. After an error the chunks that are
+        on the device or in the store are as they were.
         """
-        if len(numbers) > self.slots:
-            raise CapacityError(
-                f"a view may show {CHUNK_ROWS * len(numbers):,} Gaussians, but there is memory for {self.rows:,}: "
-                "allow more (--max-host-mem, --max-device-mem)"
-            )
-        moves = self._residency.place(numbers)
+        moves = self._residency.plan(numbers)
         if len(moves.fetched):
             changed = self._changed[moves.evicted_from]
             self._write(moves.evicted[changed], moves.evicted_from[changed])
             self._exchange_caught(moves.evicted, moves.evicted_from, moves.fetched, moves.fetched_to)
-            self._fetch(moves.fetched, moves.fetched_to)
             self._changed[moves.fetched_to] = False
+            self._residency.evict(moves)
+            self._fetch(moves.fetched, moves.fetched_to)
+        self._residency.use(moves)
         if changes:
             self._changed[moves.slots] = True
         return moves.slots
@@ -133,7 +130,7 @@ class ChunkPool:
         self._exchange_caught(*self._residency.held(), nothing, nothing.astype(np.uint32))
         self._residency.clear()
 
-    def held(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
+    def slots_of(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
         """The slot of each chunk, -1 if it is not on the device."""
         return self._residency.slots_of(numbers)
 

@@ -151,7 +151,7 @@ class VisibleChunks(Component):
         if isinstance(gaussians, DeviceGaussians):
             return self._measured_on_device(gaussians, numbers)
         assert gaussians.pool is not None
-        slots = gaussians.pool.held(numbers)
+        slots = gaussians.pool.slots_of(numbers)
         found, there = np.empty((len(numbers), BOUNDS_FLOATS), np.float32), slots >= 0
         if there.any():
             found[there] = self._measured_on_device(gaussians.in_pool, slots[there].astype(np.uint32))
