@@ -1,2 +1,3 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chunks of a model, neighbours in space: their order, their bounds, and the chunks that a camera may see."""
+"""Chunks of a model, neighbours in space: their order, their bounds and records, the chunks that a camera may see, and
+those that are on the device."""
