@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cases of chunks: their bounds, a step over some of them, their steps of Adam that were missed, and copies of chunks to
-and from the slots of a pool."""
+"""Cases of chunks: their bounds, a step over some of them, their steps of Adam that were missed, and copies of chunks
+to and from the slots of a pool."""
 
 from __future__ import annotations
 
