@@ -15,10 +15,10 @@ from clsplat.layouts.columns import CHUNK_ROWS, NO_CHUNK
 
 @dataclass(frozen=True, eq=False)
 class ChunkList:
-    """Chunks of a model over whose rows a launch runs (`kernels/shared/chunks.h`).
+    """Chunks of a model over whose rows a launch runs (`kernels/shared/chunks.h`), or slots of a pool that have them.
 
-    numbers: uint32, numbers of chunks in rising order, then NO_CHUNK.
-    model_rows: number of rows of the model.
+    numbers: uint32, numbers of chunks in rising order, or of slots in the order of their chunks; then NO_CHUNK.
+    model_rows: number of rows of the model, or of all slots.
     """
 
     numbers: DeviceArray
@@ -53,7 +53,7 @@ def padded_chunks(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 
 def send_chunks(work: Workspace, name: str, numbers: NDArray[np.uint32], model_rows: int) -> ChunkList:
-    """Send a list of chunks, in rising order, to the workspace's array `name`."""
+    """Send a list (`ChunkList`) to the workspace's array `name`."""
     padded = padded_chunks(numbers)
     array = work.array(name, padded.shape, np.uint32)
     array.send(padded)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters, gradients and moments: on the device, or on the host and streamed to the device in parts."""
+"""Parameters, gradients and moments: on the device, or streamed to it in parts from the host or a store of chunks."""
 
 from __future__ import annotations
 
@@ -104,9 +104,11 @@ class HostArray:
 
 @dataclass(frozen=True, eq=False)
 class HostGaussians(_ByGroup[HostArray | StoredArray]):
-    """Gaussians on the host; `parts` uploads `rows` of them at a time.
+    """Gaussians on the host, or in the store of a pool.
 
-    pool: the chunks that are on the device, if the arrays are fields `kind`/GROUP of its store.
+    rows: number of Gaussians that are on the device at once.
+    pool: has the chunks that are on the device; None for Gaussians on the host, which `parts` uploads.
+    kind: one of KINDS; the arrays are the fields `kind`/GROUP of the pool's store.
     """
 
     rows: int
@@ -136,26 +138,26 @@ def parts(
 ) -> Iterator[tuple[int, int, tuple[DeviceGaussians, ...]]]:
     """Yield (start, stop, the models' rows [start, stop) on the device) for each part in turn.
 
-    Models on the device have a single part. Each part of a host model is valid until the next part is requested.
+    Models on the device have a single part. Each part of another model is valid until the next part is requested.
 
-    keep: copy changes of the part back to the host.
+    models: all on the device, all on the host, or all in one pool, whose parts are as many chunks as it has slots.
+    keep: True keeps changes of the parts: they are copied back to the host, or noted in the pool.
     """
     on_device = tuple(model for model in models if isinstance(model, DeviceGaussians))
     if len(on_device) == len(models):
         yield 0, models[0].count, on_device
         return
     streamed = [model for model in models if isinstance(model, HostGaussians)]
-    count, pool = streamed[0].count, next((model.pool for model in streamed if model.pool is not None), None)
+    count, pool = streamed[0].count, streamed[0].pool
     rows = streamed[0].rows if pool is None else pool.rows
     for start in range(0, count, rows):
         stop = min(start + rows, count)
         if pool is not None:
             pool.place_run(start // CHUNK_ROWS, chunks_of(stop - start), changes=keep)
+            yield start, stop, tuple(model.first_in_pool(stop - start) for model in streamed)
+            continue
         uploaded = []
         for index, model in enumerate(streamed):
-            if model.pool is not None:
-                uploaded.append(model.first_in_pool(stop - start))
-                continue
             arrays = {}
             for name, whole in model.arrays.items():
                 values = whole.get_rows(start, stop)
@@ -163,16 +165,16 @@ def parts(
                 arrays[name].set(values)
             uploaded.append(DeviceGaussians(stop - start, model.coefficients, arrays))
         yield start, stop, tuple(uploaded)
-        for model, part in zip(streamed, uploaded, strict=True):
-            for name, array in part.arrays.items() if keep and model.pool is None else ():
+        for model, part in zip(streamed, uploaded, strict=True) if keep else ():
+            for name, array in part.arrays.items():
                 model[name].set_rows(start, array.get())
 
 
 def chunk_parts(
     work: Workspace, chunks: ChunkNumbers, *models: AnyGaussians, changes: bool = False
 ) -> Iterator[tuple[int, int, tuple[DeviceGaussians, ...], ChunkList, NDArray[np.integer[Any]]]]:
-    """Yield, for as many chunks at a time as the pool of the models has slots, the rows [start, stop) that they are
-    among the rows of all chunks, the models, in which a list of slots has these chunks, and the chunks' numbers.
+    """Yield chunks of the models in a pool, as many at a time as it has slots: which rows [start, stop) they are of a
+    launch over all of `chunks`; the rows of the pool's slots, of each model; the list of their slots; their numbers.
 
     Each part is valid until the next part is requested.
 
@@ -201,7 +203,7 @@ def store_of(models: Sequence[AnyGaussians | None], path: Path | None) -> ChunkS
         begin = CHUNK_ROWS * int(numbers[0])
         end = min(begin + CHUNK_ROWS * len(numbers), store.count)
         for kind, model in given.items():
-            for name in PARAMETER_GROUPS if model is not None else ():
+            for name in PARAMETER_GROUPS:
                 values = model[name].get_rows(begin, end)
                 for place in range(len(numbers)) if values.size else ():
                     rows = values[CHUNK_ROWS * place : CHUNK_ROWS * (place + 1)]

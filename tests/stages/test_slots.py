@@ -32,6 +32,7 @@ from clsplat.stages.device_gaussians import (
     HostGaussians,
     chunk_parts,
     host_gaussians,
+    parts,
     pooled,
     store_of,
     to_device,
@@ -185,4 +186,22 @@ def test_more_chunks_than_slots(shaped_device: Device, slots: int) -> None:
         project_step(shaped_device, step, part, camera_array, projected, pairs.rows(start, stop), of_screen, readback)
     assert listed == LISTED.tolist()
     assert not readback.get().any()
+    model.check()
+
+
+@pytest.mark.parametrize("slots", [1, 4, 6])
+def test_parts_of_a_streamed_model(default_device: Device, slots: int) -> None:
+    """All rows in order, as many chunks at a time as there are slots, whatever the slots had before; changes stay."""
+    model, begins = Model(default_device, slots), []
+    model.pool.place(np.array([5]), changes=False)
+    for start, stop, part in parts(model.work, *model.streamed, keep=True):
+        begins.append(start)
+        for of_part, whole in zip(part, model.whole, strict=True):
+            assert of_part.count == stop - start
+            for group in PARAMETER_GROUPS:
+                assert_same_bits(of_part[group].get(), whole[group].get_rows(start, stop), group)
+        part[1]["sh_rest"].set(-part[1]["sh_rest"].get())
+    assert begins == list(range(0, COUNT, CHUNK_ROWS * slots))
+    assert stop == COUNT
+    model.whole[1]["sh_rest"].set(-model.whole[1]["sh_rest"].get())
     model.check()
