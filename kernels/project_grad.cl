@@ -193,7 +193,7 @@ __kernel void project_step(
     __global float *second_sh_dc, __global float *second_sh_rest CHUNK_PARAMETERS) {
 #ifdef CHUNKS // the end of the rows from `row` on, and the model's arrays at them
 #define MODEL_ROWS(row)                                                                                                \
-  const long ahead = (row) < n ? rows_ahead(chunks, row) : 0;                                                        \
+  const long ahead = (row) < n ? rows_ahead(chunks, row) : 0;                                                          \
   const uint end = (row) < n ? end_of_rows(row, n, ahead, model_rows) : 0;                                             \
   MOVE_ROWS(ahead, )                                                                                                   \
   MOVE_ROWS(ahead, first_)                                                                                             \

@@ -38,10 +38,12 @@ from clsplat.training.supervision.resolution import by_doubling
 
 NO_CACHE = "none"
 SCRATCH_SUFFIX = ".chunks"
+"""Ending of the names of files of chunks."""
 OWNER_DIGITS = 12
+"""Hexadecimal digits of `HostMemory.owner`."""
 POOL_QUARTERS = 3
-"""Quarters of the main memory beside what a step cannot do without that the model's chunks get. The photographs get the
-rest."""
+"""Quarters that the model's chunks get of the main memory which is left after what every step needs. The photographs
+get the rest."""
 
 
 def model_bytes(config: TrainConfig) -> int:
@@ -114,7 +116,7 @@ class HostMemory:
             self.share(photographs, count, taken, begins=True)
 
     def pool(self, photographs: HostPhotographs, count: int, model: int, held: int) -> int | None:
-        """Bytes for the chunks of a model that are on a device in main memory; None if all of them fit.
+        """Bytes of main memory for the chunks that are on a device which shares it; None if all chunks fit.
 
         model: bytes per Gaussian of parameters and moments.
         held: other bytes per Gaussian.

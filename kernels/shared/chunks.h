@@ -1,13 +1,13 @@
 // The rows of a launch that covers only some chunks of a model. With CHUNKS, a kernel has the parameters
 // CHUNK_PARAMETERS at its end: `chunks` (n / CHUNK_ROWS), for each CHUNK_ROWS rows of the launch the chunk of the model
-// that they are, then NO_CHUNK; and `model_rows`, the number of rows of the model. Of a streamed model, whose chunks are
-// in the slots of a pool in any order, `chunks` has slots and `model_rows` the rows of all slots. Arrays by view,
+// that they are, then NO_CHUNK; and `model_rows`, the number of rows of the model. Of a streamed model, whose chunks
+// are in the slots of a pool in any order, `chunks` has slots and `model_rows` the rows of all slots. Arrays by view,
 // such as splats and tile_counts, have the rows of the launch; parameters, moments and statistics those of the model.
 #ifdef CHUNKS
 #define CHUNK_PARAMETERS , __global const uint *chunks, const uint model_rows
 
-// How far the model's row is ahead of the row of the launch, for all rows of a chunk. Negative where a slot stands before
-// the chunk's place in the launch.
+// How far the model's row is ahead of the row of the launch, for all rows of a chunk. Negative where a slot stands
+// before the chunk's place in the launch.
 static inline long rows_ahead(__global const uint *chunks, uint row) {
   const uint place = row / CHUNK_ROWS;
   return (long)CHUNK_ROWS * ((long)chunks[place] - place);
