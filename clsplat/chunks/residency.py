@@ -19,7 +19,7 @@ _NEVER = 0
 
 @dataclass(frozen=True, eq=False)
 class Moves:
-    """What must move before some chunks can be used.
+    """Moves that are necessary before some chunks can be used.
 
     slots: (k,) uint32, the slot that each of these chunks has or gets.
     fetched, fetched_to: the chunks among them that are not on the device yet, and the slots that they get.
@@ -48,9 +48,9 @@ class Residency:
         self._uses = 0
 
     def plan(self, numbers: NDArray[np.integer[Any]]) -> Moves:
-        """What must move before these chunks can be used; those that have not been used for longest make room.
+        """Plan moves for these chunks; those that have not been used for longest make room.
 
-        Nothing changes until `evict` and `use`, so that a move that fails leaves a true record of what is where.
+        Nothing changes until `evict` and `use`, so that after a move that fails it is still known what is where.
         Raises ValueError for more chunks than slots.
         """
         if len(numbers) > self.slots:
