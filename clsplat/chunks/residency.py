@@ -13,8 +13,6 @@ CROSSING_SHARE = 8
 """One in this many slots, and at least one, may cross the bus at once: memory for as many records is set aside."""
 _NOTHING = -1
 """Number of the chunk in a free slot, and slot of a chunk that is not on the device."""
-_NEVER = 0
-"""Number of the last use of a free slot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +41,8 @@ class Residency:
         self.slots = slots
         self._slot_of = np.full(chunks, _NOTHING, np.int64)
         self._chunk_in = np.full(slots, _NOTHING, np.int64)
-        self._used = np.full(slots, _NEVER, np.int64)
-        """By slot, the number of its chunk's last use, counted from 1."""
+        self._used = np.zeros(slots, np.int64)
+        """By slot, the number of its last use; 0 if it has had no chunk."""
         self._uses = 0
 
     def plan(self, numbers: NDArray[np.integer[Any]]) -> Moves:
@@ -68,7 +66,6 @@ class Residency:
     def evict(self, moves: Moves) -> None:
         """Note that the evicted chunks have left: their slots are free."""
         self._slot_of[moves.evicted] = self._chunk_in[moves.evicted_from] = _NOTHING
-        self._used[moves.evicted_from] = _NEVER
 
     def use(self, moves: Moves) -> None:
         """Note that the fetched chunks have come, and that all chunks of the plan are used."""
@@ -89,4 +86,4 @@ class Residency:
     def clear(self) -> None:
         """Forget all chunks."""
         self._slot_of[:] = self._chunk_in[:] = _NOTHING
-        self._used[:] = _NEVER
+        self._used[:] = 0

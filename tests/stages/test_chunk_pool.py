@@ -125,7 +125,7 @@ def test_only_what_has_changed_is_written(device: Device) -> None:
         pool.place(np.array(numbers), changes=changes)
         moved.append(pool.moved_bytes // record)
     assert moved == [2, 2, 3, 7, 7], "fetched: 2, 0, 1, 3, 0; written: chunk 1 as it leaves"
-    pool.place(np.array([4]), changes=True)
+    pool.place(np.array([5]), changes=True)  # in another slot than chunk 1 was in
     for _ in range(2):
         pool.write_back()
         assert pool.moved_bytes == 8 * record, "once written, it is as in the store"
