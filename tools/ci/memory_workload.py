@@ -137,7 +137,7 @@ def subgroups(device: Device) -> None:
 def cases(device: Device) -> None:
     """Cases of stages by themselves, on a few rows or pixels, some of them twice for their builds that differ."""
     for name, case in CASES.items():
-        size = (17, 7) if isinstance(case.sizes[0], tuple) else 1 if name == "chunk_records" else 9  # 1024 rows each
+        size = (17, 7) if isinstance(case.sizes[0], tuple) else 9
         twice = ("marks", "harmonics", "settle", "chunks", "catch_up")
         for draw in range({"adam": 3, **dict.fromkeys(twice, 2)}.get(name, 1)):
             given = case.random(np.random.default_rng([draw, *name.encode()]), size)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from clsplat.chunks.store import record_type
+from clsplat.chunks.store import chunks_of, record_type
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
@@ -355,6 +355,8 @@ CATCH_UP_CASE = Case(
 
 SPARE_SLOTS = 2
 """Slots of a pool that no copy uses."""
+MADE_WORDS = 4999
+"""Words of which records are made, again and again. It divides no record, so that no two are alike."""
 
 
 def _records_of(words: NDArray[np.uint32], slots: NDArray[np.int64], coefficients: int) -> Inputs:
@@ -376,15 +378,16 @@ def _records_of(words: NDArray[np.uint32], slots: NDArray[np.int64], coefficient
 
 
 def _random_records(rng: Generator, count: int) -> Inputs:
-    """Records of any bits, those of NaN among them. The slots are in any order."""
-    words = rng.integers(0, 1 << 32, 4096, dtype=np.uint32)
+    """Records of any bits, those of NaN among them, of a model of `count` rows. The slots are in any order."""
+    chunks = chunks_of(count)
+    words = rng.integers(0, 1 << 32, MADE_WORDS, dtype=np.uint32)
     words[::3] |= 0x7F800000  # NaN with any payload
-    slots = rng.permutation(count + SPARE_SLOTS)[:count]
+    slots = rng.permutation(chunks + SPARE_SLOTS)[:chunks]
     return _records_of(words, slots, int(rng.choice([1, 4, 16])))
 
 
 def _frozen_records(bench: CaseBench) -> list[Inputs]:
-    words = np.arange(1, 5000, dtype=np.uint32) * np.uint32(2654435761)
+    words = np.arange(1, MADE_WORDS + 1, dtype=np.uint32) * np.uint32(2654435761)  # odd: no word comes twice
     return [_records_of(words, np.array([3, 0, 4]), bench.model.coefficients)]
 
 
@@ -416,7 +419,7 @@ def _twin_of_records(given: Inputs, _: Arrays) -> dict[str, Expected]:
 
 
 CHUNK_RECORDS_CASE = Case(
-    sizes=(1, 33, 2, 9),
+    sizes=(1, 33 * CHUNK_ROWS, CHUNK_ROWS + 1, 9 * CHUNK_ROWS),
     random=_random_records,
     launch=_launch_records,
     twin=_twin_of_records,
