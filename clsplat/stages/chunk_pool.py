@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.chunks.residency import CROSSING_SHARE, Residency
-from clsplat.chunks.store import ChunkStore
+from clsplat.chunks.store import ChunkStore, ScratchError
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
@@ -77,6 +77,8 @@ class ChunkPool:
         self._changed = np.zeros(self.slots, np.bool_)
         self.cull: Callable[[Camera], NDArray[np.integer[Any]]] | None = None
         """The chunks that a camera may show; None if that is not known."""
+        self._torn = False
+        """True while chunks move, and after a move that failed: what is where is not known then."""
         self.moved_bytes = 0
         """Bytes of the records that have been fetched or written back."""
 
@@ -101,13 +103,16 @@ class ChunkPool:
                 f"a view may show {CHUNK_ROWS * len(numbers):,} Gaussians, but there is memory for {self.rows:,}: "
                 "allow more (--max-host-mem, --max-device-mem)"
             )
+        self._require_whole()
         moves = self._residency.place(numbers)
         if len(moves.fetched):
+            self._torn = True
             changed = self._changed[moves.evicted_from]
             self._write(moves.evicted[changed], moves.evicted_from[changed])
             self._exchange_caught(moves.evicted, moves.evicted_from, moves.fetched, moves.fetched_to)
             self._fetch(moves.fetched, moves.fetched_to)
             self._changed[moves.fetched_to] = False
+            self._torn = False
         if changes:
             self._changed[moves.slots] = True
         return moves.slots
@@ -120,11 +125,16 @@ class ChunkPool:
         self.place(numbers, changes=changes)
 
     def write_back(self) -> None:
-        """Write the chunks that the device has changed to the store."""
+        """Write the chunks that the device has changed to the store. Raises ScratchError if a move has failed."""
+        self._require_whole()
         numbers, slots = self._residency.held()
         changed = self._changed[slots]
         self._write(numbers[changed], slots[changed])
         self._changed[:] = False
+
+    def _require_whole(self) -> None:
+        if self._torn:
+            raise ScratchError("the Gaussians on the device are incomplete, because their move has failed")
 
     def release(self) -> None:
         """Write back, and forget what is on the device: the store is going to change, or other chunks are wanted."""

@@ -3,11 +3,8 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
-import secrets
-from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,10 +12,10 @@ from clsplat.config.checks import parse_bytes
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError, amount
-from clsplat.files.atomic import machine_mark, remove
 from clsplat.gaussians import floats_of
 from clsplat.rendering.memory_needs import MODELS
 from clsplat.runs.run import Run
+from clsplat.runs.scratch import ScratchFiles, owner_of
 from clsplat.stages.density import gaussian_bytes
 from clsplat.training.batch import OWNER_ARRAYS_PER_PARAMETER
 from clsplat.training.step.visible_chunks import streams_by_chunk
@@ -31,8 +28,6 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
 
 NO_CACHE = "none"
-SCRATCH_SUFFIX = ".chunks"
-OWNER_DIGITS = 12
 POOL_QUARTERS = 3
 """Quarters of the main memory beside what a step cannot do without that the model's chunks get. The photographs get the
 rest."""
@@ -52,7 +47,8 @@ class HostMemory:
     cache: folder of the cache of decoded photographs; None for no cache.
     keeps_cache: True if the user named that folder, which then stays.
     scratch: folder of the files of chunks; None for none.
-    owner: name of this training's files there.
+    owner: beginning of the names of this training's files there.
+    run: run whose checkpoints name these files.
     """
 
     limit: int | None = None
@@ -60,6 +56,7 @@ class HostMemory:
     keeps_cache: bool = False
     scratch: Path | None = None
     owner: str = ""
+    run: Run | None = None
 
     @classmethod
     def chosen(
@@ -79,9 +76,14 @@ class HostMemory:
         if scratch is not None and (not str(scratch) or Path(scratch).is_file()):
             raise InputError(f"--scratch {scratch}: expected a folder")
         place = Path(scratch) if scratch is not None else (run.scratch_path if run is not None else None)
-        of = str(run.path.resolve()) if run is not None else f"{machine_mark()} {os.getpid()}"
-        owner = hashlib.sha256(of.encode("utf-8", "surrogatepass")).hexdigest()[:OWNER_DIGITS]
-        return replace(memory, scratch=place, owner=owner)
+        if run is not None and place is not None:
+            run.scratch_path = place
+        return replace(memory, scratch=place, owner=owner_of(run), run=run)
+
+    @cached_property
+    def files(self) -> ScratchFiles | None:
+        """This training's files of chunks; None if there is no folder for them."""
+        return ScratchFiles(self.scratch, self.owner, self.run) if self.scratch is not None else None
 
     @classmethod
     def _with_cache(cls, limit: int | None, cache: str | Path | None, run: Run | None) -> HostMemory:
@@ -124,18 +126,18 @@ class HostMemory:
         no folder for it."""
         if self.limit is None or self.limit >= nbytes + photographs.least:
             return None
-        if self.scratch is None:
+        if self.files is None:
             raise InputError(
                 f"--max-host-mem {amount(self.limit)} leaves {amount(nbytes)} of Gaussians to files: name a folder for "
                 "them (--scratch DIR), or a run's folder (-o)"
             )
-        return self.scratch / f"{self.owner}-{secrets.token_hex(4)}{SCRATCH_SUFFIX}"
+        return self.files.new_file()
 
     def remove_scratch(self) -> None:
-        """Remove this training's files of chunks, which may be of a process that was killed."""
-        for path in self.scratch.glob(f"{self.owner}-*{SCRATCH_SUFFIX}") if self.scratch is not None else ():
-            with suppress(OSError):
-                remove(path)
+        """Remove this training's files of chunks that no checkpoint names, such as those of a process that was
+        killed."""
+        if self.files is not None:
+            self.files.remove_unnamed()
 
     def share(self, photographs: HostPhotographs, count: int, taken: int, *, begins: bool) -> bool:
         """Give the photographs the memory that the Gaussians leave. Returns False if that is too little.

@@ -14,6 +14,7 @@ from clsplat.gaussians import floats_of
 from clsplat.rendering.memory_needs import MODELS, StepMemory, plan_step
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.runs.scratch import ScratchFiles
 from clsplat.scenes.scene import Scene
 from clsplat.stages.density import gaussian_bytes
 from clsplat.training.batch import OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PER_PARAMETER, Batch
@@ -78,6 +79,11 @@ class MemoryPlanner:
     def scratch_file(self, nbytes: int) -> Path | None:
         """A new file for so many bytes of chunks; None if main memory has room for them. Raises InputError."""
         return self._memory.scratch_file(nbytes, self._photographs.host)
+
+    @property
+    def scratch_files(self) -> ScratchFiles | None:
+        """The training's files of chunks; None if there is no folder for them."""
+        return self._memory.files
 
     def _plan(self, device: Device, count: int, memory: StepMemory, models: int) -> Plan:
         cameras, coefficients = [view.camera for view in self._scene.views], (self._config.sh_degree + 1) ** 2

@@ -24,7 +24,7 @@ from clsplat.runs.appearance import held_out_looks
 from clsplat.runs.checkpoints import Checkpoint, unusable
 from clsplat.scenes.start.initialise import from_scene
 from clsplat.stages.density import DensityStatistics
-from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, download_gaussians
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, close_saved, download_gaussians
 from clsplat.stages.loss import Loss
 from clsplat.training.appearance.choice import appearance_of
 from clsplat.training.batch import Batch, Losses
@@ -125,6 +125,7 @@ class Trainer:
             self.rasterizer.work,
             self._make_plan,
             self.planner.scratch_file,
+            self.planner.scratch_files,
             sh_degree=self.config.sh_degree,
             counts_contributions=self.strategy.needs().contributions,
         )
@@ -465,24 +466,28 @@ class Trainer:
         The whole model is finite, unless `monitor.retries.lost`.
         """
         self.repair(look=True)
-        arrays = self._arrays()
-        repair = self.monitor.examine_all(arrays)  # finds non-finite values in Gaussians that no step has visited
-        if repair is not None:
-            self._apply(repair)
-            arrays = self._arrays()
-        return arrays, self.position.state(self.monitor.retries)
+        finite = self.model.changes_are_finite()
+        arrays, state = self._arrays()
+        if not finite:  # there may be non-finite values in Gaussians that no step has visited
+            repair = self.monitor.examine_all(arrays if self.model.store is None else self.model.arrays())
+            if repair is not None:
+                self._apply(repair)
+                arrays, state = self._arrays()
+        return arrays, self.position.state(self.monitor.retries) | state
 
-    def _arrays(self) -> dict[str, NDArray[Any]]:
+    def _arrays(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+        model, state = self.model.record()
         arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
         arrays.update({f"strategy/{name}": array for name, array in self.strategy.arrays().items()})
-        arrays |= self.model.arrays()
+        arrays |= model
         for component in self.components:
             arrays |= component.arrays()
-        return arrays
+        return arrays, state
 
     def restart(self) -> None:
         """Start again from step 0, with the rate factor of `monitor.retries`."""
         self.pending.forget()
+        self.model.close()
         self.model.free()
         self.monitor.forget()
         self._start()
@@ -493,7 +498,10 @@ class Trainer:
         self.monitor.retries, self.mark = self.position.load(checkpoint, len(self.views)), None
         self.monitor.forget()
         self.pending.forget()
-        self.model.load(models, checkpoint)
+        try:
+            self.model.load(models, checkpoint)
+        finally:
+            close_saved(models)
         self.strategy.load(checkpoint.named("strategy/"))
         try:
             for component in self.components:
