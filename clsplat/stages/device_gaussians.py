@@ -19,6 +19,7 @@ from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, floats_of, group_shapes
 from clsplat.layouts.columns import CHUNK_ROWS
+from clsplat.stages.chunk_lists import ChunkList, ChunkNumbers, exact_chunks
 from clsplat.stages.chunk_pool import ChunkPool, StoredArray
 
 
@@ -193,6 +194,26 @@ def fields_of(coefficients: int) -> dict[str, tuple[int, ...]]:
     """Fields of a store of chunks: parameters, first and second moments."""
     shapes = group_shapes(1, coefficients)
     return {f"{kind}/{name}": shape[1:] for kind in KINDS for name, shape in shapes.items()}
+
+
+def chunk_parts(
+    work: Workspace, chunks: ChunkNumbers, *models: AnyGaussians, changes: bool = False
+) -> Iterator[tuple[int, int, tuple[DeviceGaussians, ...], ChunkList, NDArray[np.integer[Any]]]]:
+    """Yield, for as many chunks at a time as the pool of the models has slots, the rows [start, stop) that they are
+    among the rows of all chunks, the models, in which a list of slots has these chunks, and the chunks' numbers.
+
+    Each part is valid until the next part is requested.
+
+    changes: True if the device will change the models.
+    """
+    streamed = [model for model in models if isinstance(model, HostGaussians)]
+    pool = streamed[0].pool
+    assert pool is not None, "only a pool has chunks"
+    for begin in range(0, len(chunks.numbers), pool.slots):
+        numbers = chunks.numbers[begin : begin + pool.slots]
+        slots = exact_chunks(work, "chunk_slots", pool.place(numbers, changes=changes), pool.rows)
+        start = CHUNK_ROWS * begin
+        yield start, start + CHUNK_ROWS * len(numbers), tuple(model.in_pool for model in streamed), slots, numbers
 
 
 def store_of(models: Sequence[AnyGaussians | None], path: Path | None) -> ChunkStore:
