@@ -122,6 +122,11 @@ class SavedArray:
         """A copy of the rows [start, stop)."""
         return self.store.get_rows(self.field, start, stop)
 
+    def __getitem__(self, rows: slice) -> NDArray[np.float32]:
+        """A copy of some rows that follow each other."""
+        start, stop, _ = rows.indices(self.store.count)
+        return self.get_rows(start, stop)
+
 
 @dataclass(frozen=True, eq=False)
 class HostGaussians(_ByGroup[Any]):
@@ -263,11 +268,9 @@ def saved_models(store: ChunkStore) -> list[HostGaussians]:
     ]
 
 
-def close_saved(models: Sequence[HostGaussians]) -> None:
-    """Close the file that `saved_models` read."""
-    for array in models[0].arrays.values():
-        if isinstance(array, SavedArray):
-            array.store.close()
+def saved_arrays(models: Sequence[HostGaussians]) -> dict[str, Any]:
+    """The arrays of `saved_models` by their names in a checkpoint; none of models in main memory."""
+    return {array.field: array for model in models for array in model.arrays.values() if isinstance(array, SavedArray)}
 
 
 def allocate_gaussians(device: Device, count: int, coefficients: int, *, zero: bool = False) -> DeviceGaussians:

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +26,13 @@ from clsplat.runs.appearance import held_out_looks
 from clsplat.runs.checkpoints import Checkpoint, unusable
 from clsplat.scenes.start.initialise import from_scene
 from clsplat.stages.density import DensityStatistics
-from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, close_saved, download_gaussians
+from clsplat.stages.device_gaussians import (
+    AnyGaussians,
+    DeviceGaussians,
+    HostGaussians,
+    download_gaussians,
+    saved_arrays,
+)
 from clsplat.stages.loss import Loss
 from clsplat.training.appearance.choice import appearance_of
 from clsplat.training.batch import Batch, Losses
@@ -497,13 +505,17 @@ class Trainer:
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continue from a checkpoint."""
         models = self.model.saved(checkpoint)
+        in_file = saved_arrays(models)
+        with ExitStack() as reading:
+            for array in in_file.values():
+                reading.callback(array.store.close)
+            self._restore(models, replace(checkpoint, arrays={**checkpoint.arrays, **in_file}))
+
+    def _restore(self, models: Sequence[HostGaussians], checkpoint: Checkpoint) -> None:
         self.monitor.retries, self.mark = self.position.load(checkpoint, len(self.views)), None
         self.monitor.forget()
         self.pending.forget()
-        try:
-            self.model.load(models, checkpoint)
-        finally:
-            close_saved(models)
+        self.model.load(models, checkpoint)
         self.strategy.load(checkpoint.named("strategy/"))
         try:
             for component in self.components:
