@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from io import FileIO
+from itertools import pairwise
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -278,9 +279,8 @@ class ChunkStore:
 def runs(slots: NDArray[np.int64]) -> Iterator[tuple[int, int, int]]:
     """Yield (place, slot, length) of each run of slots that follow each other. NO_SLOT is left out."""
     ends = np.flatnonzero((np.diff(slots) != 1) | (slots[:-1] == NO_SLOT)) + 1
-    begins = [0, *ends.tolist()] if len(slots) else []
-    for begin, end in zip(begins, [*begins[1:], len(slots)], strict=True):
-        if slots[begin] != NO_SLOT:
+    for begin, end in pairwise([0, *ends.tolist(), len(slots)]):
+        if begin < end and slots[begin] != NO_SLOT:
             yield begin, int(slots[begin]), end - begin
 
 

@@ -42,10 +42,14 @@ class ScratchFiles:
         """Name of a new file."""
         return self.folder / f"{self._owner}-{secrets.token_hex(4)}{SCRATCH_SUFFIX}"
 
-    def may_write(self, path: Path) -> bool:
-        """True for a file in the folder that no other run has made."""
+    def is_own(self, path: Path) -> bool:
+        """True for a file that no other run needs."""
         inside = self._run is not None and path.parent == (self._run.path / "scratch").absolute()
-        return path.parent == self.folder and (path.name.startswith(self._owner) or inside)
+        return path.name.startswith(self._owner) or inside
+
+    def may_write(self, path: Path) -> bool:
+        """True for a file in which this training can go on."""
+        return self.is_own(path) and path.parent == self.folder
 
     def follow(self, store: ChunkStore) -> None:
         """Keep the slots of a file that checkpoints name, from now on. Tell the rate of a network disk."""
@@ -68,7 +72,7 @@ class ScratchFiles:
 
         current: file that stays.
         """
-        own = set(self.folder.glob(f"{self._owner}-*{SCRATCH_SUFFIX}")) | set(filter(self.may_write, self._named))
+        own = set(self.folder.glob(f"{self._owner}-*{SCRATCH_SUFFIX}")) | set(filter(self.is_own, self._named))
         if not own - {current}:
             return
         named = {manifest.path for _, manifest in self._manifests()}

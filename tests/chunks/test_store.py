@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from wide import flip, full
 
 from clsplat.chunks import store as store_module
 from clsplat.chunks.manifest import Manifest, manifest_of
@@ -164,12 +164,6 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
-def flip(path: Path, at: int) -> None:
-    data = bytearray(path.read_bytes())
-    data[at] ^= 16
-    path.write_bytes(data)
-
-
 @pytest.mark.parametrize("name", DAMAGE)
 def test_a_damaged_file_gives_no_rows(store: ChunkStore, name: str) -> None:
     written(store)
@@ -207,10 +201,6 @@ def test_a_full_disk_is_known_before_anything_is_written(
     assert [path.name for path in (tmp_path / "scratch").iterdir()] == ["x.chunks"]
 
 
-def full(*_: object) -> None:
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
 def test_a_write_that_fails_gives_no_wrong_row(store: ChunkStore, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a slot of its own the chunk stays what it was; in place half of it is new, and reading says so."""
     records = written(store)
@@ -233,9 +223,8 @@ def test_a_write_that_fails_gives_no_wrong_row(store: ChunkStore, monkeypatch: p
 
 def test_a_folder_in_which_nothing_can_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(WriteError, match="cannot be written") as caught:
+    with pytest.raises(WriteError, match=r"x\.chunks: cannot be written"):
         ChunkStore(COUNT, FIELDS, tmp_path / "file" / "x.chunks")
-    assert caught.value.exit_status == 2
 
 
 def test_a_manifest_comes_back_from_a_checkpoint(store: ChunkStore) -> None:
@@ -265,7 +254,7 @@ WRONG: dict[str, Callable[[Manifest], Manifest]] = {
 def test_a_manifest_that_was_never_written_is_refused(store: ChunkStore, name: str) -> None:
     written(store)
     wrong = WRONG[name](store.manifest())
-    with pytest.raises(ValueError, match="its list of chunks|its chunks"):
+    with pytest.raises(ValueError, match=r"its list of chunks|its chunks"):
         manifest_of(wrong.arrays(), wrong.state())
 
 
