@@ -13,6 +13,7 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError, amount
 from clsplat.gaussians import floats_of
+from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.rendering.memory_needs import MODELS
 from clsplat.runs.run import Run
 from clsplat.runs.scratch import ScratchFiles, owner_of
@@ -106,20 +107,26 @@ class HostMemory:
         """Raise InputError if the limit is too small for the first step. Writes nothing."""
         if self.limit is not None:
             count = len(scene.points) or config.random_points
-            by_chunk = streams_by_chunk(config, device, count)
-            each = gaussian_bytes(contributions=False) if by_chunk else model_bytes(config)
-            taken = count * each if device.shares_memory else 0
+            taken = count * model_bytes(config)
+            if streams_by_chunk(config, device, count):
+                model = MODELS * 4 * floats_of((config.sh_degree + 1) ** 2)
+                taken = _least_pool(model) + count * gaussian_bytes(contributions=False)
+            taken *= device.shares_memory
             self.share(self._photographs(scene, config), count, taken, begins=True)
 
-    def pool(self, photographs: HostPhotographs, count: int, model: int, held: int) -> int | None:
+    def pool(self, photographs: HostPhotographs, count: int, model: int, held: int, *, begins: bool) -> int | None:
         """Bytes for the chunks of a model that are on a device in main memory; None if all of them fit.
 
         model: bytes per Gaussian of parameters and moments.
         held: other bytes per Gaussian.
+        begins: as in `share`.
         """
         if self.limit is None or self.limit >= count * (model + held) + photographs.least:
             return None
-        return max((self.limit - photographs.least - count * held) * POOL_QUARTERS // 4, 0)
+        pool = (self.limit - photographs.least - count * held) * POOL_QUARTERS // 4
+        if begins and pool < CHUNK_ROWS * model:
+            raise self._too_little(photographs, count, _least_pool(model) + count * held)
+        return max(pool, CHUNK_ROWS * model)
 
     def scratch_file(self, nbytes: int, photographs: HostPhotographs) -> Path | None:
         """A new file for so many bytes of chunks; None if main memory has room for them. Raises InputError if there is
@@ -150,14 +157,17 @@ class HostMemory:
             return True
         enough = self.limit - taken >= photographs.least
         if begins and not enough:
-            least = -(-(taken + photographs.least) // 2**20)
-            raise InputError(
-                f"--max-host-mem {amount(self.limit)} is too little: the photographs need at least "
-                f"{amount(photographs.least)}, and {count:,} Gaussians take {amount(taken)} of main memory; expected "
-                f"at least {least}MiB"
-            )
+            raise self._too_little(photographs, count, taken)
         photographs.follow(self.limit - taken)
         return enough
+
+    def _too_little(self, photographs: HostPhotographs, count: int, taken: int) -> InputError:
+        least = -(-(taken + photographs.least) // 2**20)
+        return InputError(
+            f"--max-host-mem {amount(self.limit or 0)} is too little: the photographs need at least "
+            f"{amount(photographs.least)}, and {count:,} Gaussians take {amount(taken)} of main memory; expected at "
+            f"least {least}MiB"
+        )
 
     def end(self, run: Run | None) -> None:
         """Remove the cache in the folder of a run that has finished, unless it was named as the cache's folder."""
@@ -165,6 +175,11 @@ class HostMemory:
             return
         if not (self.keeps_cache and self.cache is not None and self.cache.resolve() == run.cache_path.resolve()):
             remove_decoded(run.cache_path)
+
+
+def _least_pool(model: int) -> int:
+    """Bytes beside photographs and statistics with which the pool has room for one chunk. model: bytes per Gaussian."""
+    return -(-CHUNK_ROWS * model * 4 // POOL_QUARTERS)
 
 
 UNLIMITED = HostMemory()

@@ -63,7 +63,9 @@ class MemoryPlanner:
             row_bytes=sum(component.row_bytes for component in components),
             pixel_bytes=sum(component.pixel_bytes for component in components),
             by_chunk=by_chunk,
-            pool=self._memory.pool(self._photographs.host, count, model, held) if by_chunk and on_host else None,
+            pool=self._memory.pool(self._photographs.host, count, model, held, begins=self.begins)
+            if by_chunk and on_host
+            else None,
         )
         models = max(component.models for component in components)
         usual = MODELS if self._batch is None else OWNER_ARRAYS_PER_PARAMETER

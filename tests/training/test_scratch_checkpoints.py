@@ -120,7 +120,9 @@ def steps_of(run: Run) -> list[int]:
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-def test_killed_and_resumed(go: Train, whole: Callable[[TrainConfig], bytes], name: str) -> None:
+def test_killed_and_resumed(
+    go: Train, whole: Callable[[TrainConfig], bytes], recwarn: pytest.WarningsRecorder, name: str
+) -> None:
     """In the same file, again and again; every checkpoint but the first writes only what has changed."""
     config = SETTINGS[name]
     wanted = whole(config)
@@ -130,6 +132,7 @@ def test_killed_and_resumed(go: Train, whole: Callable[[TrainConfig], bytes], na
         assert all(read_manifest(path) is not None for _, path in run.checkpoints())
     run = go(config)
     assert run.model_path.read_bytes() == wanted
+    assert not [each for each in recwarn if "not finite" in str(each.message)], "of rows behind the model's last one"
 
 
 @pytest.mark.parametrize("limits", [(LIMIT, None), (None, LIMIT), (LIMIT, 5 << 20), (LIMIT, 64 << 20)])
@@ -306,6 +309,19 @@ def test_a_read_only_folder(go: Train, tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(store_module, "FileIO", refused)
     with pytest.raises(WriteError, match=r"\.chunks: cannot be written: the disk is read-only"):
         go(scratch=tmp_path / "scratch")
+
+
+def test_the_least_limit_is_told(go: Train, whole: Callable[[TrainConfig], bytes]) -> None:
+    wanted = whole(STEADY)
+    with pytest.raises(
+        InputError, match=r"--max-host-mem 100 KiB is too little: .*; expected at least \d+MiB$"
+    ) as caught:
+        go(limit=100 << 10, name="little")
+    least = int(str(caught.value).split("at least ")[-1].removesuffix("MiB"))
+    run = go(limit=least << 20)
+    assert run.model_path.read_bytes() == wanted
+    assert least == 1, "a tenth of the state"
+    assert files_of(run)
 
 
 def test_scratch_may_be_elsewhere(go: Train, whole: Callable[[TrainConfig], bytes], tmp_path: Path) -> None:
