@@ -36,13 +36,11 @@ from clsplat.stages.device_gaussians import (
 from clsplat.stages.loss import Loss
 from clsplat.training.appearance.choice import appearance_of
 from clsplat.training.batch import Batch, Losses
-from clsplat.training.cameras.refinement import Cameras
-from clsplat.training.cameras.validation import ValidationViews, validate
+from clsplat.training.cameras.refinement import Cameras, ValidationViews
 from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
 from clsplat.training.density.choice import strategy_of
-from clsplat.training.host_memory import UNLIMITED, HostMemory
 from clsplat.training.learning_rates import rates_at
-from clsplat.training.memory_planner import MemoryPlanner
+from clsplat.training.memory import UNLIMITED, HostMemory, MemoryPlanner
 from clsplat.training.mip_filter import MipFilter
 from clsplat.training.stability.non_finite import NonFiniteMonitor, Repair
 from clsplat.training.step.component import Component
@@ -339,7 +337,7 @@ class Trainer:
             return False
         self.settle()
         look = held_out_looks(self.appearance.record())
-        validate(self.cameras, self.validation_views, self.step, lambda camera: self.draw(camera).image, look)
+        self.cameras.validate(self.validation_views, self.step, lambda camera: self.draw(camera).image, look)
         return True
 
     def _note(self, *, begun: bool = False) -> None:
