@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from clsplat.layouts.columns import CHUNK_ROWS
 
-STATE_KEY = "chunks"
+MANIFEST_KEY = "chunks"
 SLOTS_KEY, CHECKSUMS_KEY = "chunks/slots", "chunks/checksums"
 _MOST_FIELDS, _MOST_FLOATS = 64, 64
 """Limits of what a damaged file can ask for: fields of a record, and elements of a row of one."""
@@ -27,7 +27,7 @@ def chunks_of(rows: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Manifest:
-    """What a checkpoint says of its chunks.
+    """List of a checkpoint's chunks.
 
     path: the scratch file.
     count: number of Gaussians.
@@ -49,12 +49,12 @@ class Manifest:
     def state(self) -> dict[str, Any]:
         """Its part of a checkpoint's state."""
         fields = {name: list(shape) for name, shape in self.fields.items()}
-        return {STATE_KEY: {"file": str(self.path), "count": self.count, "rows": CHUNK_ROWS, "fields": fields}}
+        return {MANIFEST_KEY: {"file": str(self.path), "count": self.count, "rows": CHUNK_ROWS, "fields": fields}}
 
 
 def manifest_of(arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) -> Manifest | None:
     """The manifest of a checkpoint; None if its Gaussians are arrays. Raises ValueError for a wrong one."""
-    if (record := state.get(STATE_KEY)) is None:
+    if (record := state.get(MANIFEST_KEY)) is None:
         return None
     slots, checksums = arrays.get(SLOTS_KEY), arrays.get(CHECKSUMS_KEY)
     if not isinstance(record, dict) or slots is None or checksums is None:

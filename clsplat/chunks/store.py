@@ -97,7 +97,7 @@ class ChunkStore:
         return cls(manifest.count, manifest.fields, manifest.path, opened=(file, manifest))
 
     def manifest(self) -> Manifest:
-        """What a checkpoint has to say of the file. All that was written is on the disk then. Raises WriteError."""
+        """List of the chunks for a checkpoint. All that was written is on the disk then. Raises WriteError."""
         assert self.path is not None
         try:
             os.fsync(self._file.fileno())

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +50,7 @@ from clsplat.stages.device_gaussians import (
     host_zeros,
     in_memory,
     pooled,
+    saved_arrays,
     saved_models,
     store_of,
     to_device,
@@ -103,19 +106,25 @@ class TrainedModel:
         else:
             self.set(upload_gaussians(self._device, initial))
 
-    def saved(self, checkpoint: Checkpoint) -> list[HostGaussians]:
-        """Parameters, first and second moments of a checkpoint. Raises InputError for arrays of another model."""
-        most, manifest = (self._sh_degree + 1) ** 2, checkpoint.manifest
-        try:
-            if manifest is not None:
-                models = saved_models(ChunkStore.opened(manifest, writable=False))
-            else:
-                models = [host_model(checkpoint.arrays, kind) for kind in KINDS]
-            if (n := max(model.coefficients for model in models)) > most:
-                raise ValueError(f"has {n} SH coefficients, more than the {most} of --sh-degree {self._sh_degree}")
-        except ValueError as error:
-            raise unusable(checkpoint, str(error)) from None
-        return models
+    @contextmanager
+    def saved(self, checkpoint: Checkpoint) -> Iterator[tuple[list[HostGaussians], Checkpoint]]:
+        """Context with parameters, first and second moments of a checkpoint, and the checkpoint with their arrays.
+
+        A scratch file that has them is open in the context. Raises InputError for arrays of another model.
+        """
+        with ExitStack() as reading:
+            try:
+                if checkpoint.manifest is not None:
+                    store = reading.enter_context(closing(ChunkStore.opened(checkpoint.manifest, writable=False)))
+                    models = saved_models(store)
+                else:
+                    models = [host_model(checkpoint.arrays, kind) for kind in KINDS]
+                n, most = max(model.coefficients for model in models), (self._sh_degree + 1) ** 2
+                if n > most:
+                    raise ValueError(f"has {n} SH coefficients, more than the {most} of --sh-degree {self._sh_degree}")
+            except ValueError as error:
+                raise unusable(checkpoint, str(error)) from None
+            yield models, replace(checkpoint, arrays={**checkpoint.arrays, **saved_arrays(models)})
 
     def load(self, models: Sequence[HostGaussians], checkpoint: Checkpoint) -> None:
         """Continue with the models (`saved`) and the statistics of a checkpoint.

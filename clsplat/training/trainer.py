@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -26,13 +24,7 @@ from clsplat.runs.appearance import held_out_looks
 from clsplat.runs.checkpoints import Checkpoint, unusable
 from clsplat.scenes.start.initialise import from_scene
 from clsplat.stages.density import DensityStatistics
-from clsplat.stages.device_gaussians import (
-    AnyGaussians,
-    DeviceGaussians,
-    HostGaussians,
-    download_gaussians,
-    saved_arrays,
-)
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, download_gaussians
 from clsplat.stages.loss import Loss
 from clsplat.training.appearance.choice import appearance_of
 from clsplat.training.batch import Batch, Losses
@@ -502,21 +494,14 @@ class Trainer:
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continue from a checkpoint."""
-        models = self.model.saved(checkpoint)
-        in_file = saved_arrays(models)
-        with ExitStack() as reading:
-            for array in in_file.values():
-                reading.callback(array.store.close)
-            self._restore(models, replace(checkpoint, arrays={**checkpoint.arrays, **in_file}))
-
-    def _restore(self, models: Sequence[HostGaussians], checkpoint: Checkpoint) -> None:
-        self.monitor.retries, self.mark = self.position.load(checkpoint, len(self.views)), None
-        self.monitor.forget()
-        self.pending.forget()
-        self.model.load(models, checkpoint)
-        self.strategy.load(checkpoint.named("strategy/"))
-        try:
-            for component in self.components:
-                component.load(checkpoint.named, self.step, self.parameters.count)
-        except ValueError as error:
-            raise unusable(checkpoint, str(error)) from None
+        with self.model.saved(checkpoint) as (models, arrays):
+            self.monitor.retries, self.mark = self.position.load(checkpoint, len(self.views)), None
+            self.monitor.forget()
+            self.pending.forget()
+            self.model.load(models, checkpoint)
+            self.strategy.load(checkpoint.named("strategy/"))
+            try:
+                for component in self.components:
+                    component.load(arrays.named, self.step, self.parameters.count)
+            except ValueError as error:
+                raise unusable(checkpoint, str(error)) from None

@@ -24,7 +24,7 @@ from clsplat.chunks.slots import MAX_TENTHS
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError, WriteError
-from clsplat.files import mounts
+from clsplat.files import atomic, mounts
 from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.runs.checkpoints import read_manifest
 from clsplat.runs.run import Run, owned_files
@@ -183,6 +183,34 @@ def test_bytes_on_the_disk(go: Train, monkeypatch: pytest.MonkeyPatch, name: str
         assert len(steps_of(run)) == 2
         state = 12 * CHUNK_ROWS * 3 * 4 * 38
         assert sum(written) < state * config.iterations / 4, "a view shows two of the twelve chunks"
+
+
+def test_chunks_are_on_the_disk_before_the_manifest_names_them(go: Train, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And slots of a checkpoint are free only after it is removed."""
+    order: list[str] = []
+    flush, rename, write = os.fsync, atomic.replace, store_module.ChunkStore._write_at
+
+    def fsync(descriptor: int) -> None:
+        if any(os.path.samestat(os.fstat(descriptor), path.stat()) for path in scratch.glob("*.chunks")):
+            order.append("flushed")
+        flush(descriptor)
+
+    def replace_file(source: Path, target: Path) -> None:
+        order.extend(["named"] * (target.suffix == ".npz"))
+        rename(source, target)
+
+    def write_at(store: store_module.ChunkStore, *arguments: Any) -> None:
+        order.append("written")
+        write(store, *arguments)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(atomic, "replace", replace_file)
+    monkeypatch.setattr(store_module.ChunkStore, "_write_at", write_at)
+    scratch = go(until=0).scratch_path
+    go(STEADY)
+    assert order.count("named") == 7
+    for place in (place for place, event in enumerate(order) if event == "named"):
+        assert order[place - 1] == "flushed", "nothing is written between"
 
 
 def test_density_control_takes_a_new_file(go: Train) -> None:
@@ -433,6 +461,7 @@ def start_training(scene: Path, run: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 def test_two_trainings_in_one_folder(
     folder: Path, go: Train, whole: Callable[[TrainConfig], bytes], tmp_path: Path
 ) -> None:
