@@ -275,6 +275,16 @@ class TrainedModel:
         pool = self._pool = ChunkPool(self._device, self._work, store, self.plan.rows)
         self.parameters, self.first, self.second = pooled(pool, coefficients)
 
+    @property
+    def in_file(self) -> bool:
+        """True if main memory has no room for the whole model."""
+        return self.store is not None
+
+    @property
+    def moved_bytes(self) -> int:
+        """Bytes of chunks that have gone to or come from the device."""
+        return 0 if self._pool is None else self._pool.moved_bytes
+
     def close(self) -> None:
         """Remove the scratch file of a streamed model, unless a checkpoint names it. The model cannot be used any
         longer."""

@@ -185,9 +185,11 @@ def test_bytes_on_the_disk(go: Train, monkeypatch: pytest.MonkeyPatch, name: str
         assert sum(written) < state * config.iterations / 4, "a view shows two of the twelve chunks"
 
 
-def test_chunks_are_on_the_disk_before_the_manifest_names_them(go: Train, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And slots of a checkpoint are free only after it is removed."""
+def test_chunks_are_on_the_disk_before_the_manifest_names_them(
+    go: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     order: list[str] = []
+    scratch = tmp_path / "run" / "scratch"
     flush, rename, write = os.fsync, atomic.replace, store_module.ChunkStore._write_at
 
     def fsync(descriptor: int) -> None:
@@ -206,7 +208,6 @@ def test_chunks_are_on_the_disk_before_the_manifest_names_them(go: Train, monkey
     monkeypatch.setattr(os, "fsync", fsync)
     monkeypatch.setattr(atomic, "replace", replace_file)
     monkeypatch.setattr(store_module.ChunkStore, "_write_at", write_at)
-    scratch = go(until=0).scratch_path
     go(STEADY)
     assert order.count("named") == 7
     for place in (place for place, event in enumerate(order) if event == "named"):
