@@ -17,7 +17,7 @@ _NOTHING = -1
 
 @dataclass(frozen=True, eq=False)
 class Moves:
-    """What must move before a step can use some chunks.
+    """Moves that a step waits for, so that it can use some chunks.
 
     slots: (k,) uint32, the slot of each of these chunks.
     fetched, fetched_to: the chunks among them that are not on the device yet, and their slots.

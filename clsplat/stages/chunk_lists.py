@@ -61,7 +61,7 @@ def send_chunks(work: Workspace, name: str, numbers: NDArray[np.uint32], model_r
 
 
 def exact_chunks(work: Workspace, name: str, numbers: NDArray[np.integer[Any]], model_rows: int) -> ChunkList:
-    """As `send_chunks`, without any NO_CHUNK."""
+    """List of chunks as of `send_chunks`, without any NO_CHUNK."""
     array = work.array(name, numbers.shape, np.uint32)
     array.set(numbers.astype(np.uint32))
     return ChunkList(array, model_rows)
