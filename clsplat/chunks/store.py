@@ -3,7 +3,7 @@
 
 A record has all fields of CHUNK_ROWS rows, one field after the other, so that a chunk moves by one read or write. In a
 file each field of a record has a checksum, so that a file that was cut or changed never gives a wrong row. A chunk that
-a kept checkpoint names is not overwritten, but written to another slot (docs/decisions/0052-store-of-chunks.md).
+a kept checkpoint names is not overwritten, but written to another slot (docs/decisions/0052-a-store-of-chunks.md).
 """
 
 from __future__ import annotations
