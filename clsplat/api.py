@@ -71,7 +71,8 @@ def train(
         Folder for decoded photographs, which stays and may be shared by trainings, or "none". None means the run's
         folder until the training has finished if `max_host_mem` is given, else no cache.
     scratch : str or Path, optional
-        Folder for the Gaussians that `max_host_mem` leaves no room for, until the end. None means the run's folder.
+        Folder for the Gaussians that `max_host_mem` leaves no room for. The file that the run's checkpoints name stays
+        there. None means the run's folder.
     run : Run, optional
         A folder for metrics, checkpoints, held-out renders and the model. With None nothing is written.
     resume : bool

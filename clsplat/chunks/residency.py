@@ -17,7 +17,7 @@ _NOTHING = -1
 
 @dataclass(frozen=True, eq=False)
 class Moves:
-    """Moves that are necessary before some chunks can be used.
+    """Moves that a step waits for, so that it can use some chunks.
 
     slots: (k,) uint32, the slot that each of these chunks has or gets.
     fetched, fetched_to: the chunks among them that are not on the device yet, and the slots that they get.

@@ -2,19 +2,19 @@
 """Records of a model's chunks, in main memory or in a scratch file.
 
 A record has all fields of CHUNK_ROWS rows, one field after the other, so that a chunk moves by one read or write. In a
-file each field of a record has a checksum, so that a file that was cut or changed never gives a wrong row. The file is
-read and not mapped, because a file that is cut while it is mapped would end the process
-(docs/decisions/0045-photographs-by-the-slice.md). What it holds of main memory is the system's file cache, which gives
-way to other needs.
+file each field of a record has a checksum, so that a file that was cut or changed never gives a wrong row. A chunk that
+a kept checkpoint names is not overwritten, but written to another slot (docs/decisions/0052-a-store-of-chunks.md).
 """
 
 from __future__ import annotations
 
 import os
+import time
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from io import FileIO
+from itertools import pairwise
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import InputError, reason_of
-from clsplat.files.atomic import remove, require_room, write_error
+from clsplat.chunks.manifest import Manifest, chunks_of
+from clsplat.chunks.slots import NO_SLOT, SlotTable
+from clsplat.errors import InputError, WriteError, reason_of
+from clsplat.files.atomic import remove, require_room, sync_folder, write_error
 from clsplat.layouts.columns import CHUNK_ROWS
 
 _BLOCK_CHUNKS = 64
@@ -34,9 +36,8 @@ class ScratchError(InputError):
     """A scratch file that cannot be used any longer. No row of it has been used that is not as it was written."""
 
 
-def chunks_of(rows: int) -> int:
-    """Number of chunks of a model of `rows` Gaussians."""
-    return -(-rows // CHUNK_ROWS)
+KeptSlots = Sequence[NDArray[np.int64]]
+"""Slots of the chunks of each kept checkpoint."""
 
 
 def record_type(fields: Mapping[str, tuple[int, ...]]) -> np.dtype[Any]:
@@ -49,21 +50,66 @@ class ChunkStore:
 
     fields: shape of a row of each field, by name. A field without elements takes no place in the records.
     path: scratch file that holds the records, which is made anew; None holds them in main memory.
+    opened: that file as it is, and a checkpoint's manifest of it.
+    release: function that is called where the file would become larger than `SlotTable.most`. It removes the oldest
+        checkpoint and returns the slots of those that are left, or None if all have to stay.
+    moved: function that is called with the bytes of each read or write, and its seconds.
     Raises WriteError for a file that cannot be made, or a disk without room for it.
     """
 
-    def __init__(self, count: int, fields: Mapping[str, tuple[int, ...]], path: Path | None = None) -> None:
+    def __init__(
+        self,
+        count: int,
+        fields: Mapping[str, tuple[int, ...]],
+        path: Path | None = None,
+        *,
+        opened: tuple[FileIO, Manifest] | None = None,
+    ) -> None:
         self.count, self.fields, self.path = count, dict(fields), path
         self.chunks, self.record = chunks_of(count), record_type(fields)
+        self.release: Callable[[], KeptSlots | None] = lambda: None
+        self.moved: Callable[[int, float], object] = lambda _nbytes, _seconds: None
         self._memory: NDArray[Any] | None = None
         if path is None:
             self._memory = np.zeros(self.chunks, self.record)
             return
         self._names = tuple(self.record.names or ())
-        self._checksums = np.zeros((self.chunks, len(self._names)), np.uint32)
-        self._written = np.zeros(self.chunks, np.bool_)
-        """Chunks that are in the file; the others are zero."""
-        self._file = _new_file(path, self.nbytes)
+        if opened is not None:
+            self._file, manifest = opened
+            size = os.fstat(self._file.fileno()).st_size // self.record.itemsize
+            self._checksums, current = manifest.checksums.copy(), manifest.slots.copy()
+        else:
+            self._file, size = _new_file(path, self.nbytes), self.chunks
+            self._checksums = np.zeros((self.chunks, len(self._names)), np.uint32)
+            current = np.full(self.chunks, NO_SLOT, np.int64)
+        if (most := int(current.max(initial=NO_SLOT))) >= size:
+            self._file.close()
+            raise ScratchError(f"{path}: has been cut: it has room for {size} chunks, expected at least {most + 1}")
+        self.slots = SlotTable(current, size)
+
+    @classmethod
+    def opened(cls, manifest: Manifest, *, writable: bool) -> ChunkStore:
+        """The records that a checkpoint names. Raises ScratchError for a file that is missing or too short."""
+        try:
+            file = FileIO(manifest.path, "r+" if writable else "r")
+        except OSError as error:
+            raise ScratchError(f"{manifest.path} cannot be opened: {reason_of(error)}") from None
+        return cls(manifest.count, manifest.fields, manifest.path, opened=(file, manifest))
+
+    def manifest(self) -> Manifest:
+        """List of the chunks for a checkpoint. All that was written is on the disk then. Raises WriteError."""
+        assert self.path is not None
+        try:
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise write_error(str(self.path), error) from None
+        sync_folder(self.path.parent)
+        return Manifest(self.path, self.count, self.fields, self.slots.current.copy(), self._checksums.copy())
+
+    def verify(self) -> None:
+        """Read all chunks. Raises ScratchError if one is not as it was written."""
+        for numbers in self.blocks():
+            self.read(numbers)
 
     @property
     def nbytes(self) -> int:
@@ -71,11 +117,18 @@ class ChunkStore:
         return self.chunks * self.record.itemsize
 
     def close(self) -> None:
-        """Remove the file, or give back the memory. The store cannot be used any longer."""
+        """Give back the memory, or remove the file unless a checkpoint names slots of it. The store cannot be used any
+        longer."""
         self._memory = None
-        if self.path is not None:
-            self._file.close()
-            with suppress(OSError):
+        if self.path is None or self._file.closed:
+            return
+        kept, writable = self.slots.end_of_held, self._file.writable()
+        with suppress(OSError):
+            if writable and kept:
+                self._file.truncate(kept * self.record.itemsize)
+        self._file.close()
+        with suppress(OSError):
+            if writable and not kept:
                 remove(self.path)
 
     def read(self, numbers: NDArray[np.integer[Any]]) -> NDArray[Any]:
@@ -88,13 +141,12 @@ class ChunkStore:
             records = self._memory[numbers]
             return records
         records = np.empty(len(numbers), self.record)
-        for begin, first, length in runs(numbers):
+        slots = self.slots.current[numbers]
+        records[slots == NO_SLOT] = np.zeros((), self.record)
+        for begin, first, length in runs(slots):
             self._read_at(first * self.record.itemsize, records[begin : begin + length])
-        for place, number in enumerate(numbers):
-            if self._written[number]:
-                self._check(int(number), self._names, records[place])
-            else:
-                records[place] = np.zeros((), self.record)
+        for place in np.flatnonzero(slots != NO_SLOT):
+            self._check(int(numbers[place]), self._names, records[place])
         return records
 
     def write(self, numbers: NDArray[np.integer[Any]], records: NDArray[Any]) -> None:
@@ -102,11 +154,13 @@ class ChunkStore:
         if self._memory is not None:
             self._memory[numbers] = records
             return
+        self._make_room(numbers)
+        slots = self.slots.targets(numbers)
+        for begin, first, length in runs(slots):
+            self._write_at(first * self.record.itemsize, records[begin : begin + length])
+        self.slots.written(numbers, slots)
         for place, number in enumerate(numbers):
             self._checksums[number] = [zlib.crc32(records[place][name]) for name in self._names]
-        for begin, first, length in runs(numbers):
-            self._write_at(first * self.record.itemsize, records[begin : begin + length])
-        self._written[numbers] = True
 
     def get_rows(self, field: str, start: int, stop: int) -> NDArray[np.float32]:
         """A copy of the rows [start, stop) of a field. Raises ScratchError as `read`."""
@@ -138,6 +192,20 @@ class ChunkStore:
         for number in range(self.chunks):
             self._set_field(number, field, rows)
 
+    def rows_of(
+        self, numbers: NDArray[np.integer[Any]], kinds: Sequence[str], names: Iterable[str]
+    ) -> dict[str, dict[str, NDArray[np.float32]]]:
+        """Rows of the model in these chunks, in rising order: fields `kind`/`name` by kind and name."""
+        records = self.read(numbers)
+        rows = CHUNK_ROWS * len(numbers)
+        if len(numbers) and numbers[-1] == self.chunks - 1:
+            rows -= -self.count % CHUNK_ROWS
+        return {kind: {name: self._rows(records, f"{kind}/{name}")[:rows] for name in names} for kind in kinds}
+
+    def _rows(self, records: NDArray[Any], field: str) -> NDArray[np.float32]:
+        shape = (len(records) * CHUNK_ROWS, *self.fields[field])
+        return records[field].reshape(shape) if field in self._names else np.zeros(shape, np.float32)
+
     def blocks(self) -> Iterator[NDArray[np.int64]]:
         """Numbers of all chunks, some at a time, in rising order."""
         for begin in range(0, self.chunks, _BLOCK_CHUNKS):
@@ -151,16 +219,33 @@ class ChunkStore:
             return rows
         kind, offset = self.record.fields[field][:2]  # type: ignore[index]  # it has fields
         rows = np.zeros(kind.shape, np.float32)
-        if self._written[number]:
-            self._read_at(number * self.record.itemsize + offset, rows)
+        if (slot := int(self.slots.current[number])) != NO_SLOT:
+            self._read_at(slot * self.record.itemsize + offset, rows)
             self._check(number, (field,), {field: rows})
         return rows
 
     def _set_field(self, number: int, field: str, rows: NDArray[np.float32]) -> None:
-        if not self._written[number]:
-            self.write(np.array([number]), np.zeros(1, self.record))
+        numbers = np.array([number])
+        if not self.slots.in_place(numbers)[0]:
+            record = self.read(numbers)
+            record[field][0] = rows
+            self.write(numbers, record)
+            return
+        slot = int(self.slots.current[number])
+        self._write_at(slot * self.record.itemsize + self.record.fields[field][1], rows)  # type: ignore[index]
         self._checksums[number, self._names.index(field)] = zlib.crc32(rows.data)
-        self._write_at(number * self.record.itemsize + self.record.fields[field][1], rows)  # type: ignore[index]
+
+    def _make_room(self, numbers: NDArray[np.integer[Any]]) -> None:
+        """Let the file have free slots for these chunks. Raises WriteError."""
+        assert self.path is not None
+        while (lacking := self.slots.lacking(numbers)) > 0:
+            more = self.slots.growth(lacking)
+            if not more and (kept := self.release()) is not None:
+                self.slots.hold(kept)
+                continue
+            more = more or lacking
+            _reserve(self._file, self.path, self.slots.size * self.record.itemsize, more * self.record.itemsize)
+            self.slots.grow(more)
 
     def _check(self, number: int, names: Sequence[str], record: Any) -> None:
         """Raise ScratchError if fields of a record differ from what was written."""
@@ -169,31 +254,34 @@ class ChunkStore:
                 raise ScratchError(f"{self.path}: chunk {number} of the model has changed since it was written")
 
     def _read_at(self, offset: int, into: NDArray[Any]) -> None:
-        """Read an array. What is behind the file's end is left as it is: its checksum tells."""
-        left = into.view(np.uint8).reshape(-1).data
+        left, start = into.view(np.uint8).reshape(-1).data, time.perf_counter()
         try:
             self._file.seek(offset)
             while left and (count := self._file.readinto(left)):
                 left = left[count:]
         except OSError as error:
             raise ScratchError(f"{self.path} cannot be read ({reason_of(error)})") from None
+        if left:
+            raise ScratchError(f"{self.path}: has been cut: {len(left):,} bytes at {offset:,} are missing")
+        self.moved(into.nbytes, time.perf_counter() - start)
 
     def _write_at(self, offset: int, values: NDArray[Any]) -> None:
-        left = np.ascontiguousarray(values).view(np.uint8).reshape(-1).data
+        left, start = np.ascontiguousarray(values).view(np.uint8).reshape(-1).data, time.perf_counter()
         try:
             self._file.seek(offset)
             while left:
                 left = left[self._file.write(left) :]
         except OSError as error:
             raise write_error(str(self.path), error, needs=self.nbytes) from None
+        self.moved(values.nbytes, time.perf_counter() - start)
 
 
-def runs(numbers: NDArray[np.integer[Any]]) -> Iterator[tuple[int, int, int]]:
-    """Yield (place, number, length) of each run of numbers that follow each other."""
-    ends = np.flatnonzero(np.diff(numbers) != 1) + 1
-    begins = [0, *ends.tolist()] if len(numbers) else []
-    for begin, end in zip(begins, [*begins[1:], len(numbers)], strict=True):
-        yield begin, int(numbers[begin]), end - begin
+def runs(slots: NDArray[np.int64]) -> Iterator[tuple[int, int, int]]:
+    """Yield (place, slot, length) of each run of slots that follow each other. NO_SLOT is left out."""
+    ends = np.flatnonzero((np.diff(slots) != 1) | (slots[:-1] == NO_SLOT)) + 1
+    for begin, end in pairwise([0, *ends.tolist(), len(slots)]):
+        if begin < end and slots[begin] != NO_SLOT:
+            yield begin, int(slots[begin]), end - begin
 
 
 def _pieces(start: int, stop: int) -> Iterator[tuple[int, slice, slice]]:
@@ -205,17 +293,30 @@ def _pieces(start: int, stop: int) -> Iterator[tuple[int, slice, slice]]:
 
 
 def _new_file(path: Path, nbytes: int) -> FileIO:
-    """A new file of that size, so that a full disk is known before the first row is written. Raises WriteError."""
+    """A new file of that size. Raises WriteError."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with suppress(FileNotFoundError):
-            remove(path)  # of a training that was killed
-        with require_room(path, nbytes):
-            file = FileIO(path, "x+")
-            if hasattr(os, "posix_fallocate"):
-                os.posix_fallocate(file.fileno(), 0, nbytes)
+        file = FileIO(path, "x+")
     except OSError as error:
+        raise write_error(path, error, needs=nbytes) from None
+    try:
+        _reserve(file, path, 0, nbytes)
+    except BaseException:
+        file.close()
         with suppress(OSError):
             remove(path)
-        raise write_error(path, error, needs=nbytes) from None
+        raise
     return file
+
+
+def _reserve(file: FileIO, path: Path, offset: int, nbytes: int) -> None:
+    """Let a file grow by so many bytes at `offset`, so that a full disk is known before a row is written. Raises
+    WriteError."""
+    try:
+        with require_room(path, nbytes):
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), offset, nbytes)
+            else:
+                file.truncate(offset + nbytes)
+    except OSError as error:
+        raise error if isinstance(error, WriteError) else write_error(path, error, needs=nbytes) from None

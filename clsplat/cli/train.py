@@ -62,8 +62,8 @@ class TrainVerb(Verb):
     """Folder for decoded photographs. It stays after the training, and several trainings may share it. none: no cache.
     If not given: with --max-host-mem cache/ in the run's folder until the training has finished, else none."""
     scratch: Annotated[str | None, arg(metavar="DIR")] = None
-    """Folder, on a local disk, for the Gaussians that --max-host-mem leaves no room for. Its files are removed at the
-    end. If not given: scratch/ in the run's folder."""
+    """Folder, on a local disk, for the Gaussians that --max-host-mem leaves no room for. The file that checkpoints name
+    stays there, at most 2.2 times the size of parameters and moments. If not given: scratch/ in the run's folder."""
     auto: Flag = False
     """Adapt settings to findings on the scene, such as --appearance exposure if the photographs' exposures differ.
     Settings given as flags stay. The findings are printed even without --auto."""

@@ -120,7 +120,7 @@ def atomic_writer(path: str | os.PathLike[str], needs: int | None = None) -> Ite
         yield file
         file.flush()
         os.fsync(file.fileno())
-    _sync_folder(Path(os.path.realpath(path)).parent)
+    sync_folder(Path(os.path.realpath(path)).parent)
 
 
 def write_error(path: str | os.PathLike[str], error: OSError, written: int = 0, needs: int | None = None) -> WriteError:
@@ -221,6 +221,16 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
         file.write(data)
 
 
+def sync_folder(folder: Path) -> None:
+    """Flush a folder to disk, so that a rename survives a power cut. Windows and some network shares cannot do this."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
 def replace(source: Path, target: Path) -> None:
     """Rename a file or a folder. An existing file at the target is replaced. Raises OSError."""
     _retry_on_windows(lambda: source.replace(target))
@@ -259,13 +269,3 @@ def _retry_on_windows(act: Callable[[], object], *, windows: bool = ON_WINDOWS) 
             time.sleep(0.02)
         else:
             return
-
-
-def _sync_folder(folder: Path) -> None:
-    """Flush a folder to disk, so that a rename survives a power cut. Windows and some network shares cannot do this."""
-    with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

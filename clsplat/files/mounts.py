@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detection of network file systems."""
+"""Detection of network file systems, and their rates."""
 
 from __future__ import annotations
 
@@ -8,8 +8,12 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
+from clsplat.errors import amount
+
 MOUNTS = Path("/proc/mounts")
 """Linux's list of mounted file systems. Other systems do not have this file."""
+NETWORK_SAMPLE_BYTES = 16 << 20
+"""Bytes that are read or written before the rate of a network disk is reported."""
 NETWORK_TYPES = ("nfs", "nfs4", "cifs", "smb3", "fuse.sshfs", "9p")
 
 
@@ -26,3 +30,30 @@ def network_type(folder: Path) -> str:
                 found = (below, kind)
         return found[1] if found[1] in NETWORK_TYPES else ""
     return ""
+
+
+class NetworkRate:
+    """The rate of a folder on a network disk, which is told once.
+
+    flag: flag that names another folder.
+    """
+
+    def __init__(self, folder: Path, flag: str) -> None:
+        self._folder, self._flag = folder, flag
+        self._network = network_type(folder)
+        self._moved, self._seconds = 0, 0.0
+
+    def count(self, nbytes: int, seconds: float) -> str:
+        """Count bytes that were read or written. Returns a line for the user, or ""."""
+        if not self._network:
+            return ""
+        self._moved += nbytes
+        self._seconds += seconds
+        if self._moved < NETWORK_SAMPLE_BYTES:
+            return ""
+        network, self._network = self._network, ""
+        rate = amount(int(self._moved / max(self._seconds, 1e-6)))
+        return (
+            f"{self._folder}: is on a network disk ({network}), which moves {rate} a second: a local folder "
+            f"({self._flag} DIR) may be faster"
+        )

@@ -20,6 +20,7 @@ from zipfile import ZIP_STORED, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.chunks.manifest import CHECKSUMS_KEY, SLOTS_KEY, Manifest, manifest_of
 from clsplat.errors import InputError, examples
 from clsplat.files.atomic import atomic_writer
 from clsplat.files.documents import open_input, parse_json
@@ -43,11 +44,13 @@ class Checkpoint:
     step: optimisation steps done.
     arrays: arrays by name.
     state: JSON values.
+    manifest: where its Gaussians are; None if they are arrays.
     """
 
     step: int
     arrays: Arrays
     state: dict[str, Any]
+    manifest: Manifest | None = None
 
     def named(self, prefix: str) -> Arrays:
         """Arrays whose names start with `prefix`, keyed by the rest of their names."""
@@ -123,20 +126,37 @@ def read_checkpoint(path: Path, expected: int | None = None) -> Checkpoint:
                 raise ValueError(f"{name} has changed since it was written: its sha256 differs")
     if expected is not None and step != expected:
         raise ValueError(f"it contains step {step}, but its name says step {expected}")
-    return Checkpoint(step, arrays, state)
+    return Checkpoint(step, arrays, state, manifest_of(arrays, state))
 
 
 def scene_of(path: Path) -> str | None:
     """Digest of the scene that a checkpoint's state names; None if it names none or the file is damaged."""
     try:
-        with open_input(path, "a checkpoint") as file, ZipFile(_Bounded(file)) as archive:
-            member = archive.getinfo(f"{STATE_KEY}.npy")
-            if member.compress_type != ZIP_STORED:
-                return None
-            scene = parse_json(_array(archive.read(member), STATE_KEY).tobytes())["state"].get("scene")
-            return scene if isinstance(scene, str) else None
+        scene = _part(path)[1].get("scene")
     except Exception:  # noqa: BLE001  # as in load_latest_checkpoint, which reports the damage
         return None
+    return scene if isinstance(scene, str) else None
+
+
+def read_manifest(path: Path) -> Manifest | None:
+    """The manifest of a checkpoint; None if it has none or the file is damaged."""
+    try:
+        return manifest_of(*_part(path, SLOTS_KEY, CHECKSUMS_KEY))
+    except Exception:  # noqa: BLE001  # as in load_latest_checkpoint, which reports the damage
+        return None
+
+
+def _part(path: Path, *names: str) -> tuple[Arrays, dict[str, Any]]:
+    """Some arrays of a checkpoint, those that it has, and its state. Its digests are not checked."""
+    arrays: Arrays = {}
+    with open_input(path, "a checkpoint") as file, ZipFile(_Bounded(file)) as archive:
+        for name in {*names, STATE_KEY} & {name.removesuffix(".npy") for name in archive.namelist()}:
+            member = archive.getinfo(f"{name}.npy")
+            if member.compress_type != ZIP_STORED:
+                raise ValueError(f"its member {name!r} does not belong to a checkpoint")
+            arrays[name] = _array(archive.read(member), name)
+    state: dict[str, Any] = parse_json(arrays.pop(STATE_KEY).tobytes())["state"]
+    return arrays, state
 
 
 class _Bounded:

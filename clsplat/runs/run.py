@@ -11,13 +11,16 @@ import os
 import re
 import shlex
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.chunks.manifest import Manifest
+from clsplat.chunks.store import ChunkStore
 from clsplat.config.training import TrainConfig
 from clsplat.errors import ClsplatError, InputError, warn
 from clsplat.files.atomic import TEMPORARY_SUFFIX, atomic_write, atomic_writer, remove, write_error
@@ -25,7 +28,7 @@ from clsplat.files.documents import open_input, parse_json, read_document
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import comment
 from clsplat.models.formats import model_path, ply
-from clsplat.runs.checkpoints import Checkpoint, read_checkpoint, write_checkpoint
+from clsplat.runs.checkpoints import Checkpoint, read_checkpoint, read_manifest, write_checkpoint
 from clsplat.runs.locks import locked
 from clsplat.runs.settings import (
     MAX_METRICS_BYTES,
@@ -36,10 +39,17 @@ from clsplat.runs.settings import (
 )
 
 KEPT_CHECKPOINTS = 2
+SCRATCH_SUFFIX = ".chunks"
+OWNER_DIGITS = 12
+SCRATCH_NAME = re.compile(rf"[0-9a-f]{{{OWNER_DIGITS}}}-[0-9a-f]{{8}}{re.escape(SCRATCH_SUFFIX)}")
+"""Name of a file of chunks: the run, and a number of its own (`runs.scratch`)."""
 
 
 class Run:
-    """A run folder. `Run.create` makes one, `Run.open` opens an existing one."""
+    """A run folder. `Run.create` makes one, `Run.open` opens an existing one.
+
+    scratch_path: folder of the files of chunks, which may be elsewhere.
+    """
 
     def __init__(self, path: Path, config: TrainConfig, scene: Path | None, *, resuming: bool = False) -> None:
         self.path, self.config, self.scene, self.resuming = path, config, scene, resuming
@@ -54,6 +64,8 @@ class Run:
         self.test_path = path / "test"
         self.cache_path = path / "cache"
         self.scratch_path = path / "scratch"
+        self._intact: int | None = None
+        """Step of the latest checkpoint that has been written or verified."""
         self.resume_command = shlex.join(["clsplat", "train", "-o", str(path), "--resume"])
 
     @classmethod
@@ -195,6 +207,7 @@ class Run:
         self.checkpoints_path.mkdir(parents=True, exist_ok=True)
         path = self.checkpoints_path / f"step-{step:07d}.npz"
         write_checkpoint(path, step, arrays, state)
+        self._intact = step
         earlier = [(s, p) for s, p in self.checkpoints() if s <= step]
         keep = {p for _, p in earlier[-KEPT_CHECKPOINTS:]}
         for _, other in self.checkpoints():
@@ -207,6 +220,44 @@ class Run:
         matches = [(re.fullmatch(r"step-(\d+)\.npz", path.name), path) for path in self.checkpoints_path.glob("*.npz")]
         return sorted((int(match[1]), path) for match, path in matches if match)
 
+    def manifests(self) -> list[tuple[Path, Manifest]]:
+        """Checkpoints with their Gaussians in files of chunks, and their manifests, the earliest first.
+
+        Damaged ones, and those later than the latest that is known to be intact, are left out.
+        """
+        found = []
+        for step, path in self.checkpoints():
+            if (self._intact is None or step <= self._intact) and (manifest := read_manifest(path)) is not None:
+                found.append((path, self._located(manifest)))
+        return found
+
+    def give_up_checkpoint(self) -> bool:
+        """Remove the earliest checkpoint in a file of chunks, but not the latest that is known to be intact.
+
+        Returns False if there is no other. Raises OSError.
+        """
+        found = self.manifests()
+        if self._intact is None or len(found) < 2:
+            return False
+        remove(found[0][0])
+        return True
+
+    def _located(self, manifest: Manifest) -> Manifest:
+        """The manifest with the file where it is now: in the folder of the files of chunks, or where it was made."""
+        here = self.scratch_path.absolute() / manifest.path.name
+        return replace(manifest, path=here) if here.is_file() else manifest
+
+    def _verified(self, checkpoint: Checkpoint) -> Checkpoint:
+        """The checkpoint, if its chunks are as they were written. Raises ValueError and ScratchError."""
+        if checkpoint.manifest is None:
+            return checkpoint
+        if SCRATCH_NAME.fullmatch(checkpoint.manifest.path.name) is None:
+            raise ValueError(f"{checkpoint.manifest.path} is no file of chunks")
+        manifest = self._located(checkpoint.manifest)
+        with closing(ChunkStore.opened(manifest, writable=False)) as store:
+            store.verify()
+        return replace(checkpoint, manifest=manifest)
+
     def load_latest_checkpoint(self) -> Checkpoint | None:
         """The latest intact checkpoint; None if there are no checkpoints.
 
@@ -216,15 +267,19 @@ class Run:
         """
         checkpoints = self.checkpoints()
         checkpoint: Checkpoint | None = None
+        why = ""
         for step, path in reversed(checkpoints):
             try:
-                checkpoint = read_checkpoint(path, step)
+                checkpoint = self._verified(read_checkpoint(path, step))
+                self._intact = step
                 break
             except Exception as error:  # noqa: BLE001  # zipfile and NumPy raise nearly any exception for a flipped bit
                 why = str(error) or type(error).__name__
                 warn(f"{path}: is a damaged checkpoint and is skipped ({why})")
         if checkpoints and checkpoint is None:
-            raise InputError(f"{self.checkpoints_path}: has no intact checkpoint, use --overwrite to start again")
+            raise InputError(
+                f"{self.checkpoints_path}: has no intact checkpoint ({why}), use --overwrite to start again"
+            )
         if checkpoint is None and (lost := max((record.get("step", 0) for record in self.read_metrics()), default=0)):
             warn(f"{self.path}: has no checkpoint: training starts again, and the {lost} earlier steps are lost")
         if self.resuming:
@@ -287,6 +342,7 @@ def owned_files(path: Path) -> list[Path]:
         "depth/**/*.png",
         "refined/*.txt",
         "cache/*.pixels",
+        f"scratch/*{SCRATCH_SUFFIX}",
         "**/.*" + TEMPORARY_SUFFIX,
     )
     # config.toml last: an interrupted removal still leaves a run, which --overwrite can remove.

@@ -117,7 +117,7 @@ class ChunkPool:
         self.place(numbers, changes=changes)
 
     def write_back(self) -> None:
-        """Write the chunks that the device has changed to the store."""
+        """Write the chunks that the device has changed to the store. Raises WriteError."""
         numbers, slots = self._residency.held()
         changed = self._changed[slots]
         self._write(numbers[changed], slots[changed])

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from clsplat.chunks.store import ChunkStore, chunks_of
+from clsplat.chunks.manifest import chunks_of
+from clsplat.chunks.store import ChunkStore
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, floats_of, group_shapes
@@ -103,12 +104,37 @@ class HostArray:
 
 
 @dataclass(frozen=True, eq=False)
-class HostGaussians(_ByGroup[HostArray | StoredArray]):
-    """Gaussians on the host, or in the store of a pool.
+class SavedArray:
+    """A field of the chunks of a checkpoint, with the interface of a DeviceArray for reading."""
+
+    store: ChunkStore
+    field: str
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.store.count, *self.store.fields[self.field]
+
+    def get(self) -> NDArray[np.float32]:
+        """A copy of all rows."""
+        return self.get_rows(0, self.store.count)
+
+    def get_rows(self, start: int, stop: int) -> NDArray[np.float32]:
+        """A copy of the rows [start, stop)."""
+        return self.store.get_rows(self.field, start, stop)
+
+    def __getitem__(self, rows: slice) -> NDArray[np.float32]:
+        """A copy of some rows that follow each other."""
+        start, stop, _ = rows.indices(self.store.count)
+        return self.get_rows(start, stop)
+
+
+@dataclass(frozen=True, eq=False)
+class HostGaussians(_ByGroup[Any]):
+    """Gaussians on the host or in a store of chunks, as `HostArray`, `StoredArray` or `SavedArray`.
 
     rows: number of Gaussians that are on the device at once.
-    pool: has the chunks that are on the device; None for Gaussians on the host, which `parts` uploads.
-    kind: one of KINDS; the arrays are the fields `kind`/GROUP of the pool's store.
+    kind: "" if the arrays are in main memory; else they are fields `kind`/GROUP of a store.
+    pool: the chunks of that store that are on the device; None for the store of a checkpoint.
     """
 
     rows: int
@@ -170,6 +196,12 @@ def parts(
                 model[name].set_rows(start, array.get())
 
 
+def fields_of(coefficients: int) -> dict[str, tuple[int, ...]]:
+    """Fields of a store of chunks: parameters, first and second moments."""
+    shapes = group_shapes(1, coefficients)
+    return {f"{kind}/{name}": shape[1:] for kind in KINDS for name, shape in shapes.items()}
+
+
 def chunk_parts(
     work: Workspace, chunks: ChunkNumbers, *models: AnyGaussians, changes: bool = False
 ) -> Iterator[tuple[int, int, tuple[DeviceGaussians, ...], ChunkList, NDArray[np.integer[Any]]]]:
@@ -196,9 +228,7 @@ def store_of(models: Sequence[AnyGaussians | None], path: Path | None) -> ChunkS
     """A store of parameters, first and second moments. Moments that are None are zero. Raises WriteError."""
     parameters = models[0]
     assert parameters is not None
-    shapes = group_shapes(parameters.count, parameters.coefficients)
-    fields = {f"{kind}/{name}": shape[1:] for kind in KINDS for name, shape in shapes.items()}
-    store = ChunkStore(parameters.count, fields, path)
+    store = ChunkStore(parameters.count, fields_of(parameters.coefficients), path)
     given = {kind: model for kind, model in zip(KINDS, models, strict=True) if model is not None}
     for numbers in store.blocks():
         records = np.zeros(len(numbers), store.record)
@@ -218,12 +248,32 @@ def pooled(pool: ChunkPool, coefficients: int) -> tuple[HostGaussians, HostGauss
     """Parameters, first and second moments of a pool's store."""
 
     def of(kind: str) -> HostGaussians:
-        arrays: dict[str, HostArray | StoredArray] = {
-            name: StoredArray(pool, f"{kind}/{name}") for name in PARAMETER_GROUPS
-        }
+        arrays = {name: StoredArray(pool, f"{kind}/{name}") for name in PARAMETER_GROUPS}
         return HostGaussians(pool.store.count, coefficients, arrays, pool.rows, pool, kind)
 
     return of("parameters"), of("first"), of("second")
+
+
+def saved_models(store: ChunkStore) -> list[HostGaussians]:
+    """Parameters, first and second moments of the chunks of a checkpoint. Raises ValueError for other fields."""
+    coefficients = store.fields.get("parameters/sh_rest", (0,))[0] + 1
+    if store.fields != fields_of(coefficients):
+        raise ValueError("its chunks have other fields than this version's")
+    return [
+        HostGaussians(
+            store.count,
+            coefficients,
+            {name: SavedArray(store, f"{kind}/{name}") for name in PARAMETER_GROUPS},
+            store.count,
+            kind=kind,
+        )
+        for kind in KINDS
+    ]
+
+
+def saved_arrays(models: Sequence[HostGaussians]) -> dict[str, Any]:
+    """The arrays of `saved_models` by their names in a checkpoint; none of models in main memory."""
+    return {array.field: array for model in models for array in model.arrays.values() if isinstance(array, SavedArray)}
 
 
 def allocate_gaussians(device: Device, count: int, coefficients: int, *, zero: bool = False) -> DeviceGaussians:
@@ -285,18 +335,14 @@ def host_zeros(count: int, coefficients: int, rows: int) -> HostGaussians:
 
 def in_memory(gaussians: HostGaussians, rows: int) -> HostGaussians:
     """The same Gaussians in main memory, of which `rows` at a time are uploaded. Arrays that are there already stay."""
-    if gaussians.pool is None:
-        return replace(gaussians, rows=rows)
     return replace(to_host(gaussians), rows=rows)
 
 
 def to_host(gaussians: AnyGaussians) -> HostGaussians:
     """A copy in main memory of Gaussians on the device or in a store; those in main memory are returned unchanged."""
-    if isinstance(gaussians, HostGaussians) and gaussians.pool is None:
+    if isinstance(gaussians, HostGaussians) and not gaussians.kind:
         return gaussians
-    arrays: dict[str, HostArray | StoredArray] = {
-        name: HostArray(array.get()) for name, array in gaussians.arrays.items()
-    }
+    arrays = {name: HostArray(array.get()) for name, array in gaussians.arrays.items()}
     return HostGaussians(gaussians.count, gaussians.coefficients, arrays, gaussians.count)
 
 

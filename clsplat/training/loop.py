@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
+from clsplat.chunks.store import ScratchError
 from clsplat.device.drivers.worker_process import TrialInterrupted
 from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError
 from clsplat.evaluation.depths import keep_depths
@@ -138,6 +139,7 @@ class TrainingSession:
             if not self.trainer.monitor.retries.lost:
                 state |= {"seconds": self.seconds, **({"scene": self.scene} if self.scene else {})}
                 self.run.save_checkpoint(self.trainer.step, arrays, state)
+                self.trainer.model.saved_now()
                 self.saved = self.trainer.step
 
     def rescue(self) -> str:
@@ -150,7 +152,7 @@ class TrainingSession:
         """
         if self.run is None:
             return ""
-        earlier = f"; {self.run.resume_command} continues from the last checkpoint" if self.run.checkpoints() else ""
+        earlier = self.last_one
         if not self.trainer.step_back():
             return earlier
         try:
@@ -160,6 +162,12 @@ class TrainingSession:
         if not 0 < self.trainer.step <= self.saved:
             return ""
         return f"; a checkpoint of step {self.trainer.step} is written: {self.run.resume_command} continues from it"
+
+    @property
+    def last_one(self) -> str:
+        """End of an error message, which names the command that continues from the last checkpoint, or ""."""
+        there = self.run is not None and self.run.checkpoints()
+        return f"; {self.run.resume_command} continues from the last checkpoint" if self.run and there else ""
 
     def go_back(self) -> bool:
         """Report non-finite values. After too many steps with such values, go back to the last checkpoint with smaller
@@ -351,6 +359,8 @@ class TrainingSession:
         except InputError as error:
             if self.run is None:
                 raise
+            if isinstance(error, ScratchError):  # what was read may be wrong, so nothing is written
+                raise InputError(f"{error}{self.last_one}") from None
             raise InputError(f"{error}{self.rescue() or f'; go on with: {self.run.resume_command}'}") from None
 
     def _train(self, between: Between | None) -> Gaussians:

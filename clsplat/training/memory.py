@@ -3,12 +3,9 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
-import secrets
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 from clsplat.chunks.order import ORDERED_ROWS
@@ -17,12 +14,13 @@ from clsplat.config.masks import NO_MASKS
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError, amount, warn
-from clsplat.files.atomic import machine_mark, remove
 from clsplat.gaussians import floats_of
+from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.rendering.memory_needs import MODELS, StepMemory, plan_step
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.runs.run import Run
+from clsplat.runs.scratch import ScratchFiles, owner_of
 from clsplat.scenes.scene import Scene
 from clsplat.stages.density import gaussian_bytes
 from clsplat.training.batch import OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PER_PARAMETER, Batch
@@ -37,10 +35,6 @@ from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.supervision.resolution import by_doubling
 
 NO_CACHE = "none"
-SCRATCH_SUFFIX = ".chunks"
-"""Ending of the names of files of chunks."""
-OWNER_DIGITS = 12
-"""Hexadecimal digits of `HostMemory.owner`."""
 POOL_QUARTERS = 3
 """Quarters that the model's chunks get of the main memory which is left after what every step needs. The photographs
 get the rest."""
@@ -60,7 +54,8 @@ class HostMemory:
     cache: folder of the cache of decoded photographs; None for no cache.
     keeps_cache: True if the user named that folder, which then stays.
     scratch: folder of the files of chunks; None for none.
-    owner: name of this training's files there.
+    owner: beginning of the names of this training's files there.
+    run: run whose checkpoints name these files.
     """
 
     limit: int | None = None
@@ -68,6 +63,7 @@ class HostMemory:
     keeps_cache: bool = False
     scratch: Path | None = None
     owner: str = ""
+    run: Run | None = None
 
     @classmethod
     def chosen(
@@ -87,9 +83,14 @@ class HostMemory:
         if scratch is not None and (not str(scratch) or Path(scratch).is_file()):
             raise InputError(f"--scratch {scratch}: expected a folder")
         place = Path(scratch) if scratch is not None else (run.scratch_path if run is not None else None)
-        of = str(run.path.resolve()) if run is not None else f"{machine_mark()} {os.getpid()}"
-        owner = hashlib.sha256(of.encode("utf-8", "surrogatepass")).hexdigest()[:OWNER_DIGITS]
-        return replace(memory, scratch=place, owner=owner)
+        if run is not None and place is not None:
+            run.scratch_path = place
+        return replace(memory, scratch=place, owner=owner_of(run), run=run)
+
+    @cached_property
+    def files(self) -> ScratchFiles | None:
+        """This training's files of chunks; None if there is no folder for them."""
+        return ScratchFiles(self.scratch, self.owner, self.run) if self.scratch is not None else None
 
     @classmethod
     def _with_cache(cls, limit: int | None, cache: str | Path | None, run: Run | None) -> HostMemory:
@@ -109,39 +110,45 @@ class HostMemory:
         """Raise InputError if the limit is too small for the first step. Writes nothing."""
         if self.limit is not None:
             count = len(scene.points) or config.random_points
-            by_chunk = streams_by_chunk(config, device, count)
-            each = gaussian_bytes(contributions=False) if by_chunk else model_bytes(config)
-            taken = count * each if device.shares_memory else 0
+            taken = count * model_bytes(config)
+            if streams_by_chunk(config, device, count):
+                model = MODELS * 4 * floats_of((config.sh_degree + 1) ** 2)
+                taken = _least_pool(model) + count * gaussian_bytes(contributions=False)
+            taken *= device.shares_memory
             photographs = replace(self, cache=None).photographs(scene, config)  # the cache would make its folder
             self.share(photographs, count, taken, begins=True)
 
-    def pool(self, photographs: HostPhotographs, count: int, model: int, held: int) -> int | None:
+    def pool(self, photographs: HostPhotographs, count: int, model: int, held: int, *, begins: bool) -> int | None:
         """Bytes of main memory for the chunks that are on a device which shares it; None if all chunks fit.
 
         model: bytes per Gaussian of parameters and moments.
         held: other bytes per Gaussian.
+        begins: as in `share`.
         """
         if self.limit is None or self.limit >= count * (model + held) + photographs.least:
             return None
-        return max((self.limit - photographs.least - count * held) * POOL_QUARTERS // 4, 0)
+        pool = (self.limit - photographs.least - count * held) * POOL_QUARTERS // 4
+        if begins and pool < CHUNK_ROWS * model:
+            raise self._too_little(photographs, count, _least_pool(model) + count * held)
+        return max(pool, CHUNK_ROWS * model)
 
     def scratch_file(self, nbytes: int, photographs: HostPhotographs) -> Path | None:
         """A new file for so many bytes of chunks; None if main memory has room for them. Raises InputError if there is
         no folder for it."""
         if self.limit is None or self.limit >= nbytes + photographs.least:
             return None
-        if self.scratch is None:
+        if self.files is None:
             raise InputError(
                 f"--max-host-mem {amount(self.limit)} leaves {amount(nbytes)} of Gaussians to files: name a folder for "
                 "them (--scratch DIR), or a run's folder (-o)"
             )
-        return self.scratch / f"{self.owner}-{secrets.token_hex(4)}{SCRATCH_SUFFIX}"
+        return self.files.new_file()
 
     def remove_scratch(self) -> None:
-        """Remove this training's files of chunks, which may be of a process that was killed."""
-        for path in self.scratch.glob(f"{self.owner}-*{SCRATCH_SUFFIX}") if self.scratch is not None else ():
-            with suppress(OSError):
-                remove(path)
+        """Remove this training's files of chunks that no checkpoint names, such as those of a process that was
+        killed."""
+        if self.files is not None:
+            self.files.remove_unnamed()
 
     def share(self, photographs: HostPhotographs, count: int, taken: int, *, begins: bool) -> bool:
         """Give the photographs the memory that the Gaussians leave. Returns False if that is too little.
@@ -154,14 +161,17 @@ class HostMemory:
             return True
         enough = self.limit - taken >= photographs.least
         if begins and not enough:
-            least = -(-(taken + photographs.least) // 2**20)
-            raise InputError(
-                f"--max-host-mem {amount(self.limit)} is too little: the photographs need at least "
-                f"{amount(photographs.least)}, and {count:,} Gaussians take {amount(taken)} of main memory; expected "
-                f"at least {least}MiB"
-            )
+            raise self._too_little(photographs, count, taken)
         photographs.follow(self.limit - taken)
         return enough
+
+    def _too_little(self, photographs: HostPhotographs, count: int, taken: int) -> InputError:
+        least = -(-(taken + photographs.least) // 2**20)
+        return InputError(
+            f"--max-host-mem {amount(self.limit or 0)} is too little: the photographs need at least "
+            f"{amount(photographs.least)}, and {count:,} Gaussians take {amount(taken)} of main memory; expected at "
+            f"least {least}MiB"
+        )
 
     def end(self, run: Run | None) -> None:
         """Remove the cache in the folder of a run that has finished, unless it was named as the cache's folder."""
@@ -169,6 +179,11 @@ class HostMemory:
             return
         if not (self.keeps_cache and self.cache is not None and self.cache.resolve() == run.cache_path.resolve()):
             remove_decoded(run.cache_path)
+
+
+def _least_pool(model: int) -> int:
+    """Bytes beside photographs and statistics with which the pool has room for one chunk. model: bytes per Gaussian."""
+    return -(-CHUNK_ROWS * model * 4 // POOL_QUARTERS)
 
 
 UNLIMITED = HostMemory()
@@ -211,7 +226,9 @@ class MemoryPlanner:
             row_bytes=sum(component.row_bytes for component in components),
             pixel_bytes=sum(component.pixel_bytes for component in components),
             by_chunk=by_chunk,
-            pool=self._memory.pool(self._photographs.host, count, model, held) if by_chunk and on_host else None,
+            pool=self._memory.pool(self._photographs.host, count, model, held, begins=self.begins)
+            if by_chunk and on_host
+            else None,
         )
         models = max(component.models for component in components)
         usual = MODELS if self._batch is None else OWNER_ARRAYS_PER_PARAMETER
@@ -227,6 +244,11 @@ class MemoryPlanner:
     def scratch_file(self, nbytes: int) -> Path | None:
         """A new file for so many bytes of chunks; None if main memory has room for them. Raises InputError."""
         return self._memory.scratch_file(nbytes, self._photographs.host)
+
+    @property
+    def scratch_files(self) -> ScratchFiles | None:
+        """The training's files of chunks; None if there is no folder for them."""
+        return self._memory.files
 
     def _plan(self, device: Device, count: int, memory: StepMemory, models: int) -> Plan:
         cameras, coefficients = [view.camera for view in self._scene.views], (self._config.sh_degree + 1) ** 2

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
+from clsplat.chunks.manifest import Manifest
 from clsplat.chunks.order import ORDERED_ROWS, beside_parents, space_order
+from clsplat.chunks.store import ChunkStore
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
@@ -23,6 +27,7 @@ from clsplat.optimisation.density_rules import FRESH
 from clsplat.rendering.memory_needs import MODELS
 from clsplat.rendering.memory_plan import Plan
 from clsplat.runs.checkpoints import Checkpoint, unusable
+from clsplat.runs.scratch import ScratchFiles
 from clsplat.stages.chunk_pool import ChunkPool
 from clsplat.stages.density import (
     DensityStatistics,
@@ -36,6 +41,7 @@ from clsplat.stages.density import (
     widen,
 )
 from clsplat.stages.device_gaussians import (
+    KINDS,
     AnyGaussians,
     HostGaussians,
     allocate_gaussians,
@@ -44,12 +50,18 @@ from clsplat.stages.device_gaussians import (
     host_zeros,
     in_memory,
     pooled,
+    saved_arrays,
+    saved_models,
     store_of,
     to_device,
     to_host,
     upload_gaussians,
 )
 from clsplat.training.density import RowPlan
+from clsplat.training.stability.health import examine
+
+EXAMINED_CHUNKS = 64
+"""Chunks whose numbers are examined at once."""
 
 
 class TrainedModel:
@@ -57,6 +69,7 @@ class TrainedModel:
 
     make_plan: function that plans the device's memory for a number of Gaussians.
     scratch: function that names a new file for so many bytes of chunks, or returns None to keep them in main memory.
+    files: the training's files of chunks; None if there is no folder for them.
     sh_degree: final SH degree.
     counts_contributions: True if the statistics have contributions.
     """
@@ -73,11 +86,12 @@ class TrainedModel:
         work: Workspace,
         make_plan: Callable[[int], Plan],
         scratch: Callable[[int], Path | None],
+        files: ScratchFiles | None,
         *,
         sh_degree: int,
         counts_contributions: bool,
     ) -> None:
-        self._device, self._work, self._make_plan, self._scratch = device, work, make_plan, scratch
+        self._device, self._work, self._make_plan, self._scratch, self._files = device, work, make_plan, scratch, files
         self._pool: ChunkPool | None = None
         self._sh_degree, self._counts_contributions = sh_degree, counts_contributions
 
@@ -92,16 +106,25 @@ class TrainedModel:
         else:
             self.set(upload_gaussians(self._device, initial))
 
-    def saved(self, checkpoint: Checkpoint) -> list[HostGaussians]:
-        """Parameters, first and second moments of a checkpoint. Raises InputError for arrays of another model."""
-        most = (self._sh_degree + 1) ** 2
-        try:
-            models = [host_model(checkpoint.arrays, kind) for kind in self.kinds()]
-            if (n := max(model.coefficients for model in models)) > most:
-                raise ValueError(f"has {n} SH coefficients, more than the {most} of --sh-degree {self._sh_degree}")
-        except ValueError as error:
-            raise unusable(checkpoint, str(error)) from None
-        return models
+    @contextmanager
+    def saved(self, checkpoint: Checkpoint) -> Iterator[tuple[list[HostGaussians], Checkpoint]]:
+        """Context with parameters, first and second moments of a checkpoint, and the checkpoint with their arrays.
+
+        A scratch file that has them is open in the context. Raises InputError for arrays of another model.
+        """
+        with ExitStack() as reading:
+            try:
+                if checkpoint.manifest is not None:
+                    store = reading.enter_context(closing(ChunkStore.opened(checkpoint.manifest, writable=False)))
+                    models = saved_models(store)
+                else:
+                    models = [host_model(checkpoint.arrays, kind) for kind in KINDS]
+                n, most = max(model.coefficients for model in models), (self._sh_degree + 1) ** 2
+                if n > most:
+                    raise ValueError(f"has {n} SH coefficients, more than the {most} of --sh-degree {self._sh_degree}")
+            except ValueError as error:
+                raise unusable(checkpoint, str(error)) from None
+            yield models, replace(checkpoint, arrays={**checkpoint.arrays, **saved_arrays(models)})
 
     def load(self, models: Sequence[HostGaussians], checkpoint: Checkpoint) -> None:
         """Continue with the models (`saved`) and the statistics of a checkpoint.
@@ -111,7 +134,9 @@ class TrainedModel:
         """
         self.free()
         self.plan = self._make_plan(models[0].count)
-        self.set(*models)
+        if not self._go_on_in(checkpoint.manifest, models[0].coefficients):
+            self._place(*models)
+        self.statistics = new_statistics(self._device, models[0].count, contributions=self._counts_contributions)
         statistics = checkpoint.named("statistics/")
         for name, array in self.statistics.named().items():
             if name in statistics and (statistics[name].shape, statistics[name].dtype) != (array.shape, array.dtype):
@@ -144,6 +169,37 @@ class TrainedModel:
         return {
             f"{kind}/{group}": model[group].get() for kind, model in self.kinds().items() for group in PARAMETER_GROUPS
         }
+
+    @property
+    def store(self) -> ChunkStore | None:
+        """The store of the chunks, if they are in a scratch file."""
+        return self._pool.store if self._pool is not None and self._pool.store.path is not None else None
+
+    def record(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+        """Arrays and state of a checkpoint, without the statistics: a manifest if there is a scratch file."""
+        if (store := self.store) is None or self._pool is None:
+            return self.arrays(), {}
+        self._pool.write_back()
+        manifest = store.manifest()
+        return manifest.arrays(), manifest.state()
+
+    def saved_now(self) -> None:
+        """Note that a checkpoint has been written."""
+        if self._files is not None:
+            self._files.saved(self.store)
+
+    def changes_are_finite(self) -> bool:
+        """True if the Gaussians are in a scratch file, and those that have changed since the last checkpoint are
+        finite."""
+        if (store := self.store) is None or self._pool is None:
+            return False
+        self._pool.write_back()
+        changed = np.flatnonzero(store.slots.in_place(np.arange(store.chunks)))
+        for begin in range(0, len(changed), EXAMINED_CHUNKS):
+            numbers = changed[begin : begin + EXAMINED_CHUNKS]
+            if np.any(examine(**store.rows_of(numbers, KINDS, PARAMETER_GROUPS))):
+                return False
+        return True
 
     def marker(self) -> DeviceMarker:
         """Marker of the Gaussians by density rules."""
@@ -190,18 +246,39 @@ class TrainedModel:
         if self.plan.streamed and count > ORDERED_ROWS:
             store = store_of((parameters, first, second), self._scratch(MODELS * 4 * floats_of(coefficients) * count))
             self.close()
-            pool = self._pool = ChunkPool(self._device, self._work, store, self.plan.rows)
-            self.parameters, self.first, self.second = pooled(pool, coefficients)
+            self._use(store, coefficients)
             return
         models = [self._placed(model) for model in (parameters, first, second) if model is not None]
         self.close()
         self.parameters, *moments = models
         self.first, self.second = moments or (self._zeros(count, coefficients), self._zeros(count, coefficients))
 
+    def _go_on_in(self, manifest: Manifest | None, coefficients: int) -> bool:
+        """Go on in the scratch file of a checkpoint. Returns False if the Gaussians belong elsewhere."""
+        if (
+            manifest is None
+            or not self.plan.streamed
+            or self._files is None
+            or not self._files.may_write(manifest.path)
+        ):
+            return False
+        if self._scratch(MODELS * 4 * floats_of(coefficients) * manifest.count) is None:
+            return False
+        self.close()
+        self._use(ChunkStore.opened(manifest, writable=True), coefficients)
+        return True
+
+    def _use(self, store: ChunkStore, coefficients: int) -> None:
+        """Let the rows be those of a store of chunks."""
+        if self._files is not None and store.path is not None:
+            self._files.follow(store)
+        pool = self._pool = ChunkPool(self._device, self._work, store, self.plan.rows)
+        self.parameters, self.first, self.second = pooled(pool, coefficients)
+
     @property
     def in_file(self) -> bool:
         """True if main memory has no room for the whole model."""
-        return self._pool is not None and self._pool.store.path is not None
+        return self.store is not None
 
     @property
     def moved_bytes(self) -> int:
@@ -209,7 +286,8 @@ class TrainedModel:
         return 0 if self._pool is None else self._pool.moved_bytes
 
     def close(self) -> None:
-        """Remove the scratch file of a streamed model. The model cannot be used any longer."""
+        """Remove the scratch file of a streamed model, unless a checkpoint names it. The model cannot be used any
+        longer."""
         if self._pool is not None:
             self._pool.close()
             self._pool = None

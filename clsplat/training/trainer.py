@@ -123,6 +123,7 @@ class Trainer:
             self.rasterizer.work,
             self._make_plan,
             self.planner.scratch_file,
+            self.planner.scratch_files,
             sh_degree=self.config.sh_degree,
             counts_contributions=self.strategy.needs().contributions,
         )
@@ -472,38 +473,42 @@ class Trainer:
         The whole model is finite, unless `monitor.retries.lost`.
         """
         self.repair(look=True)
-        arrays = self._arrays()
-        repair = self.monitor.examine_all(arrays)  # finds non-finite values in Gaussians that no step has visited
-        if repair is not None:
-            self._apply(repair)
-            arrays = self._arrays()
-        return arrays, self.position.state(self.monitor.retries)
+        finite = self.model.changes_are_finite()
+        arrays, state = self._arrays()
+        if not finite:  # there may be non-finite values in Gaussians that no step has visited
+            repair = self.monitor.examine_all(self.model.arrays() if self.model.in_file else arrays)
+            if repair is not None:
+                self._apply(repair)
+                arrays, state = self._arrays()
+        return arrays, self.position.state(self.monitor.retries) | state
 
-    def _arrays(self) -> dict[str, NDArray[Any]]:
+    def _arrays(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+        model, state = self.model.record()
         arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
         arrays.update({f"strategy/{name}": array for name, array in self.strategy.arrays().items()})
-        arrays |= self.model.arrays()
+        arrays |= model
         for component in self.components:
             arrays |= component.arrays()
-        return arrays
+        return arrays, state
 
     def restart(self) -> None:
         """Start again from step 0, with the rate factor of `monitor.retries`."""
         self.pending.forget()
+        self.model.close()
         self.model.free()
         self.monitor.forget()
         self._start()
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continue from a checkpoint."""
-        models = self.model.saved(checkpoint)
-        self.monitor.retries, self.mark = self.position.load(checkpoint, len(self.views)), None
-        self.monitor.forget()
-        self.pending.forget()
-        self.model.load(models, checkpoint)
-        self.strategy.load(checkpoint.named("strategy/"))
-        try:
-            for component in self.components:
-                component.load(checkpoint.named, self.step, self.parameters.count)
-        except ValueError as error:
-            raise unusable(checkpoint, str(error)) from None
+        with self.model.saved(checkpoint) as (models, arrays):
+            self.monitor.retries, self.mark = self.position.load(checkpoint, len(self.views)), None
+            self.monitor.forget()
+            self.pending.forget()
+            self.model.load(models, checkpoint)
+            self.strategy.load(checkpoint.named("strategy/"))
+            try:
+                for component in self.components:
+                    component.load(arrays.named, self.step, self.parameters.count)
+            except ValueError as error:
+                raise unusable(checkpoint, str(error)) from None

@@ -290,7 +290,7 @@ def test_a_network_disk_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
         f"disk / ext4 rw 0 0\nserver:/a {here}/far\\040away nfs4 rw 0 0\nx {here}/far\\040away/near tmpfs rw 0 0\n"
     )
     monkeypatch.setattr(mounts, "MOUNTS", table)
-    monkeypatch.setattr(decoded_store, "NETWORK_SAMPLE_BYTES", 2 * PIXELS.nbytes)
+    monkeypatch.setattr(mounts, "NETWORK_SAMPLE_BYTES", 2 * PIXELS.nbytes)
     assert mounts.network_type(tmp_path) == ""
     assert mounts.network_type(tmp_path / "far away") == "nfs4"
     assert mounts.network_type(tmp_path / "far away" / "near") == ""

@@ -15,7 +15,8 @@ from calls import noted
 from compare import assert_same_bits
 from quick import quick
 from same_bytes import State, make_too_small, outcome, stopped
-from tiny import cameras, hidden_model, run_steps, short
+from tiny import cameras, run_steps, short
+from wide import ROWS, let_small_models_have_chunks, start_wide, wide_model
 
 from clsplat.camera import Camera
 from clsplat.chunks.bounds import ChunkBounds
@@ -24,7 +25,6 @@ from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.device.selection import open_device
 from clsplat.errors import DriverError
-from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.scenes.scene import Scene
 from clsplat.stages.chunk_pool import ChunkPool
@@ -39,7 +39,6 @@ from clsplat.training.step.visible_chunks import Missed, VisibleChunks
 from clsplat.training.telemetry import largest_contributions
 from clsplat.training.trainer import Trainer
 
-ROWS = 11 * CHUNK_ROWS + 100
 CONFIG = short(iterations=40, report=False, warmup=(), density={"max_gaussians": 16_000})
 SPARSE = replace(CONFIG, optimiser=OptimiserConfig(sparse=True))
 
@@ -47,32 +46,9 @@ UNCHANGED_ROWS = short(iterations=40, report=False, warmup=(), density={"every":
 COOLED = replace(UNCHANGED_ROWS, optimiser=OptimiserConfig(cooldown=36, cooldown_to=1e-6))
 
 
-def wide_model(rows: int = ROWS, *, around: bool = True) -> Gaussians:
-    """The tiny scene's Gaussians many times, at eight places.
-
-    The first place is the scene's, which every view shows, and four are above, which no view shows. Three are around
-    it, of which a view shows some, or, if not `around`, above too.
-    """
-    small, rng = hidden_model(), np.random.default_rng(5)
-    rows_of = rng.integers(0, len(small), rows)
-    taken = {name: array[rows_of].copy() for name, array in small.arrays().items()}
-    model = replace(small, **taken)
-    place = np.arange(rows) * 8 // rows
-    beside, above = (place > 4) & around, (place > 0) & ((place <= 4) | (not around))
-    angle = place * 2 * np.pi / 3
-    away = np.column_stack([12 * beside * np.cos(angle), 30 * above, 12 * beside * np.sin(angle)])
-    away[:, 0] += 9 * above * place
-    model.means += away.astype(np.float32)
-    model.means += rng.normal(0, 0.1, model.means.shape).astype(np.float32)
-    model.log_scales -= 1
-    model.opacity_logits -= 2
-    return model
-
-
 @pytest.fixture(autouse=True)
 def _small_models_have_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(visible_chunks, "ORDERED_ROWS", 2 * CHUNK_ROWS)
-    monkeypatch.setattr(trained_model, "ORDERED_ROWS", 2 * CHUNK_ROWS)
+    let_small_models_have_chunks(monkeypatch)
 
 
 @pytest.fixture
@@ -91,8 +67,9 @@ def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 def state(trainer: Trainer) -> State:
-    """All arrays of a checkpoint."""
-    return {name: array.copy() for name, array in trainer.checkpoint()[0].items()}
+    """All arrays of a checkpoint, with those of Gaussians that are in a scratch file."""
+    saved = {name: array.copy() for name, array in trainer.checkpoint()[0].items() if not name.startswith("chunks/")}
+    return saved | trainer.model.arrays()
 
 
 def trained(
@@ -276,14 +253,7 @@ def test_a_look_changes_no_byte(scene: Scene, default_device: Device) -> None:
 
 @pytest.fixture
 def _starts_wide(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every training starts from `wide_model`."""
-    start = Trainer._start
-
-    def begin(trainer: Trainer) -> None:
-        trainer.given = wide_model()
-        start(trainer)
-
-    monkeypatch.setattr(Trainer, "_start", begin)
+    start_wide(monkeypatch)
 
 
 @pytest.mark.usefixtures("_starts_wide")

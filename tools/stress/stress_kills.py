@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kill trainings with SIGKILL at random times, resume them until they are finished, and compare the models' bytes.
 
-    tools/stress/run kills [--kills 100] [--seed 0] [--device DEVICE] [--json]
+    tools/stress/run kills [--kills 100] [--seed 0] [--scratch] [--device DEVICE] [--json]
 
 The scene is the small one of the tests: 40 points, 8 pictures of 48x40, and two held out. A training writes a
 checkpoint every second step, so that many kills interrupt the writing. A process is killed after a random time, between
 its start (imports, building of kernels, reading the checkpoint) and its end. A finished training is compared with an
 undisturbed one: the bytes of model.ply, and the steps in metrics.jsonl. The exit status is 1 if these differ, or if a
 process fails.
+
+--scratch: the model begins with 11,364 Gaussians, counts as a large one, and is in a scratch file under --max-host-mem
+4MiB. It is compared with one that was trained without a limit.
 """
 
 from __future__ import annotations
@@ -28,6 +31,7 @@ from measuring import plain_parser, tool
 from tiny import write_scene
 
 from clsplat.errors import ClsplatError
+from clsplat.runs.run import Run
 
 ITERATIONS, CHECKPOINT_EVERY = 240, 2
 SETTINGS = (
@@ -36,6 +40,23 @@ SETTINGS = (
     *("--density.start", "30", "--density.every", "20", "--density.stop", "200", "--density.max-gaussians", "300"),
     *("--density.gradient-threshold", "1e-3", "--density.opacity-reset-every", "90"),
 )
+LIMITED = ("--max-host-mem", "4MiB")
+SCRATCH_SETTINGS = (
+    *("--iterations", "60", "--checkpoint-every", str(CHECKPOINT_EVERY), "--no-report"),
+    *("--sh-degree", "2", "--sh-degree-every", "1", "--warmup", "", "--density.max-gaussians", "16000"),
+    *("--density.start", "10", "--density.every", "15", "--density.stop", "50", "--density.gradient-threshold", "4e-3"),
+)
+WIDE_TRAINING = """
+import sys
+sys.path[:0] = sys.argv.pop(1).split(":")
+import pytest
+import wide
+patch = pytest.MonkeyPatch()
+wide.let_small_models_have_chunks(patch)
+wide.start_wide(patch, around=False)
+from clsplat.cli.main import main
+sys.exit(main(sys.argv[1:]))
+"""
 WHILE_WRITING = 0.4
 """Fraction of the kills that wait until the next checkpoint is being written. Writing takes little of the time."""
 DEADLINE = 300.0
@@ -69,8 +90,8 @@ def half_written(run: Path) -> set[str]:
 class Kills:
     """Trainings of one scene in one folder."""
 
-    def __init__(self, folder: Path, device: str | None, seed: int) -> None:
-        self.folder, self.random, self.figures = folder, random.Random(seed), Figures()
+    def __init__(self, folder: Path, device: str | None, seed: int, *, scratch: bool) -> None:
+        self.folder, self.random, self.figures, self.scratch = folder, random.Random(seed), Figures(), scratch
         self.more = ("--device", device) if device else ()
         self.scene = write_scene(folder / "scene")
         self.whole = folder / "whole"
@@ -83,8 +104,11 @@ class Kills:
 
     def start(self, run: Path) -> subprocess.Popen[str]:
         """Start a training, or resume it if the run exists."""
-        command = [sys.executable, "-m", "clsplat", "train", "-o", str(run), *self.more]
-        command += ["--resume"] if (run / "config.toml").exists() else [str(self.scene), *SETTINGS]
+        child = ["-c", WIDE_TRAINING, ":".join(sys.path[:4])] if self.scratch else ["-m", "clsplat"]
+        command = [sys.executable, *child, "train", "-o", str(run), *self.more]
+        command += LIMITED if self.scratch and run != self.whole else ()
+        settings = SCRATCH_SETTINGS if self.scratch else SETTINGS
+        command += ["--resume"] if (run / "config.toml").exists() else [str(self.scene), *settings]
         return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
     def end_of(self, process: subprocess.Popen[str]) -> None:
@@ -134,6 +158,9 @@ class Kills:
             raise ClsplatError(f"after {self.figures.kills} kills metrics.jsonl has the steps {steps}")
         if left := list(run.rglob(".*.clsplat-tmp")):
             raise ClsplatError(f"a half-written file has stayed: {left[0].name}")
+        named = {manifest.path for _, manifest in Run.open(run).manifests()}
+        if named != set(run.absolute().glob("scratch/*")) or bool(named) != (self.scratch and run != self.whole):
+            raise ClsplatError(f"{run}/scratch: has not the files that checkpoints name, {named}")
         self.figures.compared += 1
 
     def survive(self, count: int) -> Figures:
@@ -157,13 +184,14 @@ def main(arguments: Sequence[str]) -> int:
     parser = plain_parser(__doc__)
     parser.add_argument("--kills", metavar="N", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--scratch", action="store_true")
     parser.add_argument("--device")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)
     if options.kills < 1:
         parser.error(f"--kills {options.kills}: expected at least 1")
     with tempfile.TemporaryDirectory(prefix="clsplat-kills-") as folder:
-        figures = Kills(Path(folder), options.device, options.seed).survive(options.kills)
+        figures = Kills(Path(folder), options.device, options.seed, scratch=options.scratch).survive(options.kills)
     if options.json:
         print(json.dumps(asdict(figures), indent=2))
         return 0

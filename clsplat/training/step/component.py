@@ -17,7 +17,8 @@ from clsplat.runs.run import Run
 from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.training.step.inputs import ViewInputs
 
-Named = Callable[[str], Mapping[str, NDArray[Any]]]
+Named = Callable[[str], Mapping[str, Any]]
+"""Arrays of a checkpoint by the rest of their names. Those of the Gaussians may be files that are read by slices."""
 """Arrays of a checkpoint whose names have a prefix, by name without the prefix."""
 
 

@@ -24,16 +24,14 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from clsplat.errors import WriteError, amount, reason_of
+from clsplat.errors import WriteError, reason_of
 from clsplat.files.atomic import TEMPORARY_NAME, atomic_name, is_abandoned, remove
-from clsplat.files.mounts import network_type
+from clsplat.files.mounts import NetworkRate
 from clsplat.version import package_version
 
 FORMAT_VERSION = 1
 SUFFIX = ".pixels"
 KEY_BYTES = 32
-NETWORK_SAMPLE_BYTES = 16 << 20
-"""Bytes that are read or written before the rate of a network disk is reported."""
 _MAGIC = b"clsplat\x00"
 _HEADER = struct.Struct(f"<8sIIIII{KEY_BYTES}s")
 _CHECKSUM = struct.Struct("<I")
@@ -61,11 +59,9 @@ class DecodedStore:
         self._lock = threading.Lock()
         self._notes: list[str] = []
         self._told_damage = False
-        self._network = ""
-        self._moved, self._seconds = 0, 0.0
+        self._rate = NetworkRate(folder, "--cache")
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._network = network_type(folder)
             self._remove_abandoned()
         except OSError as error:
             self._give_up(reason_of(error))
@@ -139,18 +135,9 @@ class DecodedStore:
 
     def _count(self, nbytes: int, seconds: float) -> None:
         """Count bytes that were read or written, and note the rate of a network disk."""
-        if not self._network:
-            return
         with self._lock:
-            self._moved += nbytes
-            self._seconds += seconds
-            if self._network and self._moved >= NETWORK_SAMPLE_BYTES:
-                rate = amount(int(self._moved / max(self._seconds, 1e-6)))
-                self._notes.append(
-                    f"{self.folder}: is on a network disk ({self._network}), which moves {rate} a second: a local "
-                    "folder (--cache DIR) may be faster"
-                )
-                self._network = ""
+            if note := self._rate.count(nbytes, seconds):
+                self._notes.append(note)
 
 
 def remove_decoded(folder: Path) -> None:

@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The store of chunks: the rows that were written or an error, and slots that a checkpoint names stay as they are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from wide import flip, full
+
+from clsplat.chunks import store as store_module
+from clsplat.chunks.manifest import Manifest, manifest_of
+from clsplat.chunks.slots import MAX_TENTHS, NO_SLOT, SlotTable
+from clsplat.chunks.store import ChunkStore, ScratchError, runs
+from clsplat.errors import WriteError
+from clsplat.layouts.columns import CHUNK_ROWS
+
+FIELDS: dict[str, tuple[int, ...]] = {"a": (3,), "b": (), "none": (0, 3)}
+COUNT = 20 * CHUNK_ROWS - 5
+ALL = np.arange(20)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[ChunkStore]:
+    made = ChunkStore(COUNT, FIELDS, tmp_path / "scratch" / "x.chunks")
+    yield made
+    made.close()
+
+
+def records_of(store: ChunkStore, numbers: NDArray[Any], value: float = 0.0) -> NDArray[Any]:
+    """Records whose elements differ by chunk, row and field."""
+    records = np.zeros(len(numbers), store.record)
+    for place, number in enumerate(numbers):
+        rows = value + CHUNK_ROWS * number + np.arange(CHUNK_ROWS)
+        records["a"][place], records["b"][place] = rows[:, None] * [1, 2, 3], -rows
+    return records
+
+
+def written(store: ChunkStore, value: float = 0.0, numbers: NDArray[Any] = ALL) -> NDArray[Any]:
+    records = records_of(store, numbers, value)
+    store.write(numbers, records)
+    return records
+
+
+def size_of(store: ChunkStore) -> int:
+    assert store.path is not None
+    return store.path.stat().st_size
+
+
+@pytest.mark.parametrize("in_file", [False, True])
+def test_rows_come_back(tmp_path: Path, in_file: bool) -> None:
+    store = ChunkStore(COUNT, FIELDS, tmp_path / "x.chunks" if in_file else None)
+    assert not any(store.read(ALL)[name].any() for name in ("a", "b"))
+    numbers = np.array([3, 4, 9, 1])
+    records = written(store, 7.0, numbers)
+    assert store.read(np.array([9, 0, 1, 3]))[[0, 2, 3]].tobytes() == records[[2, 3, 0]].tobytes()
+    assert not store.read(np.array([9, 0, 1]))["a"][1].any()
+    store.set_rows("b", 4 * CHUNK_ROWS - 2, np.arange(5, dtype=np.float32))
+    got = store.get_rows("b", 4 * CHUNK_ROWS - 3, 4 * CHUNK_ROWS + 4)
+    np.testing.assert_array_equal(got[1:6], np.arange(5))
+    np.testing.assert_array_equal(got[[0, 6]], [records["b"][0, -3], records["b"][1, 3]])
+    store.fill("a", 2.0)
+    assert (store.get_rows("a", 0, COUNT) == 2).all()
+    assert store.get_rows("none", 0, 5).shape == (5, 0, 3)
+    store.close()
+    assert not list(tmp_path.iterdir()), "the file is removed, as no checkpoint names it"
+
+
+def test_rows_of_some_chunks(tmp_path: Path) -> None:
+    """Without those behind the model's last one."""
+    store = ChunkStore(COUNT, {"first/a": (3,), "first/none": (0, 3)}, tmp_path / "x.chunks")
+    values = np.arange(3 * COUNT, dtype=np.float32).reshape(COUNT, 3)
+    store.set_rows("first/a", 0, values)
+    found = store.rows_of(np.array([4, 19]), ("first",), ("a", "none"))["first"]
+    np.testing.assert_array_equal(found["a"], np.concatenate([values[4096:5120], values[19 * CHUNK_ROWS :]]))
+    assert found["none"].shape == (2 * CHUNK_ROWS - 5, 0, 3)
+    store.close()
+
+
+def test_what_a_checkpoint_names_is_not_overwritten(store: ChunkStore) -> None:
+    before = written(store)
+    manifest = store.manifest()
+    store.slots.hold([manifest.slots])
+    written(store, 100.0, np.array([2, 5]))
+    store.set_rows("b", 7 * CHUNK_ROWS, np.ones(1, np.float32))
+    store.fill("b", 3.0)
+    saved = ChunkStore.opened(manifest, writable=False)
+    assert saved.read(ALL).tobytes() == before.tobytes()
+    saved.close()
+    assert store.path is not None
+    assert store.path.exists(), "a file that is only read is never removed"
+    assert (store.get_rows("b", 0, COUNT) == 3).all()
+
+
+def test_chunks_that_no_checkpoint_names_are_written_in_place(store: ChunkStore) -> None:
+    written(store)
+    size, slots = size_of(store), store.slots.current.copy()
+    written(store, 1.0)
+    store.fill("b", 3.0)
+    assert size_of(store) == size == store.nbytes
+    np.testing.assert_array_equal(store.slots.current, slots)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.3, 0.04])
+def test_the_file_is_at_most_2_2_times_the_state(store: ChunkStore, share: float) -> None:
+    """Also where every chunk changes between checkpoints. One checkpoint stays intact at any moment."""
+    kept: list[Manifest] = []
+    rng = np.random.default_rng(1)
+
+    def release() -> list[NDArray[np.int64]] | None:
+        if len(kept) < 2:
+            return None
+        del kept[0]
+        return [manifest.slots for manifest in kept]
+
+    store.release = release
+    records = written(store)
+    saved = {}
+    for number in range(12):
+        for _ in range(3):
+            numbers = np.sort(rng.choice(20, max(int(20 * share), 1), replace=False))
+            records[numbers] = written(store, float(rng.integers(1000)), numbers)
+            assert size_of(store) * 10 <= MAX_TENTHS * store.nbytes
+            for manifest in kept:
+                reader = ChunkStore.opened(manifest, writable=False)
+                assert reader.read(ALL).tobytes() == saved[id(manifest)]
+                reader.close()
+        kept = [*kept, store.manifest()][-2:]
+        saved[id(kept[-1])] = records.tobytes()
+        store.slots.hold([manifest.slots for manifest in kept])
+        assert number == 0 or len(kept) == 2
+        assert store.read(ALL).tobytes() == records.tobytes()
+    assert (len(kept) == 2) and size_of(store) > store.nbytes
+
+
+def test_a_store_goes_on_in_the_file_of_a_checkpoint(store: ChunkStore) -> None:
+    records = written(store)
+    manifest = store.manifest()
+    store.slots.hold([manifest.slots])
+    written(store, 50.0, np.array([0, 1, 2]))
+    again = ChunkStore.opened(manifest, writable=True)
+    again.slots.hold([manifest.slots])
+    again.verify()
+    records[5:7] = written(again, 70.0, np.array([5, 6]))
+    assert again.read(ALL).tobytes() == records.tobytes()
+    again.close()
+    assert size_of(store) == store.nbytes, "slots behind the last that is kept are given back"
+
+
+DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "cut": (lambda path: os.truncate(path, path.stat().st_size - 1), "has been cut"),
+    "empty": (lambda path: path.write_bytes(b""), "has been cut"),
+    "missing": (lambda path: path.unlink(), "cannot be opened: there is no such file"),
+    "changed": (lambda path: flip(path, 5000), "chunk 0 of the model has changed"),
+    "the last byte": (lambda path: flip(path, path.stat().st_size - 1), "chunk 19 of the model has changed"),
+    "other": (lambda path: path.write_bytes(bytes(path.stat().st_size)), "chunk 0 of the model has changed"),
+    "a folder": (lambda path: (path.unlink(), path.mkdir()), "cannot be opened"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_a_damaged_file_gives_no_rows(store: ChunkStore, name: str) -> None:
+    written(store)
+    manifest = store.manifest()
+    damage, message = DAMAGE[name]
+    damage(manifest.path)
+    with pytest.raises(ScratchError, match=message):
+        ChunkStore.opened(manifest, writable=True).verify()
+
+
+@pytest.mark.parametrize("name", ["cut", "changed", "the last byte", "other"])
+def test_a_file_that_is_damaged_while_it_is_used(store: ChunkStore, name: str) -> None:
+    written(store)
+    assert store.path is not None
+    damage, message = DAMAGE[name]
+    damage(store.path)
+    with pytest.raises(ScratchError, match=message):
+        store.read(ALL)
+    with pytest.raises(ScratchError, match=message):
+        _ = [store.get_rows(field, 0, COUNT) for field in ("a", "b")]
+
+
+def test_a_full_disk_is_known_before_anything_is_written(
+    store: ChunkStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    records = written(store)
+    manifest = store.manifest()
+    store.slots.hold([manifest.slots])
+    monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
+    with pytest.raises(WriteError, match=r"x\.chunks: cannot be written: the disk is full"):
+        written(store, 1.0)
+    assert store.read(ALL).tobytes() == records.tobytes()
+    with pytest.raises(WriteError, match="the disk is full"):
+        ChunkStore(COUNT, FIELDS, tmp_path / "scratch" / "y.chunks")
+    assert [path.name for path in (tmp_path / "scratch").iterdir()] == ["x.chunks"]
+
+
+def test_a_write_that_fails_gives_no_wrong_row(store: ChunkStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a slot of its own the chunk stays what it was; in place half of it is new, and reading says so."""
+    records = written(store)
+    store.slots.hold([store.manifest().slots[:10]])
+    real = ChunkStore._write_at
+
+    def half(self: ChunkStore, offset: int, values: NDArray[Any]) -> None:
+        real(self, offset, np.ascontiguousarray(values).view(np.uint8).reshape(-1)[:10_000])
+        full()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store_module.ChunkStore, "_write_at", half)
+        for number in (3, 15):
+            with pytest.raises(OSError, match="space"):
+                written(store, 1.0, np.array([number]))
+    assert store.read(ALL[:10]).tobytes() == records[:10].tobytes()
+    with pytest.raises(ScratchError, match="chunk 15 of the model has changed"):
+        store.read(ALL)
+
+
+def test_a_folder_in_which_nothing_can_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(WriteError, match=r"x\.chunks: cannot be written"):
+        ChunkStore(COUNT, FIELDS, tmp_path / "file" / "x.chunks")
+
+
+def test_a_manifest_comes_back_from_a_checkpoint(store: ChunkStore) -> None:
+    written(store)
+    manifest = store.manifest()
+    again = manifest_of(manifest.arrays(), {"step": 1, **manifest.state()})
+    assert again is not None
+    assert (again.path, again.count, dict(again.fields)) == (manifest.path, manifest.count, FIELDS)
+    np.testing.assert_array_equal(again.slots, manifest.slots)
+    assert manifest_of({}, {}) is None
+
+
+WRONG: dict[str, Callable[[Manifest], Manifest]] = {
+    "two chunks in a slot": lambda m: replace(m, slots=np.where(m.slots == 3, 2, m.slots)),
+    "fewer slots": lambda m: replace(m, slots=m.slots[:-1]),
+    "negative slots": lambda m: replace(m, slots=m.slots - 5),
+    "another type": lambda m: replace(m, slots=m.slots.astype(np.int32)),  # type: ignore[arg-type]
+    "more Gaussians": lambda m: replace(m, count=m.count + CHUNK_ROWS),
+    "no Gaussians": lambda m: replace(m, count=0),
+    "fewer checksums": lambda m: replace(m, checksums=m.checksums[:, :1]),
+    "a huge field": lambda m: replace(m, fields={**m.fields, "b": (1 << 40,)}),
+    "many fields": lambda m: replace(m, fields={str(k): () for k in range(99)}),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_manifest_that_was_never_written_is_refused(store: ChunkStore, name: str) -> None:
+    written(store)
+    wrong = WRONG[name](store.manifest())
+    with pytest.raises(ValueError, match=r"its list of chunks|its chunks"):
+        manifest_of(wrong.arrays(), wrong.state())
+
+
+def test_slots_far_behind_the_end_are_refused(store: ChunkStore) -> None:
+    written(store)
+    with pytest.raises(ScratchError, match="has been cut: it has room for 20 chunks"):
+        ChunkStore.opened(replace(store.manifest(), slots=store.slots.current + (1 << 60)), writable=False)
+
+
+def test_low_slots_are_taken_first() -> None:
+    table = SlotTable(np.array([0, 1, 2, NO_SLOT]), 4)
+    table.hold([np.array([0, 1, NO_SLOT, NO_SLOT])])
+    assert table.targets(np.array([2])) == [2], "no checkpoint names it"
+    assert table.targets(np.array([1])) == [3]
+    assert table.lacking(np.array([0, 1, 3])) == 2
+    assert table.end_of_held == 2
+    table.grow(table.growth(2))
+    np.testing.assert_array_equal(table.targets(np.array([3, 0])), [3, 4])
+
+
+def test_runs() -> None:
+    assert list(runs(np.array([4, 5, 2, NO_SLOT, 0, 1, NO_SLOT]))) == [(0, 4, 2), (2, 2, 1), (4, 0, 2)]
+    assert list(runs(np.array([], np.int64))) == []

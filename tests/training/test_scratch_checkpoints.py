@@ -1,0 +1,491 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checkpoints of a training whose Gaussians are in a scratch file: manifests, resumed trainings, damaged files."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tiny import short
+from wide import flip, full, let_small_models_have_chunks, start_wide
+
+from clsplat.api import train
+from clsplat.chunks import store as store_module
+from clsplat.chunks.manifest import Manifest
+from clsplat.chunks.slots import MAX_TENTHS
+from clsplat.config.training import OptimiserConfig, TrainConfig
+from clsplat.device.context import Device
+from clsplat.errors import CapacityError, InputError, WriteError
+from clsplat.files import atomic, mounts
+from clsplat.layouts.columns import CHUNK_ROWS
+from clsplat.runs.checkpoints import read_manifest
+from clsplat.runs.run import Run, owned_files
+from clsplat.runs.scratch import owner_of
+from clsplat.scenes.scene import Scene
+from clsplat.stages import chunk_pool
+from clsplat.training.trainer import Trainer
+
+LIMIT = 4 << 20
+"""Bytes of main memory with which `wide_model` is in a scratch file."""
+DENSE = short(
+    iterations=26, report=False, warmup=(), sh_degree_every=1, checkpoint_every=4, density={"max_gaussians": 16_000}
+)
+SPARSE = replace(DENSE, optimiser=OptimiserConfig(sparse=True))
+STEADY = replace(DENSE, density=replace(DENSE.density, every=0))
+"""A training whose rows do not move, so that all checkpoints are in one file."""
+SPARE = replace(SPARSE, density=STEADY.density)
+SETTINGS = {"dense": DENSE, "sparse": SPARSE, "rows that stay": STEADY, "chunks that stay": SPARE}
+
+
+@pytest.fixture(autouse=True)
+def _starts_wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every training starts from a model with chunks, most of which no view shows."""
+    let_small_models_have_chunks(monkeypatch)
+    start_wide(monkeypatch, around=False)
+
+
+Train = Callable[..., Run]
+
+
+@pytest.fixture
+def go(scene: Scene, default_device: Device, tmp_path: Path) -> Train:
+    """Function that trains in tmp_path/run, or another folder there, and returns the run.
+
+    until: step before which the training is stopped without a word, as by a kill; None for its end.
+    each: called before each step with the trainer.
+    """
+
+    def train_run(
+        config: TrainConfig = STEADY,
+        *,
+        until: int | None = None,
+        name: str = "run",
+        limit: int | None = LIMIT,
+        each: Callable[[Trainer], object] = lambda _: None,
+        **options: Any,
+    ) -> Run:
+        folder = tmp_path / name
+        run = Run.create(folder, config, resume=folder.exists())
+
+        def between(trainer: Trainer, _: object) -> None:
+            each(trainer)
+            if trainer.step == until:
+                trainer.model.close = lambda: None  # type: ignore[method-assign]  # a killed process removes nothing
+                raise _KilledError
+
+        options = {"max_host_mem": limit, "between": between, **options}
+        try:
+            train(scene, config, device=default_device, run=run, resume=run.resuming, **options)
+        except _KilledError:
+            assert until is not None
+        return run
+
+    return train_run
+
+
+class _KilledError(Exception):
+    """The end of a process."""
+
+
+@pytest.fixture
+def whole(go: Train) -> Callable[[TrainConfig], bytes]:
+    """Bytes of model.ply of a training without a limit."""
+
+    def model(config: TrainConfig) -> bytes:
+        if repr(config) not in _MODELS:
+            _MODELS[repr(config)] = go(config, name="whole", limit=None).model_path.read_bytes()
+        return _MODELS[repr(config)]
+
+    return model
+
+
+_MODELS: dict[str, bytes] = {}
+"""Models of trainings that others are compared with, by their settings."""
+
+
+def files_of(run: Run) -> list[Path]:
+    return sorted(run.scratch_path.glob("*"))
+
+
+def steps_of(run: Run) -> list[int]:
+    return [step for step, _ in run.checkpoints()]
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_killed_and_resumed(
+    go: Train, whole: Callable[[TrainConfig], bytes], recwarn: pytest.WarningsRecorder, name: str
+) -> None:
+    """In the same file, again and again; every checkpoint but the first writes only what has changed."""
+    config = SETTINGS[name]
+    wanted = whole(config)
+    for step in (5, 9, 14, 19, 23):
+        run = go(config, until=step)
+        assert steps_of(run)[-1] == step - step % 4
+        assert all(read_manifest(path) is not None for _, path in run.checkpoints())
+    run = go(config)
+    assert run.model_path.read_bytes() == wanted
+    assert not [each for each in recwarn if "not finite" in str(each.message)], "of rows behind the model's last one"
+
+
+@pytest.mark.parametrize("limits", [(LIMIT, None), (None, LIMIT), (LIMIT, 5 << 20), (LIMIT, 64 << 20)])
+def test_resumed_under_another_limit(
+    go: Train, whole: Callable[[TrainConfig], bytes], limits: tuple[int | None, int | None]
+) -> None:
+    wanted = whole(DENSE)
+    first, second = limits
+    assert bool(files_of(go(DENSE, until=14, limit=first))) == (first is not None)
+    run = go(DENSE, limit=second)
+    assert run.model_path.read_bytes() == wanted
+    manifests = [manifest.path for _, manifest in run.manifests()]
+    assert set(files_of(run)) == set(manifests), "files that no checkpoint names any longer are removed"
+    assert bool(manifests) == (second in (LIMIT, 5 << 20))
+
+
+def test_a_finished_training_can_go_on(go: Train, whole: Callable[[TrainConfig], bytes]) -> None:
+    more = replace(STEADY, iterations=33)
+    wanted = whole(more)
+    assert len(files_of(go(STEADY))) == 1
+    assert go(more).model_path.read_bytes() == wanted
+
+
+@pytest.mark.parametrize("name", ["rows that stay", "chunks that stay"])
+def test_bytes_on_the_disk(go: Train, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """At most 2.2 times the state. Only chunks that have changed are written, and hidden ones have not, without
+    moments."""
+    sizes: list[float] = []
+
+    def measure(trainer: Trainer) -> None:
+        if (store := trainer.model.store) is not None:
+            assert store.path is not None
+            sizes.append(store.path.stat().st_size / store.nbytes)
+
+    written: list[int] = []
+    real = store_module.ChunkStore._write_at
+
+    def write(store: store_module.ChunkStore, offset: int, values: Any) -> None:
+        written.append(values.nbytes)
+        real(store, offset, values)
+
+    monkeypatch.setattr(store_module.ChunkStore, "_write_at", write)
+    config = SETTINGS[name]
+    run = go(config, each=measure)
+    assert len(sizes) > config.iterations - 4, "from the second step on, when the model has all SH bands"
+    assert 1 < max(sizes) <= MAX_TENTHS / 10
+    if name == "chunks that stay":
+        assert len(steps_of(run)) == 2
+        state = 12 * CHUNK_ROWS * 3 * 4 * 38
+        assert sum(written) < state * config.iterations / 4, "a view shows two of the twelve chunks"
+
+
+def test_chunks_are_on_the_disk_before_the_manifest_names_them(
+    go: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    order: list[str] = []
+    scratch = tmp_path / "run" / "scratch"
+    flush, rename, write = os.fsync, atomic.replace, store_module.ChunkStore._write_at
+
+    def fsync(descriptor: int) -> None:
+        if any(os.path.samestat(os.fstat(descriptor), path.stat()) for path in scratch.glob("*.chunks")):
+            order.append("flushed")
+        flush(descriptor)
+
+    def replace_file(source: Path, target: Path) -> None:
+        order.extend(["named"] * (target.suffix == ".npz"))
+        rename(source, target)
+
+    def write_at(store: store_module.ChunkStore, *arguments: Any) -> None:
+        order.append("written")
+        write(store, *arguments)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(atomic, "replace", replace_file)
+    monkeypatch.setattr(store_module.ChunkStore, "_write_at", write_at)
+    go(STEADY)
+    assert order.count("named") == 7
+    for place in (place for place, event in enumerate(order) if event == "named"):
+        assert order[place - 1] == "flushed", "nothing is written between"
+
+
+def test_density_control_takes_a_new_file(go: Train) -> None:
+    """The file before stays as long as a checkpoint names it."""
+    seen: list[set[str]] = []
+
+    def look(trainer: Trainer) -> None:
+        if (store := trainer.model.store) is not None:
+            assert store.path is not None
+            seen.append({path.name for path in store.path.parent.iterdir()})
+
+    run = go(DENSE, each=look)
+    assert len(set().union(*seen)) > 1
+    assert max(map(len, seen)) == 2
+    assert {path.name for path in files_of(run)} == {manifest.path.name for _, manifest in run.manifests()}
+
+
+DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "cut": (lambda path: os.truncate(path, 4000), "has been cut"),
+    "missing": (lambda path: path.unlink(), "cannot be opened: there is no such file"),
+    "another's": (lambda path: path.write_bytes(os.urandom(path.stat().st_size)), "has changed since it was written"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_without_an_intact_file_nothing_is_trained(go: Train, name: str) -> None:
+    run = go(until=14)
+    (path,) = files_of(run)
+    damage, message = DAMAGE[name]
+    damage(path)
+    with pytest.warns(UserWarning, match=message), pytest.raises(InputError, match=message) as caught:
+        go()
+    assert str(path) in str(caught.value)
+    assert caught.value.exit_status == 2
+    assert "--overwrite" in str(caught.value)
+
+
+def test_a_damaged_chunk_leaves_the_checkpoint_before(go: Train, whole: Callable[[TrainConfig], bytes]) -> None:
+    wanted = whole(SPARE)
+    run = go(SPARE, until=14)
+    (_, before), (_, last) = run.manifests()
+    assert before.path == last.path
+    only = set(last.slots.tolist()) - set(before.slots.tolist())
+    assert only, "chunks have changed between the checkpoints"
+    assert set(last.slots.tolist()) & set(before.slots.tolist()), "others have not"
+    flip(last.path, last.path.stat().st_size // (int(last.slots.max()) + 1) * min(only) + 77)
+    with pytest.warns(UserWarning, match=r"step-0000012\.npz: is a damaged checkpoint and is skipped"):
+        resumed = go(SPARE, until=9 + 4)
+    assert steps_of(resumed) == [8, 12]
+    assert go(SPARE).model_path.read_bytes() == wanted
+
+
+@pytest.mark.parametrize("name", ["cut", "changed"])
+def test_a_file_that_is_damaged_while_it_is_trained_in(go: Train, tmp_path: Path, name: str) -> None:
+    """No checkpoint is written of what was read. The ones before are verified by the resume."""
+
+    def damage(trainer: Trainer) -> None:
+        if trainer.step == 10:
+            store = trainer.model.store
+            assert store is not None
+            assert store.path is not None
+            at = store.record.itemsize
+            if name == "cut":
+                os.truncate(store.path, 2 * at)
+            else:
+                for slot in range(store.slots.size):
+                    flip(store.path, slot * at + 5)
+
+    with pytest.raises(InputError, match=r"has been cut|has changed since") as caught:
+        go(each=damage)
+    assert "continues from the last checkpoint" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert steps_of(Run.open(tmp_path / "run"))[-1] == 8
+
+
+def test_a_move_that_fails_leaves_no_wrong_checkpoint(
+    go: Train, whole: Callable[[TrainConfig], bytes], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """What is where on the device is still known, so that its checkpoint has every row."""
+    wanted, real = whole(STEADY), chunk_pool.copy_chunks
+
+    def fail(trainer: Trainer) -> None:
+        if trainer.step == 10:
+            monkeypatch.setattr(chunk_pool, "copy_chunks", failed)
+
+    def failed(*arguments: Any, to_records: bool) -> None:
+        if not to_records:
+            monkeypatch.setattr(chunk_pool, "copy_chunks", real)
+            raise CapacityError("there is no memory left")
+        real(*arguments, to_records=to_records)
+
+    with pytest.raises(CapacityError, match=r"no memory left; a checkpoint of step 1\d is written"):
+        go(each=fail)
+    assert steps_of(Run.open(tmp_path / "run"))[-1] >= 10
+    assert go().model_path.read_bytes() == wanted
+
+
+def test_a_full_disk(go: Train, whole: Callable[[TrainConfig], bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    """One line, and the training goes on once there is room."""
+    wanted = whole(STEADY)
+
+    def fill(trainer: Trainer) -> None:
+        if trainer.step == 5:
+            monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
+
+    real = getattr(os, "posix_fallocate", None)
+    with pytest.raises(WriteError, match=r"\.chunks: cannot be written: the disk is full"):
+        go(each=fill)
+    monkeypatch.setattr(os, "posix_fallocate", real, raising=False)
+    assert go().model_path.read_bytes() == wanted
+
+
+def test_a_disk_that_is_full_at_the_start(go: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
+    with pytest.raises(WriteError, match=r"the disk is full.*are needed"):
+        go(scratch=tmp_path / "scratch")
+    assert not list((tmp_path / "scratch").iterdir())
+
+
+def test_a_read_only_folder(go: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(store_module, "FileIO", refused)
+    with pytest.raises(WriteError, match=r"\.chunks: cannot be written: the disk is read-only"):
+        go(scratch=tmp_path / "scratch")
+
+
+def test_the_least_limit_is_told(go: Train, whole: Callable[[TrainConfig], bytes]) -> None:
+    wanted = whole(STEADY)
+    with pytest.raises(
+        InputError, match=r"--max-host-mem 100 KiB is too little: .*; expected at least \d+MiB$"
+    ) as caught:
+        go(limit=100 << 10, name="little")
+    least = int(str(caught.value).split("at least ")[-1].removesuffix("MiB"))
+    run = go(limit=least << 20)
+    assert run.model_path.read_bytes() == wanted
+    assert least == 1, "a tenth of the state"
+    assert files_of(run)
+
+
+def test_scratch_may_be_elsewhere(go: Train, whole: Callable[[TrainConfig], bytes], tmp_path: Path) -> None:
+    """A resume with another folder takes the file's content there."""
+    wanted = whole(STEADY)
+    folders = [tmp_path / name for name in ("one", "two")]
+    for folder in folders:
+        (folder / "sub").mkdir(parents=True)
+        (folder / "theirs.txt").write_text("")
+    go(until=10, scratch=folders[0])
+    (first,) = folders[0].glob("*.chunks")
+    go(until=11, scratch=folders[1])
+    assert first.exists(), "its checkpoint is the latest"
+    run = go(scratch=folders[1])
+    assert run.model_path.read_bytes() == wanted
+    assert not first.exists(), "no checkpoint names it"
+    assert len(list(folders[1].glob("*.chunks"))) == 1
+    assert all((folder / "theirs.txt").exists() for folder in folders)
+
+
+def test_a_run_that_has_been_moved(go: Train, whole: Callable[[TrainConfig], bytes], tmp_path: Path) -> None:
+    wanted = whole(STEADY)
+    go(until=10, name="old").path.rename(tmp_path / "run")
+    assert go().model_path.read_bytes() == wanted
+
+
+def test_the_file_of_another_run_is_only_read(go: Train, whole: Callable[[TrainConfig], bytes], tmp_path: Path) -> None:
+    """As after a copy of a run whose files are elsewhere."""
+    wanted, scratch = whole(STEADY), tmp_path / "scratch"
+    run = go(until=10, name="first", scratch=scratch)
+    (theirs,) = scratch.glob("*.chunks")
+    before = theirs.read_bytes()
+    shutil.copytree(run.path, tmp_path / "run")
+    assert go(scratch=scratch).model_path.read_bytes() == wanted
+    assert theirs.read_bytes() == before
+    assert len(list(scratch.glob("*.chunks"))) == 2
+    assert go(name="first", scratch=scratch).model_path.read_bytes() == wanted
+
+
+def test_what_a_killed_training_left_is_removed(go: Train, tmp_path: Path) -> None:
+    run = go(until=10)
+    (named,) = files_of(run)
+    owner, theirs = owner_of(run), run.scratch_path / ("0" * 12 + "-00000000.chunks")
+    left = run.scratch_path / f"{owner}-ffffffff.chunks"
+    for path in (left, theirs):
+        path.write_bytes(b"x")
+    run = go(until=14)
+    assert set(files_of(run)) == {named, theirs}
+    assert set(owned_files(run.path)) >= {named, theirs}
+    Run.create(run.path, STEADY, overwrite=True)
+    assert not files_of(run)
+
+
+def test_a_checkpoint_that_names_another_file(go: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hostile one must not have any file written that it names."""
+    precious = tmp_path / "precious"
+    real = Manifest.state
+
+    def state(manifest: Manifest) -> dict[str, Any]:
+        return real(replace(manifest, path=precious))
+
+    monkeypatch.setattr(Manifest, "state", state)
+    (path,) = files_of(go(until=10))
+    path.rename(precious)
+    before = precious.read_bytes()
+    with (
+        pytest.warns(UserWarning, match="precious is no file of chunks"),
+        pytest.raises(InputError, match="no intact checkpoint"),
+    ):
+        go()
+    assert precious.read_bytes() == before
+
+
+def test_a_network_disk_is_told_once(go: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    table = tmp_path / "mounts"
+    table.write_text(f"disk / ext4 rw 0 0\nserver:/a {str(tmp_path).replace(' ', chr(92) + '040')} nfs4 rw 0 0\n")
+    monkeypatch.setattr(mounts, "MOUNTS", table)
+    with pytest.warns(UserWarning, match=r"is on a network disk \(nfs4\)") as caught:
+        go(DENSE)
+    told = [str(each.message) for each in caught if "network disk" in str(each.message)]
+    assert len([text for text in told if "--scratch DIR" in text]) == 1
+
+
+ONE_TRAINING = """
+import sys
+from pathlib import Path
+sys.path[:0] = sys.argv[3:]
+import pytest
+import wide
+from clsplat.api import train
+from clsplat.runs.run import Run
+from clsplat.scenes.loading import load_scene
+patch = pytest.MonkeyPatch()
+wide.let_small_models_have_chunks(patch)
+wide.start_wide(patch, around=False)
+run = Run.open(Path(sys.argv[2]))
+run.resuming = bool(run.checkpoints())
+print("ready", flush=True)
+sys.stdin.readline()
+train(load_scene(Path(sys.argv[1])), run.config, run=run, resume=run.resuming, max_host_mem=4 << 20,
+      scratch=run.path.parent / "scratch")
+"""
+"""A training, or its resume, that begins when it is told to."""
+
+
+def start_training(scene: Path, run: Path) -> subprocess.Popen[str]:
+    """A process that waits for a line before it trains."""
+    line = [sys.executable, "-c", ONE_TRAINING, str(scene), str(run), str(Path(__file__).parents[1] / "support")]
+    return subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+@pytest.mark.slow
+def test_two_trainings_in_one_folder(
+    folder: Path, go: Train, whole: Callable[[TrainConfig], bytes], tmp_path: Path
+) -> None:
+    """At once, one of them killed and resumed: each has files of its own."""
+    wanted = whole(SPARE)
+    for name in ("one", "two"):
+        Run.create(tmp_path / name, SPARE)
+    processes = [start_training(folder, tmp_path / name) for name in ("one", "two")]
+    for process in processes:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+    for process in processes:
+        assert process.stdin is not None
+        process.stdin.write("\n")
+        process.stdin.flush()
+    while not list((tmp_path / "one" / "checkpoints").glob("step-*.npz")) and processes[0].poll() is None:
+        pass
+    processes[0].kill()
+    processes[0].communicate()
+    processes[1].communicate()
+    assert processes[1].returncode == 0
+    again = start_training(folder, tmp_path / "one")
+    again.communicate("\n")
+    assert again.returncode == 0
+    for name in ("one", "two"):
+        assert (tmp_path / name / "model.ply").read_bytes() == wanted
