@@ -36,6 +36,7 @@ from clsplat.training.host_memory import UNLIMITED, HostMemory
 from clsplat.training.learning_rates import rates_at
 from clsplat.training.memory_planner import MemoryPlanner
 from clsplat.training.mip_filter import MipFilter
+from clsplat.training.stability.health import finite_or_zero
 from clsplat.training.stability.non_finite import NonFiniteMonitor, Repair
 from clsplat.training.step.component import Component
 from clsplat.training.step.gradient_step import GradientStep, StepMaker, StepProbe, slot_fields, view_gradients
@@ -365,9 +366,8 @@ class Trainer:
     def _apply(self, repair: Repair | None) -> None:
         if repair is None:
             return
-        for kind, groups in repair.moments.items():
-            for group, values in groups.items():
-                self.model.kinds()[kind][group].set(values)
+        if repair.moments:
+            self.model.change_moments(finite_or_zero)
         self._rearrange(RowPlan(repair.rows))
 
     def rates(self) -> dict[str, float]:
