@@ -18,8 +18,8 @@ from clsplat.report.page import write_last
 from clsplat.runs.locks import locked
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
-from clsplat.training.host_memory import HostMemory
 from clsplat.training.loop import Between, StepReport, TrainingSession
+from clsplat.training.memory import HostMemory
 from clsplat.training.preparation import begin, check_scene, settings_of
 from clsplat.training.trainer import Trainer
 

@@ -155,7 +155,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     from clsplat.runs import scene_record
     from clsplat.runs.locks import locked
     from clsplat.runs.run import Run, check_resumed
-    from clsplat.training.host_memory import HostMemory
+    from clsplat.training.memory import HostMemory
     from clsplat.training.preparation import check_steps_left
 
     verb.device.check()

@@ -10,10 +10,13 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from functools import cache
 from math import inf
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from clsplat.config.checks import Rule, check_rules
 from clsplat.errors import InputError
+
+if TYPE_CHECKING:
+    from clsplat.cameras.model import CameraModel
 
 Filter = Literal["box", "blackman-harris"]
 
@@ -69,6 +72,11 @@ class FramingConfig:
             raise InputError("--overscan and --region exclude each other: a region lies within the frame")
         if not 1 <= self.supersample <= _MAX_SUPERSAMPLES:
             raise InputError(f"--supersample {self.supersample}: expected 1 to {_MAX_SUPERSAMPLES}")
+
+    def check_model(self, model: CameraModel) -> None:
+        """Raise InputError for a panorama with a filter wider than a pixel, as it has no pixels beyond its edges."""
+        if self.supersample > 1 and self.filter != "box" and model.wraps:
+            raise InputError(f"--filter {self.filter}: needs pixels beyond a panorama's edges; use --filter box")
 
 
 def parse_overscan(text: str) -> tuple[int, float]:

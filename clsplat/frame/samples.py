@@ -48,13 +48,12 @@ def _margin(config: FramingConfig) -> int:
 def finer(camera: Camera, config: FramingConfig) -> Camera:
     """The camera of the picture to filter: `supersample` times larger, with the margin that the filter reads.
 
-    Raises InputError for a panorama with a filter wider than a pixel, since a panorama has no pixels beyond its edges.
+    Raises InputError like `FramingConfig.check_model`.
     """
     margin, samples = _margin(config), config.supersample
     if margin == 0:
         return camera.resized(camera.width * samples, camera.height * samples)
-    if camera.model.wraps:
-        raise InputError(f"--filter {config.filter}: needs pixels beyond a panorama's edges; use --filter box")
+    config.check_model(camera.model)
     padded = camera.cropped(-margin, -margin, camera.width + 2 * margin, camera.height + 2 * margin)
     return padded.resized(padded.width * samples, padded.height * samples)
 

@@ -21,8 +21,8 @@ from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.memory_plan import Plan
 from clsplat.stages.append import MAX_MEAN_PAIRS, append, appends
 from clsplat.stages.blend import Blended, ImageInputs, blend, blend_grad
-from clsplat.stages.bounds import ChunkList, send_chunks
 from clsplat.stages.channels import Channels, Features, Floats, Motion, channels, features
+from clsplat.stages.chunk_lists import ChunkList, ChunkNumbers, send_chunks
 from clsplat.stages.chunk_pool import ChunkPool
 from clsplat.stages.deep import deep
 from clsplat.stages.device_camera import pack_camera, tiles_of
@@ -205,7 +205,7 @@ class Rasterizer:
         room: PairCapacity | None = None,
         thinning: Thinning | None = None,
         nearness: bool = False,
-        chunks: ChunkList | None = None,
+        chunks: ChunkList | ChunkNumbers | None = None,
     ) -> ForwardPass:
         """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2).
 
@@ -216,7 +216,7 @@ class Rasterizer:
         thinning: random dropout of the model's Gaussians in this pass.
         nearness: like `nearness` of `blend`.
         chunks: the only chunks of the model that may be in view; None takes the whole model, or, of a streamed model
-            whose pool knows it, the chunks in view.
+            whose pool knows it, the chunks in view. With ChunkNumbers the pairs are counted first.
         """
         device, work = self.device_of(camera), self.work
         if chunks is None and isinstance(gaussians, HostGaussians) and gaussians.pool is not None:
@@ -252,6 +252,7 @@ class Rasterizer:
         if room is None:
             return ForwardPass(camera, camera_array, colours, *make())
         size, how = (camera.width, camera.height), (backward, thinning is not None, nearness)
+        assert not isinstance(chunks, ChunkNumbers), "the host moves chunks in the middle of the pass"
         rows = None if chunks is None else chunks.key
         key = (self.readback, device, colours, *size, *how, room.pairs, room.turn, by_append, rows)
         made = work.replayed(gaussians, key, make, thinning_numbers(thinning), (camera_array,))
@@ -259,11 +260,13 @@ class Rasterizer:
 
     def _in_view(
         self, gaussians: HostGaussians, pool: ChunkPool, camera: Camera
-    ) -> tuple[AnyGaussians, ChunkList | None]:
+    ) -> tuple[AnyGaussians, ChunkList | ChunkNumbers | None]:
         """The rows of a pool, and the slots that the camera may show; the whole model if that is not known."""
         if pool.cull is None:
             return gaussians, None
         numbers = pool.cull(camera)
+        if len(numbers) > pool.slots:
+            return gaussians, ChunkNumbers(numbers)
         slots = send_chunks(self.work, "chunk_slots", pool.place(numbers, changes=False), pool.rows)
         return gaussians.in_pool, slots
 

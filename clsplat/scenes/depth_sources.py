@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Known depths of a scene's views, from COLMAP's tracks or from depth maps."""
+"""Depths of what a scene's photographs show: known depths for training, from COLMAP's tracks or from depth maps, and
+the scene's length unit."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from clsplat.config.depth import DepthUse
 from clsplat.errors import InputError, examples, warn
 from clsplat.files.documents import is_file
 from clsplat.images.depth_maps import DEPTH_MAP_SUFFIXES, map_header, read_map
-from clsplat.scenes.dataset import tracked_in_view
+from clsplat.scenes.dataset import nearest_around, occlusion_cell, pixels_of, tracked_in_view
 from clsplat.scenes.readers import colmap
 from clsplat.scenes.sidecar_files import bases_of, beside, owned
 from clsplat.scenes.supervision.depth_samples import KnownDepth, sampled
@@ -30,6 +31,17 @@ MIN_DEPTH_FIT_POINTS = 10
 """Minimum number of points in a photograph for a fit of its relative depth map."""
 MAX_DEPTH_SCALE_RATIO = 5.0
 """Largest factor by which the scale fitted to a relative depth map may differ from the median scale of all maps."""
+DEPTH_TO_UNIT = 1.4
+"""The largest length unit, as a multiple of the median depth.
+
+The extent of the orbited scenes that were tried is at most 1.29 times the median depth. They keep it.
+"""
+NEAR_PER_EXTENT = 1e-6
+"""Least depth of a point that counts, as a fraction of the extent."""
+MAX_SAMPLED_VIEWS = 200
+"""Maximum number of sampled photographs, spread evenly over the training photographs."""
+MAX_SAMPLED_POINTS = 100_000
+"""Maximum number of a scene's points that are projected, if it is not known which photographs show them."""
 
 
 def with_depths(scene: Scene, use: DepthUse) -> Scene:
@@ -55,10 +67,9 @@ def with_depths(scene: Scene, use: DepthUse) -> Scene:
 
 def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
     """Points that COLMAP observed in each photograph. Their weight is 1/(1 + e^2), with the error e in pixels."""
-    model = None if scene.source is None else colmap.find_model(scene.source)
-    if model is None:
+    if (read := _tracks_of(scene)) is None:
         raise InputError(f"{scene.name}: {asked} needs to know which photographs show a point, expected a COLMAP model")
-    tracks = colmap.read_tracks(model)
+    model, tracks = read
     weights = 1 / (1 + np.square(np.maximum(tracks.errors, 0.0)))
     tracked = sorted(name for name, rows in tracks.by_image.items() if len(rows))
     if not tracked:
@@ -186,3 +197,59 @@ def _maps_in(folder: Path) -> Iterator[Path]:
     for path in sorted(folder.rglob("*")):
         if path.suffix.lower() in DEPTH_MAP_SUFFIXES and not path.name.startswith(".") and is_file(path):
             yield path
+
+
+def _tracks_of(scene: Scene) -> tuple[Path, colmap.Tracks] | None:
+    """The COLMAP model that the scene was read from, and its tracks; None without such a model."""
+    model = None if scene.source is None else colmap.find_model(scene.source)
+    return None if model is None else (model, colmap.read_tracks(model))
+
+
+def length_unit_of(scene: Scene) -> float:
+    """Length unit in world units: the extent, but at most `DEPTH_TO_UNIT` times the median depth.
+
+    The depth is the median over the training photographs of the median depth of the points that they show. These are
+    the points of a COLMAP model's tracks. Without tracks, each cell of a picture shows its nearest point.
+    """
+    medians = [float(np.median(depths)) for depths in _depths(scene) if len(depths)]
+    unit = DEPTH_TO_UNIT * float(np.median(medians)) if medians else np.inf
+    return min(unit, scene.extent) if unit > 0 else scene.extent
+
+
+def _depths(scene: Scene) -> Iterator[Float64]:
+    """Depths (k,) of the points that each of the sampled photographs shows."""
+    views = scene.train_views
+    views = views[:: max(-(-len(views) // MAX_SAMPLED_VIEWS), 1)]
+    tracked = _tracked_points(scene, views)
+    points = scene.points[:: max(-(-len(scene.points) // MAX_SAMPLED_POINTS), 1)]
+    for view in views:
+        if tracked:
+            depths = view.camera.depths_of(tracked.get(view.name, np.empty((0, 3))))
+            yield depths[depths > 0]
+        elif len(points):
+            yield _nearest(points, view, NEAR_PER_EXTENT * scene.extent)
+
+
+def _tracked_points(scene: Scene, views: Sequence[View]) -> dict[str, Float64]:
+    """Points (k, 3) of the tracks of each view, by its name; empty without tracks in the cameras' world frame."""
+    if not len(scene.points) or (read := _tracks_of(scene)) is None:
+        return {}
+    _, tracks = read
+    found = {name: tracks.points[rows] for name, rows in tracks.shown_in([view.name for view in views]).items()}
+    near = NEAR_PER_EXTENT * scene.extent
+    shown = [view for view in views if view.name in found]
+    *_, enough = tracked_in_view((view.camera.before(near), view.lens, found[view.name]) for view in shown)
+    return found if enough else {}
+
+
+def _nearest(points: Float64, view: View, near: float) -> Float64:
+    """Depth of the nearest of the points (N, 3) in each occupied cell of the view's picture.
+
+    near: depth from which points count, if the camera has no near plane of its own.
+    """
+    camera = view.camera.before(near)
+    rows, columns, inside = pixels_of(points, camera, view.lens)
+    depths = camera.depths_of(points[inside])
+    around = nearest_around(rows, columns, depths, occlusion_cell(camera, len(depths)))
+    nearest: Float64 = depths[depths == around]
+    return nearest

@@ -185,7 +185,7 @@ class Scene:
     depth_use: choice of known depths (`scenes.depth_sources`).
     clouds: point files next to the scene that are not used.
     missing: names of listed pictures that do not exist.
-    unit: the length unit, if it is not the extent (`scenes.analysis.length_unit`).
+    unit: the length unit, if it is not the extent (`scenes.depth_sources`).
     """
 
     name: str

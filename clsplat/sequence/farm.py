@@ -23,8 +23,7 @@ from clsplat.errors import ClsplatError, InputError, warn
 from clsplat.images.video import VideoWriter
 from clsplat.sequence.finished_frames import is_complete, remove_temporaries, stamp
 from clsplat.sequence.frame_renderer import FrameRenderer, open_frame_renderer
-from clsplat.sequence.job_models import load_job_models
-from clsplat.sequence.mattes import mattes_of, names_of
+from clsplat.sequence.job_models import load_job_models, names_of
 from clsplat.sequence.task import Record, RenderOptions, Task
 from clsplat.sequence.workers import WRITE_QUEUE_BYTES, Result, encode_frame, encoded, frame_bytes, record_of
 from clsplat.version import package_version
@@ -84,7 +83,7 @@ class _Held:
                     f"{job.model}: has SHA-256 {job_models.digest[:12]} on a worker, expected {job.digest[:12]}"
                 )
             model = job_models.models if job.placed else job_models.one
-            mattes = mattes_of(job_models, job.options.channels, job.options.ids_from)
+            mattes = job_models.mattes(job.options.channels, job.options.ids_from)
             if names_of(mattes) != job.options.mattes:
                 raise InputError(f"{job.model}: has other mattes on a worker than it had when the job began")
             self.renderer = open_frame_renderer(

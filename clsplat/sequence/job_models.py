@@ -5,27 +5,35 @@ device."""
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.config.channels import CRYPTOMATTE_CHANNELS
 from clsplat.config.pictures import PictureConfig
 from clsplat.errors import InputError, warn
 from clsplat.files.documents import digest
+from clsplat.frame.mattes import Matte
 from clsplat.gaussians import Gaussians
-from clsplat.models.formats import colour_space, format_of
+from clsplat.models.formats import colour_space, format_of, unpacked
+from clsplat.models.formats.ply import read_whole_numbers
 from clsplat.models.formats.usd import USD_SUFFIXES
 from clsplat.models.instances import Changing, Ensemble, Placement, State, Track, extrapolated, kind_of, near_of
 from clsplat.models.series import ModelSeries
 from clsplat.runs.run import model_file
 from clsplat.sequence.numbered import digest_of_name, is_sequence, open_sequence
-from clsplat.sequence.task import Task, end_before, model_times
+from clsplat.sequence.task import MatteNames, Task, end_before, model_times
 from clsplat.shots.frame_numbers import ranges
 from clsplat.shots.shot_file import KeyedTrack, Volume, Within, is_layout, read_layout
 from clsplat.shots.usd_models import read_stage
 
 Known = dict[Placement | State, Placement | State]
 """Cache of placements, each under itself as the key, so that equal placements are stored once."""
+MAX_MATTE_OBJECTS = 256
+"""Limit of objects in a matte. Each takes a plane of floats while a frame is rendered."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +100,57 @@ class JobModels:
         state = self.state(frame)
         return self.one if state is None else Ensemble(self.models).at(state)
 
+    def mattes(self, channels: Collection[str], ids_from: str = "") -> dict[str, Matte]:
+        """Mattes among the channels, by name.
+
+        ids_from: property of the model files that holds semantic ids.
+        Raises InputError.
+        """
+        made = {}
+        if self.changing and (asked := [name for name in CRYPTOMATTE_CHANNELS if name in channels]):
+            raise InputError(
+                f"--channels {asked[0]}: {self.path} changes over time, expected models whose Gaussians stay the same"
+            )
+        if "objects" in channels:
+            made["objects"] = self._objects()
+        if "semantic" in channels:
+            made["semantic"] = self._semantic(ids_from)
+        for name, matte in made.items():
+            if len(matte.names) > MAX_MATTE_OBJECTS:
+                raise InputError(
+                    f"--channels {name}: has {len(matte.names):,} objects, expected at most {MAX_MATTE_OBJECTS}"
+                )
+        return made
+
+    def _objects(self) -> Matte:
+        """A matte with one object for each model, and one for each volume of a model.
+
+        A Gaussian in a volume belongs to the volume and not to the model; in several volumes, to the first.
+        """
+        names, owners = list(self.names), []
+        for index, model in enumerate(self.still):
+            own = np.full(len(model), index, np.int32)
+            for volume in reversed(self.volumes[index] if self.volumes else ()):  # the first volume wins
+                own[volume.holds(model)] = len(names)
+                names.append(volume.name)
+            owners.append(own)
+        return Matte(tuple(names), np.concatenate(owners))
+
+    def _semantic(self, ids_from: str) -> Matte:
+        """A matte with one object for each value of the property."""
+        if not self.files:
+            raise InputError(f"--ids-from {ids_from}: {self.path} is a USD stage, expected PLY files with the property")
+        columns: list[NDArray[np.int64]] = []
+        for file, model in zip(self.files, self.still, strict=True):
+            with unpacked(file) as (opened, form):
+                if form.name != "3DGS PLY":
+                    found = f"{file} is {form.name}, expected a 3DGS PLY that has the property"
+                    raise InputError(f"--ids-from {ids_from}: {found}")
+                columns.append(read_whole_numbers(opened, ids_from))
+            assert len(columns[-1]) == len(model)
+        numbers, owners = np.unique(np.concatenate(columns), return_inverse=True)
+        return Matte(tuple(str(number) for number in numbers.tolist()), owners.astype(np.int32))
+
     def seen(self, tasks: Sequence[Task], pictures: PictureConfig, channels: Collection[str]) -> list[Task]:
         """The tasks with placements of the models, and cameras adapted to these. Raises InputError."""
         known: Known = {}
@@ -144,6 +203,15 @@ class JobModels:
                 )
             if missing := sorted({number for number in numbers if number not in files}):
                 warn(f"{path}: has no file of the frame(s) {ranges(missing)}, so neighbouring files are used; {have}")
+
+
+def names_of(mattes: Mapping[str, Matte]) -> tuple[MatteNames, ...]:
+    """Names and digests of the mattes, for the options of a job."""
+    return tuple(
+        MatteNames(name, mattes[name].names, hashlib.sha256(mattes[name].owners.tobytes()).hexdigest()[:32])
+        for name in CRYPTOMATTE_CHANNELS
+        if name in mattes
+    )
 
 
 def load_job_models(path: Path, transform: KeyedTrack | None = None) -> JobModels:

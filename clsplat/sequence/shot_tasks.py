@@ -17,7 +17,7 @@ from clsplat.sequence.task import Task
 from clsplat.shots import Shot
 from clsplat.shots import motion as moving
 from clsplat.shots.frame_numbers import check_pattern, output_paths, path_of
-from clsplat.shots.optics import settled
+from clsplat.shots.optics import Optics
 from clsplat.shots.stereo import EYE_FIELD_PATTERN, for_eye
 
 
@@ -99,6 +99,32 @@ def make_tasks(
         looks = (after, earlier, looked_at, None, None if frame.optics is None else own, frame.optics)
         tasks.append(Task(frame.number, frame.name, camera, path, *looks, lens=frame.lens, ends=ends))
     return tasks
+
+
+def settled(flags: SamplingConfig, optics: Optics | None, camera: Camera) -> SamplingConfig:
+    """Shutter and lens of a frame: the flags' settings, and the USD stage's settings where no flag is given.
+
+    The lens size becomes an aperture radius, unless flags give the sensor width or the metres per unit.
+    """
+    if optics is None:
+        return flags
+    settings = flags
+    if flags.shutter_angle is None and flags.shutter_open is None and any(optics.shutter):
+        opens, closes = optics.shutter
+        settings = replace(settings, shutter_open=opens, shutter_close=closes)
+    focus = flags.focus if flags.focus is not None else optics.focus or None
+    asked = flags.aperture is not None or flags.f_stop is not None
+    f_stop = flags.f_stop if asked else optics.f_stop
+    applies = camera.is_pinhole and (asked or focus is not None)
+    if f_stop and applies:
+        if flags.sensor_width is None and flags.metres is None:
+            settings = replace(settings, aperture=optics.radius(f_stop), f_stop=None)
+        else:
+            metres = flags.metres or optics.metres
+            sensor = optics.focal_length * camera.width / camera.fx * 1000 * metres
+            sensor_width = flags.sensor_width or sensor
+            settings = replace(settings, f_stop=f_stop, sensor_width=sensor_width, metres=metres)
+    return replace(settings, focus=focus) if asked or (f_stop and applies) else settings
 
 
 def held_out(tasks: Sequence[Task], pattern: str, config: HoldoutConfig) -> list[Task]:

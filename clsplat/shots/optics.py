@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shutter and lens settings that a USD stage gives for a frame. Flags override them."""
+"""Shutter and lens settings that a USD stage gives for a frame."""
 
 from __future__ import annotations
 
@@ -53,32 +53,6 @@ class Optics:
         for name, time in zip(("open", "close"), self.shutter, strict=True):
             if time:
                 yield f"shutter:{name} ({time:g})"
-
-
-def settled(flags: SamplingConfig, optics: Optics | None, camera: Camera) -> SamplingConfig:
-    """Shutter and lens of a frame: the flags' settings, and the USD stage's settings where no flag is given.
-
-    The lens size becomes an aperture radius, unless flags give the sensor width or the metres per unit.
-    """
-    if optics is None:
-        return flags
-    settings = flags
-    if flags.shutter_angle is None and flags.shutter_open is None and any(optics.shutter):
-        opens, closes = optics.shutter
-        settings = replace(settings, shutter_open=opens, shutter_close=closes)
-    focus = flags.focus if flags.focus is not None else optics.focus or None
-    asked = flags.aperture is not None or flags.f_stop is not None
-    f_stop = flags.f_stop if asked else optics.f_stop
-    applies = camera.is_pinhole and (asked or focus is not None)
-    if f_stop and applies:
-        if flags.sensor_width is None and flags.metres is None:
-            settings = replace(settings, aperture=optics.radius(f_stop), f_stop=None)
-        else:
-            metres = flags.metres or optics.metres
-            sensor = optics.focal_length * camera.width / camera.fx * 1000 * metres
-            sensor_width = flags.sensor_width or sensor
-            settings = replace(settings, f_stop=f_stop, sensor_width=sensor_width, metres=metres)
-    return replace(settings, focus=focus) if asked or (f_stop and applies) else settings
 
 
 def headers(camera: Camera, number: int, optics: Optics | None, sampling: SamplingConfig) -> dict[str, tuple[str, Any]]:

@@ -19,7 +19,7 @@ from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
 from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.optimisation.step_noise import NO_EXPLORATION
 from clsplat.stages.adam import AdamStep
-from clsplat.stages.bounds import ChunkList
+from clsplat.stages.chunk_lists import ChunkList
 from clsplat.stages.device_gaussians import DeviceGaussians
 from clsplat.stages.project import CPU_STEP_ROWS, step_numbers
 

@@ -19,6 +19,7 @@ from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, floats_of, group_shapes
 from clsplat.layouts.columns import CHUNK_ROWS
+from clsplat.stages.chunk_lists import ChunkList, ChunkNumbers, exact_chunks
 from clsplat.stages.chunk_pool import ChunkPool, StoredArray
 
 
@@ -167,6 +168,26 @@ def parts(
         for model, part in zip(streamed, uploaded, strict=True):
             for name, array in part.arrays.items() if keep and model.pool is None else ():
                 model[name].set_rows(start, array.get())
+
+
+def chunk_parts(
+    work: Workspace, chunks: ChunkNumbers, *models: AnyGaussians, changes: bool = False
+) -> Iterator[tuple[int, int, tuple[DeviceGaussians, ...], ChunkList, NDArray[np.integer[Any]]]]:
+    """Yield, for as many chunks at a time as the pool of the models has slots, the rows [start, stop) that they are
+    among the rows of all chunks, the models, in which a list of slots has these chunks, and the chunks' numbers.
+
+    Each part is valid until the next part is requested.
+
+    changes: True if the device will change the models.
+    """
+    streamed = [model for model in models if isinstance(model, HostGaussians)]
+    pool = streamed[0].pool
+    assert pool is not None, "only a pool has chunks"
+    for begin in range(0, len(chunks.numbers), pool.slots):
+        numbers = chunks.numbers[begin : begin + pool.slots]
+        slots = exact_chunks(work, "chunk_slots", pool.place(numbers, changes=changes), pool.rows)
+        start = CHUNK_ROWS * begin
+        yield start, start + CHUNK_ROWS * len(numbers), tuple(model.in_pool for model in streamed), slots, numbers
 
 
 Models = Sequence["AnyGaussians | None"]

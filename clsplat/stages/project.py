@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import inf
 from typing import NamedTuple
@@ -20,9 +21,9 @@ from clsplat.layouts.columns import PLAIN_SLOTS, SPLAT, SlotFields
 from clsplat.optimisation.dropout import Thinning
 from clsplat.optimisation.step_noise import NO_EXPLORATION, Exploration
 from clsplat.stages.adam import AdamStep
-from clsplat.stages.bounds import ChunkList
+from clsplat.stages.chunk_lists import ChunkList, ChunkNumbers
 from clsplat.stages.device_camera import tiles_of
-from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, chunk_parts, parts
 
 CPU_STEP_ROWS = 128
 """Number of Gaussians per group of `project_step` on a CPU. Their gradients, 30 KiB, stay in the cache, and each array
@@ -84,6 +85,18 @@ def thinning_numbers(thinning: Thinning | None) -> tuple[float, ...]:
     return (*map(LaunchParameterWord, (*thinning.key, thinning.threshold)), LaunchParameter(thinning.factor))
 
 
+def _projected_parts(
+    work: Workspace, gaussians: AnyGaussians, projected: Projected, chunks: ChunkList | ChunkNumbers | None
+) -> Iterator[tuple[int, DeviceGaussians, Projected]]:
+    """Yield, for each part of the model that is on the device at once, its first row, the part, and its projection."""
+    if isinstance(chunks, ChunkNumbers):
+        for start, stop, (part,), slots, _ in chunk_parts(work, chunks, gaussians):
+            yield start, part, replace(projected.rows(start, stop), chunks=slots)
+        return
+    for start, stop, (part,) in parts(work, gaussians):
+        yield start, part, projected if chunks is not None else projected.rows(start, stop)
+
+
 @stage("project")
 def project(
     device: Device,
@@ -92,7 +105,7 @@ def project(
     camera: Camera,
     camera_array: DeviceArray,
     thinning: Thinning | None = None,
-    chunks: ChunkList | None = None,
+    chunks: ChunkList | ChunkNumbers | None = None,
 ) -> Projected:
     """Project all Gaussians that thinning does not drop, and count their tiles (Kerbl et al. 2023, section 4).
 
@@ -104,9 +117,9 @@ def project(
     rays = device.switched("RAYS")
     keeps_culled = not rays and device.switched("NO_FRUSTUM_CULL")
     shown = work.array("shown", (n,), np.uint32) if keeps_culled else None
-    projected = Projected(splats, tile_counts, shown, chunks)
-    for start, stop, (part,) in parts(work, gaussians):
-        out = projected if chunks is not None else projected.rows(start, stop)
+    listed = chunks if isinstance(chunks, ChunkList) else None
+    projected = Projected(splats, tile_counts, shown, listed)
+    for start, part, out in _projected_parts(work, gaussians, projected, chunks):
         defines = {**out.chunk_defines, **({"SH_DEGREES": True} if "sh_degrees" in part.arrays else {})}
         if part["sh_rest"].dtype == np.float16:
             defines["SH_HALF"] = True

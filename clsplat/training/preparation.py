@@ -14,11 +14,9 @@ from clsplat.images.alpha import background_colour
 from clsplat.runs import scene_record
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes.analysis import sanity_checks
-from clsplat.scenes.analysis.length_unit import length_unit_of
-from clsplat.scenes.depth_sources import with_depths
+from clsplat.scenes.depth_sources import length_unit_of, with_depths
 from clsplat.scenes.scene import Scene
-from clsplat.scenes.start.initialise import is_colourless, photographed
-from clsplat.scenes.start.point_cloud import with_points
+from clsplat.scenes.start.point_cloud import is_colourless, photographed, with_points
 from clsplat.training.cameras.refinement import check_refinable
 
 
@@ -37,7 +35,8 @@ def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None) -> S
     unit = _length_unit(scene, resumed, is_prepared=is_prepared)
     if unit != scene.unit:
         scene = replace(scene, unit=unit)
-    return with_depths(with_points(scene, start), config.depth_use)
+    scene = with_points(scene, start)
+    return with_depths(scene, config.depth_use)
 
 
 def _length_unit(scene: Scene, resumed: Run | None, *, is_prepared: bool) -> float | None:

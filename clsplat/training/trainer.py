@@ -28,13 +28,11 @@ from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, downl
 from clsplat.stages.loss import Loss
 from clsplat.training.appearance.choice import appearance_of
 from clsplat.training.batch import Batch, Losses
-from clsplat.training.cameras.refinement import Cameras
-from clsplat.training.cameras.validation import ValidationViews, validate
+from clsplat.training.cameras.refinement import Cameras, ValidationViews
 from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
 from clsplat.training.density.choice import strategy_of
-from clsplat.training.host_memory import UNLIMITED, HostMemory
 from clsplat.training.learning_rates import rates_at
-from clsplat.training.memory_planner import MemoryPlanner
+from clsplat.training.memory import UNLIMITED, HostMemory, MemoryPlanner
 from clsplat.training.mip_filter import MipFilter
 from clsplat.training.stability.health import finite_or_zero
 from clsplat.training.stability.non_finite import NonFiniteMonitor, Repair
@@ -189,7 +187,7 @@ class Trainer:
         result: Loss | Losses
         if self.batch is None:
             run = partial(self._run, step, inputs[0], needs, reads_loss)
-            result = self.pending.launch(run, self._room(factor), number=self.step, reads_loss=reads_loss)
+            result = self.pending.launch(run, self._room(factor, inputs[0]), number=self.step, reads_loss=reads_loss)
             if self.position.queue:  # upload the next step's photograph, at this resolution
                 self.photographs.ahead(self.position.queue[-1], factor)
         else:
@@ -241,11 +239,13 @@ class Trainer:
         self._after_adam()
         return result
 
-    def _room(self, factor: float) -> int:
+    def _room(self, factor: float, inputs: ViewInputs) -> int:
         """Capacity, in pairs, with which the next step is launched.
 
         0 if the pairs have to be counted first, for example if the strategy inspects the model after each step.
         """
+        if inputs.chunks is not None and inputs.chunks.one_by_one:
+            return 0
         if not self.pending.on or self._looks_at_steps or not self.rasterizer.takes_room:
             return 0
         return self.pending.room(self.rasterizer, (factor, self.rasterizer), self.parameters.count)
@@ -329,7 +329,7 @@ class Trainer:
             return False
         self.settle()
         look = held_out_looks(self.appearance.record())
-        validate(self.cameras, self.validation_views, self.step, lambda camera: self.draw(camera).image, look)
+        self.cameras.validate(self.validation_views, self.step, lambda camera: self.draw(camera).image, look)
         return True
 
     def _note(self, *, begun: bool = False) -> None:

@@ -16,7 +16,7 @@ from clsplat.arrays import Float64
 from clsplat.device.context import Device
 from clsplat.runs import scene_record
 from clsplat.runs.run import Run
-from clsplat.scenes.analysis.length_unit import DEPTH_TO_UNIT, length_unit_of
+from clsplat.scenes.depth_sources import DEPTH_TO_UNIT, length_unit_of
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.readers.colmap import Tracks
 from clsplat.scenes.scene import Scene

@@ -16,8 +16,7 @@ from clsplat.config.training import TrainConfig
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.outliers import MAX_OUTLIER_CAMERA_FRACTION, OUTLIER_DISTANCE_RATIO, strays
 from clsplat.scenes.scene import Scene
-from clsplat.scenes.start.point_cloud import with_points
-from clsplat.scenes.start.sky_points import sky_points
+from clsplat.scenes.start.point_cloud import sky_points, with_points
 from clsplat.shots.read import choose_shot
 from clsplat.training.cameras.poses import Poses
 from clsplat.viewer.pose import start_of

@@ -13,7 +13,7 @@ from clsplat.config.masks import MaskUse
 from clsplat.images.writing import write_image
 from clsplat.scenes.dataset import Lens
 from clsplat.scenes.scene import Scene, View
-from clsplat.scenes.start.initialise import COLOUR_VIEWS_PER_POINT, photographed
+from clsplat.scenes.start.point_cloud import COLOUR_VIEWS_PER_POINT, photographed
 from clsplat.scenes.supervision.masks import Mask
 
 SIDE = 120

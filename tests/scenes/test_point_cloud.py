@@ -16,9 +16,18 @@ from clsplat.config.points import StartPoints
 from clsplat.errors import InputError
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
-from clsplat.scenes.start.initialise import from_scene, is_colourless, photographed
-from clsplat.scenes.start.point_cloud import Cloud, check_place, read_cloud, thinned, with_points
-from clsplat.scenes.start.sky_points import half_sphere, sky_points
+from clsplat.scenes.start.initialise import from_scene
+from clsplat.scenes.start.point_cloud import (
+    Cloud,
+    check_place,
+    half_sphere,
+    is_colourless,
+    photographed,
+    read_cloud,
+    sky_points,
+    thinned,
+    with_points,
+)
 
 RNG = np.random.default_rng(5)
 

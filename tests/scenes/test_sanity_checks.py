@@ -25,7 +25,8 @@ from clsplat.scenes.analysis import sanity_checks
 from clsplat.scenes.dataset import pixels_of
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
-from clsplat.scenes.start.initialise import MIN_START_COLOUR, from_points, is_colourless, photographed
+from clsplat.scenes.start.initialise import MIN_START_COLOUR, from_points
+from clsplat.scenes.start.point_cloud import is_colourless, photographed
 from clsplat.spherical_harmonics import SH_C0
 
 

@@ -15,10 +15,10 @@ from needs import require
 from clsplat.camera import Camera
 from clsplat.config.pictures import PictureConfig, SamplingConfig
 from clsplat.reference.cameras import pixel_from_world
-from clsplat.sequence.shot_tasks import make_tasks
+from clsplat.sequence.shot_tasks import make_tasks, settled
 from clsplat.sequence.task import RenderOptions, Task, camera_after, picture_camera, settings_digest
 from clsplat.shots import Shot, choose_shot, read_shot
-from clsplat.shots.optics import Optics, settled, time_code
+from clsplat.shots.optics import Optics, time_code
 from clsplat.shots.readers.usd_settings import CONFORM_POLICIES
 
 LENS = "float fStop = 2\nfloat focusDistance = 5\n"

@@ -21,7 +21,8 @@ from clsplat.optimisation.dropout import Thinning
 from clsplat.reference import bounds as reference
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.adam import AdamStep
-from clsplat.stages.bounds import ChunkList, bounds, send_chunks
+from clsplat.stages.bounds import bounds
+from clsplat.stages.chunk_lists import ChunkList, send_chunks
 from clsplat.stages.density import add_contributions, add_statistics, new_statistics
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 from clsplat.stages.project import project, project_step

@@ -20,8 +20,8 @@ from clsplat.layouts.columns import CHUNK_ROWS, NO_CHUNK, READBACK, REFUSED, SPL
 from clsplat.selftest.case import fresh_readback
 from clsplat.selftest.cases.steps import uploaded_groups
 from clsplat.stages.adam import AdamStep, adam
-from clsplat.stages.bounds import ChunkList
 from clsplat.stages.catch_up import StepTable, catch_up, step_table
+from clsplat.stages.chunk_lists import ChunkList
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import DeviceGaussians
 from clsplat.stages.project import Projected, Screen, Slots, project_step

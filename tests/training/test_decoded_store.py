@@ -24,8 +24,8 @@ from clsplat.files import mounts
 from clsplat.files.atomic import machine_mark, temporary_name
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
-from clsplat.training import host_memory
-from clsplat.training.host_memory import HostMemory
+from clsplat.training.memory import HostMemory
+from clsplat.training.memory import model_bytes as bytes_of_a_gaussian
 from clsplat.training.supervision import decoded_store
 from clsplat.training.supervision.decoded_store import SUFFIX, DecodedStore, key_of, remove_decoded
 
@@ -166,7 +166,7 @@ def test_several_writers_and_readers(store: DecodedStore) -> None:
 
 def little_memory(scene: Scene) -> int:
     """A limit in bytes with which most photographs are read again and again."""
-    return HostMemory().photographs(scene, CONFIG).least + len(scene.points) * host_memory.model_bytes(CONFIG)
+    return HostMemory().photographs(scene, CONFIG).least + len(scene.points) * bytes_of_a_gaussian(CONFIG)
 
 
 @pytest.mark.slow

@@ -37,8 +37,8 @@ from clsplat.scenes.analysis import sanity_checks
 from clsplat.scenes.dataset import Lens
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene, View
-from clsplat.training.host_memory import HostMemory
-from clsplat.training.host_memory import model_bytes as bytes_of_a_gaussian
+from clsplat.training.memory import HostMemory
+from clsplat.training.memory import model_bytes as bytes_of_a_gaussian
 from clsplat.training.supervision import host_photographs
 from clsplat.training.supervision.decoded_store import DecodedStore
 from clsplat.training.supervision.decoding import Decoder, PhotographError, stored

@@ -2,7 +2,7 @@
 """`clsplat render`, from the call to the exit status.
 
 `clsplat.cli.render.request` checks the flags. `clsplat.cli.render.job` reads cameras and models, and makes the tasks.
-`clsplat.cli.render.dry_run` prints them for --dry-run, else the job has them rendered and written.
+For --dry-run it prints them, else it has them rendered and written.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ __all__ = ["RenderVerb", "run"]
 
 def run(verb: RenderVerb, services: Services) -> int:
     """Render a model from cameras to images."""
-    from clsplat.cli.render.job import job_of, write_frames
+    from clsplat.cli.render.job import dry_run, job_of, write_frames
     from clsplat.cli.render.request import checked
 
     request = checked(verb)
@@ -35,8 +35,6 @@ def run(verb: RenderVerb, services: Services) -> int:
         for selector in (() if verb.on_farm else request.devices)
     ]
     if verb.dry_run:
-        from clsplat.cli.render.dry_run import dry_run
-
         return dry_run(job, [renderer.memory_plan(job.tasks) for renderer in renderers])
     for renderer in renderers:
         renderer.check(job.tasks)

@@ -71,7 +71,7 @@ def of_pictures(
     kind: name of the kind of views, for the message.
     """
     checked = spread(views, MAX_CHECKED_VIEWS)
-    drawn = [draw(_small(view.camera)) for view in checked]
+    drawn = [draw(view.camera.resized(*_small_size(view.camera))) for view in checked]
     if not any(alpha.any() for _, alpha in drawn):
         return (
             f"no Gaussian is visible in any of the {len(checked)} {kind} views that were checked: the points do not "
@@ -85,13 +85,12 @@ def of_pictures(
     return ""
 
 
-def _small(camera: Camera) -> Camera:
-    return camera.resized(max(camera.width // CHECK_DOWNSCALE, 1), max(camera.height // CHECK_DOWNSCALE, 1))
+def _small_size(camera: Camera) -> tuple[int, int]:
+    return max(camera.width // CHECK_DOWNSCALE, 1), max(camera.height // CHECK_DOWNSCALE, 1)
 
 
 def _pixels(view: View) -> NDArray[np.float32]:
-    small = _small(view.camera)
-    return view.load(small.width, small.height)
+    return view.load(*_small_size(view.camera))
 
 
 def _is_flat(image: NDArray[Any]) -> bool:

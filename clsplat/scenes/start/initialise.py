@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Initial Gaussians: one per point, isotropic, with a size according to the distance to the point's neighbours.
-
-Points without colours take the median colour of the training photographs that show them.
-"""
+"""Initial Gaussians: one per point, isotropic, with a size according to the distance to the point's neighbours."""
 
 from __future__ import annotations
 
@@ -11,13 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsplat.arrays import Float32, Float64
+from clsplat.arrays import Float64
 from clsplat.camera import DEFAULT_NEAR_PLANE
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.images.alpha import composite
-from clsplat.scenes.dataset import nearest_around, occlusion_cell, pixels_of
-from clsplat.scenes.point_files import UNCOLOURED_GREY, of_one_colour
 from clsplat.spherical_harmonics import SH_C0
 
 if TYPE_CHECKING:
@@ -37,18 +31,6 @@ MIN_START_COLOUR = 1 / 512
 A channel that starts at 0 is at the colour clamp, where it has no gradient. Rounding may then keep it at 0.
 """
 SCALE_NEIGHBOURS = 3
-COLOUR_VIEWS_PER_POINT = 15
-"""Number of nearest photographs that give a point its colour.
-
-In distant photographs the colour of a point is mixed with its surroundings. With fewer photographs than this number, a
-photograph with something else in front of the point would have too much weight.
-"""
-OCCLUSION_DEPTH_RATIO = 1.05
-"""Ratio of a point's depth to that of the nearest point in its cell, above which the point counts as occluded."""
-HIDDEN_POINT_RANK = 1e30
-"""An occluded point's rank is this times its relative depth. It thus exceeds the rank of any visible point."""
-UNSEEN_GREY = UNCOLOURED_GREY
-"""Grey value of points that no photograph shows."""
 
 
 def from_scene(scene: Scene, random_count: int, rng: np.random.Generator) -> Gaussians:
@@ -137,50 +119,3 @@ def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Ge
     points = low + rng.random((count, 3)) * (high - low)
     colors = 0.5 + SH_C0 * rng.random((count, 3)) / 255
     return points, colors
-
-
-def is_colourless(scene: Scene) -> bool:
-    """True if points lack colours: some are marked as colourless (from --points), or all have the same colour, as from
-    another cloud without colours."""
-    return scene.colourless is not None or of_one_colour(scene.point_colors)
-
-
-def photographed(scene: Scene, background: ArrayLike) -> Float32:
-    """Colours (N, 3) float32 in [0, 1] of the scene's points. Points with colours of their own keep them.
-
-    A colour is the median per channel over the nearest COLOUR_VIEWS_PER_POINT training photographs that show the point,
-    at the training size. Masked and occluded points do not count as shown. A point that is occluded in all photographs
-    uses the photographs in which it is least occluded.
-    """
-    count = len(scene.points)
-    ranks, colors = (
-        np.full((count, COLOUR_VIEWS_PER_POINT), np.inf),
-        np.full((count, COLOUR_VIEWS_PER_POINT, 3), np.inf, np.float32),
-    )
-    for view in scene.train_views:
-        camera, picture = view.camera.before(scene.near), view.load_masked()
-        rows, columns, inside = pixels_of(scene.points, camera, view.lens)
-        which, depths = np.flatnonzero(inside), camera.depths_of(scene.points[inside])
-        behind = depths / nearest_around(rows, columns, depths, occlusion_cell(camera, len(which)))
-        rank = np.where(behind <= OCCLUSION_DEPTH_RATIO, depths / camera.fx, HIDDEN_POINT_RANK * behind)
-        pixels = picture[rows, columns]
-        counts = pixels[:, 4] > 0 if pixels.shape[1] == 5 else np.ones(len(which), np.bool_)
-        last = ranks[which].argmax(axis=1)
-        kept = counts & (rank < ranks[which, last])
-        which, last = which[kept], last[kept]
-        ranks[which, last] = rank[kept]
-        colors[which, last] = composite(pixels[None, kept, :4], background)[0]
-    shown = ranks < HIDDEN_POINT_RANK
-    colors[~shown & shown.any(axis=1, keepdims=True)] = np.inf
-    medians = np.clip(_medians(colors), 0, 1)
-    return medians if scene.colourless is None else np.where(scene.colourless[:, None], medians, scene.point_colors)
-
-
-def _medians(colors: Float32) -> Float32:
-    """Medians per channel, (N, 3), of the finite colours in (N, K, 3); UNSEEN_GREY if there are none. Sorts `colors` in
-    place."""
-    counts = np.isfinite(colors).all(axis=2).sum(axis=1)[:, None, None]
-    colors.sort(axis=1)
-    middles = np.concatenate([np.maximum(counts - 1, 0) // 2, counts // 2], axis=1)
-    medians = np.take_along_axis(colors, middles, axis=1).mean(axis=1)
-    return np.asarray(np.where(counts[:, 0] > 0, medians, np.float32(UNSEEN_GREY)))

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds from which training starts. They are checked against the cameras and thinned to one point per voxel."""
+"""Points from which training starts: clouds, the sky's points, and the colours of both.
+
+Clouds are checked against the cameras and thinned to one point per voxel. Sky points lie on a sphere around the scene,
+where photographs show the sky. Points without colours take the median colour of the photographs that show them.
+"""
 
 from __future__ import annotations
 
@@ -8,19 +12,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from clsplat.arrays import Float64
-from clsplat.config.points import StartPoints
+from clsplat.arrays import Float32, Float64
+from clsplat.camera import Camera
+from clsplat.config.points import SKY_RADIUS_RATIO, StartPoints
 from clsplat.errors import InputError, warn
-from clsplat.scenes.dataset import pixels_of
+from clsplat.images.alpha import composite
+from clsplat.scenes.dataset import nearest_around, occlusion_cell, pixels_of
 from clsplat.scenes.outliers import MAX_OUTLIER_POINT_FRACTION, OUTLIER_DISTANCE_RATIO, strays
-from clsplat.scenes.point_files import Cloud, read_cloud
-from clsplat.scenes.start.initialise import UNSEEN_GREY
-from clsplat.scenes.start.sky_points import sky_points
+from clsplat.scenes.point_files import UNCOLOURED_GREY, Cloud, of_one_colour, read_cloud
 
 if TYPE_CHECKING:
-    from clsplat.scenes.scene import Scene
+    from clsplat.scenes.scene import Scene, View
 
 MAX_CHECKED_CLOUD_POINTS = 20_000
 """Maximum number of a cloud's points that are checked against the cameras, evenly spaced."""
@@ -35,6 +39,29 @@ VOXEL_SIZE_TOLERANCE = 0.02
 """Relative amount by which the voxel size may exceed the smallest sufficient size."""
 MAX_VOXELS_PER_SIDE = 1 << 20
 """Maximum number of voxels along the longest side of the box, so that three indices fit in 64 bits."""
+SKY_IMAGE_SIDE_PX = 400
+"""Longer side in pixels to which larger photographs are reduced. A sky point covers several pixels of the full size."""
+SKY_RADIUS_QUANTILE = 0.95
+"""Quantile of the distances of the scene's points that counts as the farthest distance."""
+SKY_OVERSAMPLING = 4
+"""Number of candidate directions on the half sphere, per requested point."""
+SKYLINE_COLUMNS = 24
+"""Number of column strips of a photograph. In each, the sky is above all points."""
+MIN_SKY_VOTE_FRACTION = 0.5
+"""A direction is sky if at least this fraction of the photographs that show it have sky there."""
+_GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5.0))
+COLOUR_VIEWS_PER_POINT = 15
+"""Number of nearest photographs that give a point its colour.
+
+In distant photographs the colour of a point is mixed with its surroundings. With fewer photographs than this number, a
+photograph with something else in front of the point would have too much weight.
+"""
+OCCLUSION_DEPTH_RATIO = 1.05
+"""Ratio of a point's depth to that of the nearest point in its cell, above which the point counts as occluded."""
+HIDDEN_POINT_RANK = 1e30
+"""An occluded point's rank is this times its relative depth. It thus exceeds the rank of any visible point."""
+UNSEEN_GREY = UNCOLOURED_GREY
+"""Grey value of points that no photograph shows."""
 
 
 def with_points(scene: Scene, start: StartPoints) -> Scene:
@@ -193,3 +220,122 @@ def _means(values: NDArray[Any], cells: NDArray[np.int64]) -> Float64:
     """Mean per voxel, (voxels, 3), of values (N, 3). They are summed in the order of the file."""
     counts = np.bincount(cells)
     return np.stack([np.bincount(cells, values[:, axis]) / counts for axis in range(3)], axis=1)
+
+
+def sky_points(scene: Scene, count: int) -> tuple[Float64, Float32]:
+    """At most `count` points (N, 3) on the sky sphere in the world, and their mean colours (N, 3) in the photographs.
+
+    A direction above the horizon is sky if, in most photographs that show it, no scene point lies above it in its
+    column strip.
+    Raises InputError if there is no such direction, no common up direction, or no points in the scene.
+    """
+    if len(scene.points) == 0:
+        raise InputError(
+            f"{scene.name}: --sky needs points to find the sky above them, and the scene has none; leave out --sky"
+        )
+    cameras = [view.camera for view in scene.train_views]
+    middle, *_ = scene.spread
+    up = -np.stack([camera.rotation[1] for camera in cameras]).mean(axis=0)
+    if (length := float(np.linalg.norm(up))) < 0.1:
+        raise InputError(f"{scene.name}: --sky needs cameras with a common up direction; leave out --sky")
+    radius = SKY_RADIUS_RATIO * max(
+        float(np.quantile(np.linalg.norm(scene.points - middle, axis=1), SKY_RADIUS_QUANTILE)), scene.extent
+    )
+    directions = half_sphere(SKY_OVERSAMPLING * count, up / length)
+    places = middle + radius * directions
+    sums, votes, shown = np.zeros((len(places), 3)), np.zeros(len(places)), np.zeros(len(places))
+    for view in scene.train_views:
+        factor = min(SKY_IMAGE_SIDE_PX / max(view.camera.width, view.camera.height), 1.0)
+        width, height = (max(round(factor * side), 1) for side in (view.camera.width, view.camera.height))
+        camera = view.camera.resized(width, height).before(scene.near)
+        rows, columns, inside = pixels_of(places, camera, view.lens)
+        shown += inside
+        if not inside.any():
+            continue
+        is_sky = rows < _skyline(scene.points, camera, view)[columns]
+        there = np.flatnonzero(inside)[is_sky]
+        if len(there):
+            picture = composite(view.load(width, height), np.zeros(3))
+            sums[there] += picture[rows[is_sky], columns[is_sky]]
+            votes[there] += 1
+    chosen = np.flatnonzero((votes > 0) & (votes >= MIN_SKY_VOTE_FRACTION * shown))
+    if len(chosen) == 0:
+        raise InputError(f"{scene.name}: --sky: no photograph shows sky above its points; leave out --sky")
+    if len(chosen) > count:
+        chosen = chosen[np.linspace(0, len(chosen) - 1, count).astype(int)]
+    colors: Float32 = np.clip(sums[chosen] / votes[chosen, None], 0, 1).astype(np.float32)
+    return places[chosen], colors
+
+
+def half_sphere(count: int, up: Float64) -> Float64:
+    """Directions (count, 3), evenly spaced over the half sphere around `up` on a golden-angle spiral."""
+    height = (np.arange(count) + 0.5) / count
+    level, angle = np.sqrt(1 - height**2), _GOLDEN_ANGLE * np.arange(count)
+    aside = np.eye(3)[int(np.argmin(np.abs(up)))]
+    east = np.cross(up, aside)
+    east /= np.linalg.norm(east)
+    along = np.outer(level * np.cos(angle), east) + np.outer(level * np.sin(angle), np.cross(up, east))
+    return np.asarray(along + np.outer(height, up))
+
+
+def _skyline(points: Float64, camera: Camera, view: View) -> NDArray[np.int64]:
+    """Row above which a picture shows no scene points, for each column.
+
+    It is the same for all columns of a strip, and takes the neighbouring strips into account. It is 0 for strips
+    without points, which may be too plain to have any.
+    """
+    rows, columns, _ = pixels_of(points, camera, view.lens)
+    part = np.minimum(columns * SKYLINE_COLUMNS // camera.width, SKYLINE_COLUMNS - 1)
+    tops = np.full(SKYLINE_COLUMNS + 2, camera.height)
+    np.minimum.at(tops, part + 1, rows)
+    tops = np.minimum(np.minimum(tops[:-2], tops[1:-1]), tops[2:])
+    tops[tops == camera.height] = 0
+    margin = camera.height // 40
+    return np.asarray(np.maximum(tops[np.arange(camera.width) * SKYLINE_COLUMNS // camera.width] - margin, 0))
+
+
+def is_colourless(scene: Scene) -> bool:
+    """True if points lack colours: some are marked as colourless (from --points), or all have the same colour, as from
+    another cloud without colours."""
+    return scene.colourless is not None or of_one_colour(scene.point_colors)
+
+
+def photographed(scene: Scene, background: ArrayLike) -> Float32:
+    """Colours (N, 3) float32 in [0, 1] of the scene's points. Points with colours of their own keep them.
+
+    A colour is the median per channel over the nearest COLOUR_VIEWS_PER_POINT training photographs that show the point,
+    at the training size. Masked and occluded points do not count as shown. A point that is occluded in all photographs
+    uses the photographs in which it is least occluded.
+    """
+    count = len(scene.points)
+    ranks, colors = (
+        np.full((count, COLOUR_VIEWS_PER_POINT), np.inf),
+        np.full((count, COLOUR_VIEWS_PER_POINT, 3), np.inf, np.float32),
+    )
+    for view in scene.train_views:
+        camera, picture = view.camera.before(scene.near), view.load_masked()
+        rows, columns, inside = pixels_of(scene.points, camera, view.lens)
+        which, depths = np.flatnonzero(inside), camera.depths_of(scene.points[inside])
+        behind = depths / nearest_around(rows, columns, depths, occlusion_cell(camera, len(which)))
+        rank = np.where(behind <= OCCLUSION_DEPTH_RATIO, depths / camera.fx, HIDDEN_POINT_RANK * behind)
+        pixels = picture[rows, columns]
+        counts = pixels[:, 4] > 0 if pixels.shape[1] == 5 else np.ones(len(which), np.bool_)
+        last = ranks[which].argmax(axis=1)
+        kept = counts & (rank < ranks[which, last])
+        which, last = which[kept], last[kept]
+        ranks[which, last] = rank[kept]
+        colors[which, last] = composite(pixels[None, kept, :4], background)[0]
+    shown = ranks < HIDDEN_POINT_RANK
+    colors[~shown & shown.any(axis=1, keepdims=True)] = np.inf
+    medians = np.clip(_medians(colors), 0, 1)
+    return medians if scene.colourless is None else np.where(scene.colourless[:, None], medians, scene.point_colors)
+
+
+def _medians(colors: Float32) -> Float32:
+    """Medians per channel, (N, 3), of the finite colours in (N, K, 3); UNSEEN_GREY if there are none. Sorts `colors` in
+    place."""
+    counts = np.isfinite(colors).all(axis=2).sum(axis=1)[:, None, None]
+    colors.sort(axis=1)
+    middles = np.concatenate([np.maximum(counts - 1, 0) // 2, counts // 2], axis=1)
+    medians = np.take_along_axis(colors, middles, axis=1).mean(axis=1)
+    return np.asarray(np.where(counts[:, 0] > 0, medians, np.float32(UNSEEN_GREY)))

@@ -22,8 +22,9 @@ from clsplat.selftest.cases.steps import ADAM_CASE, ADAM_ENDS, ADAM_RATES, rando
 from clsplat.selftest.harness import Array, CaseBench
 from clsplat.selftest.scenes import evenly
 from clsplat.stages.adam import AdamStep
-from clsplat.stages.bounds import ChunkList, bounds, padded_chunks
+from clsplat.stages.bounds import bounds
 from clsplat.stages.catch_up import StepTable, catch_up, step_table
+from clsplat.stages.chunk_lists import ChunkList, padded_chunks
 from clsplat.stages.density import add_contributions, add_statistics, new_statistics
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, host_gaussians, upload_gaussians

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of training views, refined with the model, and their gradients, which also align held-out views."""
+"""Cameras of training views, refined with the model: their gradients, which also align held-out views, and their
+validation with held-out photographs."""
 
 from __future__ import annotations
 
@@ -17,16 +18,22 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
-from clsplat.errors import InputError
+from clsplat.errors import InputError, warn
+from clsplat.evaluation import metrics
+from clsplat.images.alpha import background_colour, composite
+from clsplat.runs.appearance import Look
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, View
+from clsplat.scenes.scene import Scene, View, spread
 from clsplat.stages.pose import LENS_NUMBERS, POSE_NUMBERS, lens_rows, pose_rows, sum_of, sums_of
 from clsplat.training.cameras.export import keep_cameras
 from clsplat.training.cameras.intrinsics import RefinedLenses
 from clsplat.training.cameras.poses import Poses
-from clsplat.training.cameras.validation_gate import CameraGate, Drift, drift
+from clsplat.training.cameras.validation_gate import MAX_GATE_VIEWS, CameraGate, Drift, drift
 from clsplat.training.step.component import Component, Named
 from clsplat.training.step.inputs import StepRows, ViewInputs, ViewPart
+from clsplat.training.supervision.decoding import Decoder
+from clsplat.training.supervision.host_photographs import HostPhotographs
+from clsplat.training.supervision.image_cache import ImageCache
 
 REFINEMENT_ARRAYS_PER_PARAMETER = 4
 """Arrays on the device for each parameter: the parameter, two moments, and a view's gradient."""
@@ -105,6 +112,39 @@ class CameraSums(ViewPart):
         return self._gradient(LENS_NUMBERS)
 
 
+Draw = Callable[[Camera], NDArray[Any]]
+"""Function that renders an image (H, W, 3), over the background of evaluations, with a camera in world coordinates."""
+
+
+class ValidationViews:
+    """Held-out views for the gate, at most MAX_GATE_VIEWS. Their pixels are decoded once."""
+
+    def __init__(self, scene: Scene, device: Device, config: TrainConfig) -> None:
+        self.views = spread(scene.test_views, MAX_GATE_VIEWS)
+        self._photographs = ImageCache(device, HostPhotographs(Decoder(self.views)))
+        self._background = background_colour(config.background)
+        self._measure = metrics.psnr if config.appearance == "none" else metrics.psnr_corrected
+
+    def psnr(self, draw: Draw, look: Look, cameras: Sequence[Camera]) -> float:
+        """Mean PSNR in dB of the views, rendered from these cameras; 0 if no photograph counts.
+
+        A photograph counts if its mask keeps a pixel. If appearance is learnt, colours are fitted before the
+        comparison.
+
+        look: function that gives a render the appearance of a view, if that is known.
+        """
+        found = []
+        for index, camera in enumerate(cameras):
+            pixels, counts = self._photographs.load(index, 1.0), None
+            if pixels.shape[2] == 5:
+                pixels, counts = pixels[:, :, :4], pixels[:, :, 4] > 0
+                if not counts.any():
+                    continue
+            image = look(self.views[index].name, np.nan_to_num(draw(camera)))
+            found.append(self._measure(image, composite(pixels, self._background), counts))
+        return float(np.mean(found)) if found else 0.0
+
+
 class Cameras(Component):
     """Cameras of the training views. Refined poses and lenses change until the validation gate ends the refinement.
 
@@ -163,6 +203,24 @@ class Cameras(Component):
         """Drift of the refined poses from the given ones; None if poses are not refined."""
         given = [view.camera for view in self._views]
         return drift(given, self.poses.cameras, self._scene.length_unit) if self.poses.on else None
+
+    def validate(self, views: ValidationViews, step: int, draw: Draw, look: Look) -> None:
+        """Measure the held-out views with the refined cameras. If the gate rejects the cameras, warn and go back to
+        earlier cameras.
+
+        Held-out views are measured twice, with their given poses, and with these poses moved by the drift of the
+        refined poses. The better result counts. The given poses are right if only some training poses were wrong, and
+        the moved ones if the whole world has drifted.
+        """
+        seen = [self.lenses.seen(view.lens, view.camera) for view in views.views]
+        psnr = views.psnr(draw, look, seen)
+        if (moved := self.drift()) is not None:
+            psnr = max(psnr, views.psnr(draw, look, [moved.taken_along(camera) for camera in seen]))
+        best, warning = self.gate.validate(step, psnr, self.refined_arrays())
+        if best is not None:
+            self.go_back(best)
+        if warning:
+            warn(warning)
 
     def refined_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a checkpoint, by name, without the gate's."""

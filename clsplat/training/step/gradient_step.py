@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property, partial
 from typing import TypeVar
 from weakref import ref
@@ -18,15 +18,15 @@ from clsplat.optimisation.dropout import Thinning, thinning_of
 from clsplat.optimisation.step_noise import NO_EXPLORATION, Exploration
 from clsplat.rendering.rasterizer import ForwardPass, PairCapacity, Rasterizer
 from clsplat.stages.adam import AdamStep, adam
-from clsplat.stages.bounds import ChunkList
-from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians, parts
+from clsplat.stages.chunk_lists import ChunkList, ChunkNumbers, exact_chunks
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians, chunk_parts, parts
 from clsplat.stages.loss import Loss, loss
 from clsplat.stages.loss_terms import LossTerm
 from clsplat.stages.noise import noise, noise_numbers
-from clsplat.stages.project import Slots, project_grad, project_step, step_numbers, thinning_numbers
+from clsplat.stages.project import Projected, Slots, project_grad, project_step, step_numbers, thinning_numbers
 from clsplat.stages.target import is_photograph, on_device, target
 from clsplat.training.density import StatisticsNeeds
-from clsplat.training.step.inputs import StepRows, ViewInputs, ViewRows
+from clsplat.training.step.inputs import PlacedChunks, StepRows, ViewInputs, ViewRows
 from clsplat.training.step.loss_terms import loss_terms
 
 R = TypeVar("R")
@@ -137,7 +137,7 @@ class GradientStep:
             probe.forward(frame)
             probe.loss(result)
             probe.pair_gradients(slots)
-        self._change(model, inputs, frame, slots, gradients, probe, None if placed is None else placed.listed)
+        self._change(model, inputs, frame, slots, gradients, probe, placed)
         self.learn(inputs, own)
         return result
 
@@ -148,7 +148,7 @@ class GradientStep:
         sent: tuple[DeviceArray, DeviceArray],
         source: DeviceArray,
         terms: Sequence[LossTerm],
-        chunks: ChunkList | None,
+        chunks: ChunkList | ChunkNumbers | None,
         probe: StepProbe = NO_PROBE,
         *,
         reads_loss: bool = False,
@@ -174,7 +174,11 @@ class GradientStep:
         return frame, result, slots, own
 
     def _key(
-        self, inputs: ViewInputs, source: DeviceArray, terms: Sequence[LossTerm], chunks: ChunkList | None
+        self,
+        inputs: ViewInputs,
+        source: DeviceArray,
+        terms: Sequence[LossTerm],
+        chunks: ChunkList | ChunkNumbers | None,
     ) -> tuple[object, ...] | None:
         """All that the launches of a view's gradient depend on, except the model; None if they cannot be replayed in
         one: with exact counts, with parts or depths, or if a mask gives each photograph a divisor of its own."""
@@ -183,6 +187,7 @@ class GradientStep:
             return None
         of_view = (self.rasterizer.device_of(camera), source.shape, source.dtype)  # the camera has the source's size
         of_step = (room.pairs, room.turn, room.appends, fields.absolute, fields.contributions, fields.nearness)
+        assert not isinstance(chunks, ChunkNumbers), "such a step has exact counts"
         rows = None if chunks is None else chunks.key
         return (*of_view, *of_step, self.turn, self.config.thinning > 0, keys, rows)
 
@@ -233,14 +238,15 @@ class GradientStep:
         slots: Slots,
         gradients: DeviceGaussians | None,
         probe: StepProbe,
-        chunks: ChunkList | None,
+        placed: PlacedChunks | None,
     ) -> None:
         """Take Adam's step for the model, part by part, or for some of its chunks."""
+        chunks = None if placed is None else placed.listed
 
         def change() -> None:
-            for start, stop, part in parts(self.rasterizer.work, *model, keep=True):
-                end = stop if chunks is None else frame.projected.tile_counts.shape[0]
-                self._change_rows(self._rows(start, end, part, inputs, frame, slots, gradients, chunks), inputs, probe)
+            for start, part, projected, listed in self._parts(model, frame.projected, placed):
+                rows = self._rows(start, part, inputs, frame.camera_array, projected, slots, gradients, listed)
+                self._change_rows(rows, inputs, probe)
 
         if self.room is None or gradients is not None or any(part.changes_rows for part in inputs.parts):
             change()
@@ -252,28 +258,43 @@ class GradientStep:
         given = (frame.camera_array,)
         self.replayed(model[0], (*key, *probe.key), change, numbers, given, probe.before_replay)
 
+    def _parts(
+        self, model: tuple[AnyGaussians, ...], projected: Projected, placed: PlacedChunks | None
+    ) -> Iterator[tuple[int, tuple[DeviceGaussians, ...], Projected, ChunkList | None]]:
+        """Yield, for each part of the model that is on the device at once, its first row, the part, its projection, and
+        the list of its chunks, if the step has chunks."""
+        work = self.rasterizer.work
+        if placed is not None and isinstance(placed.in_model, ChunkNumbers):
+            for start, stop, part, slots, numbers in chunk_parts(work, placed.in_model, *model, changes=True):
+                listed = exact_chunks(work, "chunks", numbers, model[0].count)
+                yield start, part, replace(projected.rows(start, stop), chunks=slots), listed
+            return
+        for start, stop, part in parts(work, *model, keep=True):
+            yield start, part, *((projected.rows(start, stop), None) if placed is None else (projected, placed.listed))
+
     def _rows(
         self,
         start: int,
-        stop: int,
         model: tuple[DeviceGaussians, ...],
         inputs: ViewInputs,
-        frame: ForwardPass,
+        camera_array: DeviceArray,
+        projected: Projected,
         slots: Slots,
         gradients: DeviceGaussians | None,
         chunks: ChunkList | None,
     ) -> StepRows:
-        """Rows [start, stop) of the model or of `chunks`, with arrays for their gradients."""
-        by_lens = (part.lens_gradients(stop - start) for part in inputs.parts)
+        """Rows of the model or of `chunks` from `start` on, with arrays for their gradients."""
+        count = projected.tile_counts.shape[0]
+        by_lens = (part.lens_gradients(count) for part in inputs.parts)
         return StepRows(
             start,
-            stop,
-            frame.projected.rows(start, stop),
-            self.rasterizer.screen(stop - start, self.fields),
+            start + count,
+            projected,
+            self.rasterizer.screen(count, self.fields),
             model,
             self.rasterizer.device_of(inputs.camera),
-            frame.camera_array,
-            slots.rows(start, stop),
+            camera_array,
+            slots.rows(start, start + count),
             gradients,
             next((room for room in by_lens if room is not None), None),
             chunks=chunks,

@@ -13,7 +13,7 @@ from clsplat.camera import Camera
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.stages.adam import AdamStep
-from clsplat.stages.bounds import ChunkList
+from clsplat.stages.chunk_lists import ChunkList, ChunkNumbers
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians
 from clsplat.stages.loss_terms import DepthTerm
 from clsplat.stages.project import Projected, Screen, Slots
@@ -23,18 +23,24 @@ from clsplat.stages.project import Projected, Screen, Slots
 class PlacedChunks:
     """Chunks that are ready for a step.
 
-    listed: their numbers in the model.
     model: the model that the kernels get: the whole model, or, if it is streamed, the rows of the pool's slots.
-    in_model: the chunks for kernels that read `model`.
+    in_model: the chunks for kernels that read `model`. ChunkNumbers come to the pool one after the other; `model` is
+        the streamed model then.
+    listed: the numbers of the chunks in the model; None with ChunkNumbers.
     """
 
-    listed: ChunkList
     model: tuple[AnyGaussians, ...]
-    in_model: ChunkList
+    in_model: ChunkList | ChunkNumbers
+    listed: ChunkList | None
 
 
 class ChunksInView(Protocol):
     """The chunks of the model over which a step runs."""
+
+    @property
+    def one_by_one(self) -> bool:
+        """True if not all of them have room on the device at once."""
+        return False
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> PlacedChunks | None:
         """Make the chunks ready for the step. None if the step runs over the whole model."""

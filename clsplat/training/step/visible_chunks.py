@@ -24,8 +24,9 @@ from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.optimisation.dropout import thinning_of
 from clsplat.rendering.rasterizer import MAX_COUNTED_PASSES, Rasterizer
 from clsplat.stages.adam import AdamStep
-from clsplat.stages.bounds import BOUNDS_FLOATS, bounds, send_chunks
+from clsplat.stages.bounds import BOUNDS_FLOATS, bounds
 from clsplat.stages.catch_up import StepTable, catch_up, step_table
+from clsplat.stages.chunk_lists import ChunkNumbers, send_chunks
 from clsplat.stages.chunk_pool import ChunkPool
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostArray, HostGaussians
 from clsplat.training.learning_rates import largest_rates
@@ -134,7 +135,7 @@ class VisibleChunks(Component):
         pool = gaussians.pool if isinstance(gaussians, HostGaussians) else None
         if isinstance(gaussians, HostGaussians) and (pool is None or self._config.thinning > 0):
             return  # thinning draws its random numbers by the row of the launch
-        self._streamed = pool is not None
+        self._streamed, self._slots = pool is not None, len(self._last) if pool is None else pool.slots
         if pool is not None:
             pool.cull = self.in_view
         self._since = 0
@@ -185,7 +186,7 @@ class VisibleChunks(Component):
         self._scales_moved[shown] += self._step_limit * rates["log_scales"]
         numbers = np.flatnonzero(shown).astype(np.uint32)
         missed = self._missed(shown, step - 1)
-        return [replace(of_view, chunks=_ChunksInView(self, numbers, missed, self._found, whole=whole))]
+        return [replace(of_view, chunks=_ChunksInView(self, numbers, missed, self._found, self._slots, whole=whole))]
 
     def in_view(self, camera: Camera) -> NDArray[np.int64]:
         """The chunks that a camera may show, as they are after the last step."""
@@ -230,8 +231,9 @@ class VisibleChunks(Component):
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep, chunks: _ChunksInView) -> PlacedChunks | None:
         """Catch up the chunks that a step's view shows, and send their list. A repeated step is the same again."""
+        everything = np.arange(len(self._last), dtype=np.uint32)
         if chunks.of_rows is not self._found:  # rows have moved since, and all have taken every step
-            chunks = _ChunksInView(self, np.arange(len(self._last), dtype=np.uint32), None, self._found, whole=True)
+            chunks = _ChunksInView(self, everything, None, self._found, len(everything), whole=True)
         if chunks.missed is not None:
             self._catch_up(model, chunks.missed)
         older = {number: last for number, last in self._before.items() if number >= step.number - MAX_COUNTED_PASSES}
@@ -241,13 +243,14 @@ class VisibleChunks(Component):
         self._note(step)
         if chunks.whole:
             return None
-        work = self._rasterizer.work
+        work, pool = self._rasterizer.work, _pool_of(model)
+        if pool is not None and len(chunks.numbers) > pool.slots:
+            return PlacedChunks(model, ChunkNumbers(chunks.numbers), None)
         listed = send_chunks(work, "chunks", chunks.numbers, model[0].count)
-        pool = _pool_of(model)
         if pool is None:
-            return PlacedChunks(listed, model, listed)
+            return PlacedChunks(model, listed, listed)
         slots = send_chunks(work, "chunk_slots", pool.place(chunks.numbers, changes=True), pool.rows)
-        return PlacedChunks(listed, _in_pool(model), slots)
+        return PlacedChunks(_in_pool(model), slots, listed)
 
     def _note(self, step: AdamStep) -> None:
         """Put a step into the table, from which steps go that all chunks have taken."""
@@ -337,6 +340,7 @@ class _ChunksInView(ChunksInView):
     """The chunks of a step's view, and the steps that some of them have missed.
 
     of_rows: bounds of the chunks that are listed, an array of its own for each order of the model's rows.
+    slots: number of chunks for which the device has room.
     whole: True if the step runs over the whole model, of which all chunks are listed.
     """
 
@@ -344,7 +348,13 @@ class _ChunksInView(ChunksInView):
     numbers: NDArray[np.uint32]
     missed: Missed | None
     of_rows: Float64
+    slots: int
     whole: bool
+
+    @property
+    def one_by_one(self) -> bool:
+        """True if not all of them have room on the device at once."""
+        return len(self.numbers) > self.slots
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> PlacedChunks | None:
         """Catch up these chunks, and send their list."""
