@@ -121,6 +121,7 @@ def _copy(
     fresh: NDArray[np.bool_],
 ) -> None:
     """Copy rows of old records to places in new ones, of both of which the rows count on from record to record."""
+    parts = list(_by_chunk(places))
     for name in old.dtype.names or ():
         values = old[name].reshape(-1, *old[name].shape[2:]).take(at, axis=0)
         if not name.startswith("parameters/"):
@@ -128,7 +129,7 @@ def _copy(
         target = records[name]
         if target.shape[2:] != values.shape[1:]:  # more SH coefficients
             target = target[:, :, : values.shape[1]]
-        for number, theirs, ours in _by_chunk(places):
+        for number, theirs, ours in parts:
             target[number, theirs] = values[ours]
 
 

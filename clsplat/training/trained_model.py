@@ -253,19 +253,20 @@ class TrainedModel:
         pool = self._pool if models is None else None
         if self.plan.streamed and count > ORDERED_ROWS:
             store = new_store(count, coefficients, self._scratch(MODELS * 4 * floats_of(coefficients) * count))
-            passed = None
-            if pool is not None and pool.store.path is None and store.path is None:
-                changes()  # memory for a second copy is not needed: the chunks go as soon as they are copied
-                passed = pool.store.give_back
+            make = partial(ChunkPool, self._device, self._work, store, self.plan.rows)
             try:
-                copy_to_store(own, rows, store, passed)
+                new = make() if isinstance(own[0], HostGaussians) and pool is None else None
+                frees = pool is not None and pool.store.path is None and store.path is None
+                if frees:  # no memory for a second copy is needed
+                    changes()
+                copy_to_store(own, rows, store, pool.store.give_back if frees and pool is not None else None)
             except BaseException:
                 store.close()
                 raise
             changes()
             del own
             self._free_models()
-            self._pool = ChunkPool(self._device, self._work, store, self.plan.rows)
+            self._pool = new or make()
             self.parameters, self.first, self.second = pooled(self._pool, coefficients)
             return
         if pool is None:
@@ -360,7 +361,7 @@ class TrainedModel:
         self, rows: DeviceArray | NDArray[np.uint32], changes: Callable[[], None], *, new_statistics: bool
     ) -> None:
         """Move all arrays, so that row j becomes the old row rows[j], with zero moments if it is FRESH."""
-        count, gathers = rows.shape[0], self.plan.gathers
+        count, before, gathers = rows.shape[0], self.parameters.count, self.plan.gathers
         with only_tried(self._device):
             try_gather(self._device, count, self.parameters)
         try:
@@ -370,8 +371,7 @@ class TrainedModel:
             else:
                 rows = self._gather(rows, on_device=gathers and self.plan.gathers, changes=changes)
         except CapacityError as error:
-            count = self.parameters.count
-            raise CapacityError(f"{error}; with --density.max-gaussians {count} the model grows no further") from None
+            raise CapacityError(f"{error}; with --density.max-gaussians {before} the model grows no further") from None
         statistics = self.statistics.named()
         del self.statistics
         self.statistics = carried(self._device, self._work, rows, statistics, densified=new_statistics)
