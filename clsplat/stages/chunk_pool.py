@@ -21,8 +21,8 @@ from clsplat.device.profile import stage
 from clsplat.errors import CapacityError
 from clsplat.layouts.columns import CHUNK_ROWS
 
-INVISIBLE_LOGIT = -1e30
-"""Opacity logit of a row that is not of the model."""
+INVISIBLE_LOGIT = -1e9
+"""Opacity logit of a row that is not of the model. Its square is finite, as `adam` wants it."""
 _VECTOR = 4
 """Words that an item of the kernel copies."""
 _MAX_CROSSING = 32
