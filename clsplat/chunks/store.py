@@ -160,11 +160,6 @@ class ChunkStore:
             self._memory[number] = None
         self._given_back = before
 
-    def blocks(self) -> Iterator[NDArray[np.int64]]:
-        """Numbers of all chunks, some at a time, in rising order."""
-        for begin in range(0, self.chunks, BLOCK_CHUNKS):
-            yield np.arange(begin, min(begin + BLOCK_CHUNKS, self.chunks))
-
     def _in_memory(self, number: int) -> NDArray[np.uint8]:
         """The bytes of a chunk in main memory."""
         held = self._memory[number]

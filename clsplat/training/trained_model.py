@@ -39,6 +39,7 @@ from clsplat.stages.density import (
     widen,
 )
 from clsplat.stages.device_gaussians import (
+    KINDS,
     AnyGaussians,
     HostArray,
     HostGaussians,
@@ -241,51 +242,72 @@ class TrainedModel:
     ) -> None:
         """Put Gaussians where the plan assigns them. The rows of a large streamed model are in a store of chunks.
 
-        models: parameters and moments, of the same number of rows and without a store; None for this model's, which
-            then have a store, or get one.
+        models: parameters and moments, without a store; None for this model's, which have a store or get one.
         rows: the source of each row; None for all as they are.
         coefficients: number of SH coefficients; 0 for as many as there are.
         changes: called before the first change of this model.
         """
-        own = self.with_moments if models is None else models
-        assert own[0] is not None
-        count, coefficients = own[0].count if rows is None else len(rows), coefficients or own[0].coefficients
-        pool = self._pool if models is None else None
+        parameters = self.parameters if models is None else models[0]
+        assert parameters is not None
+        count, coefficients = parameters.count if rows is None else len(rows), coefficients or parameters.coefficients
         if self.plan.streamed and count > ORDERED_ROWS:
-            store = new_store(count, coefficients, self._scratch(MODELS * 4 * floats_of(coefficients) * count))
-            make = partial(ChunkPool, self._device, self._work, store, self.plan.rows)
-            try:
-                new = make() if isinstance(own[0], HostGaussians) and pool is None else None
-                frees = pool is not None and pool.store.path is None and store.path is None
-                if frees:  # no memory for a second copy is needed
-                    changes()
-                copy_to_store(own, rows, store, pool.store.give_back if frees and pool is not None else None)
-            except BaseException:
-                store.close()
-                raise
-            changes()
-            del own
-            self._free_models()
-            self._pool = new or make()
-            self.parameters, self.first, self.second = pooled(self._pool, coefficients)
-            return
-        if pool is None:
-            placed = [self._placed(model) for model in own if model is not None]
+            del parameters
+            self._to_store(models, count, rows, coefficients, changes)
+        elif models is None:
+            del parameters
+            self._from_store(count, rows, coefficients, changes)
+        else:
+            placed = [self._placed(model) for model in models if model is not None]
             self.close()
             self.parameters, *moments = placed
             self.first, self.second = moments or (self._zeros(count, coefficients), self._zeros(count, coefficients))
-            return
-        pool.write_back()
+
+    def _to_store(
+        self,
+        models: Models | None,
+        count: int,
+        rows: NDArray[np.uint32] | None,
+        coefficients: int,
+        changes: Callable[[], None],
+    ) -> None:
+        """Put Gaussians into a new store, and make its pool. Arguments as those of `_place`."""
+        source, old = self.with_moments if models is None else models, self._pool if models is None else None
+        store = new_store(count, coefficients, self._scratch(MODELS * 4 * floats_of(coefficients) * count))
+        make = partial(ChunkPool, self._device, self._work, store, self.plan.rows)
+        try:
+            pool = make() if isinstance(source[0], HostGaussians) and old is None else None
+            if old is not None and old.store.path is None and store.path is None:
+                changes()  # no memory for a second copy is needed: each chunk is given back when it has been copied
+                copy_to_store(source, rows, store, old.store.give_back)
+            else:
+                copy_to_store(source, rows, store)
+        except BaseException:
+            store.close()
+            raise
         changes()
-        del own
-        self._pool = None
+        del source, old  # the old pool makes room for the new one
         self._free_models()
-        pool.arrays.clear()
-        host = partial(host_zeros, count, coefficients, self.plan.rows)
-        make = host if self.plan.streamed else partial(allocate_gaussians, self._device, count, coefficients)
-        self.parameters, self.first, self.second = to = make(), make(), make()
-        copy_to_models(pooled(pool, coefficients), rows, to)
-        pool.close()
+        self._pool = pool or make()
+        self.parameters, self.first, self.second = pooled(self._pool, coefficients)
+
+    def _from_store(
+        self, count: int, rows: NDArray[np.uint32] | None, coefficients: int, changes: Callable[[], None]
+    ) -> None:
+        """Take this model's Gaussians from its store to arrays. Arguments as those of `_place`."""
+        old, self._pool = self._pool, None
+        assert old is not None
+        old.write_back()
+        changes()
+        self._free_models()
+        old.arrays.clear()
+        if self.plan.streamed:
+            to = [host_zeros(count, coefficients, self.plan.rows) for _ in KINDS]
+            self.parameters, self.first, self.second = to
+        else:
+            on_device = [allocate_gaussians(self._device, count, coefficients) for _ in KINDS]
+            self.parameters, self.first, self.second = on_device
+        copy_to_models(pooled(old, coefficients), rows, self.with_moments)
+        old.close()
 
     def _free_models(self) -> None:
         """Free parameters and moments, on the device or in a store."""
