@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import prod
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -154,6 +155,23 @@ MAX_SH_COEFFICIENT = 1e7
 """Largest SH coefficient. A colour too large for project.cl to draw has a coefficient above it."""
 MAX_PARAMETER = 1e19
 """Largest parameter, so that its square fits in float32."""
+
+
+class GaussiansOfFile(Gaussians):
+    """A model in a file, for which main memory may have no room: its arrays are read when they are first used.
+
+    like: Gaussians with the model's origin, near plane and other properties.
+    """
+
+    def __init__(self, path: Path, like: Gaussians) -> None:
+        self.path, self.origin, self.near = path, like.origin, like.near
+        self.antialiased, self.by_rays = like.antialiased, like.by_rays
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in {group.field for group in PARAMETER_GROUPS.values()}:
+            raise AttributeError(name)
+        vars(self).update(Gaussians.load(self.path).arrays())
+        return vars(self)[name]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import InputError, plain
 from clsplat.files.documents import digest, parse_json, read_document
-from clsplat.gaussians import Gaussians
+from clsplat.gaussians import Gaussians, GaussiansOfFile
 from clsplat.runs.run import Run
 
 Record = dict[str, Any]
@@ -244,6 +244,9 @@ def _add_model(numbers: RunNumbers, model: Gaussians | None) -> None:
     path: Path = numbers.run.model_path
     if not path.exists():
         numbers.notes.append("model.ply is missing: the model cannot be described.")
+        return
+    if isinstance(model, GaussiansOfFile):
+        numbers.notes.append("The model is not described, as it is larger than --max-host-mem: clsplat info does it.")
         return
     try:
         model = model or Gaussians.load(path)

@@ -10,7 +10,7 @@ import json
 import os
 import re
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from clsplat.files.atomic import TEMPORARY_SUFFIX, atomic_write, atomic_writer, 
 from clsplat.files.documents import open_input, parse_json, read_document
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import comment
-from clsplat.models.formats import model_path
+from clsplat.models.formats import model_path, ply
 from clsplat.runs.checkpoints import Checkpoint, read_checkpoint, write_checkpoint
 from clsplat.runs.locks import locked
 from clsplat.runs.settings import (
@@ -117,6 +117,12 @@ class Run:
         space: the colour space that the model was trained in (`colour.photos_space`).
         """
         gaussians.save(self.model_path, comments=[comment(space)])
+
+    def save_model_rows(
+        self, model: Gaussians, count: int, rows: Callable[[int, int], Gaussians], space: str = "sRGB"
+    ) -> None:
+        """Write model.ply of a model that is not in memory as a whole. Arguments as of `ply.write_rows`."""
+        ply.write_rows(self.model_path, model, count, rows, comments=[comment(space)])
 
     def write_eval(self, result: Mapping[str, Any]) -> None:
         """Write eval.json."""

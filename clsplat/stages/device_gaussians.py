@@ -373,8 +373,9 @@ def to_device(device: Device, gaussians: HostGaussians) -> DeviceGaussians:
     return DeviceGaussians(gaussians.count, gaussians.coefficients, arrays)
 
 
-def download_gaussians(gaussians: AnyGaussians) -> Gaussians:
-    """A host copy as `Gaussians`."""
-    host = {name: gaussians[name].get() for name in PARAMETER_GROUPS}
+def download_gaussians(gaussians: AnyGaussians, start: int = 0, stop: int | None = None) -> Gaussians:
+    """A host copy of the rows [start, stop) as `Gaussians`; None for all rows from `start` on."""
+    stop = gaussians.count if stop is None else stop
+    host = {name: gaussians[name].get_rows(start, stop) for name in PARAMETER_GROUPS}
     sh = np.concatenate([host["sh_dc"][:, None], host["sh_rest"]], axis=1)
     return Gaussians(host["means"], host["quaternions"], host["log_scales"], host["opacity_logits"], sh)

@@ -21,7 +21,7 @@ from clsplat.device.drivers.worker_process import TrialInterrupted
 from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError
 from clsplat.evaluation.depths import keep_depths
 from clsplat.evaluation.held_out import EvaluatedModel, Evaluation, evaluate
-from clsplat.gaussians import Gaussians
+from clsplat.gaussians import Gaussians, GaussiansOfFile
 from clsplat.images.alpha import background_colour
 from clsplat.images.colour import photos_space
 from clsplat.process import Interrupted, endings, handled
@@ -366,9 +366,16 @@ class TrainingSession:
                 raise type(error)(f"{error}{written}") from error
             raise
         trainer.finish()
-        model = trainer.gaussians()
+        space = photos_space(view.path for view in trainer.scene.views)
+        if run is not None and trainer.model.in_file:
+            rows = trainer.rows()
+            run.save_model_rows(rows(0, 1), trainer.parameters.count, rows, space)
+            model: Gaussians = GaussiansOfFile(run.model_path, rows(0, 1))
+        else:
+            model = trainer.gaussians()
+            if run is not None:
+                run.save_model(model, space)
         if run is not None:
-            run.save_model(model, photos_space(view.path for view in trainer.scene.views))
             for component in trainer.components:
                 component.write(run)
             if trainer.scene.test_views:

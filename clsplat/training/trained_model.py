@@ -315,6 +315,11 @@ class TrainedModel:
         for name in ("parameters", "first", "second"):
             vars(self).pop(name, None)
 
+    @property
+    def in_file(self) -> bool:
+        """True if main memory has no room for the whole model."""
+        return self._pool is not None and self._pool.store.path is not None
+
     def close(self) -> None:
         """Remove the scratch file of a streamed model. The model cannot be used any longer."""
         if self._pool is not None:

@@ -452,7 +452,14 @@ class Trainer:
 
     def gaussians(self) -> Gaussians:
         """Model so far, on the host, with room for its final SH degree."""
-        model = download_gaussians(self.complete_parameters)
+        return self._of_rows(self.complete_parameters, 0, self.parameters.count)
+
+    def rows(self) -> Callable[[int, int], Gaussians]:
+        """Function that returns Gaussians [start, stop) of the model so far, as `gaussians` does."""
+        return partial(self._of_rows, self.complete_parameters)
+
+    def _of_rows(self, parameters: AnyGaussians, start: int, stop: int) -> Gaussians:
+        model = download_gaussians(parameters, start, stop)
         full = np.zeros((len(model), (self.config.sh_degree + 1) ** 2, 3), np.float32)
         full[:, : model.sh.shape[1]] = model.sh
         model.sh, model.origin, model.near = full, self.origin, self.near

@@ -247,8 +247,8 @@ def all_finite(array: NDArray[Any]) -> bool:
         return bool(np.isfinite(array.sum(dtype=np.float64)))
 
 
-def check_writable(path: Path, gaussians: Gaussians, *, least: int = 0) -> None:
-    """Check a model before it is written to `path`.
+def check_writable(path: Path, gaussians: Gaussians, *, least: int = 0, first: int = 0) -> None:
+    """Check a model before it is written to `path`, or its Gaussians from number `first` on.
 
     Raises ValueError for invalid arrays (`Gaussians.check`), InputError for non-finite values and for fewer than
     `least` Gaussians.
@@ -257,7 +257,7 @@ def check_writable(path: Path, gaussians: Gaussians, *, least: int = 0) -> None:
     for name, array in zip(GAUSSIAN_ARRAY_NOUNS, gaussians.arrays().values(), strict=True):
         if not all_finite(array):
             row = int((~np.isfinite(array.reshape(len(array), -1)).all(axis=1)).argmax())
-            raise InputError(f"{path}: cannot be written: Gaussian {row} has {name} that is not finite")
+            raise InputError(f"{path}: cannot be written: Gaussian {first + row} has {name} that is not finite")
     if len(gaussians) < least:
         raise InputError(f"{path}: cannot be written: the model has no Gaussians")
 

@@ -13,8 +13,9 @@ rounds. So a second element stores the exact means, and a comment their origin. 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 from math import isqrt
 from pathlib import Path
@@ -160,12 +161,33 @@ def write(
     Raises ValueError for a degree lower than the model's, a comment that is not a line of ASCII, and invalid arrays
     (`Gaussians.check`). Raises InputError for non-finite values.
     """
+    gaussians.check()
+    write_rows(path, gaussians, len(gaussians), partial(_taken, gaussians), sh_degree=sh_degree, comments=comments)
+
+
+def _taken(gaussians: Gaussians, start: int, stop: int) -> Gaussians:
+    return take(gaussians, slice(start, stop))
+
+
+def write_rows(
+    path: str | os.PathLike[str],
+    model: Gaussians,
+    count: int,
+    rows: Callable[[int, int], Gaussians],
+    *,
+    sh_degree: int | None = None,
+    comments: Sequence[str] = (),
+) -> None:
+    """Write as `write` does a model of `count` Gaussians, of which only some at a time are in memory.
+
+    model: has the model's origin, near plane and other properties, and its SH degree.
+    rows: function that returns the Gaussians [start, stop).
+    """
     check_comments(comments)
-    values.check_writable(Path(path), gaussians)
-    degree = gaussians.sh_degree if sh_degree is None else sh_degree
-    if misfit(int, degree) or not gaussians.sh_degree <= degree <= MAX_SH_DEGREE:
-        raise ValueError(f"sh_degree is {degree}, expected {gaussians.sh_degree} (the model's) to {MAX_SH_DEGREE}")
-    stored, padded = gaussians.sh.shape[1] - 1, (degree + 1) ** 2 - 1
+    degree = model.sh_degree if sh_degree is None else sh_degree
+    if misfit(int, degree) or not model.sh_degree <= degree <= MAX_SH_DEGREE:
+        raise ValueError(f"sh_degree is {degree}, expected {model.sh_degree} (the model's) to {MAX_SH_DEGREE}")
+    stored, padded = model.sh.shape[1] - 1, (degree + 1) ** 2 - 1
     rest_names = [f"f_rest_{index}" for index in range(3 * padded)]
     names = [
         *POSITION_PROPERTIES,
@@ -178,29 +200,30 @@ def write(
         *SCALE_PROPERTIES,
         *ROTATION_PROPERTIES,
     ]
-    far, count = bool(gaussians.origin.any()), len(gaussians)
-    head = _header(gaussians, names, comments)
+    far, head = bool(model.origin.any()), _header(model, count, names, comments)
+    blocks = [(block.start, block.stop) for block in values.row_blocks(count, IO_BLOCK_ROWS)]
     with atomic_writer(path, len(head) + 4 * count * (len(names) + (3 if far else 0))) as file:
         file.write(head)
-        for rows in values.row_blocks(count, IO_BLOCK_ROWS):
-            sh = gaussians.sh[rows]
-            block = np.zeros((len(sh), len(names)), "<f4")
-            block[:, 0:3] = gaussians.means[rows] + gaussians.origin if far else gaussians.means[rows]
-            block[:, 6:9] = sh[:, 0]
-            rest = block[:, 9 : 9 + 3 * padded].reshape(len(sh), 3, padded)  # a view
-            rest[:, :, :stored] = sh[:, 1:].transpose(0, 2, 1)
-            block[:, -8] = gaussians.opacity_logits[rows]
-            block[:, -7:-4] = gaussians.log_scales[rows]
-            block[:, -4:] = gaussians.quaternions[rows]
+        for start, stop in blocks:
+            some = rows(start, stop)
+            values.check_writable(Path(path), some, first=start)
+            block = np.zeros((len(some), len(names)), "<f4")
+            block[:, 0:3] = some.means + model.origin if far else some.means
+            block[:, 6:9] = some.sh[:, 0]
+            rest = block[:, 9 : 9 + 3 * padded].reshape(len(some), 3, padded)  # a view
+            rest[:, :, :stored] = some.sh[:, 1:].transpose(0, 2, 1)
+            block[:, -8] = some.opacity_logits
+            block[:, -7:-4] = some.log_scales
+            block[:, -4:] = some.quaternions
             file.write(block.data)
-        if far:
-            file.write(np.ascontiguousarray(gaussians.means, "<f4").data)
+        for start, stop in blocks if far else ():
+            file.write(np.ascontiguousarray(rows(start, stop).means, "<f4").data)
 
 
-def _header(gaussians: Gaussians, names: Sequence[str], comments: Sequence[str]) -> bytes:
+def _header(gaussians: Gaussians, count: int, names: Sequence[str], comments: Sequence[str]) -> bytes:
     """Header of a 3DGS PLY, up to and including `end_header`. names: properties of a Gaussian."""
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
-    far, count = bool(gaussians.origin.any()), len(gaussians)
+    far = bool(gaussians.origin.any())
     if far:
         lines.append(" ".join([*ORIGIN_COMMENT, *(repr(float(value)) for value in gaussians.origin)]))
     if gaussians.near != DEFAULT_NEAR_PLANE:
