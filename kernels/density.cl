@@ -100,7 +100,7 @@ __kernel void density_marks(const uint n, const uint first, const float cut_off,
   marks[2 * (size_t)n + i] = !gone && wanted && large && !(largest > oversized_half_edge);
 }
 
-// marks (3, n); places (3, n): their prefix sums; counts[0]: the sum of marks; first: as in density_marks -> rows (2 n):
+// marks (3, n); places (3, n): their prefix sums; counts[0]: the sum of marks; first: as in density_marks -> rows (2n):
 // the source row of each new row; counts[1]: the number of splits. Order: remaining Gaussians, clones, first halves,
 // second halves. All but the remaining ones have the flag FRESH.
 __kernel void density_rows(const uint n, const uint first, __global const uint *marks, __global const uint *places,

@@ -375,14 +375,18 @@ class TrainedModel:
         halved: Sequence[str],
     ) -> None:
         """Replace the copies of split Gaussians with their halves, computed from the groups `halved`."""
-        most = moved.halves if self._pool is None else HALVED_ROWS
-        begins, split = range(0, moved.halves // 2, most), dict[str, Float32]()
-        for second, begin in product((False, True), begins):
-            of_first, of_second = (_some(places, begin, most) for places in moved.halves_at)
-            if len(begins) > 1 or not second:  # the second halves are still copies
-                split = {group: rows_at(self.parameters[group], of_second) for group in halved}
-            for group, values in halves(split, second).items():
-                set_rows_at(self.parameters[group], of_second if second else of_first, values)
+        first, second = moved.halves_at
+        if self._pool is None:  # one copy of each array crosses the bus
+            split = {group: rows_at(self.parameters[group], second) for group in halved}
+            sides = [halves(split, later) for later in (False, True)]
+            for group, values in sides[0].items():
+                set_rows_at(self.parameters[group], _both(first, second), np.concatenate([values, sides[1][group]]))
+            return
+        for places, begin in product((first, second), range(0, moved.halves // 2, HALVED_ROWS)):
+            copies, some = (_some(each, begin) for each in (second, places))  # second halves are still copies
+            split = {group: rows_at(self.parameters[group], copies) for group in halved}
+            for group, values in halves(split, places is second).items():
+                set_rows_at(self.parameters[group], some, values)
 
     def _move(
         self, rows: DeviceArray | NDArray[np.uint32], changes: Callable[[], None], *, new_statistics: bool
@@ -425,8 +429,14 @@ def _on_host(rows: DeviceArray | NDArray[np.uint32]) -> NDArray[np.uint32]:
     return rows.get() if isinstance(rows, DeviceArray) else rows
 
 
-def _some(places: Places, begin: int, most: int) -> Places:
-    """`most` of the places, from the one of number `begin` on."""
+def _both(first: Places, second: Places) -> Places:
+    if isinstance(first, slice) or isinstance(second, slice):
+        return slice(first.start, second.stop)  # type: ignore[union-attr]  # both are
+    return np.concatenate([first, second])
+
+
+def _some(places: Places, begin: int) -> Places:
+    """HALVED_ROWS of the places, from the one of number `begin` on."""
     if isinstance(places, slice):
-        return slice(places.start + begin, min(places.start + begin + most, places.stop))
-    return places[begin : begin + most]
+        return slice(places.start + begin, min(places.start + begin + HALVED_ROWS, places.stop))
+    return places[begin : begin + HALVED_ROWS]
