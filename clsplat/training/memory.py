@@ -11,11 +11,12 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from clsplat.chunks.order import ORDERED_ROWS
 from clsplat.config.checks import parse_bytes
 from clsplat.config.masks import NO_MASKS
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
-from clsplat.errors import InputError, amount, warn
+from clsplat.errors import CapacityError, InputError, amount, warn
 from clsplat.files.atomic import machine_mark, remove
 from clsplat.gaussians import floats_of
 from clsplat.rendering.memory_needs import MODELS, StepMemory, plan_step
@@ -28,7 +29,7 @@ from clsplat.training.batch import OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PE
 from clsplat.training.density import StatisticsNeeds
 from clsplat.training.step.component import Component
 from clsplat.training.step.gradient_step import slot_fields
-from clsplat.training.step.visible_chunks import streams_by_chunk
+from clsplat.training.step.visible_chunks import settings_of_whole_streams, streams_by_chunk
 from clsplat.training.supervision.decoded_store import DecodedStore, remove_decoded
 from clsplat.training.supervision.decoding import Decoder
 from clsplat.training.supervision.host_photographs import HostPhotographs
@@ -227,7 +228,15 @@ class MemoryPlanner:
 
     def _plan(self, device: Device, count: int, memory: StepMemory, models: int) -> Plan:
         cameras, coefficients = [view.camera for view in self._scene.views], (self._config.sh_degree + 1) ** 2
-        return plan_step(device, count, coefficients, cameras, self._config.rasterizer, memory, models=models)
+        try:
+            return plan_step(device, count, coefficients, cameras, self._config.rasterizer, memory, models=models)
+        except CapacityError as error:
+            whole = settings_of_whole_streams(self._config) if count > ORDERED_ROWS else []
+            if not whole:
+                raise
+            raise CapacityError(
+                f"{error}; without {', '.join(whole)} steps need memory for the Gaussians in view alone"
+            ) from None
 
     def _share_host(self, plan: Plan, count: int, statistics: int) -> None:
         """Give the photographs the main memory that the Gaussians leave.

@@ -320,6 +320,11 @@ class TrainedModel:
         """True if main memory has no room for the whole model."""
         return self._pool is not None and self._pool.store.path is not None
 
+    @property
+    def moved_bytes(self) -> int:
+        """Bytes of chunks that have gone to or come from the device."""
+        return 0 if self._pool is None else self._pool.moved_bytes
+
     def close(self) -> None:
         """Remove the scratch file of a streamed model. The model cannot be used any longer."""
         if self._pool is not None:

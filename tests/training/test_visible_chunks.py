@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from calls import noted
+from compare import assert_same_bits
 from quick import quick
 from same_bytes import State, make_too_small, outcome, stopped
 from tiny import cameras, hidden_model, run_steps, short
@@ -26,10 +27,12 @@ from clsplat.errors import DriverError
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.scenes.scene import Scene
+from clsplat.stages.chunk_pool import ChunkPool
 from clsplat.training import trained_model
 from clsplat.training.density import ModelState, RowPlan
 from clsplat.training.density.adaptive import Adaptive
 from clsplat.training.learning_rates import largest_rates, rates_at
+from clsplat.training.memory import UNLIMITED, HostMemory
 from clsplat.training.step import gradient_step, visible_chunks
 from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
 from clsplat.training.step.visible_chunks import Missed, VisibleChunks
@@ -38,8 +41,6 @@ from clsplat.training.trainer import Trainer
 
 ROWS = 11 * CHUNK_ROWS + 100
 CONFIG = short(iterations=40, report=False, warmup=(), density={"max_gaussians": 16_000})
-LITTLE = 7 << 20
-"""Bytes of device memory with which `wide_model` is streamed."""
 SPARSE = replace(CONFIG, optimiser=OptimiserConfig(sparse=True))
 
 UNCHANGED_ROWS = short(iterations=40, report=False, warmup=(), density={"every": 0})
@@ -103,12 +104,13 @@ def trained(
     whole: bool = False,
     around: bool = True,
     change: Callable[[Trainer], None] = lambda _: None,
+    memory: HostMemory = UNLIMITED,
 ) -> tuple[State, Trainer]:
     """A training's state after some steps. whole: every step runs over the whole model. change: called before them."""
     with pytest.MonkeyPatch.context() as patch:
         if whole:
             patch.setattr(visible_chunks, "ORDERED_ROWS", 1 << 30)
-        trainer = Trainer(scene, config, device, wide_model(around=around))
+        trainer = Trainer(scene, config, device, wide_model(around=around), memory=memory)
         change(trainer)
         run_steps(steps, trainer)
         return state(trainer), trainer
@@ -156,18 +158,57 @@ def test_the_bytes_of_the_whole_model(
     assert min(shares) < visible_chunks.MAX_SHARE_IN_VIEW, "some steps leave chunks out"
 
 
+LIMITS = {
+    "device 4 MiB": (4 << 20, None),
+    "device 7 MiB": (7 << 20, None),
+    "host 1 MiB": (None, 1 << 20),
+    "host 5 MiB": (None, 5 << 20),
+}
+"""Limits of memory, of the device and of the host, at which the pool has room for 3, 6, 1 and 7 of the 12 chunks; 6 are
+in view. A host limit puts the chunks into a file."""
+
+
 @pytest.mark.parametrize("optimiser", ["dense", "sparse"])
-def test_a_streamed_model(scene: Scene, default_device: Device, shares: list[float], optimiser: str) -> None:
-    """With sparse Adam only the chunks in view are uploaded; the model has the bytes of one that is on the device."""
-    wanted, _ = trained(scene, SETTINGS[optimiser], default_device, 16, whole=True, around=False)
-    limited = open_device(memory_limit=LITTLE)
-    parts: list[int] = []
+@pytest.mark.parametrize("name", LIMITS)
+def test_a_streamed_model(
+    scene: Scene, default_device: Device, shares: list[float], tmp_path: Path, optimiser: str, name: str
+) -> None:
+    """At every limit the model has the bytes of one that is on the device."""
+    wanted, _ = trained(scene, SETTINGS[optimiser], default_device, 32, whole=True)
+    of_device, of_host = LIMITS[name]
+    device = default_device if of_device is None else open_device(memory_limit=of_device)
+    memory = HostMemory(limit=of_host, scratch=tmp_path, owner="test")
+    placed: list[int] = []
     with pytest.MonkeyPatch.context() as patch:
-        noted(patch, visible_chunks, "upload_chunks", lambda _, numbers, *__: parts.append(len(numbers)))
-        got, trainer = trained(scene, SETTINGS[optimiser], limited, 16, around=False)
+        noted(patch, ChunkPool, "place", lambda _, numbers, **__: placed.append(len(numbers)))
+        got, trainer = trained(scene, SETTINGS[optimiser], device, 32, memory=memory)
     assert trainer.plan.streamed
+    assert min(shares) < 1, "some steps leave chunks out"
+    assert 0 < max(placed) <= trainer.plan.rows // CHUNK_ROWS < trainer.parameters.count / CHUNK_ROWS
+    assert len(list(tmp_path.iterdir())) == (of_host is not None)
     assert_same(got, wanted)
-    assert bool(parts) == (optimiser == "sparse"), (trainer.plan.rows, shares)
+    trainer.close()
+    assert not list(tmp_path.iterdir()), "the file of chunks is gone"
+
+
+@pytest.mark.parametrize("optimiser", ["dense", "sparse"])
+def test_a_look_at_a_streamed_model(
+    scene: Scene, default_device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, optimiser: str
+) -> None:
+    """Pictures of a model in training show the same at every limit, and change no byte of it."""
+    config, memory = SETTINGS[optimiser], HostMemory(limit=1 << 20, scratch=tmp_path, owner="test")
+    free, limited = Trainer(scene, config, default_device, wide_model()), None
+    limited = Trainer(scene, config, default_device, wide_model(), memory=memory)
+    for step in range(24):
+        free.train_step()
+        limited.train_step()
+        if step % 4 == 0:
+            camera = cameras()[step % 5]
+            assert_same_bits(limited.draw(camera).image, free.draw(camera).image)
+        if step % 7 == 0:
+            some = limited.rows()(100, 3000)
+            assert_same_bits(some.sh, free.gaussians().sh[100:3000])
+    assert_same(state(limited), state(free))
 
 
 @pytest.mark.parametrize("optimiser", ["dense", "sparse"])

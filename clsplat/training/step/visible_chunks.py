@@ -43,18 +43,33 @@ MOST_MISSED_STEPS = 1024
 """Steps after which a chunk is caught up even if no view shows it."""
 
 
+def settings_of_whole_steps(config: TrainConfig) -> list[str]:
+    """The settings with which a step runs over the whole model: it changes hidden Gaussians by more than Adam, or reads
+    their gradients."""
+    wanted = {
+        "--density.growth mcmc": config.density.growth == "mcmc",
+        "--antialiased": config.antialiased,
+        "--optimiser.late": config.optimiser.late,
+        "--batch": config.batch > 1,
+        "--refine-poses and --refine-intrinsics": config.refines,
+    }
+    return [name for name, given in wanted.items() if given]
+
+
 def runs_by_chunk(config: TrainConfig, device: Device) -> bool:
-    """True if a step may run over the chunks in view: it changes hidden Gaussians at most by Adam, and reads gradients
-    of none of them."""
-    by_adam_only = config.density.growth != "mcmc" and not config.antialiased and not config.optimiser.late
-    one_view = config.batch == 1 and not config.refines
-    return by_adam_only and one_view and device.max_group >= DEFAULT_GROUP_ITEMS
+    """True if a step may run over the chunks in view."""
+    return not settings_of_whole_steps(config) and device.max_group >= DEFAULT_GROUP_ITEMS
 
 
 def streams_by_chunk(config: TrainConfig, device: Device, count: int) -> bool:
-    """True if a model of `count` Gaussians may be streamed by chunks. Thinning draws its random numbers by the row of
-    the launch, which is not the model's then."""
-    return count > ORDERED_ROWS and config.thinning == 0 and runs_by_chunk(config, device)
+    """True if a model of `count` Gaussians may be streamed by chunks."""
+    return count > ORDERED_ROWS and not settings_of_whole_streams(config) and runs_by_chunk(config, device)
+
+
+def settings_of_whole_streams(config: TrainConfig) -> list[str]:
+    """The settings with which a model is streamed as a whole. Thinning draws its random numbers by the row of the
+    launch, which is not the model's if only chunks are streamed."""
+    return settings_of_whole_steps(config) + (["--thinning"] if config.thinning else [])
 
 
 @dataclass(frozen=True, eq=False)
