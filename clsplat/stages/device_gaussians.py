@@ -178,12 +178,14 @@ def chunk_parts(
 
     Each part is valid until the next part is requested.
 
-    changes: True if the device will change the models.
+    changes: True if the device will change the models. Then the last chunks come first: a pass that only reads has
+        left them on the device.
     """
     streamed = [model for model in models if isinstance(model, HostGaussians)]
     pool = streamed[0].pool
     assert pool is not None, "only a pool has chunks"
-    for begin in range(0, len(chunks.numbers), pool.slots):
+    begins = range(0, len(chunks.numbers), pool.slots)
+    for begin in reversed(begins) if changes else begins:
         numbers = chunks.numbers[begin : begin + pool.slots]
         slots = exact_chunks(work, "chunk_slots", pool.place(numbers, changes=changes), pool.rows)
         start = CHUNK_ROWS * begin

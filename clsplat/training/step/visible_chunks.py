@@ -51,7 +51,8 @@ def settings_of_whole_steps(config: TrainConfig) -> list[str]:
         "--antialiased": config.antialiased,
         "--optimiser.late": config.optimiser.late,
         "--batch": config.batch > 1,
-        "--refine-poses and --refine-intrinsics": config.refines,
+        "--refine-poses": config.refine_poses,
+        "--refine-lenses": config.refine_lenses,
     }
     return [name for name, given in wanted.items() if given]
 
