@@ -79,40 +79,40 @@ __kernel void density_scores(const uint n, const float gradient_edge, const floa
   scores[i] = useless ? USELESS : wanted ? gradient : UNWANTED;
 }
 
-// Marks `count` of the n Gaussians, from row `first` on. scores, radii (n); log_scales (count, 3), logits (count): of
-// these rows; cut_off, cut_off_row: scores above `cut_off` qualify, and scores equal to it up to row cut_off_row ->
-// marks (3, n), 0 or 1: the Gaussian remains, is cloned, is split.
-__kernel void density_marks(const uint n, const uint first, const uint count, const float cut_off,
-                            const uint cut_off_row, const float large_edge, const float transparent_edge,
-                            const float oversized_edge, const float oversized_half_edge, const float radius_edge,
-                            __global const float *scores, __global const float *radii, __global const float *log_scales,
-                            __global const float *logits, __global uint *marks) {
-  const size_t j = get_global_id(0), i = first + j;
-  if (j >= count) return;
-  const float a = log_scales[3 * j], b = log_scales[3 * j + 1], c = log_scales[3 * j + 2], ab = a > b ? a : b;
+// Marks n Gaussians, of which number i is the model's row first + i. scores, radii, logits (n); log_scales (n, 3);
+// cut_off, cut_off_row: scores above `cut_off` qualify, and scores equal to it up to row cut_off_row -> marks (3, n), 0
+// or 1: the Gaussian remains, is cloned, is split.
+__kernel void density_marks(const uint n, const uint first, const float cut_off, const uint cut_off_row,
+                            const float large_edge, const float transparent_edge, const float oversized_edge,
+                            const float oversized_half_edge, const float radius_edge, __global const float *scores,
+                            __global const float *radii, __global const float *log_scales, __global const float *logits,
+                            __global uint *marks) {
+  const size_t i = get_global_id(0);
+  if (i >= n) return;
+  const float a = log_scales[3 * i], b = log_scales[3 * i + 1], c = log_scales[3 * i + 2], ab = a > b ? a : b;
   const float largest = a == a && b == b ? (ab > c ? ab : c) : -INFINITY;
   const float score = scores[i];
-  const bool wanted = score >= 0.0f && (score > cut_off || (score == cut_off && i <= cut_off_row));
-  const bool large = largest > large_edge, gone = score == USELESS || logits[j] <= transparent_edge;
+  const bool wanted = score >= 0.0f && (score > cut_off || (score == cut_off && first + i <= cut_off_row));
+  const bool large = largest > large_edge, gone = score == USELESS || logits[i] <= transparent_edge;
   const bool stays = !gone && !(largest > oversized_edge);
   marks[i] = stays && !(wanted && large) && !(radii[i] > radius_edge);
   marks[(size_t)n + i] = stays && wanted && !large;
   marks[2 * (size_t)n + i] = !gone && wanted && large && !(largest > oversized_half_edge);
 }
 
-// marks (3, n); places (3, n): their prefix sums; counts[0]: the sum of marks -> rows (2 n): the source row of each new
-// row; counts[1]: the number of splits. Order: remaining Gaussians, clones, first halves, second halves. All but the
-// remaining ones have the flag FRESH.
-__kernel void density_rows(const uint n, __global const uint *marks, __global const uint *places, __global uint *rows,
-                           __global uint *counts) {
+// marks (3, n); places (3, n): their prefix sums; counts[0]: the sum of marks; first: as in density_marks -> rows (2n):
+// the source row of each new row; counts[1]: the number of splits. Order: remaining Gaussians, clones, first halves,
+// second halves. All but the remaining ones have the flag FRESH.
+__kernel void density_rows(const uint n, const uint first, __global const uint *marks, __global const uint *places,
+                           __global uint *rows, __global uint *counts) {
   const size_t i = get_global_id(0);
   if (i >= n) return;
-  const uint splits = counts[0] - places[2 * (size_t)n];
+  const uint row = first + (uint)i, splits = counts[0] - places[2 * (size_t)n];
   for (uint kind = 0; kind < 3; ++kind) {
     const size_t at = kind * (size_t)n + i;
     if (marks[at] == 0) continue;
-    rows[places[at]] = (uint)i | (kind == 0 ? 0 : FRESH);
-    if (kind == 2) rows[places[at] + splits] = (uint)i | FRESH;
+    rows[places[at]] = row | (kind == 0 ? 0 : FRESH);
+    if (kind == 2) rows[places[at] + splits] = row | FRESH;
   }
   if (i == 0) counts[1] = splits;
 }

@@ -28,7 +28,7 @@ from clsplat.errors import InputError, WriteError, reason_of
 from clsplat.files.atomic import remove, require_room, sync_folder, write_error
 from clsplat.layouts.columns import CHUNK_ROWS
 
-_BLOCK_CHUNKS = 64
+BLOCK_CHUNKS = 16
 """Chunks that are read or written at once where all of them are."""
 
 
@@ -69,9 +69,10 @@ class ChunkStore:
         self.chunks, self.record = chunks_of(count), record_type(fields)
         self.release: Callable[[], KeptSlots | None] = lambda: None
         self.moved: Callable[[int, float], object] = lambda _nbytes, _seconds: None
-        self._memory: NDArray[Any] | None = None
+        self._memory: list[NDArray[np.uint8] | None] = [None] * self.chunks if path is None else []
+        """The bytes of each chunk in main memory, None for zeros: an array each, to be given back alone."""
+        self._given_back = 0
         if path is None:
-            self._memory = np.zeros(self.chunks, self.record)
             return
         self._names = tuple(self.record.names or ())
         if opened is not None:
@@ -119,7 +120,7 @@ class ChunkStore:
     def close(self) -> None:
         """Give back the memory, or remove the file unless a checkpoint names slots of it. The store cannot be used any
         longer."""
-        self._memory = None
+        self._memory.clear()
         if self.path is None or self._file.closed:
             return
         kept, writable = self.slots.end_of_held, self._file.writable()
@@ -136,11 +137,12 @@ class ChunkStore:
 
         Raises ScratchError if the file has not what was written.
         """
-        records: NDArray[Any]
-        if self._memory is not None:
-            records = self._memory[numbers]
-            return records
         records = np.empty(len(numbers), self.record)
+        if self.path is None:
+            for row, number in zip(_rows_of(records), numbers, strict=True):
+                held = self._memory[number]
+                row[:] = 0 if held is None else held
+            return records
         slots = self.slots.current[numbers]
         records[slots == NO_SLOT] = np.zeros((), self.record)
         for begin, first, length in runs(slots):
@@ -151,8 +153,9 @@ class ChunkStore:
 
     def write(self, numbers: NDArray[np.integer[Any]], records: NDArray[Any]) -> None:
         """Replace the records of these chunks. Raises WriteError if they cannot be written."""
-        if self._memory is not None:
-            self._memory[numbers] = records
+        if self.path is None:
+            for row, number in zip(_rows_of(records), numbers, strict=True):
+                self._in_memory(int(number))[:] = row
             return
         self._make_room(numbers)
         slots = self.slots.targets(numbers)
@@ -176,20 +179,22 @@ class ChunkStore:
         if values.size == 0:
             return
         for number, mine, theirs in _pieces(start, start + len(values)):
-            if self._memory is not None:
-                self._memory[field][number, theirs] = values[mine]
-                continue
             rows = self._field(number, field)
             rows[theirs] = values[mine]
             self._set_field(number, field, rows)
 
-    def fill(self, field: str, value: float) -> None:
-        """Set all elements of a field."""
-        if self._memory is not None:
-            self._memory[field] = value
-            return
-        rows = np.full((CHUNK_ROWS, *self.fields[field]), value, np.float32)
-        for number in range(self.chunks):
+    def get_at(self, field: str, places: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
+        """A copy of the rows (k,) of a field at these places. Raises ScratchError as `read`."""
+        rows = np.empty((len(places), *self.fields[field]), np.float32)
+        for number, mine in _by_chunk(places) if rows.size else ():
+            rows[mine] = self._field(number, field)[places[mine] % CHUNK_ROWS]
+        return rows
+
+    def set_at(self, field: str, places: NDArray[np.integer[Any]], values: NDArray[np.float32]) -> None:
+        """Replace the rows (k,) of a field at these places. Raises WriteError and ScratchError."""
+        for number, mine in _by_chunk(places) if values.size else ():
+            rows = self._field(number, field)
+            rows[places[mine] % CHUNK_ROWS] = values[mine]
             self._set_field(number, field, rows)
 
     def rows_of(
@@ -208,16 +213,39 @@ class ChunkStore:
 
     def blocks(self) -> Iterator[NDArray[np.int64]]:
         """Numbers of all chunks, some at a time, in rising order."""
-        for begin in range(0, self.chunks, _BLOCK_CHUNKS):
-            yield np.arange(begin, min(begin + _BLOCK_CHUNKS, self.chunks))
+        for begin in range(0, self.chunks, BLOCK_CHUNKS):
+            yield np.arange(begin, min(begin + BLOCK_CHUNKS, self.chunks))
+
+    def change(self, field: str, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> None:
+        """Replace the rows of a field with what a function makes of them, chunk by chunk. Chunks that it leaves as they
+        are, are not written. Raises WriteError and ScratchError."""
+        for number in range(self.chunks) if prod(self.fields[field]) else ():
+            rows = self._field(number, field)
+            own = rows[: self.count - CHUNK_ROWS * number]
+            changed = change(own)
+            if changed.tobytes() != own.tobytes():
+                own[:] = changed
+                self._set_field(number, field, rows)
+
+    def give_back(self, before: int) -> None:
+        """Give back the memory of the chunks below number `before`, which nobody reads again."""
+        for number in range(self._given_back, before) if self.path is None else ():
+            self._memory[number] = None
+        self._given_back = before
+
+    def _in_memory(self, number: int) -> NDArray[np.uint8]:
+        """The bytes of a chunk in main memory."""
+        held = self._memory[number]
+        if held is None:
+            held = self._memory[number] = np.zeros(self.record.itemsize, np.uint8)
+        return held
 
     def _field(self, number: int, field: str) -> NDArray[np.float32]:
-        """A field (CHUNK_ROWS, ...) of a chunk's record."""
-        rows: NDArray[np.float32]
-        if self._memory is not None:
-            rows = self._memory[field][number]
-            return rows
+        """A field (CHUNK_ROWS, ...) of a chunk's record. In main memory it is the field itself."""
         kind, offset = self.record.fields[field][:2]  # type: ignore[index]  # it has fields
+        if self.path is None:
+            held = self._in_memory(number)[offset : offset + kind.itemsize]
+            return held.view(np.float32).reshape(kind.shape)
         rows = np.zeros(kind.shape, np.float32)
         if (slot := int(self.slots.current[number])) != NO_SLOT:
             self._read_at(slot * self.record.itemsize + offset, rows)
@@ -225,6 +253,9 @@ class ChunkStore:
         return rows
 
     def _set_field(self, number: int, field: str, rows: NDArray[np.float32]) -> None:
+        """Write a field that `_field` returned, and that has changed since."""
+        if self.path is None:
+            return
         numbers = np.array([number])
         if not self.slots.in_place(numbers)[0]:
             record = self.read(numbers)
@@ -290,6 +321,20 @@ def _pieces(start: int, stop: int) -> Iterator[tuple[int, slice, slice]]:
         first = CHUNK_ROWS * number
         begin, end = max(start, first), min(stop, first + CHUNK_ROWS)
         yield number, slice(begin - start, end - start), slice(begin - first, end - first)
+
+
+def _by_chunk(places: NDArray[np.integer[Any]]) -> Iterator[tuple[int, NDArray[np.int64]]]:
+    """Yield, for each chunk that has some of the rows at these places, its number, and which of them it has."""
+    chunks = places // CHUNK_ROWS
+    order = np.argsort(chunks, kind="stable")
+    ends = np.flatnonzero(np.diff(chunks[order])) + 1
+    for mine in np.split(order, ends) if len(places) else ():
+        yield int(chunks[mine[0]]), mine
+
+
+def _rows_of(records: NDArray[Any]) -> NDArray[np.uint8]:
+    """The bytes (k, itemsize) of records (k,)."""
+    return np.ascontiguousarray(records).view(np.uint8).reshape(len(records), records.dtype.itemsize)
 
 
 def _new_file(path: Path, nbytes: int) -> FileIO:

@@ -213,7 +213,21 @@ class StoredArray:
         self.pool.release()
         self.pool.store.set_rows(self.field, start, values)
 
+    def get_at(self, places: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
+        """A copy of the rows at these places."""
+        self.pool.write_back()
+        return self.pool.store.get_at(self.field, places)
+
+    def set_at(self, places: NDArray[np.integer[Any]], values: NDArray[np.float32]) -> None:
+        """Replace the rows at these places."""
+        self.pool.release()
+        self.pool.store.set_at(self.field, places, values)
+
+    def change(self, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> None:
+        """Replace the rows with what a function makes of them, chunk by chunk."""
+        self.pool.release()
+        self.pool.store.change(self.field, change)
+
     def fill(self, value: float) -> None:
         """Set every element."""
-        self.pool.release()
-        self.pool.store.fill(self.field, value)
+        self.change(lambda rows: np.full_like(rows, value))

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
+from clsplat.chunks.gathering import SourceList, in_source_order
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.command_buffer import LaunchParameter
 from clsplat.device.context import Device
@@ -19,7 +20,7 @@ from clsplat.device.profile import stage
 from clsplat.gaussians import group_shapes
 from clsplat.layouts.columns import SPLAT
 from clsplat.optimisation.density_rules import FRESH, MarkRules
-from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostArray, HostGaussians, parts
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostArray, HostGaussians
 from clsplat.stages.project import Projected, Screen
 from clsplat.stages.scan import scan
 
@@ -30,6 +31,8 @@ def gaussian_bytes(*, contributions: bool) -> int:
 
 
 SCORED_STATISTICS = ("whole_largest", "current_largest")
+LISTED_ROWS = 1 << 16
+"""Rows of a list on the host that are uploaded at a time."""
 CONTRIBUTION_STATISTICS = ("current_totals", "current_largest", "whole_totals", "whole_largest")
 
 
@@ -161,6 +164,11 @@ class DeviceRowList:
         """Number of rows."""
         return self.rows.shape[0]
 
+    def entries(self) -> NDArray[np.uint32]:
+        """The list on the host."""
+        entries: NDArray[np.uint32] = self.rows.get()
+        return entries
+
 
 @dataclass(frozen=True, eq=False)
 class DeviceMarker:
@@ -177,31 +185,48 @@ class DeviceMarker:
 
     def scores(self, rules: MarkRules) -> Float32:
         """Mean gradient norms (n,) of the Gaussians that may be densified; negative for the others."""
-        return _scored(self.device, self, rules).scores.get()
+        found = np.empty(self.parameters.count, np.float32)
+        for start, stop in self._pieces():
+            found[start:stop] = _scored(self.device, self, rules, start, stop).scores.get()
+        return found
 
-    def rows(self, rules: MarkRules) -> DeviceRowList:
-        """List the rows that the rules produce."""
-        return _listed(self.device, self, rules)
+    def rows(self, rules: MarkRules) -> DeviceRowList | SourceList:
+        """List the rows that the rules produce; those of a streamed model on the host."""
+        if isinstance(self.parameters, DeviceGaussians):
+            return _listed(self.device, self, rules, 0, self.parameters.count)
+        pieces = (_listed(self.device, self, rules, *piece) for piece in self._pieces())
+        return in_source_order(piece.entries() for piece in pieces)
+
+    def _pieces(self) -> Iterator[tuple[int, int]]:
+        """Rows that are marked together: as many as the plan brings to the device."""
+        model = self.parameters
+        rows = model.rows if isinstance(model, HostGaussians) else max(model.count, 1)
+        for start in range(0, model.count, rows):
+            yield start, min(start + rows, model.count)
 
 
 @dataclass(frozen=True, eq=False)
 class _Scratch:
-    """Scratch memory: scores (n) float32; marks (3n), places (3n) and rows (2n), all uint32."""
+    """Scratch memory for n rows: scores (n), log scales (n, 3) and opacity logits (n), float32; marks (3n), places (3n)
+    and rows (2n), uint32."""
 
     scores: DeviceArray
+    log_scales: DeviceArray
+    opacity_logits: DeviceArray
     marks: DeviceArray
     places: DeviceArray
     rows: DeviceArray
 
 
 @stage("density")
-def _scored(device: Device, marker: DeviceMarker, rules: MarkRules) -> _Scratch:
-    n, statistics, unit = marker.parameters.count, marker.statistics, device.row_alignment
-    sizes = (n, 3 * n, 3 * n, 2 * n)
+def _scored(device: Device, marker: DeviceMarker, rules: MarkRules, start: int, stop: int) -> _Scratch:
+    n, statistics, unit = stop - start, marker.statistics.rows(start, stop), device.row_alignment
+    sizes = (n, 3 * n, n, 3 * n, 3 * n, 2 * n)
     begins = [0, *np.cumsum([-(-size // unit) * unit for size in sizes]).tolist()]
     space = marker.work.array("splats", (max(begins[-1], len(SPLAT) * n),), np.uint32)
-    scores, *rest = (space.rows(begin, begin + size) for begin, size in zip(begins, sizes, strict=False))
-    scratch = _Scratch(replace(scores, dtype=np.dtype(np.float32)), *rest)
+    words = [space.rows(begin, begin + size) for begin, size in zip(begins, sizes, strict=False)]
+    floats = [replace(array, dtype=np.dtype(np.float32)) for array in words[:3]]
+    scratch = _Scratch(floats[0], floats[1].reshaped(n, 3), floats[2], *words[3:])
     views = (statistics.gradient_sums, statistics.seen)
     known = [getattr(statistics, name) or statistics.seen for name in SCORED_STATISTICS]
     edges = (rules.gradient, rules.contribution)
@@ -210,24 +235,24 @@ def _scored(device: Device, marker: DeviceMarker, rules: MarkRules) -> _Scratch:
 
 
 @stage("density")
-def _listed(device: Device, marker: DeviceMarker, rules: MarkRules) -> DeviceRowList:
-    n, model, kernels = marker.parameters.count, marker.parameters, device.kernels("density")
-    scratch, counts = _scored(device, marker, rules), allocate(device, (2,), np.uint32)
-    columns = model.only("log_scales", "opacity_logits")
+def _listed(device: Device, marker: DeviceMarker, rules: MarkRules, start: int, stop: int) -> DeviceRowList:
+    """The list of the rows [start, stop), which the next one overwrites."""
+    n, model, kernels = stop - start, marker.parameters, device.kernels("density")
+    scratch, counts = _scored(device, marker, rules, start, stop), allocate(device, (2,), np.uint32)
+    columns = {name: getattr(scratch, name) for name in ("log_scales", "opacity_logits")}
+    for name, column in columns.items():
+        array = model[name]
+        if isinstance(array, DeviceArray):
+            columns[name] = array
+        else:
+            column.set(array.get_rows(start, stop))
     edges = (rules.large, rules.transparent, rules.oversized, rules.oversized_half, rules.radius)
-    for start, stop, (part,) in parts(marker.work, columns):
-        some, arrays = stop - start, (scratch.scores, marker.statistics.radii, *part.arrays.values(), scratch.marks)
-        launch_items(device, kernels.density_marks, some, n, start, some, *rules.cut_off, *edges, *arrays)
+    arrays = (scratch.scores, marker.statistics.rows(start, stop).radii, *columns.values(), scratch.marks)
+    launch_items(device, kernels.density_marks, n, n, start, *rules.cut_off, *edges, *arrays)
     scan(device, marker.work, scratch.marks, scratch.places, counts)
-    launch_items(device, kernels.density_rows, n, n, scratch.marks, scratch.places, scratch.rows, counts)
+    launch_items(device, kernels.density_rows, n, n, start, scratch.marks, scratch.places, scratch.rows, counts)
     total, splits = (int(number) for number in counts.get())
     return DeviceRowList(scratch.rows.reshaped(total + splits), 2 * splits)
-
-
-def list_rows(device: Device, rows: NDArray[np.uint32], fresh: NDArray[np.bool_] | None) -> DeviceRowList:
-    """Upload a list of source rows from the host; entries where `fresh` is set are marked FRESH."""
-    entries = rows.astype(np.uint32) if fresh is None else np.where(fresh, rows | FRESH, rows).astype(np.uint32)
-    return DeviceRowList(upload(device, entries), halves=0)
 
 
 def try_gather(device: Device, count: int, source: AnyGaussians) -> None:
@@ -263,16 +288,47 @@ def gather(
 
 
 @stage("density")
-def carry(
-    device: Device, rows: DeviceArray, source: DensityStatistics, to: DensityStatistics, *, densified: bool
-) -> None:
-    """Copy statistics to arrays of new sizes: row j is row rows[j] of the source, or infinite if FRESH.
+def carried(
+    device: Device,
+    work: Workspace,
+    rows: DeviceArray | NDArray[np.uint32],
+    source: dict[str, DeviceArray],
+    *,
+    densified: bool,
+) -> DensityStatistics:
+    """Statistics of moved rows: row j is row rows[j] of the source, or infinite if FRESH.
 
-    Contributions are always copied, the other statistics only if nothing was densified.
+    Contributions are always carried, the other statistics only if nothing was densified.
+
+    source: arrays by name (`DensityStatistics.named`). Each is removed as soon as it is copied, so that the memory for
+    one of them is enough.
     """
-    for name, array in to.named().items():
-        if name in CONTRIBUTION_STATISTICS or not densified:
-            _gather_array(device, rows, source.named()[name], array, np.inf)
+    arrays: dict[str, DeviceArray] = {}
+    for name in tuple(source):
+        old = source.pop(name)
+        copies = name in CONTRIBUTION_STATISTICS or not densified
+        if not copies:
+            del old
+        arrays[name] = allocate(device, rows.shape, np.float32)
+        if not copies:
+            arrays[name].fill(0.0)
+            continue
+        for begin, listed in _on_device(work, rows):
+            to = arrays[name].rows(begin, begin + listed.shape[0])
+            _gather_array(device, listed, old, to, np.inf)
+    return DensityStatistics(**arrays)
+
+
+def _on_device(work: Workspace, rows: DeviceArray | NDArray[np.uint32]) -> Iterator[tuple[int, DeviceArray]]:
+    """A list of rows on the device, with its first place: all of it if it is there, else a part at a time."""
+    if isinstance(rows, DeviceArray):
+        yield 0, rows
+        return
+    for begin in range(0, len(rows), LISTED_ROWS):
+        some = np.ascontiguousarray(rows[begin : begin + LISTED_ROWS])
+        listed = work.array("listed_rows", some.shape, np.uint32)
+        listed.set(some)
+        yield begin, listed
 
 
 def _gather_array(device: Device, rows: DeviceArray, source: DeviceArray, to: DeviceArray, fresh: float | None) -> None:

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
+from clsplat.chunks.gathering import gathered
 from clsplat.chunks.manifest import chunks_of
-from clsplat.chunks.store import ChunkStore
+from clsplat.chunks.store import ChunkStore, record_type, runs
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, floats_of, group_shapes
@@ -155,6 +156,7 @@ class HostGaussians(_ByGroup[Any]):
 
 
 AnyGaussians = DeviceGaussians | HostGaussians
+AnyArray = DeviceArray | HostArray | StoredArray
 KINDS = ("parameters", "first", "second")
 """Kinds of arrays of a model in training, as a checkpoint and a store of chunks name them."""
 
@@ -224,24 +226,70 @@ def chunk_parts(
         yield start, start + CHUNK_ROWS * len(numbers), tuple(model.in_pool for model in streamed), slots, numbers
 
 
-def store_of(models: Sequence[AnyGaussians | None], path: Path | None) -> ChunkStore:
-    """A store of parameters, first and second moments. Moments that are None are zero. Raises WriteError."""
+Models = Sequence["AnyGaussians | None"]
+"""Parameters, first and second moments. Moments that are None are zero."""
+
+
+def new_store(count: int, coefficients: int, path: Path | None) -> ChunkStore:
+    """A store for parameters, first and second moments of `count` Gaussians. Raises WriteError."""
+    return ChunkStore(count, fields_of(coefficients), path)
+
+
+def copy_to_store(
+    models: Models, rows: NDArray[np.uint32] | None, to: ChunkStore, passed: Callable[[int], None] | None = None
+) -> None:
+    """Copy Gaussians to a store, chunk by chunk, so that row j is row rows[j]; None copies all rows.
+
+    passed: as in `chunks.gathering.gathered`.
+    Raises WriteError and ScratchError.
+    """
+    for numbers, records in _gathered(models, rows, to.record, passed or (lambda _: None)):
+        to.write(numbers, records)
+
+
+def copy_to_models(models: Models, rows: NDArray[np.uint32] | None, to: Sequence[AnyGaussians]) -> None:
+    """Copy Gaussians of a store to models on the device or in main memory, chunk by chunk, as `copy_to_store` does.
+
+    Raises ScratchError.
+    """
+    fields = {
+        f"{kind}/{name}": to_model[name] for kind, to_model in zip(KINDS, to, strict=True) for name in PARAMETER_GROUPS
+    }
+    record = record_type({name: array.shape[1:] for name, array in fields.items()})
+    for numbers, records in _gathered(models, rows, record, lambda _: None):
+        begin = CHUNK_ROWS * int(numbers[0])
+        count = min(CHUNK_ROWS * len(numbers), to[0].count - begin)
+        for name in record.names or ():
+            array = fields[name]
+            array.set_rows(begin, records[name].reshape(-1, *array.shape[1:])[:count])
+
+
+def _gathered(
+    models: Models, rows: NDArray[np.uint32] | None, record: np.dtype[Any], passed: Callable[[int], None]
+) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
     parameters = models[0]
     assert parameters is not None
-    store = ChunkStore(parameters.count, fields_of(parameters.coefficients), path)
+    if rows is None:
+        rows = np.arange(parameters.count, dtype=np.uint32)
+    if isinstance(parameters, HostGaussians) and parameters.pool is not None:
+        parameters.pool.write_back()
+        return gathered(rows, parameters.pool.store.read, record, passed)
     given = {kind: model for kind, model in zip(KINDS, models, strict=True) if model is not None}
-    for numbers in store.blocks():
-        records = np.zeros(len(numbers), store.record)
-        begin = CHUNK_ROWS * int(numbers[0])
-        end = min(begin + CHUNK_ROWS * len(numbers), store.count)
-        for kind, model in given.items():
-            for name in PARAMETER_GROUPS:
-                values = model[name].get_rows(begin, end)
-                for place in range(len(numbers)) if values.size else ():
-                    rows = values[CHUNK_ROWS * place : CHUNK_ROWS * (place + 1)]
-                    records[f"{kind}/{name}"][place, : len(rows)] = rows
-        store.write(numbers, records)
-    return store
+    arrays = {f"{kind}/{name}": model[name] for kind, model in given.items() for name in PARAMETER_GROUPS}
+    return gathered(rows, partial(_records, parameters.count, arrays), record, passed)
+
+
+def _records(count: int, arrays: Mapping[str, AnyArray], numbers: NDArray[np.int64]) -> NDArray[Any]:
+    """Records of chunks of `count` Gaussians, from arrays by field."""
+    records = np.empty(len(numbers), record_type({name: array.shape[1:] for name, array in arrays.items()}))
+    for place, first, length in runs(numbers):
+        begin, end = CHUNK_ROWS * first, min(CHUNK_ROWS * (first + length), count)
+        for name in records.dtype.names or ():
+            values = arrays[name].get_rows(begin, end)
+            for chunk in range(length):
+                some = values[CHUNK_ROWS * chunk : CHUNK_ROWS * (chunk + 1)]
+                records[name][place + chunk, : len(some)] = some
+    return records
 
 
 def pooled(pool: ChunkPool, coefficients: int) -> tuple[HostGaussians, HostGaussians, HostGaussians]:
@@ -274,6 +322,37 @@ def saved_models(store: ChunkStore) -> list[HostGaussians]:
 def saved_arrays(models: Sequence[HostGaussians]) -> dict[str, Any]:
     """The arrays of `saved_models` by their names in a checkpoint; none of models in main memory."""
     return {array.field: array for model in models for array in model.arrays.values() if isinstance(array, SavedArray)}
+
+
+def rows_at(array: AnyArray, places: NDArray[np.integer[Any]] | slice) -> NDArray[np.float32]:
+    """A copy of the rows (k,) at these places."""
+    if isinstance(places, slice):
+        return array.get_rows(places.start, places.stop)
+    if isinstance(array, StoredArray):
+        return array.get_at(places)
+    rows: NDArray[np.float32] = array.get()[places]
+    return rows
+
+
+def set_rows_at(array: AnyArray, places: NDArray[np.integer[Any]] | slice, values: NDArray[np.float32]) -> None:
+    """Replace the rows (k,) at these places."""
+    if isinstance(places, slice):
+        array.set_rows(places.start, values)
+        return
+    if isinstance(array, StoredArray):
+        array.set_at(places, values)
+        return
+    changed = array.get()
+    changed[places] = values
+    array.set(changed)
+
+
+def change_rows(array: AnyArray, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> None:
+    """Replace the rows with what a function makes of them, of all rows or of some at a time."""
+    if isinstance(array, StoredArray):
+        array.change(change)
+    else:
+        array.set(change(array.get()))
 
 
 def allocate_gaussians(device: Device, count: int, coefficients: int, *, zero: bool = False) -> DeviceGaussians:
@@ -331,11 +410,6 @@ def host_zeros(count: int, coefficients: int, rows: int) -> HostGaussians:
     shapes = group_shapes(count, coefficients)
     arrays = {name: HostArray(np.zeros(shape, np.float32)) for name, shape in shapes.items()}
     return HostGaussians(count, coefficients, arrays, rows)
-
-
-def in_memory(gaussians: HostGaussians, rows: int) -> HostGaussians:
-    """The same Gaussians in main memory, of which `rows` at a time are uploaded. Arrays that are there already stay."""
-    return replace(to_host(gaussians), rows=rows)
 
 
 def to_host(gaussians: AnyGaussians) -> HostGaussians:

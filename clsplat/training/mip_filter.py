@@ -13,7 +13,7 @@ from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
-from clsplat.stages.device_gaussians import AnyGaussians
+from clsplat.stages.device_gaussians import AnyGaussians, HostArray
 from clsplat.stages.sampling import SAMPLING_GAUSSIAN_BYTES, limit_scales, sampling_limits, upload_cameras
 from clsplat.training.step.component import Component, Named
 
@@ -57,7 +57,7 @@ class MipFilter(Component):
         if self._least is not None:
             limit_scales(self._device, self._work, gaussians, self._least)
 
-    def rows_moved(self, listed: DeviceArray) -> None:  # noqa: ARG002
+    def rows_moved(self, listed: DeviceArray | HostArray) -> None:  # noqa: ARG002
         """Forget the limits."""
         self._least = None
 

@@ -6,7 +6,9 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
+from clsplat.chunks.gathering import SourceList, row_entries
 from clsplat.chunks.manifest import Manifest
 from clsplat.chunks.order import ORDERED_ROWS, beside_parents, space_order
 from clsplat.chunks.store import ChunkStore
@@ -33,26 +36,32 @@ from clsplat.stages.density import (
     DensityStatistics,
     DeviceMarker,
     DeviceRowList,
-    carry,
+    carried,
     gather,
-    list_rows,
     new_statistics,
     try_gather,
     widen,
 )
 from clsplat.stages.device_gaussians import (
     KINDS,
+    AnyArray,
     AnyGaussians,
+    HostArray,
     HostGaussians,
+    Models,
     allocate_gaussians,
+    change_rows,
+    copy_to_models,
+    copy_to_store,
     host_gaussians,
     host_model,
     host_zeros,
-    in_memory,
+    new_store,
     pooled,
+    rows_at,
     saved_arrays,
     saved_models,
-    store_of,
+    set_rows_at,
     to_device,
     to_host,
     upload_gaussians,
@@ -62,6 +71,40 @@ from clsplat.training.stability.health import examine
 
 EXAMINED_CHUNKS = 64
 """Chunks whose numbers are examined at once."""
+
+HALVED_ROWS = 1 << 15
+"""Split Gaussians of a model in a store whose halves are computed at a time."""
+Places = NDArray[np.integer[Any]] | slice
+
+
+@dataclass(frozen=True, eq=False)
+class MovedRows:
+    """The rows of a model after a move.
+
+    rows: (m,) uint32, a source row each, plus FRESH if new.
+    halves: number of halves of split Gaussians.
+    places: place of each row of the list that the plan has; None if they are the same, or as in `listed`.
+    listed: the list, if it is of a large streamed model.
+    """
+
+    rows: DeviceArray | NDArray[np.uint32]
+    halves: int = 0
+    places: NDArray[np.uint32] | None = None
+    listed: SourceList | None = None
+
+    def at(self, rows: NDArray[Any]) -> NDArray[Any]:
+        """Places in the model of rows of the plan's list."""
+        places = self.places if self.listed is None else self.listed.by_kind()
+        return rows if places is None else places[rows]
+
+    @property
+    def halves_at(self) -> tuple[Places, Places]:
+        """Places in the model of the first halves, and of the second halves."""
+        if self.listed is not None:
+            return self.listed.seconds - 1, self.listed.seconds
+        count = self.rows.shape[0]
+        first, second = slice(count - self.halves, count - self.halves // 2), slice(count - self.halves // 2, count)
+        return (first, second) if self.places is None else (self.places[first], self.places[second])
 
 
 class TrainedModel:
@@ -135,7 +178,7 @@ class TrainedModel:
         self.free()
         self.plan = self._make_plan(models[0].count)
         if not self._go_on_in(checkpoint.manifest, models[0].coefficients):
-            self._place(*models)
+            self._place(models)
         self.statistics = new_statistics(self._device, models[0].count, contributions=self._counts_contributions)
         statistics = checkpoint.named("statistics/")
         for name, array in self.statistics.named().items():
@@ -152,7 +195,7 @@ class TrainedModel:
     ) -> None:
         """Set the arrays, where the plan assigns them, with new statistics. Moments that are not given start from
         zero."""
-        self._place(parameters, first, second)
+        self._place((parameters, first, second))
         self.statistics = new_statistics(self._device, parameters.count, contributions=self._counts_contributions)
 
     def kinds(self) -> dict[str, AnyGaussians]:
@@ -169,6 +212,13 @@ class TrainedModel:
         return {
             f"{kind}/{group}": model[group].get() for kind, model in self.kinds().items() for group in PARAMETER_GROUPS
         }
+
+    def by_kind(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Mapping[str, AnyArray]]:
+        """Parameters and moments by kind and group: those of a checkpoint, or of the scratch file, of which a
+        checkpoint has only a manifest."""
+        if self.in_file:
+            return {kind: model.arrays for kind, model in self.kinds().items()}
+        return {kind: _host_arrays({g: arrays[f"{kind}/{g}"] for g in PARAMETER_GROUPS}) for kind in KINDS}
 
     @property
     def store(self) -> ChunkStore | None:
@@ -197,7 +247,8 @@ class TrainedModel:
         changed = np.flatnonzero(store.slots.in_place(np.arange(store.chunks)))
         for begin in range(0, len(changed), EXAMINED_CHUNKS):
             numbers = changed[begin : begin + EXAMINED_CHUNKS]
-            if np.any(examine(**store.rows_of(numbers, KINDS, PARAMETER_GROUPS))):
+            rows = store.rows_of(numbers, KINDS, PARAMETER_GROUPS)
+            if np.any(examine(**{kind: _host_arrays(arrays) for kind, arrays in rows.items()})):
                 return False
         return True
 
@@ -207,51 +258,124 @@ class TrainedModel:
 
     def widen(self, coefficients: int) -> None:
         """Make room for more SH coefficients, which start from zero."""
+        if self._pool is not None:
+            self._place(coefficients=coefficients)
+            return
         if not self.plan.gathers:
             self._take_down()
-        self._place(*(widen(self._device, model, coefficients) for model in self.with_moments))
+        self._place([widen(self._device, model, coefficients) for model in self.with_moments])
 
-    def rearrange(self, plan: RowPlan, changes: Callable[[], None]) -> DeviceArray | None:
+    def rearrange(self, plan: RowPlan, changes: Callable[[], None]) -> DeviceArray | HostArray | None:
         """Carry out a plan of density control, or of a repair. Returns the list of rows if rows have moved.
 
         changes: function that is called just before the first change, when the kernels have been tried in the sandbox
-            and the moved rows have their memory.
+            and the moved rows have their memory. It may be called several times.
         Raises CapacityError, before any change, if there is too little memory for the moved rows.
         """
-        listed = plan.listed
-        if plan.rows is not None:
-            listed = list_rows(self._device, plan.rows, plan.fresh)
-        moved, places = None, None
-        if listed is not None:
-            assert isinstance(listed, DeviceRowList)
-            moved, places = self._ordered(listed)
-            self._move(moved, changes, new_statistics=plan.new_statistics)
-            if listed.halves and plan.halves is not None:
-                self._halve(listed, places, plan.halves, plan.halved)
+        moved = self._ordered(plan)
+        if moved is not None:
+            self._move(moved.rows, changes, new_statistics=plan.new_statistics)
+            if moved.halves and plan.halves is not None:
+                self._halve(moved, plan.halves, plan.halved)
         changes()
         for group, (rows, values) in plan.values.items():
-            self._set_rows(group, rows if places is None else places[rows], values)
+            set_rows_at(self.parameters[group], rows if moved is None else moved.at(rows), values)
         for group, change in plan.changes.items():
-            self.parameters[group].set(change(self.parameters[group].get()))
+            change_rows(self.parameters[group], change)
         for group in plan.restarted:
             self.first[group].fill(0.0)
             self.second[group].fill(0.0)
         if plan.forget_contributions:
             self.statistics.forget_contributions()
-        return moved
+        if moved is None:
+            return None
+        return moved.rows if isinstance(moved.rows, DeviceArray) else HostArray(moved.rows)
 
-    def _place(self, parameters: AnyGaussians, first: AnyGaussians | None, second: AnyGaussians | None) -> None:
-        """Put the arrays where the plan assigns them. The rows of a large streamed model are in a store of chunks."""
-        count, coefficients = parameters.count, parameters.coefficients
+    def change_moments(self, change: Callable[[Float32], Float32]) -> None:
+        """Replace all moments with what a function makes of those of any rows."""
+        for model, group in product((self.first, self.second), PARAMETER_GROUPS):
+            change_rows(model[group], change)
+
+    def _place(
+        self,
+        models: Models | None = None,
+        rows: NDArray[np.uint32] | None = None,
+        coefficients: int = 0,
+        changes: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Put Gaussians where the plan assigns them. The rows of a large streamed model are in a store of chunks.
+
+        models: parameters and moments, without a store; None for this model's, which have a store or get one.
+        rows: the source of each row; None for all as they are.
+        coefficients: number of SH coefficients; 0 for as many as there are.
+        changes: called before the first change of this model.
+        """
+        parameters = self.parameters if models is None else models[0]
+        assert parameters is not None
+        count, coefficients = parameters.count if rows is None else len(rows), coefficients or parameters.coefficients
         if self.plan.streamed and count > ORDERED_ROWS:
-            store = store_of((parameters, first, second), self._scratch(MODELS * 4 * floats_of(coefficients) * count))
+            del parameters
+            self._to_store(models, count, rows, coefficients, changes)
+        elif models is None:
+            del parameters
+            self._from_store(count, rows, coefficients, changes)
+        else:
+            placed = [self._placed(model) for model in models if model is not None]
             self.close()
-            self._use(store, coefficients)
-            return
-        models = [self._placed(model) for model in (parameters, first, second) if model is not None]
+            self.parameters, *moments = placed
+            self.first, self.second = moments or (self._zeros(count, coefficients), self._zeros(count, coefficients))
+
+    def _to_store(
+        self,
+        models: Models | None,
+        count: int,
+        rows: NDArray[np.uint32] | None,
+        coefficients: int,
+        changes: Callable[[], None],
+    ) -> None:
+        """Put Gaussians into a new store, and make its pool. Arguments as those of `_place`."""
+        source, old = self.with_moments if models is None else models, self._pool if models is None else None
+        store = new_store(count, coefficients, self._scratch(MODELS * 4 * floats_of(coefficients) * count))
+        make = partial(ChunkPool, self._device, self._work, store, self.plan.rows)
+        try:
+            pool = make() if isinstance(source[0], HostGaussians) and old is None else None
+            if old is not None and old.store.path is None and store.path is None:
+                changes()  # no memory for a second copy is needed: each chunk is given back when it has been copied
+                copy_to_store(source, rows, store, old.store.give_back)
+            else:
+                copy_to_store(source, rows, store)
+        except BaseException:
+            store.close()
+            raise
+        changes()
+        del source, old  # the old pool makes room for the new one
+        self._free_models()
+        self._use(pool or make(), coefficients)
+
+    def _from_store(
+        self, count: int, rows: NDArray[np.uint32] | None, coefficients: int, changes: Callable[[], None]
+    ) -> None:
+        """Take this model's Gaussians from its store to arrays. Arguments as those of `_place`."""
+        old, self._pool = self._pool, None
+        assert old is not None
+        old.write_back()
+        changes()
+        self._free_models()
+        old.arrays.clear()
+        if self.plan.streamed:
+            to = [host_zeros(count, coefficients, self.plan.rows) for _ in KINDS]
+            self.parameters, self.first, self.second = to
+        else:
+            on_device = [allocate_gaussians(self._device, count, coefficients) for _ in KINDS]
+            self.parameters, self.first, self.second = on_device
+        copy_to_models(pooled(old, coefficients), rows, self.with_moments)
+        old.close()
+
+    def _free_models(self) -> None:
+        """Free parameters and moments, on the device or in a store."""
         self.close()
-        self.parameters, *moments = models
-        self.first, self.second = moments or (self._zeros(count, coefficients), self._zeros(count, coefficients))
+        for name in ("parameters", "first", "second"):
+            vars(self).pop(name, None)
 
     def _go_on_in(self, manifest: Manifest | None, coefficients: int) -> bool:
         """Go on in the scratch file of a checkpoint. Returns False if the Gaussians belong elsewhere."""
@@ -265,14 +389,15 @@ class TrainedModel:
         if self._scratch(MODELS * 4 * floats_of(coefficients) * manifest.count) is None:
             return False
         self.close()
-        self._use(ChunkStore.opened(manifest, writable=True), coefficients)
+        store = ChunkStore.opened(manifest, writable=True)
+        self._use(ChunkPool(self._device, self._work, store, self.plan.rows), coefficients)
         return True
 
-    def _use(self, store: ChunkStore, coefficients: int) -> None:
-        """Let the rows be those of a store of chunks."""
-        if self._files is not None and store.path is not None:
-            self._files.follow(store)
-        pool = self._pool = ChunkPool(self._device, self._work, store, self.plan.rows)
+    def _use(self, pool: ChunkPool, coefficients: int) -> None:
+        """Let the rows be those of a pool's store."""
+        if self._files is not None and pool.store.path is not None:
+            self._files.follow(pool.store)
+        self._pool = pool
         self.parameters, self.first, self.second = pooled(pool, coefficients)
 
     @property
@@ -304,73 +429,111 @@ class TrainedModel:
     def _placed(self, model: AnyGaussians) -> AnyGaussians:
         """The model on the device or on the host, as the plan assigns; it is moved there if necessary."""
         if isinstance(model, HostGaussians):
-            return in_memory(model, self.plan.rows) if self.plan.streamed else to_device(self._device, model)
+            return (
+                replace(to_host(model), rows=self.plan.rows) if self.plan.streamed else to_device(self._device, model)
+            )
         return model
 
-    def _ordered(self, listed: DeviceRowList) -> tuple[DeviceArray, NDArray[np.int64] | None]:
-        """The rows of a list in the model's order, and the place there of each row of the list; None if they are the
-        same.
+    def _ordered(self, plan: RowPlan) -> MovedRows | None:
+        """The rows of a plan in the model's order; None if no row moves.
 
         In a large model new rows stand behind those that they come from. When a model becomes large, its rows are put
         in order of their places in space.
         """
-        if listed.count <= ORDERED_ROWS:
-            return listed.rows, None
-        entries = listed.rows.get()
-        sources = entries & ~FRESH
-        if self.parameters.count > ORDERED_ROWS:
-            order = beside_parents(sources)
+        listed, was_large = plan.listed, self.parameters.count > ORDERED_ROWS
+        if plan.rows is not None:
+            entries, halves = row_entries(plan.rows, plan.fresh), 0
+        elif isinstance(listed, SourceList):
+            if listed.count > ORDERED_ROWS and was_large:
+                return MovedRows(listed.rows, listed.halves, listed=listed)
+            entries, halves = listed.entries(), listed.halves
+        elif isinstance(listed, DeviceRowList):
+            if listed.count <= ORDERED_ROWS:
+                return MovedRows(listed.rows, listed.halves)
+            entries, halves = listed.entries(), listed.halves
         else:
-            order = space_order(self.parameters["means"].get()[sources])
-        return upload(self._device, entries[order]), np.argsort(order)
+            return None
+        sources = entries & ~FRESH
+        if len(entries) <= ORDERED_ROWS or (was_large and bool((sources[:-1] <= sources[1:]).all())):
+            return MovedRows(entries, halves)
+        order = beside_parents(sources) if was_large else space_order(self.parameters["means"].get()[sources])
+        places = np.empty_like(order)
+        places[order] = np.arange(len(order), dtype=np.uint32)
+        return MovedRows(entries[order], halves, places)
 
     def _halve(
         self,
-        listed: DeviceRowList,
-        places: NDArray[np.int64] | None,
-        halves: Callable[[Mapping[str, Float32]], Mapping[str, Float32]],
+        moved: MovedRows,
+        halves: Callable[[Mapping[str, Float32], bool], Mapping[str, Float32]],
         halved: Sequence[str],
     ) -> None:
-        """Replace the last rows of a list, which are copies of split Gaussians, with their halves, computed from the
-        groups `halved`.
-
-        places: place in the model of each row of the list. With None, only rows of the halves are copied to the host.
-        """
-        begin, middle = listed.count - listed.halves, listed.count - listed.halves // 2
-        if places is None:
-            split = {group: self.parameters[group].get_rows(middle, listed.count) for group in halved}
-            for group, values in halves(split).items():
-                self.parameters[group].set_rows(begin, values)
+        """Replace the copies of split Gaussians with their halves, computed from the groups `halved`."""
+        first, second = moved.halves_at
+        if self._pool is None:  # one copy of each array crosses the bus
+            split = {group: rows_at(self.parameters[group], second) for group in halved}
+            sides = [halves(split, later) for later in (False, True)]
+            for group, values in sides[0].items():
+                set_rows_at(self.parameters[group], _both(first, second), np.concatenate([values, sides[1][group]]))
             return
-        split = {group: self.parameters[group].get()[places[middle:]] for group in halved}
-        for group, values in halves(split).items():
-            self._set_rows(group, places[begin:], values)
+        for places, begin in product((first, second), range(0, moved.halves // 2, HALVED_ROWS)):
+            copies, some = (_some(each, begin) for each in (second, places))  # second halves are still copies
+            split = {group: rows_at(self.parameters[group], copies) for group in halved}
+            for group, values in halves(split, places is second).items():
+                set_rows_at(self.parameters[group], some, values)
 
-    def _set_rows(self, group: str, rows: NDArray[Any], values: Float32) -> None:
-        """Set rows of a parameter group."""
-        changed = self.parameters[group].get()
-        changed[rows] = values
-        self.parameters[group].set(changed)
-
-    def _move(self, listed: DeviceArray, changes: Callable[[], None], *, new_statistics: bool) -> None:
-        """Move all arrays, so that row j becomes the old row listed[j], with zero moments if it is FRESH."""
-        gathers = self.plan.gathers
+    def _move(
+        self, rows: DeviceArray | NDArray[np.uint32], changes: Callable[[], None], *, new_statistics: bool
+    ) -> None:
+        """Move all arrays, so that row j becomes the old row rows[j], with zero moments if it is FRESH."""
+        count, before, gathers = rows.shape[0], self.parameters.count, self.plan.gathers
         with only_tried(self._device):
-            try_gather(self._device, listed.shape[0], self.parameters)
+            try_gather(self._device, count, self.parameters)
         try:
-            self.plan = self._make_plan(listed.shape[0])
-            rows: DeviceArray | NDArray[np.uint32] = listed
-            if not (gathers and self.plan.gathers):
-                self._take_down()
-                rows = listed.get()
-            moved = [
-                gather(self._device, rows, model, renews=index > 0) for index, model in enumerate(self.with_moments)
-            ]
+            self.plan = self._make_plan(count)
+            if self._pool is not None or (self.plan.streamed and count > ORDERED_ROWS):
+                self._place(rows=_on_host(rows), changes=changes)
+            else:
+                rows = self._gather(rows, on_device=gathers and self.plan.gathers, changes=changes)
         except CapacityError as error:
-            count = self.parameters.count
-            raise CapacityError(f"{error}; with --density.max-gaussians {count} the model grows no further") from None
+            raise CapacityError(f"{error}; with --density.max-gaussians {before} the model grows no further") from None
+        statistics = self.statistics.named()
+        del self.statistics
+        self.statistics = carried(self._device, self._work, rows, statistics, densified=new_statistics)
+
+    def _gather(
+        self, rows: DeviceArray | NDArray[np.uint32], *, on_device: bool, changes: Callable[[], None]
+    ) -> DeviceArray | NDArray[np.uint32]:
+        """Move the rows of a model without a store. Returns the list on the device, if they moved there."""
+        if on_device:
+            rows = rows if isinstance(rows, DeviceArray) else upload(self._device, rows)
+        else:
+            self._take_down()
+        to_gather = rows if on_device else _on_host(rows)
+        moved = [
+            gather(self._device, to_gather, model, renews=index > 0) for index, model in enumerate(self.with_moments)
+        ]
         changes()
-        statistics = self.statistics
-        self.free()
-        self.set(*(self._placed(model) for model in moved))
-        carry(self._device, listed, statistics, self.statistics, densified=new_statistics)
+        self._free_models()
+        self._place(moved)
+        return rows
+
+
+def _host_arrays(arrays: Mapping[str, NDArray[Any]]) -> dict[str, AnyArray]:
+    return {name: HostArray(values) for name, values in arrays.items()}
+
+
+def _on_host(rows: DeviceArray | NDArray[np.uint32]) -> NDArray[np.uint32]:
+    return rows.get() if isinstance(rows, DeviceArray) else rows
+
+
+def _both(first: Places, second: Places) -> Places:
+    if isinstance(first, slice) or isinstance(second, slice):
+        return slice(first.start, second.stop)  # type: ignore[union-attr]  # both are
+    return np.concatenate([first, second])
+
+
+def _some(places: Places, begin: int) -> Places:
+    """HALVED_ROWS of the places, from the one of number `begin` on."""
+    if isinstance(places, slice):
+        return slice(places.start + begin, min(places.start + begin + HALVED_ROWS, places.stop))
+    return places[begin : begin + HALVED_ROWS]

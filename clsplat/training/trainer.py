@@ -34,6 +34,7 @@ from clsplat.training.density.choice import strategy_of
 from clsplat.training.learning_rates import rates_at
 from clsplat.training.memory import UNLIMITED, HostMemory, MemoryPlanner
 from clsplat.training.mip_filter import MipFilter
+from clsplat.training.stability.health import finite_or_zero
 from clsplat.training.stability.non_finite import NonFiniteMonitor, Repair
 from clsplat.training.step.component import Component
 from clsplat.training.step.gradient_step import GradientStep, StepMaker, StepProbe, slot_fields, view_gradients
@@ -366,9 +367,8 @@ class Trainer:
     def _apply(self, repair: Repair | None) -> None:
         if repair is None:
             return
-        for kind, groups in repair.moments.items():
-            for group, values in groups.items():
-                self.model.kinds()[kind][group].set(values)
+        if repair.moments:
+            self.model.change_moments(finite_or_zero)
         self._rearrange(RowPlan(repair.rows))
 
     def rates(self) -> dict[str, float]:
@@ -476,7 +476,7 @@ class Trainer:
         finite = self.model.changes_are_finite()
         arrays, state = self._arrays()
         if not finite:  # there may be non-finite values in Gaussians that no step has visited
-            repair = self.monitor.examine_all(self.model.arrays() if self.model.in_file else arrays)
+            repair = self.monitor.examine_all(self.model.by_kind(arrays))
             if repair is not None:
                 self._apply(repair)
                 arrays, state = self._arrays()

@@ -12,10 +12,11 @@ from pipeline import Pipeline
 from quick import quick
 from test_bands import in_bands, most_in_a_tile
 
-from clsplat.device.buffers import upload
+from clsplat.chunks.gathering import row_entries
+from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.layouts.columns import SLOT, SlotFields
-from clsplat.stages.density import CONTRIBUTION_STATISTICS, add_contributions, carry, list_rows, new_statistics
+from clsplat.stages.density import CONTRIBUTION_STATISTICS, add_contributions, carried, new_statistics
 from clsplat.stages.project import Projected
 
 WITH = SlotFields(contributions=True)
@@ -114,13 +115,12 @@ def test_what_goes_on_when_rows_move(device: Device) -> None:
         *("gradient_sums", "seen", "radii"),
         *("current_totals", "current_largest", "whole_totals", "whole_largest"),
     ]
-    listed = list_rows(device, np.array([0, 2, 3, 2], np.uint32), np.array([False, False, False, True]))
-    densified = new_statistics(device, 4, contributions=True)
-    carry(device, listed.rows, statistics, densified, densified=True)
+    rows, fresh = np.array([0, 2, 3, 2], np.uint32), np.array([False, False, False, True])
+    listed, work = upload(device, row_entries(rows, fresh)), Workspace(device)
+    densified = carried(device, work, listed, statistics.named(), densified=True)
     for index, (name, array) in enumerate(densified.named().items()):
         wanted = np.array([0, 2, 3, np.inf]) + 10 * index if name in CONTRIBUTION_STATISTICS else np.zeros(4)
         np.testing.assert_array_equal(array.get(), wanted, f"{name}: all else starts again")
-    pruned = new_statistics(device, 3, contributions=True)
-    carry(device, list_rows(device, np.array([0, 2, 3], np.uint32), None).rows, statistics, pruned, densified=False)
+    pruned = carried(device, work, row_entries(rows[:3], None), statistics.named(), densified=False)
     for index, array in enumerate(pruned.named().values()):
         np.testing.assert_array_equal(array.get(), np.array([0, 2, 3]) + 10 * index)

@@ -9,10 +9,11 @@ import scenes
 from compare import assert_same_bits
 from pipeline import Pipeline
 
+from clsplat.chunks.gathering import row_entries
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
-from clsplat.stages.density import add_statistics, gather, list_rows, new_statistics, widen
+from clsplat.stages.density import add_statistics, gather, new_statistics, widen
 from clsplat.stages.device_gaussians import DeviceGaussians, to_host
 from clsplat.stages.project import Screen
 
@@ -40,10 +41,10 @@ def test_gather_takes_rows_and_zeros(device: Device, count: int, coefficients: i
         rows = rng.integers(0, count, length).astype(np.uint32)
         rows[-1] = count - 1
         fresh = np.arange(length) % 3 == 0
-        listed = list_rows(device, rows, fresh)
+        listed = row_entries(rows, fresh)
         for renews in (False, True):
-            got = gather(device, listed.rows, source, renews=renews)
-            on_host = gather(device, listed.rows.get(), to_host(source), renews=renews)
+            got = gather(device, upload(device, listed), source, renews=renews)
+            on_host = gather(device, listed, to_host(source), renews=renews)
             assert (got.count, got.coefficients) == (length, coefficients)
             for name in PARAMETER_GROUPS:
                 wanted = host[name][rows]

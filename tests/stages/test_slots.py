@@ -31,10 +31,11 @@ from clsplat.stages.device_gaussians import (
     DeviceGaussians,
     HostGaussians,
     chunk_parts,
+    copy_to_store,
     host_gaussians,
+    new_store,
     parts,
     pooled,
-    store_of,
     to_device,
 )
 from clsplat.stages.project import Projected, Screen, Slots, project, project_step
@@ -61,7 +62,9 @@ class Model:
             moments.append(Gaussians(*(made[group].astype(np.float32) for group in groups), sh.astype(np.float32)))
         host = [host_gaussians(each, COUNT) for each in (gaussians, *moments)]
         self.whole: Models = tuple(to_device(device, each) for each in host)
-        self.pool = ChunkPool(device, self.work, store_of(host, None), slots * CHUNK_ROWS)
+        store = new_store(COUNT, 9, None)
+        copy_to_store(host, None, store)
+        self.pool = ChunkPool(device, self.work, store, slots * CHUNK_ROWS)
         self.streamed: tuple[HostGaussians, ...] = pooled(self.pool, 9)
         self.chunks = send_chunks(self.work, "chunks", LISTED, COUNT)
 

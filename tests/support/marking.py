@@ -59,6 +59,7 @@ def on_host(plan: RowPlan, parameters: Mapping[str, NDArray[Any]]) -> RowPlan:
     if listed.halves and plan.halves is not None:
         split = rows[len(rows) - listed.halves // 2 :]
         halves = np.arange(len(rows) - listed.halves, len(rows))
-        drawn = plan.halves({name: parameters[name][split] for name in plan.halved})
-        values |= {name: (halves, found) for name, found in drawn.items()}
+        of_split = {name: parameters[name][split] for name in plan.halved}
+        first, second = (plan.halves(of_split, later) for later in (False, True))
+        values |= {name: (halves, np.concatenate([found, second[name]])) for name, found in first.items()}
     return replace(plan, rows=rows, fresh=entries >= FRESH, values=values, listed=None)

@@ -23,7 +23,8 @@ def test_halves_lie_on_the_longest_axis() -> None:
         "log_scales": np.log(scales)[None].astype(np.float32),
         "opacity_logits": np.log(np.array([0.8 / 0.2], np.float32)),
     }
-    halves = long_halves(split)
+    first, second = (long_halves(split, later) for later in (False, True))
+    halves = {name: np.concatenate([values, second[name]]) for name, values in first.items()}
     axis = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()[:, 1]
     offsets = halves["means"] - split["means"]
     np.testing.assert_allclose(offsets, 1.35 * 0.5 * np.stack([axis, -axis]), atol=1e-6)
@@ -37,7 +38,7 @@ def test_extreme_opacities_stay_finite(logit: float) -> None:
     split = {
         name: np.zeros((1, size), np.float32) for name, size in (("means", 3), ("quaternions", 4), ("log_scales", 3))
     }
-    halves = long_halves(split | {"opacity_logits": np.array([logit], np.float32)})
+    halves = long_halves(split | {"opacity_logits": np.array([logit], np.float32)}, second=False)
     assert all(np.isfinite(array).all() for array in halves.values())
     assert halves["opacity_logits"][0] == pytest.approx(np.log(0.6) + logit if logit < 0 else np.log(1.5), rel=1e-6)
 

@@ -132,7 +132,9 @@ def test_halves_of_the_strongest_take_the_rows_of_the_dead_and_new_ones(scene: S
     scores = sums / np.maximum(seen, 1)
     assert sorted(scores[split]) == sorted(np.sort(scores[stay])[-len(split) :])
     assert_same_bits(np.flatnonzero(plan.fresh), np.sort(np.concatenate([split.astype(np.int64), second])), "fresh")
-    halves = long_halves({group: before["parameters"][group][split] for group in (*SPLIT_GROUPS, "opacity_logits")})
+    of_split = {group: before["parameters"][group][split] for group in (*SPLIT_GROUPS, "opacity_logits")}
+    sides = [long_halves(of_split, later) for later in (False, True)]
+    halves = {group: np.concatenate([side[group] for side in sides]) for group in sides[0]}
     for group, values in halves.items():
         assert_same_bits(after["parameters"][group][np.concatenate([split, second])], values, group)
         whole = np.setdiff1d(stay, split)

@@ -22,6 +22,7 @@ from clsplat.errors import CapacityError
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.stages.density import gather
+from clsplat.stages.device_gaussians import copy_to_store
 from clsplat.training import trained_model
 from clsplat.training.step.monitor import StepMonitor
 
@@ -87,7 +88,7 @@ def test_a_buffer_that_the_driver_refuses_while_rows_move(
 ) -> None:
     """Another program may have taken memory that the plan counted on. The third group of the new rows finds none.
 
-    large: the model's new rows are put behind those that they come from.
+    large: the model's new rows are put behind those that they come from, and its chunks are streamed from a store.
     """
     if large:
         monkeypatch.setattr(trained_model, "ORDERED_ROWS", 100)
@@ -110,12 +111,18 @@ def test_a_buffer_that_the_driver_refuses_while_rows_move(
             allocate(device, (1,), np.float32)
         return gather(device, rows, source, **how)
 
+    def copied(*arguments: Any) -> None:
+        for _ in range(3):
+            allocate(device, (1,), np.float32)
+        copy_to_store(*arguments)
+
     made = buffers._Buffer
     device = default_device.with_memory_limit(600 * 1024 if on_host else None)
     with monkeypatch.context() as patch:
         noted(patch, trained_model, "try_gather", moves)
         patch.setattr(buffers, "_Buffer", buffer)
         patch.setattr(trained_model, "gather", gathered)
+        patch.setattr(trained_model, "copy_to_store", copied)
         with pytest.raises(CapacityError) as raised:
             train_on(load_scene(folder), GROWING, device=device, run=run)
     (step,) = saved_steps(run.path)

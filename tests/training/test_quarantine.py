@@ -30,6 +30,7 @@ from clsplat.runs.checkpoints import read_checkpoint, write_checkpoint
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
 from clsplat.spherical_harmonics import sh_basis
+from clsplat.stages.device_gaussians import HostArray
 from clsplat.training import repro_bundle
 from clsplat.training.stability import health
 from clsplat.training.stability.health import (
@@ -78,37 +79,43 @@ def heard() -> Iterator[list[str]]:
 # Policy
 
 
-def model(count: int = 6) -> dict[str, np.ndarray]:
+def model(count: int = 6) -> dict[str, HostArray]:
     rng = np.random.default_rng(1)
-    return {g: rng.standard_normal(shape).astype(np.float32) for g, shape in group_shapes(count, 4).items()}
+    return {g: HostArray(rng.standard_normal(shape).astype(np.float32)) for g, shape in group_shapes(count, 4).items()}
 
 
 def test_what_is_broken_and_what_is_refused() -> None:
     parameters, first, second = model(), model(), model()
     assert not np.any(examine(parameters, first, second))
-    parameters["means"][1, 2] = np.nan
-    parameters["sh_rest"][2, 1, 0] = -MAX_SH_COEFFICIENT
-    parameters["means"][3] = 1e18  # far away, but a place
-    first["sh_dc"][4, 1] = np.inf
-    second["opacity_logits"][5] = np.nan
+    parameters["means"].values[1, 2] = np.nan
+    parameters["sh_rest"].values[2, 1, 0] = -MAX_SH_COEFFICIENT
+    parameters["means"].values[3] = 1e18  # far away, but a place
+    first["sh_dc"].values[4, 1] = np.inf
+    second["opacity_logits"].values[5] = np.nan
     broken, refused = examine(parameters, first, second)
     assert broken.tolist() == [False, True, True, False, False, False]
     assert refused.tolist() == [False, False, False, False, True, True]
     assert lost("loss", broken, refused).tolist() == [False, True, True, False, False, False]
     assert lost("adam", broken, refused).tolist() == [False, True, True, False, True, True]
-    assert finite_or_zero(first["sh_dc"])[4].tolist() == [first["sh_dc"][4, 0], 0, first["sh_dc"][4, 2]]
+    assert finite_or_zero(first["sh_dc"].values)[4].tolist() == [
+        first["sh_dc"].values[4, 0],
+        0,
+        first["sh_dc"].values[4, 2],
+    ]
 
 
 def test_gaussians_are_examined_a_part_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(health, "EXAMINED_ROWS", 500)
     parameters, first, second = model(2001), model(2001), model(2001)
     rows = [0, 499, 500, 1999, 2000]
-    parameters["opacity_logits"][rows] = np.nan
-    second["sh_rest"][rows] = np.inf
+    parameters["opacity_logits"].values[rows] = np.nan
+    second["sh_rest"].values[rows] = np.inf
     for found in examine(parameters, first, second):
         assert np.flatnonzero(found).tolist() == rows
     most = peak_of(lambda: examine(parameters, first, second))
-    assert most < parameters["sh_rest"].nbytes / 2, "a part is a quarter; all would be all of it, and their marks"
+    assert most < parameters["sh_rest"].values.nbytes / 2, (
+        "a part is a quarter; all would be all of it, and their marks"
+    )
 
 
 def test_patience() -> None:

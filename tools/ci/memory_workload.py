@@ -52,7 +52,7 @@ from clsplat.stages import scan as stages_scan
 from clsplat.stages.adam import add_view
 from clsplat.stages.appearance import Gains, step_gains
 from clsplat.stages.blend import count_pairs, tile_items
-from clsplat.stages.density import DeviceMarker, carry, gather, new_statistics
+from clsplat.stages.density import DeviceMarker, DeviceRowList, carried, gather, new_statistics
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, host_gaussians, upload_gaussians
 from clsplat.stages.peak import _splats
 from clsplat.stages.probe_atomics import atomics_fault
@@ -340,9 +340,8 @@ def density(device: Device) -> None:
     rules = MarkRules(gradient=0.5, cut_off=(0.8, 9), large=-2.0, transparent=-5.0, contribution=0.01, radius=1.9)
     for model in (upload_gaussians(device, gaussians), host_gaussians(gaussians, device.row_alignment)):
         listed = DeviceMarker(device, Workspace(device), model, statistics).rows(rules)
-        after = new_statistics(device, listed.count, contributions=True)
-        carry(device, listed.rows, statistics, after, densified=True)
-        if isinstance(model, DeviceGaussians):
+        after = carried(device, Workspace(device), listed.rows, statistics.named(), densified=True)
+        if isinstance(model, DeviceGaussians) and isinstance(listed, DeviceRowList):
             gather(device, listed.rows, model, renews=True)["means"].get()
         if not 0 < listed.halves < listed.count or not np.isinf(after.named()["whole_totals"].get()).any():
             raise SystemExit("nothing is split, or nothing is new")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.random import Generator
@@ -111,10 +112,10 @@ def _launch_marks(device: Device, work: Workspace, given: Inputs) -> Read:
     statistics = new_statistics(device, model.count, contributions="whole_largest" in given.statistics)
     statistics.load(given.statistics)
     held = replace(to_host(model), rows=device.row_alignment) if given.streamed else model
-    marker, found = DeviceMarker(device, work, held, statistics), {}
+    marker, found = DeviceMarker(device, work, held, statistics), dict[str, Any]()
     for index, rules in enumerate(given.rules):
         found[f"scores {index}"], listed = marker.scores(rules), marker.rows(rules)
-        found |= {f"rows {index}": listed.rows.get(), f"halves {index}": np.array([listed.halves])}
+        found |= {f"rows {index}": listed.entries(), f"halves {index}": np.array([listed.halves])}
     return lambda: found
 
 

@@ -91,8 +91,9 @@ class RowPlan:
     fresh: (m,) bool, True for rows whose moments start at zero and whose contributions are unknown.
     listed: list from the model's marker, which takes the place of `rows` and `fresh`.
     values: by parameter group, the indices (k,) of new rows whose values change, and these values (k, ...).
-    halves: function that computes the values of the halves from the groups `halved` of the split Gaussians.
-    changes: by group, function that computes new values for all rows.
+    halves: function that computes the values of halves from the groups `halved` of split Gaussians. It is called with
+        split Gaussians of one part after the other and False, for their first halves, then again with all and True.
+    changes: by group, function that computes new values of rows from those of these rows alone.
     restarted: groups whose moments start at zero in every row.
     new_statistics: True if all statistics except contributions start from zero.
     forget_contributions: True if contributions become unknown in every row.
@@ -102,7 +103,7 @@ class RowPlan:
     fresh: NDArray[np.bool_] | None = None
     listed: RowList | None = None
     values: Mapping[str, tuple[NDArray[Any], Float32]] = field(default_factory=dict)
-    halves: Callable[[Mapping[str, Float32]], Mapping[str, Float32]] | None = None
+    halves: Callable[[Mapping[str, Float32], bool], Mapping[str, Float32]] | None = None
     halved: tuple[str, ...] = SPLIT_GROUPS
     changes: Mapping[str, Callable[[Float32], Float32]] = field(default_factory=dict)
     restarted: tuple[str, ...] = ()

@@ -23,6 +23,8 @@ HALF_OFFSET_DEVIATIONS, LONG_AXIS_HALF_RATIO, SHORT_AXIS_HALF_RATIO, HALF_OPACIT
 They are the distance of the halves' means from the original mean, in standard deviations, and the factors on the scale
 of that axis, on the scales of the other axes, and on the opacity.
 """
+SCORED_ROWS = 1 << 16
+"""Rows of which those with a given score are listed at a time."""
 
 
 class Adaptive(Strategy):
@@ -153,8 +155,22 @@ def _cut_off(config: DensityConfig, model: ModelState, rules: MarkRules) -> tupl
     scores = model.marker.scores(rules)
     if np.count_nonzero(scores >= 0) <= room:
         return -inf, 0
-    last = int(np.argsort(-scores, kind="stable")[room - 1])
-    return float(scores[last]), last
+    return weakest(scores, room)
+
+
+def weakest(scores: Float32, count: int) -> tuple[float, int]:
+    """Score and row of the last of the `count` Gaussians with the largest scores. Of equal ones the first rows count.
+
+    Makes one copy of the scores.
+    """
+    value = np.partition(scores, len(scores) - count)[len(scores) - count]
+    equal = count - np.count_nonzero(scores > value)
+    for begin in range(0, len(scores), SCORED_ROWS):
+        rows = np.flatnonzero(scores[begin : begin + SCORED_ROWS] == value)
+        if equal <= len(rows):
+            return float(value), begin + int(rows[equal - 1])
+        equal -= len(rows)
+    raise AssertionError("one of the scores is the last one")
 
 
 def budget(config: DensityConfig, step: int, count: int) -> int:
@@ -170,18 +186,23 @@ def budget(config: DensityConfig, step: int, count: int) -> int:
     return config.max_gaussians - round((config.max_gaussians - count) * left)
 
 
-def draw_halves(config: DensityConfig, split: Mapping[str, Float32], *, rng: np.random.Generator) -> dict[str, Float32]:
-    """New means and log scales of all first halves, then of all second halves, from the groups SPLIT_GROUPS of the
-    split Gaussians."""
-    means, log_scales = split_halves(config, **{name: np.tile(split[name], (2, 1)) for name in SPLIT_GROUPS}, rng=rng)
+def draw_halves(
+    config: DensityConfig,
+    split: Mapping[str, Float32],
+    second: bool,  # noqa: ARG001  # both are drawn alike
+    *,
+    rng: np.random.Generator,
+) -> dict[str, Float32]:
+    """New means and log scales of a half of each split Gaussian, from the groups SPLIT_GROUPS."""
+    means, log_scales = split_halves(config, **{name: split[name] for name in SPLIT_GROUPS}, rng=rng)
     return {"means": means, "log_scales": log_scales}
 
 
-def long_halves(split: Mapping[str, Float32]) -> dict[str, Float32]:
-    """Split Gaussians into two halves, one on each side of the mean along the longest axis (docs/gradients.md, (102)).
+def long_halves(split: Mapping[str, Float32], second: bool) -> dict[str, Float32]:
+    """Means, log scales and opacity logits of halves on one side of the mean along the longest axis, or with `second`
+    on the other (docs/gradients.md, (102)).
 
-    split: the groups SPLIT_GROUPS and opacity_logits of the Gaussians.
-    Returns means, log scales and opacity logits of all first halves, then of all second halves.
+    split: the groups SPLIT_GROUPS and opacity_logits of the split Gaussians.
     """
     log_scales = split["log_scales"].astype(np.float64)
     longest = log_scales.argmax(axis=1)
@@ -193,11 +214,11 @@ def long_halves(split: Mapping[str, Float32]) -> dict[str, Float32]:
     # The logit of a fraction p of an opacity is ln p - ln(e^-o' + 1 - p).
     part, logits = HALF_OPACITY_RATIO, split["opacity_logits"].astype(np.float64)
     opacities = np.log(part) - np.logaddexp(-logits, np.log(1 - part))
-    means = np.concatenate([split["means"] + turned, split["means"] - turned])
+    means = split["means"] - turned if second else split["means"] + turned
     return {
         "means": means.astype(np.float32),
-        "log_scales": np.tile(log_scales, (2, 1)).astype(np.float32),
-        "opacity_logits": np.tile(opacities, 2).astype(np.float32),
+        "log_scales": log_scales.astype(np.float32),
+        "opacity_logits": opacities.astype(np.float32),
     }
 
 

@@ -78,8 +78,10 @@ class Mcmc(Strategy):
         rows[places] = split[: len(places)]
         groups = {group: model.parameters[group].get()[rows] for group in (*SPLIT_GROUPS, "opacity_logits")}
         halves = np.concatenate([split, places, np.arange(model.count, len(rows))])
-        for group, parts in long_halves({group: whole[split] for group, whole in groups.items()}).items():
-            groups[group][halves] = parts
+        of_split = {group: whole[split] for group, whole in groups.items()}
+        for second, changed in ((False, split), (True, halves[len(split) :])):
+            for group, parts in long_halves(of_split, second).items():
+                groups[group][changed] = parts
         shares = self._moved(groups, rows, left, model.rng)
         changed, placed = np.union1d(halves, shares), np.concatenate([halves, left])
         fresh = np.zeros(len(rows), np.bool_)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +30,20 @@ EXAMINED_ROWS = 1 << 16
 MAX_INCIDENT_GAUSSIANS = 1000
 """Maximum number of Gaussians that are copied for an incident."""
 
-Model = Mapping[str, NDArray[np.float32]]
-"""Arrays by parameter group; the first axis is the Gaussians."""
+
+class Rows(Protocol):
+    """An array whose first axis is the Gaussians, wherever it is."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Its shape."""
+
+    def get_rows(self, start: int, stop: int) -> NDArray[np.float32]:
+        """A copy of the rows [start, stop)."""
+
+
+Model = Mapping[str, Rows]
+"""Arrays by parameter group."""
 
 
 def examine(parameters: Model, first: Model, second: Model) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -39,16 +52,20 @@ def examine(parameters: Model, first: Model, second: Model) -> tuple[NDArray[np.
     A parameter is broken if it is not finite or over its limit. `adam` also writes a non-finite moment to mark a step
     that it has refused.
     """
-    count = len(parameters["means"])
+    count = parameters["means"].shape[0]
     broken, refused = np.zeros(count, bool), np.zeros(count, bool)
     for start in range(0, count, EXAMINED_ROWS):
-        rows = slice(start, min(start + EXAMINED_ROWS, count))
+        stop = min(start + EXAMINED_ROWS, count)
         for group, values in parameters.items():
-            broken[rows] |= _any_in_row(~(np.abs(values[rows]) < PARAMETER_GROUPS[group].limit))
-        for moments in (first, second):
-            for values in moments.values():
-                refused[rows] |= _any_in_row(~np.isfinite(values[rows]))
+            broken[start:stop] |= _over(values.get_rows(start, stop), PARAMETER_GROUPS[group].limit)
+        for values in (*first.values(), *second.values()):
+            refused[start:stop] |= _any_in_row(~np.isfinite(values.get_rows(start, stop)))
     return broken, refused
+
+
+def _over(values: NDArray[np.float32], limit: float) -> NDArray[np.bool_]:
+    """Rows (n,) with a value that is not finite, or at or over a limit."""
+    return _any_in_row(~(np.abs(values, out=values) < limit))
 
 
 def _any_in_row(marks: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clsplat.device.buffers import DeviceArray
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.layouts.columns import REFUSED
-from clsplat.stages.device_gaussians import AnyGaussians
+from clsplat.stages.device_gaussians import AnyArray, AnyGaussians, rows_at
 from clsplat.training.stability import health
 from clsplat.training.stability.health import Incident, RetryBudget
 
@@ -43,11 +43,11 @@ class Repair:
     """Repair of a model.
 
     rows: rows to keep, or None for all.
-    moments: new values of all rows that change, by "first" and "second" and by group.
+    moments: True if non-finite moments become zero (`health.finite_or_zero`).
     """
 
     rows: NDArray[np.uint32] | None
-    moments: Mapping[str, Mapping[str, NDArray[np.float32]]]
+    moments: bool
 
 
 class NonFiniteMonitor:
@@ -110,26 +110,21 @@ class NonFiniteMonitor:
             return None
         (last, stage, elements), self._noticed = self._noticed, None
         self.readback.fill(0)
-        return self._judge(
-            last, stage, elements, {k: {g: m[g].get() for g in PARAMETER_GROUPS} for k, m in models.items()}
-        )
+        return self._judge(last, stage, elements, {kind: model.arrays for kind, model in models.items()})
 
-    def examine_all(self, arrays: Mapping[str, NDArray[np.float32]]) -> Repair | None:
+    def examine_all(self, models: Mapping[str, Mapping[str, AnyArray]]) -> Repair | None:
         """Check every number, also of Gaussians that `adam` has not visited. Returns the repair, or None.
 
-        arrays: arrays by "parameters/means" and so on.
+        models: arrays by kind and group.
         """
-        host = {
-            kind: {g: arrays[f"{kind}/{g}"] for g in PARAMETER_GROUPS} for kind in ("parameters", "first", "second")
-        }
-        if self.last is None or self.retries.lost or not np.any(health.examine(**host)):
+        if self.last is None or self.retries.lost or not np.any(health.examine(**models)):
             return None
-        return self._judge(self.last, "parameters", 0, host)
+        return self._judge(self.last, "parameters", 0, models)
 
     def _judge(
-        self, last: LastStep, stage: str, elements: int, host: Mapping[str, Mapping[str, NDArray[np.float32]]]
+        self, last: LastStep, stage: str, elements: int, models: Mapping[str, Mapping[str, AnyArray]]
     ) -> Repair | None:
-        broken, refused = health.examine(**host)
+        broken, refused = health.examine(**models)
         lost = health.lost(stage, broken, refused)
         concerned = np.flatnonzero(broken | refused)
         hopeless = bool(np.mean(lost) > health.MAX_BROKEN_FRACTION)
@@ -142,8 +137,8 @@ class NonFiniteMonitor:
             done=_done(stage, int(lost.sum()), len(lost), hopeless=hopeless),
             background=last.background,
             gaussians={
-                f"{k}/{g}": host[k][g][concerned[: health.MAX_INCIDENT_GAUSSIANS]]
-                for k in host
+                f"{k}/{g}": rows_at(model[g], concerned[: health.MAX_INCIDENT_GAUSSIANS])
+                for k, model in models.items()
                 for g in PARAMETER_GROUPS
             },
         )
@@ -151,9 +146,8 @@ class NonFiniteMonitor:
         self.retries.note(last.step, lost=hopeless)
         if hopeless:
             return None
-        moments = {k: {g: health.finite_or_zero(v) for g, v in host[k].items()} for k in ("first", "second")}
-        rows = np.flatnonzero(~lost).astype(np.uint32)
-        return Repair(rows if lost.any() else None, moments if refused.any() else {})
+        rows = np.flatnonzero(~lost).astype(np.uint32) if lost.any() else None
+        return Repair(rows, moments=bool(refused.any()))
 
 
 def _done(stage: str, lost: int, count: int, *, hopeless: bool) -> str:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from clsplat.device.buffers import DeviceArray
 from clsplat.runs.run import Run
-from clsplat.stages.device_gaussians import AnyGaussians
+from clsplat.stages.device_gaussians import AnyGaussians, HostArray
 from clsplat.training.step.inputs import ViewInputs
 
 Named = Callable[[str], Mapping[str, Any]]
@@ -85,7 +85,7 @@ class Component:
     def rows_changed(self) -> None:
         """Forget data about the values of Gaussians, which have changed between two steps."""
 
-    def rows_moved(self, listed: DeviceArray) -> None:
+    def rows_moved(self, listed: DeviceArray | HostArray) -> None:
         """Follow rows that have moved, or forget data about individual rows.
 
         listed: the old row of each row, or FRESH (`DeviceRowList`).

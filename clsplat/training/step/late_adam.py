@@ -98,7 +98,7 @@ class LateAdam(Component):
             return replace(parameters, arrays={group: HostArray(values) for group, values in found.items()})
         return replace(parameters, arrays={group: upload(self._device, values) for group, values in found.items()})
 
-    def rows_moved(self, listed: DeviceArray) -> None:
+    def rows_moved(self, listed: DeviceArray | HostArray) -> None:
         """Move each row's last step along with the row.
 
         A fresh row keeps the last step of its source: its moments are zero, so that missed steps do not move it.

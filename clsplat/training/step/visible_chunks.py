@@ -28,7 +28,7 @@ from clsplat.stages.bounds import BOUNDS_FLOATS, bounds
 from clsplat.stages.catch_up import StepTable, catch_up, step_table
 from clsplat.stages.chunk_lists import ChunkNumbers, send_chunks
 from clsplat.stages.chunk_pool import ChunkPool
-from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostArray, HostGaussians
 from clsplat.training.learning_rates import largest_rates
 from clsplat.training.step.component import Component, Named
 from clsplat.training.step.inputs import ChunksInView, PlacedChunks, ViewInputs
@@ -334,7 +334,7 @@ class VisibleChunks(Component):
         """Measure all bounds again."""
         self._begin(self._count, self.step)
 
-    def rows_moved(self, listed: DeviceArray) -> None:
+    def rows_moved(self, listed: DeviceArray | HostArray) -> None:
         """Measure all bounds again."""
         self._begin(listed.shape[0], self.step)
 

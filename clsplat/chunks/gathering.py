@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows that density control keeps, copies and removes: their list in the model's order, and records of the new chunks.
+
+A record is made from those of a few old chunks, because new rows stand behind the rows that they come from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.chunks.manifest import chunks_of
+from clsplat.chunks.order import beside_parents
+from clsplat.chunks.store import BLOCK_CHUNKS
+from clsplat.layouts.columns import CHUNK_ROWS
+from clsplat.optimisation.density_rules import FRESH
+
+_KEPT, _CLONE, _FIRST_HALF, _SECOND_HALF = range(4)
+"""Kinds of rows, in the order of a list by kind."""
+
+
+@dataclass(frozen=True, eq=False)
+class SourceList:
+    """The rows of a model after density control, on the host, in the order of their sources.
+
+    rows: (m,) uint32, a source row each, plus FRESH if new.
+    seconds: (k,) uint32, places of the second halves of split Gaussians. Each is behind its first half.
+    """
+
+    rows: NDArray[np.uint32]
+    seconds: NDArray[np.uint32]
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+        return len(self.rows)
+
+    @property
+    def halves(self) -> int:
+        """Number of rows that are halves."""
+        return 2 * len(self.seconds)
+
+    def by_kind(self) -> NDArray[np.uint32]:
+        """The place (m,) here of each row of the list by kind: remaining rows, clones, first halves, second halves."""
+        kinds = np.where(self.rows < FRESH, np.uint8(_KEPT), np.uint8(_CLONE))
+        kinds[self.seconds - 1], kinds[self.seconds] = _FIRST_HALF, _SECOND_HALF
+        return np.argsort(kinds, kind="stable").astype(np.uint32)
+
+    def entries(self) -> NDArray[np.uint32]:
+        """The list by kind."""
+        return self.rows[self.by_kind()]
+
+
+def row_entries(rows: NDArray[np.uint32], fresh: NDArray[np.bool_] | None) -> NDArray[np.uint32]:
+    """Entries of a list from source rows. Those where `fresh` is set are marked FRESH."""
+    return rows.astype(np.uint32) if fresh is None else np.where(fresh, rows | FRESH, rows).astype(np.uint32)
+
+
+def in_source_order(parts: Iterable[NDArray[np.uint32]]) -> SourceList:
+    """A list from lists by kind of the Gaussians of some rows each, which follow each other."""
+    rows, seconds, count = [], [], 0
+    for part in parts:
+        entries = part[beside_parents(part & ~FRESH)]
+        twice = entries[1:] == entries[:-1]  # only halves are two new rows of one source
+        seconds.append((np.flatnonzero(twice) + (count + 1)).astype(np.uint32))
+        rows.append(entries)
+        count += len(entries)
+    return SourceList(_joined(rows), _joined(seconds))
+
+
+def _joined(parts: list[NDArray[np.uint32]]) -> NDArray[np.uint32]:
+    """The parts in one array. Each is given back when it is copied."""
+    whole = np.empty(sum(map(len, parts)), np.uint32)
+    end = len(whole)
+    while parts:
+        part = parts.pop()
+        whole[end - len(part) : end] = part
+        end -= len(part)
+    return whole
+
+
+Reader = Callable[[NDArray[np.int64]], NDArray[Any]]
+"""A function that returns the records of the chunks with these numbers."""
+
+
+def gathered(
+    rows: NDArray[np.uint32], read: Reader, record: np.dtype[Any], passed: Callable[[int], None]
+) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
+    """Yield numbers and records of the new chunks, some at a time. Row j of the model becomes the old row rows[j].
+
+    The moments of FRESH rows are zero. SH coefficients that the old records do not have are zero.
+
+    read: of the old chunks.
+    record: type of the new records.
+    passed: called with the number of the first old chunk that is still read, if the sources of `rows` rise.
+    """
+    size = CHUNK_ROWS * BLOCK_CHUNKS
+    for begin in range(0, len(rows), size):
+        entries = rows[begin : begin + size]
+        sources, first = (entries & ~FRESH).astype(np.int64), begin // CHUNK_ROWS
+        records, chunks = np.zeros(chunks_of(len(entries)), record), sources // CHUNK_ROWS
+        wanted = np.unique(chunks)
+        for start in range(0, len(wanted), BLOCK_CHUNKS):
+            some = wanted[start : start + BLOCK_CHUNKS]
+            mine = np.flatnonzero((chunks >= some[0]) & (chunks <= some[-1]))
+            old = read(some)
+            at = CHUNK_ROWS * np.searchsorted(some, chunks[mine]) + sources[mine] % CHUNK_ROWS
+            _copy(old, at, records, mine, entries[mine] >= FRESH)
+        yield np.arange(first, first + len(records)), records
+        passed(int(chunks[-1]))
+
+
+def _copy(
+    old: NDArray[Any],
+    at: NDArray[np.int64],
+    records: NDArray[Any],
+    places: NDArray[np.int64],
+    fresh: NDArray[np.bool_],
+) -> None:
+    """Copy rows of old records to places in new ones, of both of which the rows count on from record to record."""
+    parts = list(_by_chunk(places))
+    for name in old.dtype.names or ():
+        values = old[name].reshape(-1, *old[name].shape[2:]).take(at, axis=0)
+        if not name.startswith("parameters/"):
+            values[fresh] = 0.0
+        target = records[name]
+        if target.shape[2:] != values.shape[1:]:  # more SH coefficients
+            target = target[:, :, : values.shape[1]]
+        for number, theirs, ours in parts:
+            target[number, theirs] = values[ours]
+
+
+def _by_chunk(places: NDArray[np.int64]) -> Iterator[tuple[int, Any, slice]]:
+    """Yield, for each chunk that has some of these rising rows (k,), its number, the rows in it, and which they are."""
+    chunks = places // CHUNK_ROWS
+    ends = np.flatnonzero(np.diff(chunks, append=-1)) + 1
+    begin = 0
+    for end in ends.tolist():
+        rows = places[begin:end] % CHUNK_ROWS
+        whole = int(rows[-1]) - int(rows[0]) == end - begin - 1
+        yield int(chunks[begin]), slice(int(rows[0]), int(rows[-1]) + 1) if whole else rows, slice(begin, end)
+        begin = end
