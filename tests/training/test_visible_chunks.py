@@ -16,8 +16,8 @@ from quick import quick
 from same_bytes import State, make_too_small, outcome, stopped
 from tiny import cameras, hidden_model, run_steps, short
 
-from clsplat.camera import Camera
 from clsplat.chunks.bounds import ChunkBounds
+from clsplat.chunks.culling import Picture
 from clsplat.chunks.order import beside_parents, space_order
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
@@ -328,9 +328,9 @@ def test_bounds_hold(
     given: list[ChunkBounds] = []
     real = visible_chunks.visible
 
-    def visible(bounds: ChunkBounds, camera: Camera, *rest: Any) -> Any:
+    def visible(picture: Picture, bounds: ChunkBounds) -> Any:
         given.append(bounds)
-        return real(bounds, camera, *rest)
+        return real(picture, bounds)
 
     monkeypatch.setattr(visible_chunks, "visible", visible)
     trainer = moving(scene, config, default_device)
