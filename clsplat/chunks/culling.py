@@ -60,8 +60,8 @@ class _Planes:
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """What culling has to know of a camera: borders of its picture, and limits of depth.
+class PictureBorders:
+    """Borders of a camera's picture, and limits of depth: all that culling has to know of a camera.
 
     culls: False if every chunk counts as visible.
     square: True if Gaussians are listed in the square of their longest half axis, which is at most the root of the sum
@@ -84,7 +84,9 @@ class Picture:
     depths: tuple[float, float]
 
     @classmethod
-    def of(cls, camera: Camera, config: RasterizerConfig = _DEFAULT_RASTERIZER, opacity_factor: float = 1.0) -> Picture:
+    def of(
+        cls, camera: Camera, config: RasterizerConfig = _DEFAULT_RASTERIZER, opacity_factor: float = 1.0
+    ) -> PictureBorders:
         """The picture of a camera.
 
         config: the rasterizer's settings, on which a Gaussian's reach depends.
@@ -140,7 +142,7 @@ class Picture:
         return _Planes(np.hstack([in_world, np.abs(in_world), along]), by_distance, constant, centre)
 
 
-def visible(picture: Picture, bounds: ChunkBounds) -> Bool:
+def visible(picture: PictureBorders, bounds: ChunkBounds) -> Bool:
     """True (B,) for chunks that may have a row with a tile in a picture; False only if none has one.
 
     Chunks whose bounds are not finite are visible. Rows appended to a chunk must be in its bounds.
@@ -161,7 +163,7 @@ def visible(picture: Picture, bounds: ChunkBounds) -> Bool:
         return ~hidden | ~bounds.finite
 
 
-def _beyond_planes(bounds: ChunkBounds, picture: Picture) -> Bool:
+def _beyond_planes(bounds: ChunkBounds, picture: PictureBorders) -> Bool:
     """True (B,) for chunks beyond a side of the picture on an image plane, or beyond the near or far plane."""
     planes = picture.planes
     # einsum and not @: BLAS takes threads even for so small a product, and they spin while they wait
@@ -194,7 +196,7 @@ class _Cones:
     factor: float
 
 
-def _cones(bounds: ChunkBounds, picture: Picture) -> _Cones:
+def _cones(bounds: ChunkBounds, picture: PictureBorders) -> _Cones:
     camera, terms = picture.camera, bounds.terms
     rounding = _CANCELLED * (terms[7] + np.abs(camera.translation).sum())
     middle = camera.rotation @ terms[:3] + camera.translation[:, None]
@@ -208,7 +210,7 @@ def _cones(bounds: ChunkBounds, picture: Picture) -> _Cones:
     return _Cones(middle, half, distance, radius, least, picture.stretch * terms[6], spread, bounds.factor)
 
 
-def _out_of_depth(cones: _Cones, picture: Picture) -> Bool:
+def _out_of_depth(cones: _Cones, picture: PictureBorders) -> Bool:
     """True (B,) for chunks before the near or beyond the far plane, for models along rays."""
     flat = picture.camera.model.flat
     depth, half = (cones.middle[2], cones.half[2]) if flat else (cones.distance, cones.radius)
@@ -217,7 +219,7 @@ def _out_of_depth(cones: _Cones, picture: Picture) -> Bool:
     return out
 
 
-def _caps(cones: _Cones, picture: Picture, pixel: float) -> tuple[Float64, Float64]:
+def _caps(cones: _Cones, picture: PictureBorders, pixel: float) -> tuple[Float64, Float64]:
     """Half angles (B,), in radians, of the largest cone of a Gaussian around its mean, and of the cone of all of them.
 
     By (12) and (13) of docs/cameras.md, a Gaussian's ellipse lies in the plane that touches the unit sphere at its
@@ -245,7 +247,7 @@ def _half_turn(sine: Float64, level: Float64) -> Float64:
     return np.where(ratio < _POLE, np.arcsin(ratio), np.nan) + _ANGLE_SLACK
 
 
-def _beyond_panorama(cones: _Cones, picture: Picture) -> Bool:
+def _beyond_panorama(cones: _Cones, picture: PictureBorders) -> Bool:
     """True (B,) for chunks that a part of a panorama does not show: above, below or at its sides, at any turn."""
     camera, (x, y, z) = picture.camera, cones.middle
     _, whole = _caps(cones, picture, max(max(1.0, 0.5 / camera.fy) / camera.fx, 1 / camera.fy))
@@ -262,7 +264,7 @@ def _beyond_panorama(cones: _Cones, picture: Picture) -> Bool:
     return beyond
 
 
-def _beyond_borders(cones: _Cones, picture: Picture) -> Bool:
+def _beyond_borders(cones: _Cones, picture: PictureBorders) -> Bool:
     """True (B,) for chunks beyond a side of a perspective picture along rays.
 
     A border is an angle in the plane of its axis and z. The kernels take a Gaussian's box as infinite where it comes
@@ -292,7 +294,7 @@ def _radius(camera: Camera, theta: Float64) -> Float64:
     return theta * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
 
 
-def _beyond_fisheye(cones: _Cones, picture: Picture) -> Bool:
+def _beyond_fisheye(cones: _Cones, picture: PictureBorders) -> Bool:
     """True (B,) for chunks that a fisheye does not show: beyond a side of its picture, or beyond its largest angle.
 
     The kernels bound a Gaussian by a rectangle along its mean's direction on the picture: from `inner` to `outer`, and
@@ -331,7 +333,7 @@ def _beyond_fisheye(cones: _Cones, picture: Picture) -> Bool:
     return beyond
 
 
-_ALONG_RAYS: dict[type[CameraModel], Callable[[_Cones, Picture], Bool]] = {
+_ALONG_RAYS: dict[type[CameraModel], Callable[[_Cones, PictureBorders], Bool]] = {
     Equirectangular: _beyond_panorama,
     PerspectiveByRays: _beyond_borders,
     Fisheye: _beyond_fisheye,

@@ -15,7 +15,7 @@ from clsplat.camera import Camera
 from clsplat.chunks import bounds_table
 from clsplat.chunks.bounds import ChunkBounds
 from clsplat.chunks.bounds_table import BoundsTable
-from clsplat.chunks.culling import Picture, visible
+from clsplat.chunks.culling import PictureBorders, visible
 
 CHUNKS = 1003
 """Chunks of a table. The last group of each level has fewer members than others."""
@@ -43,7 +43,7 @@ def boxes(rng: np.random.Generator, camera: Camera) -> Float32:
     return np.column_stack([lowest, lowest + side, largest]).astype(np.float32)
 
 
-def each_chunk(found: Float32, moved: Float64, picture: Picture) -> np.ndarray:
+def each_chunk(found: Float32, moved: Float64, picture: PictureBorders) -> np.ndarray:
     """The chunks in view, each looked at."""
     rows = found.astype(np.float64)
     bounds = ChunkBounds(rows[:, :3], rows[:, 3:6], rows[:, 6]).widened(*moved, UPDATES)
@@ -53,7 +53,7 @@ def each_chunk(found: Float32, moved: Float64, picture: Picture) -> np.ndarray:
 class Looks:
     """`visible` of a picture, which counts the chunks and groups that are looked at."""
 
-    def __init__(self, picture: Picture) -> None:
+    def __init__(self, picture: PictureBorders) -> None:
         self.picture, self.number = picture, 0
 
     def __call__(self, bounds: ChunkBounds) -> Bool:
@@ -86,7 +86,7 @@ def test_the_chunks_are_those_of_a_look_at_each(kind: str) -> None:
         table = BoundsTable(CHUNKS)
         table.measure(of(np.arange(CHUNKS)), found)
         table.move(of(np.arange(CHUNKS)), moved)
-        picture = Picture.of(camera)
+        picture = PictureBorders.of(camera)
         got = table.seen(
             partial(visible, picture),
             lambda chunks, by=hidden: by[:, chunks],
@@ -98,12 +98,12 @@ def test_the_chunks_are_those_of_a_look_at_each(kind: str) -> None:
     assert 0.1 * 60 * CHUNKS < kept < 0.9 * 60 * CHUNKS
 
 
-def beside_and_in_view() -> tuple[Float32, Float32, Picture]:
+def beside_and_in_view() -> tuple[Float32, Float32, PictureBorders]:
     """Bounds (7,) of a small box far beside a picture, and of one in it."""
     camera = scenes.tilted_camera(640, 400)
     places = [np.linalg.inv(camera.rotation) @ (place - camera.translation) for place in ([900.0, 0, 5], [0.0, 0, 5])]
     beside, inside = (np.append(np.tile(place, 2), -3.0).astype(np.float32) for place in places)
-    return beside, inside, Picture.of(camera)
+    return beside, inside, PictureBorders.of(camera)
 
 
 def test_chunks_that_are_not_measured_are_in_view() -> None:

@@ -32,7 +32,7 @@ CAMERAS = {"perspective": CAMERA, "orthographic": replace(CAMERA, fx=40.0, fy=44
 
 
 def visible(bounds: ChunkBounds, camera: Camera, config: RasterizerConfig | None = None, factor: float = 1.0) -> Bool:
-    return culling.visible(culling.Picture.of(camera, config or RasterizerConfig(), factor), bounds)
+    return culling.visible(culling.PictureBorders.of(camera, config or RasterizerConfig(), factor), bounds)
 
 
 def box(middle: np.ndarray, half: float, log_scale: float) -> ChunkBounds:

@@ -17,7 +17,7 @@ from same_bytes import State, make_too_small, outcome, stopped
 from tiny import cameras, hidden_model, run_steps, short
 
 from clsplat.chunks.bounds import ChunkBounds
-from clsplat.chunks.culling import Picture
+from clsplat.chunks.culling import PictureBorders
 from clsplat.chunks.order import beside_parents, space_order
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
@@ -328,7 +328,7 @@ def test_bounds_hold(
     given: list[ChunkBounds] = []
     real = visible_chunks.visible
 
-    def visible(picture: Picture, bounds: ChunkBounds) -> Any:
+    def visible(picture: PictureBorders, bounds: ChunkBounds) -> Any:
         given.append(bounds)
         return real(picture, bounds)
 

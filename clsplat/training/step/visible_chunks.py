@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float32, Float64
 from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_resumed_step, largest_step
 from clsplat.chunks.bounds_table import BoundsTable, Movement
-from clsplat.chunks.culling import Picture, visible
+from clsplat.chunks.culling import PictureBorders, visible
 from clsplat.chunks.order import ORDERED_ROWS
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, allocate
@@ -162,7 +162,7 @@ class VisibleChunks(Component):
         """The chunks that the view may show, in rising order. hidden, most: results of `_hidden_movement`."""
         thinning = thinning_of(self._config, step)
         factor = 1.0 if thinning is None else thinning.factor
-        picture = Picture.of(of_view.camera, self._config.rasterizer, factor)
+        picture = PictureBorders.of(of_view.camera, self._config.rasterizer, factor)
         return self._found.seen(partial(visible, picture), hidden, most, MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
 
     def _hidden_movement(self, step: int) -> tuple[Movement, Float64]:
