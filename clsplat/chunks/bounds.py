@@ -22,6 +22,9 @@ _ROUNDING = 1e-6
 """Relative slack of the root of r, for the rounding of a step's moments. It is more than eight roundings of float32."""
 _SLACK = 1e-3
 """Relative slack of the bounds. It covers the rounding of a step, and second moments that underflow."""
+GROUP_FACTOR = 1.5
+"""Factor of the spheres around groups, so that they contain those of their chunks. A sphere around a part of a box
+reaches at most sqrt(2) half diagonals from the box's middle."""
 _LEAST_EPSILON = 1e-15
 """Smallest epsilon of Adam with which second moments that underflow move a parameter by less than _SLACK."""
 
@@ -32,11 +35,13 @@ class ChunkBounds:
 
     lowest, highest: (B, 3), of the means, in world units.
     largest: (B,), the largest log scale.
+    factor: of spheres and rounding; GROUP_FACTOR for bounds of groups, which are visible where one of their chunks is.
     """
 
     lowest: Float64
     highest: Float64
     largest: Float64
+    factor: float = 1.0
 
     @classmethod
     def measured(cls, means: Float32, log_scales: Float32) -> ChunkBounds:
@@ -62,16 +67,17 @@ class ChunkBounds:
     @cached_property
     def terms(self) -> Float64:
         """Rows (8, B): middles of the boxes (3), half sides (3), largest standard deviations, and for each box the sum
-        of its farthest corner's coordinates."""
+        of its farthest corner's coordinates, to which rounding is relative."""
         with np.errstate(over="ignore", invalid="ignore"):
             middle, half = 0.5 * (self.lowest + self.highest).T, 0.5 * (self.highest - self.lowest).T
-            farthest = (np.abs(middle) + half).sum(axis=0)
+            farthest = self.factor * (np.abs(middle) + half).sum(axis=0)
             return np.vstack([middle, half, np.exp(self.largest), farthest])
 
     @cached_property
     def radius(self) -> Float64:
-        """Half diagonals (B,) of the boxes."""
-        return np.asarray(np.linalg.norm(self.terms[3:6], axis=0))
+        """Radii (B,) of spheres around the boxes: half diagonals, and more around groups."""
+        half = self.terms[3:6]
+        return np.asarray(self.factor * np.sqrt(np.einsum("ij,ij->j", half, half)))
 
     def widened(self, mean_step: float | Float64, log_scale_step: float | Float64, updates: int = 0) -> ChunkBounds:
         """The bounds after each coordinate of a mean, and each log scale, has moved by at most these steps.
@@ -84,7 +90,7 @@ class ChunkBounds:
             size = np.maximum(np.maximum(x, y), z)
             by = _with_rounding(mean_step, size, updates)[:, None]
             larger = _with_rounding(log_scale_step, np.abs(self.largest), updates)
-            return ChunkBounds(self.lowest - by, self.highest + by, self.largest + larger)
+            return ChunkBounds(self.lowest - by, self.highest + by, self.largest + larger, self.factor)
 
 
 def _with_rounding(step: float | Float64, size: Float64, updates: int) -> Float64:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -43,9 +44,28 @@ kernels do so from 0.999."""
 
 
 @dataclass(frozen=True, eq=False)
-class _PictureBorders:
-    """Borders of a picture, and limits of depth.
+class _Planes:
+    """The sides of a picture on an image plane, then its near and far plane, as functions of a box: negative beyond.
 
+    terms: (6, 8), factors of `ChunkBounds.terms`.
+    by_distance: (6,), factors of the distance of a box's farthest corner from the camera.
+    constant: (6,).
+    centre: (3, 1), of the camera in the world.
+    """
+
+    terms: Float64
+    by_distance: Float64
+    constant: Float64
+    centre: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class PictureBorders:
+    """Borders of a camera's picture, and limits of depth: all that culling has to know of a camera.
+
+    culls: False if every chunk counts as visible.
+    square: True if Gaussians are listed in the square of their longest half axis, which is at most the root of the sum
+        of both half axes' squares.
     reach: standard deviations at which a Gaussian ends.
     stretch: the most by which the camera's matrix makes a length longer: more than 1 if it is not quite a rotation.
     low, high: (2,), borders of the tiles in pixels, from the principal point.
@@ -54,6 +74,8 @@ class _PictureBorders:
     """
 
     camera: Camera
+    culls: bool
+    square: bool
     reach: float
     stretch: float
     low: Float64
@@ -62,89 +84,94 @@ class _PictureBorders:
     depths: tuple[float, float]
 
     @classmethod
-    def of(cls, camera: Camera, reach: float) -> _PictureBorders:
+    def of(
+        cls, camera: Camera, config: RasterizerConfig = _DEFAULT_RASTERIZER, opacity_factor: float = 1.0
+    ) -> PictureBorders:
+        """The picture of a camera.
+
+        config: the rasterizer's settings, on which a Gaussian's reach depends.
+        opacity_factor: the factor by which the pass multiplies opacities (thinning), at least 1.
+        """
+        switches = config.switches()
+        reach = 3.0 if switches.extent == "3sigma" else math.sqrt(2 * math.log(opacity_factor / switches.alpha_min))
         window = camera.window or Window(0, 0, camera.width, camera.height)
         low = np.array([window.x - camera.cx, window.y - camera.cy])
         high = low - TILE * (-np.array([camera.width, camera.height]) // TILE)
         slack = _ROUNDING * (np.abs([camera.cx, camera.cy]) + np.abs(low) + np.abs(high))
         depths = max(camera.near, 0.0), min(camera.far, float(np.finfo(np.float32).max))
-        return cls(camera, reach, float(np.linalg.norm(camera.rotation, 2)), low, high, slack, depths)
+        square, stretch = switches.tile_test == "square", float(np.linalg.svd(camera.rotation, compute_uv=False)[0])
+        culls, reach = switches.frustum_cull, reach * _REACH_SLACK
+        return cls(camera, culls, square, reach, stretch, low, high, slack, depths)
+
+    @cached_property
+    def planes(self) -> _Planes:
+        """The planes beyond which chunks are hidden, for cameras with an image plane.
+
+        By (2) to (6) of docs/gradients.md, the half width of an ellipse is at most k (f sqrt(1 + r^2) s / z + b), with
+        k the reach, s the largest scale, r the limit of x/z in the Jacobian, and b^2 the low-pass. An ellipse reaches
+        the left border l, from the principal point, if f x/z + k (f sqrt(1 + r^2) s / z + b) >= l. Times z > 0 this is
+
+            f x + (k b - l) z + k f sqrt(1 + r^2) s >= 0,
+
+        which is linear in the mean: a box is beyond the border if its farthest corner along (f, 0, k b - l) is. Means
+        beyond the left border have r between the Jacobian's limit and the border. For parallel rays z is 1 and r is 0.
+        """
+        camera, parallel = self.camera, self.camera.model.parallel
+        limits, blur = camera.frustum_limits, self.reach * _LOW_PASS_ROOT
+        normals, offsets, slopes = np.zeros((6, 3)), np.zeros(6), np.zeros(6)
+        for axis, focal in enumerate((camera.fx, camera.fy)):
+            for side, border in ((1, self.low[axis]), (-1, self.high[axis])):
+                plane = 2 * axis + (side < 0)
+                normals[plane, axis] = side * focal
+                (offsets if parallel else normals[:, 2])[plane] = blur - side * border
+                nearest = min(max(border / focal, limits[0, axis]), limits[1, axis])
+                farthest = limits[0 if side > 0 else 1, axis]
+                slopes[plane] = focal * (1.0 if parallel else math.hypot(1.0, max(abs(nearest), abs(farthest))))
+        if self.square:
+            steepest = 1.0 if parallel else math.hypot(1.0, *np.abs(limits).max(axis=0))
+            slopes[:4] = math.hypot(camera.fx, camera.fy) * steepest
+        normals[4:, 2], offsets[4:] = [1.0, -1.0], [-self.depths[0], self.depths[1]]
+        in_world, sums = normals @ camera.rotation, np.abs(normals).sum(axis=1)
+        along = np.column_stack([self.reach * self.stretch * slopes, _CANCELLED * sums])
+        constant = normals @ camera.translation + offsets
+        pixels = np.where(np.arange(6) < 4, self.slack.max(), 0.0)
+        constant += _ROUNDING * np.abs(offsets) + _CANCELLED * sums * np.abs(camera.translation).sum()
+        constant += pixels if parallel else 0.0
+        by_distance = _ROUNDING * np.sqrt((normals * normals).sum(axis=1)) + (0.0 if parallel else pixels)
+        centre = np.asarray(np.linalg.solve(camera.rotation, -camera.translation)[:, None], np.float64)
+        return _Planes(np.hstack([in_world, np.abs(in_world), along]), by_distance, constant, centre)
 
 
-def visible(
-    bounds: ChunkBounds,
-    camera: Camera,
-    config: RasterizerConfig = _DEFAULT_RASTERIZER,
-    opacity_factor: float = 1.0,
-) -> Bool:
-    """True (B,) for chunks that may have a row with a tile in the camera's picture; False only if none has one.
+def visible(picture: PictureBorders, bounds: ChunkBounds) -> Bool:
+    """True (B,) for chunks that may have a row with a tile in a picture; False only if none has one.
 
     Chunks whose bounds are not finite are visible. Rows appended to a chunk must be in its bounds.
-
-    config: the rasterizer's settings, on which a Gaussian's reach depends.
-    opacity_factor: the factor by which the pass multiplies opacities (thinning), at least 1.
     """
-    switches = config.switches()
-    if not switches.frustum_cull or len(bounds) == 0:
+    if not picture.culls or len(bounds) == 0:
         return np.ones(len(bounds), np.bool_)
-    reach = 3.0 if switches.extent == "3sigma" else math.sqrt(2 * math.log(opacity_factor / switches.alpha_min))
-    picture = _PictureBorders.of(camera, reach * _REACH_SLACK)
+    model = picture.camera.model
     hidden = np.zeros(len(bounds), np.bool_)
     with np.errstate(all="ignore"):  # what is not finite compares as visible
-        if camera.model.along_rays:
+        if model.along_rays:
             cones = _cones(bounds, picture)
             hidden |= _out_of_depth(cones, picture)
             for kind, beyond in _ALONG_RAYS.items():
-                if isinstance(camera.model, kind):
+                if isinstance(model, kind):
                     hidden |= beyond(cones, picture)
-        elif camera.model.is_pinhole or camera.model.parallel:
-            hidden |= _beyond_planes(bounds, picture, square=switches.tile_test == "square")
+        elif model.is_pinhole or model.parallel:
+            hidden |= _beyond_planes(bounds, picture)
         return ~hidden | ~bounds.finite
 
 
-def _beyond_planes(bounds: ChunkBounds, picture: _PictureBorders, *, square: bool) -> Bool:
-    """True (B,) for chunks beyond a side of the picture on an image plane, or beyond the near or far plane.
-
-    By (2) to (6) of docs/gradients.md, the half width of an ellipse is at most k (f sqrt(1 + r^2) s / z + b), with
-    k the reach, s the largest scale, r the limit of x/z in the Jacobian, and b^2 the low-pass. An ellipse reaches the
-    left border l, from the principal point, if f x/z + k (f sqrt(1 + r^2) s / z + b) >= l. Times z > 0 this is
-
-        f x + (k b - l) z + k f sqrt(1 + r^2) s >= 0,
-
-    which is linear in the mean: a box is beyond the border if its farthest corner along (f, 0, k b - l) is. Means
-    beyond the left border have r between the Jacobian's limit and the border. For parallel rays z is 1 and r is 0.
-
-    square: True if Gaussians are listed in the square of their longest half axis, which is at most the root of the sum
-    of both half axes' squares.
-    """
-    camera, parallel = picture.camera, picture.camera.model.parallel
-    limits, blur = camera.frustum_limits, picture.reach * _LOW_PASS_ROOT
-    normals, offsets, slopes = np.zeros((6, 3)), np.zeros(6), np.zeros(6)
-    for axis, focal in enumerate((camera.fx, camera.fy)):
-        for side, border in ((1, picture.low[axis]), (-1, picture.high[axis])):
-            plane = 2 * axis + (side < 0)
-            normals[plane, axis] = side * focal
-            (offsets if parallel else normals[:, 2])[plane] = blur - side * border
-            nearest = np.clip(border / focal, limits[0, axis], limits[1, axis])
-            farthest = limits[0 if side > 0 else 1, axis]
-            slopes[plane] = focal * (1.0 if parallel else math.hypot(1.0, max(abs(nearest), abs(farthest))))
-    if square:
-        steepest = 1.0 if parallel else math.hypot(1.0, *np.abs(limits).max(axis=0))
-        slopes[:4] = math.hypot(camera.fx, camera.fy) * steepest
-    normals[4:, 2], offsets[4:] = [1.0, -1.0], [-picture.depths[0], picture.depths[1]]
-    in_world, lengths, sums = normals @ camera.rotation, np.linalg.norm(normals, axis=1), np.abs(normals).sum(axis=1)
-    along = np.column_stack([picture.reach * picture.stretch * slopes, _CANCELLED * sums])
+def _beyond_planes(bounds: ChunkBounds, picture: PictureBorders) -> Bool:
+    """True (B,) for chunks beyond a side of the picture on an image plane, or beyond the near or far plane."""
+    planes = picture.planes
     # einsum and not @: BLAS takes threads even for so small a product, and they spin while they wait
-    farthest_corner = np.einsum("pk,kb->pb", np.hstack([in_world, np.abs(in_world), along]), bounds.terms)
-    constant = normals @ camera.translation + offsets
-    pixels = np.where(np.arange(6) < 4, picture.slack.max(), 0.0)
-    constant += _ROUNDING * np.abs(offsets) + _CANCELLED * sums * np.abs(camera.translation).sum()
-    constant += pixels if parallel else 0.0
-    away = bounds.terms[:3] - np.linalg.solve(camera.rotation, -camera.translation)[:, None]
+    farthest_corner = np.einsum("pk,kb->pb", planes.terms, bounds.terms)
+    away = bounds.terms[:3] - planes.centre
     distance = picture.stretch * (np.sqrt(np.einsum("ij,ij->j", away, away)) + bounds.radius)
-    by_distance = _ROUNDING * lengths + (0.0 if parallel else pixels)
-    farthest_corner += by_distance[:, None] * distance
-    return np.asarray((farthest_corner + constant[:, None]).min(axis=0) < 0)
+    farthest_corner += planes.by_distance[:, None] * distance
+    return np.asarray((farthest_corner + planes.constant[:, None]).min(axis=0) < 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +183,7 @@ class _Cones:
     least: (B,), distance of the nearest mean that is not before the near plane.
     size: (B,), the largest standard deviation.
     spread: (B,), half angle of the cone of all means.
+    factor: `ChunkBounds.factor`.
     """
 
     middle: Float64
@@ -165,9 +193,10 @@ class _Cones:
     least: Float64
     size: Float64
     spread: Float64
+    factor: float
 
 
-def _cones(bounds: ChunkBounds, picture: _PictureBorders) -> _Cones:
+def _cones(bounds: ChunkBounds, picture: PictureBorders) -> _Cones:
     camera, terms = picture.camera, bounds.terms
     rounding = _CANCELLED * (terms[7] + np.abs(camera.translation).sum())
     middle = camera.rotation @ terms[:3] + camera.translation[:, None]
@@ -178,10 +207,10 @@ def _cones(bounds: ChunkBounds, picture: _PictureBorders) -> _Cones:
     least = np.maximum(distance - radius, np.sqrt(np.einsum("ij,ij->j", to_box, to_box)))
     least = np.maximum(least, picture.depths[0]) * (1 - _ROUNDING)
     spread = np.arcsin(radius / distance)  # NaN if the camera is inside
-    return _Cones(middle, half, distance, radius, least, picture.stretch * terms[6], spread)
+    return _Cones(middle, half, distance, radius, least, picture.stretch * terms[6], spread, bounds.factor)
 
 
-def _out_of_depth(cones: _Cones, picture: _PictureBorders) -> Bool:
+def _out_of_depth(cones: _Cones, picture: PictureBorders) -> Bool:
     """True (B,) for chunks before the near or beyond the far plane, for models along rays."""
     flat = picture.camera.model.flat
     depth, half = (cones.middle[2], cones.half[2]) if flat else (cones.distance, cones.radius)
@@ -190,7 +219,7 @@ def _out_of_depth(cones: _Cones, picture: _PictureBorders) -> Bool:
     return out
 
 
-def _caps(cones: _Cones, picture: _PictureBorders, pixel: float) -> tuple[Float64, Float64]:
+def _caps(cones: _Cones, picture: PictureBorders, pixel: float) -> tuple[Float64, Float64]:
     """Half angles (B,), in radians, of the largest cone of a Gaussian around its mean, and of the cone of all of them.
 
     By (12) and (13) of docs/cameras.md, a Gaussian's ellipse lies in the plane that touches the unit sphere at its
@@ -218,7 +247,7 @@ def _half_turn(sine: Float64, level: Float64) -> Float64:
     return np.where(ratio < _POLE, np.arcsin(ratio), np.nan) + _ANGLE_SLACK
 
 
-def _beyond_panorama(cones: _Cones, picture: _PictureBorders) -> Bool:
+def _beyond_panorama(cones: _Cones, picture: PictureBorders) -> Bool:
     """True (B,) for chunks that a part of a panorama does not show: above, below or at its sides, at any turn."""
     camera, (x, y, z) = picture.camera, cones.middle
     _, whole = _caps(cones, picture, max(max(1.0, 0.5 / camera.fy) / camera.fx, 1 / camera.fy))
@@ -235,7 +264,7 @@ def _beyond_panorama(cones: _Cones, picture: _PictureBorders) -> Bool:
     return beyond
 
 
-def _beyond_borders(cones: _Cones, picture: _PictureBorders) -> Bool:
+def _beyond_borders(cones: _Cones, picture: PictureBorders) -> Bool:
     """True (B,) for chunks beyond a side of a perspective picture along rays.
 
     A border is an angle in the plane of its axis and z. The kernels take a Gaussian's box as infinite where it comes
@@ -265,12 +294,13 @@ def _radius(camera: Camera, theta: Float64) -> Float64:
     return theta * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
 
 
-def _beyond_fisheye(cones: _Cones, picture: _PictureBorders) -> Bool:
+def _beyond_fisheye(cones: _Cones, picture: PictureBorders) -> Bool:
     """True (B,) for chunks that a fisheye does not show: beyond a side of its picture, or beyond its largest angle.
 
     The kernels bound a Gaussian by a rectangle along its mean's direction on the picture: from `inner` to `outer`, and
     `aside` to both sides. If a Gaussian may contain the axis, or reach the largest angle, the bound is a square around
-    the axis. The rectangle's corner is then at most 1.5 times as far out as the square's side.
+    the axis. The rectangle's corner is then at most 1.5 times as far out as the square's side. The
+    sum for a rectangle is at most 2 `outer`, and less than that of a group's square.
     """
     camera, (x, y, z), fold = picture.camera, cones.middle, picture.camera.fold[0]
     widest = 1.5 / MIN_FISHEYE_SLOPE if any(camera.radial) else max(1.0, 0.5 / (math.pi * camera.fx))
@@ -298,12 +328,12 @@ def _beyond_fisheye(cones: _Cones, picture: _PictureBorders) -> Bool:
             # cosine of the smallest angle between a mean's direction and that of the border's axis
             nearest = np.where(side * along > turn_cosine, 1.0, side * along * turn_cosine + turned)
             support = np.where(nearest > 0, outer, inner) * nearest + aside
-            support = np.where(ring, support, 1.5 * outer)
+            support = np.where(ring, support, 1.5 * cones.factor * outer)
             beyond |= focal * support + slack + _ROUNDING * focal < border
     return beyond
 
 
-_ALONG_RAYS: dict[type[CameraModel], Callable[[_Cones, _PictureBorders], Bool]] = {
+_ALONG_RAYS: dict[type[CameraModel], Callable[[_Cones, PictureBorders], Bool]] = {
     Equirectangular: _beyond_panorama,
     PerspectiveByRays: _beyond_borders,
     Fisheye: _beyond_fisheye,

@@ -12,9 +12,10 @@ import scenes
 from stress_culling import BOXES, KINDS, Movements, by_kernels, compare
 from tile_boxes import reach_a_tile
 
+from clsplat.arrays import Bool
 from clsplat.camera import Camera
+from clsplat.chunks import culling
 from clsplat.chunks.bounds import ChunkBounds
-from clsplat.chunks.culling import visible
 from clsplat.chunks.order import space_order
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import OptimiserConfig
@@ -28,6 +29,10 @@ RAYS = {
     "part of a panorama": replace(CAMERA, fx=400.0, fy=400.0, projection="equirectangular"),
 }
 CAMERAS = {"perspective": CAMERA, "orthographic": replace(CAMERA, fx=40.0, fy=44.0, projection="orthographic"), **RAYS}
+
+
+def visible(bounds: ChunkBounds, camera: Camera, config: RasterizerConfig | None = None, factor: float = 1.0) -> Bool:
+    return culling.visible(culling.PictureBorders.of(camera, config or RasterizerConfig(), factor), bounds)
 
 
 def box(middle: np.ndarray, half: float, log_scale: float) -> ChunkBounds:

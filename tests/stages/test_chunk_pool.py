@@ -166,12 +166,21 @@ def test_a_stored_array_is_used_as_one_on_the_device(device: Device, path: Path 
     assert stored.shape == on_device.shape
     for start, stop in ((0, COUNT), (CHUNK_ROWS - 1, CHUNK_ROWS + 1), (COUNT - 1, COUNT), (5, 5)):
         assert_same_bits(stored.get_rows(start, stop), on_device.get_rows(start, stop), f"{name} {start}")
+    places = np.array([CHUNK_ROWS + 7, 0, COUNT - 1])
+    assert_same_bits(stored.get_at(places), on_device.get()[places])
     for array in (stored, on_device):
         array.set(np.ascontiguousarray(model[name][::-1]))
+    stored.set_at(places, new[:3])
+    for place, row in zip(places.tolist(), new, strict=False):
+        on_device.set_rows(place, row[None])
     copied = stored.get()
     assert_same_bits(copied, on_device.get())
     copied[...] = 7
     assert_same_bits(stored.get(), on_device.get(), "a copy is not the store")
+    stored.change(np.negative)
+    assert_same_bits(stored.get(), -on_device.get())
+    stored.fill(2.5)
+    assert (stored.get() == 2.5).all()
 
 
 def test_rows_behind_the_last_one(device: Device, path: Path | None) -> None:

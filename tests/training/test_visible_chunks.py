@@ -18,8 +18,8 @@ from same_bytes import State, make_too_small, outcome, stopped
 from tiny import cameras, run_steps, short
 from wide import ROWS, let_small_models_have_chunks, start_wide, wide_model
 
-from clsplat.camera import Camera
 from clsplat.chunks.bounds import ChunkBounds
+from clsplat.chunks.culling import PictureBorders
 from clsplat.chunks.order import beside_parents, space_order
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
@@ -339,9 +339,9 @@ def test_bounds_hold(
     given: list[ChunkBounds] = []
     real = visible_chunks.visible
 
-    def visible(bounds: ChunkBounds, camera: Camera, *rest: Any) -> Any:
+    def visible(picture: PictureBorders, bounds: ChunkBounds) -> Any:
         given.append(bounds)
-        return real(bounds, camera, *rest)
+        return real(picture, bounds)
 
     monkeypatch.setattr(visible_chunks, "visible", visible)
     trainer = moving(scene, config, default_device)

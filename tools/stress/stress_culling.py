@@ -24,7 +24,7 @@ from tile_boxes import reach_a_tile
 from clsplat.arrays import Bool, Float32, Float64
 from clsplat.camera import Camera, Window
 from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_step
-from clsplat.chunks.culling import visible
+from clsplat.chunks.culling import PictureBorders, visible
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
@@ -240,7 +240,7 @@ def compare(
     lowest, highest = means.min(axis=1).astype(np.float64), means.max(axis=1).astype(np.float64)
     bounds = ChunkBounds(lowest, highest, log_scales.max(axis=(1, 2)).astype(np.float64))
     moved, scaled, mean_step, scale_step, steps = movements.moved(means, log_scales, distances)
-    found = visible(bounds.widened(mean_step, scale_step, steps), camera)
+    found = visible(PictureBorders.of(camera), bounds.widened(mean_step, scale_step, steps))
     flat = (each.reshape(boxes * ROWS, -1).astype(np.float64) for each in (moved, quaternions, scaled))
     places, turns, sizes = flat
     reached = reach(places, turns, sizes, logits.reshape(-1).astype(np.float64), camera).reshape(boxes, ROWS)

@@ -5,15 +5,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.arrays import Bool, Float32, Float64
+from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_resumed_step, largest_step
-from clsplat.chunks.culling import visible
+from clsplat.chunks.bounds_table import BoundsTable, Movement
+from clsplat.chunks.culling import PictureBorders, visible
 from clsplat.chunks.order import ORDERED_ROWS
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, allocate
@@ -116,9 +118,8 @@ class VisibleChunks(Component):
         """Forget all bounds, of a model of `count` Gaussians that have all taken step number `step`."""
         chunks = -(-count // CHUNK_ROWS)
         self._count = count
-        self._found = np.full((chunks, BOUNDS_FLOATS), np.nan)  # bounds that are not finite leave nothing out
+        self._found = BoundsTable(chunks)
         self._unmeasured = np.ones(chunks, np.bool_)
-        self._means_moved, self._scales_moved = np.zeros(chunks), np.zeros(chunks)
         self._since: int | None = None
         """Steps since the last measurement; None if there is none."""
         most = 2 * (MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)  # twice, so that the table is seldom moved
@@ -160,9 +161,8 @@ class VisibleChunks(Component):
         numbers = np.flatnonzero(self._unmeasured).astype(np.uint32)
         if len(numbers) == 0:
             return
-        self._found[numbers] = self._measured(gaussians, numbers)
+        self._found.measure(numbers, self._measured(gaussians, numbers))
         self._unmeasured[numbers] = False
-        self._means_moved[numbers] = self._scales_moved[numbers] = 0.0
 
     def _measured(self, gaussians: AnyGaussians, numbers: NDArray[np.uint32]) -> Float32:
         """Bounds (chunks, BOUNDS_FLOATS) of these chunks."""
@@ -192,65 +192,68 @@ class VisibleChunks(Component):
         (of_view,) = inputs
         if self.step < step - 1:  # the steps between ran over all rows of a model that was small or streamed
             self._begin_table(step - 1, len(self._last))
-        hidden = self._hidden_movement(step)
-        shown = self._shown(of_view, step, hidden)
-        whole = not self._streamed and int(np.count_nonzero(shown)) > MAX_SHARE_IN_VIEW * len(shown)
+        hidden, most_hidden = self._hidden_movement(step)
+        numbers = self._shown(of_view, step, hidden, most_hidden)
+        whole = not self._streamed and len(numbers) > MAX_SHARE_IN_VIEW * len(self._last)
         self._since += 1
         if whole:
-            shown[:] = True
-        self._note_movement(shown, hidden)
-        rates = largest_rates(self._config, range(step, step + 1), self._unit)
-        self._means_moved[shown] += self._step_limit * rates["means"]
-        self._scales_moved[shown] += self._step_limit * rates["log_scales"]
-        numbers = np.flatnonzero(shown).astype(np.uint32)
-        missed = self._missed(shown, step - 1)
+            numbers = np.arange(len(self._last), dtype=np.uint32)
+        self._note_movement(numbers, hidden(numbers))
+        self._found.move(numbers, self._step_limit * self._mean_and_scale_rates(range(step, step + 1)))
+        missed = self._missed(numbers, step - 1)
         return [replace(of_view, chunks=_ChunksInView(self, numbers, missed, self._found, self._slots, whole=whole))]
 
-    def in_view(self, camera: Camera) -> NDArray[np.int64]:
+    def in_view(self, camera: Camera) -> NDArray[np.uint32]:
         """The chunks that a camera may show, as they are after the last step."""
-        shown = self._shown_by(camera, 1.0, self._hidden_movement(self.step + 1))
-        return np.flatnonzero(shown)
+        return self._shown_by(camera, 1.0, *self._hidden_movement(self.step + 1))
 
-    def _shown(self, of_view: ViewInputs, step: int, hidden: tuple[Float64, Float64]) -> Bool:
-        """The chunks that the view may show. hidden: result of `_hidden_movement`."""
+    def _shown(self, of_view: ViewInputs, step: int, hidden: Movement, most: Float64) -> NDArray[np.uint32]:
+        """The chunks that the view may show, in rising order. hidden, most: results of `_hidden_movement`."""
         thinning = thinning_of(self._config, step)
-        return self._shown_by(of_view.camera, 1.0 if thinning is None else thinning.factor, hidden)
+        return self._shown_by(of_view.camera, 1.0 if thinning is None else thinning.factor, hidden, most)
 
-    def _shown_by(self, camera: Camera, factor: float, hidden: tuple[Float64, Float64]) -> Bool:
-        """The chunks that a camera may show, with opacities times a factor. hidden: result of `_hidden_movement`."""
-        measured = ChunkBounds(self._found[:, :3], self._found[:, 3:6], self._found[:, 6])
-        moved = (self._means_moved + hidden[0], self._scales_moved + hidden[1])
-        now = measured.widened(*moved, MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
-        return visible(now, camera, self._config.rasterizer, factor)
+    def _shown_by(self, camera: Camera, factor: float, hidden: Movement, most: Float64) -> NDArray[np.uint32]:
+        """The chunks that a camera may show, with opacities times a factor."""
+        picture = PictureBorders.of(camera, self._config.rasterizer, factor)
+        return self._found.seen(partial(visible, picture), hidden, most, MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
 
-    def _hidden_movement(self, step: int) -> tuple[Float64, Float64]:
-        """The most by which means and log scales of each chunk move in the steps before number `step` that it has
-        missed."""
-        oldest = min(int(self._last.min(initial=step)), step - 1)
-        rates = largest_rates(self._config, range(oldest + 1, step + 1), self._unit)
-        path = np.minimum(self._step_limit * (step - 1 - self._last), self._hidden_limit)
-        return path * rates["means"], path * rates["log_scales"]
+    def _hidden_movement(self, step: int) -> tuple[Movement, Float64]:
+        """The most by which means and log scales of some chunks move in the steps before number `step` that they have
+        missed, and (2, 1) the most for any chunk."""
+        longest = np.argmin(self._last, axis=0, keepdims=True)
+        rates = self._mean_and_scale_rates(range(min(int(self._last[longest[0]]), step - 1) + 1, step + 1))
 
-    def _note_movement(self, chunks: Bool, hidden: tuple[Float64, Float64]) -> None:
-        """Note that these chunks take the steps that they have missed. hidden: result of `_hidden_movement`."""
-        self._means_moved[chunks] += hidden[0][chunks]
-        self._scales_moved[chunks] += hidden[1][chunks]
-        self._unmeasured |= chunks
+        def hidden(chunks: NDArray[np.integer]) -> Float64:
+            path = np.minimum(self._step_limit * (step - 1 - self._last[chunks]), self._hidden_limit)
+            return np.asarray(rates * path)
 
-    def _missed(self, chunks: Bool, step: int) -> Missed | None:
+        return hidden, hidden(longest)
+
+    def _mean_and_scale_rates(self, steps: range) -> Float64:
+        """Upper limits (2, 1) of the learning rates of means and log scales in these steps."""
+        rates = largest_rates(self._config, steps, self._unit)
+        return np.array([[rates["means"]], [rates["log_scales"]]])
+
+    def _note_movement(self, chunks: NDArray[np.uint32], hidden: Float64) -> None:
+        """Note that these chunks move by `hidden` (2, n) in the steps that they have missed."""
+        self._found.move(chunks, hidden)
+        self._unmeasured[chunks] = True
+
+    def _missed(self, chunks: NDArray[np.uint32], step: int) -> Missed | None:
         """The steps up to `step` that these chunks have missed; None if there is none."""
-        behind = chunks & (self._last < step)
-        if self._config.optimiser.sparse or not behind.any():
+        if self._config.optimiser.sparse:
             return None
-        numbers = np.flatnonzero(behind).astype(np.uint32)
+        numbers = chunks[self._last[chunks] < step]
+        if len(numbers) == 0:
+            return None
         last, first = self._last[numbers], int(self._last[numbers].min()) + 1
         table = self._table[first - self._first_step : step + 1 - self._first_step].copy()
         return Missed(numbers, last, step, table, first)
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep, chunks: _ChunksInView) -> PlacedChunks | None:
         """Catch up the chunks that a step's view shows, and send their list. A repeated step is the same again."""
-        everything = np.arange(len(self._last), dtype=np.uint32)
         if chunks.of_rows is not self._found:  # rows have moved since, and all have taken every step
+            everything = np.arange(len(self._last), dtype=np.uint32)
             chunks = _ChunksInView(self, everything, None, self._found, len(everything), whole=True)
         if chunks.missed is not None:
             self._catch_up(model, chunks.missed)
@@ -323,11 +326,12 @@ class VisibleChunks(Component):
 
     def complete_exactly(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
         """Catch up all chunks."""
-        missed = self._missed(np.ones(len(self._last), np.bool_), self.step)
+        missed = self._missed(np.arange(len(self._last), dtype=np.uint32), self.step)
         if missed is None:
             return
         self._catch_up((parameters, first, second), missed)
-        self._note_movement(self._last < missed.step, self._hidden_movement(missed.step + 1))
+        hidden, _ = self._hidden_movement(missed.step + 1)
+        self._note_movement(missed.numbers, hidden(missed.numbers))
         self._last[missed.numbers] = missed.step
 
     def rows_changed(self) -> None:
@@ -369,7 +373,7 @@ class _ChunksInView(ChunksInView):
     of: VisibleChunks
     numbers: NDArray[np.uint32]
     missed: Missed | None
-    of_rows: Float64
+    of_rows: BoundsTable
     slots: int
     whole: bool
 

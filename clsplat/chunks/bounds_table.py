@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The bounds of a model's chunks, and of groups of chunks, so that culling takes the time of what is near the view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Bool, Float32, Float64
+from clsplat.chunks.bounds import GROUP_FACTOR, ChunkBounds
+
+GROUP = 64
+"""Consecutive chunks in a group, and groups in a group of the next level."""
+MOST_ON_TOP = 2048
+"""Number of bounds that are looked at one by one. They take about as long as the calls of NumPy for another level."""
+_FLOATS = 7
+
+Sees = Callable[[ChunkBounds], Bool]
+"""True (n,) for bounds in view: `culling.visible` of a picture."""
+Movement = Callable[[NDArray[np.integer]], Float64]
+"""Movements (2, n) of means and log scales of chunks with given numbers (n,)."""
+
+
+class BoundsTable:
+    """Bounds of a model's chunks as they were last measured, and the most by which Gaussians have moved since.
+
+    The bounds of a group are around those of its chunks. Where one of them is not finite, the group's are NaN.
+
+    chunks: number of chunks. Their bounds are NaN, which leave nothing out, until they are measured.
+    """
+
+    def __init__(self, chunks: int) -> None:
+        self._levels = [np.full((chunks, _FLOATS), np.nan)]
+        while len(self._levels[-1]) > MOST_ON_TOP:
+            self._levels.append(np.full((-(-len(self._levels[-1]) // GROUP), _FLOATS), np.nan))
+        self._moved = np.zeros((2, chunks))
+        self._most_moved = np.zeros((2, 1))
+
+    def measure(self, numbers: NDArray[np.uint32], found: Float32) -> None:
+        """Take the bounds (n, 7) of some chunks, which have been measured: lowest, highest, largest log scale."""
+        self._levels[0][numbers] = found
+        self._moved[:, numbers] = 0.0
+        self._most_moved = self._moved.max(axis=1, initial=0.0, keepdims=True)
+        changed = numbers.astype(np.int64)
+        for below, level in pairwise(self._levels):
+            changed = np.unique(changed // GROUP)
+            members = below[np.minimum(_members(changed), len(below) - 1)]  # the last group repeats its last member
+            sides = np.hstack([members[:, :, :3].min(axis=1), members[:, :, 3:].max(axis=1)])
+            with np.errstate(invalid="ignore"):
+                finite = np.isfinite(members.sum(axis=(1, 2)))
+            level[changed] = np.where(finite[:, None], sides, np.nan)
+
+    def move(self, numbers: NDArray[np.uint32], steps: Float64) -> None:
+        """Note that coordinates of means, and log scales, of some chunks have moved by at most `steps` (2, n or 1)."""
+        self._moved[:, numbers] += steps
+        self._most_moved = np.maximum(self._most_moved, self._moved[:, numbers].max(axis=1, initial=0.0, keepdims=True))
+
+    def seen(self, sees: Sees, hidden: Movement, most_hidden: Float64, updates: int) -> NDArray[np.uint32]:
+        """The chunks in view, in rising order: all those of which `sees` is True. Others are looked at only in groups
+        in view.
+
+        hidden: further movements of chunks.
+        most_hidden: (2, 1), the largest for any chunk.
+        updates: number of updates of a parameter in all this time, as of `ChunkBounds.widened`.
+        """
+        most = self._most_moved + most_hidden
+        near = np.arange(len(self._levels[-1]))
+        for below, level in reversed(list(pairwise(self._levels))):
+            groups = _bounds(level[near], GROUP_FACTOR).widened(most[0], most[1], updates)
+            near = _members(near[sees(groups)]).ravel()
+            near = near[near < len(below)]
+        moved = self._moved[:, near] + hidden(near)
+        chunks = _bounds(self._levels[0][near]).widened(moved[0], moved[1], updates)
+        return near[sees(chunks)].astype(np.uint32)
+
+
+def _members(groups: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Numbers (n, GROUP) of the members of these groups, of which the last group has some too many."""
+    return GROUP * groups[:, None] + np.arange(GROUP)
+
+
+def _bounds(rows: Float64, factor: float = 1.0) -> ChunkBounds:
+    return ChunkBounds(rows[:, :3], rows[:, 3:6], rows[:, 6], factor)
