@@ -15,7 +15,7 @@ import pytest
 from calls import ended
 
 ROOT = Path(__file__).resolve().parents[2]
-STEP = re.compile(r'\bstep ("[^"]+") .*')
+STEP = re.compile(r'\bstep ("[^"]+") (spare )?.*')
 ROW = re.compile(r"^ *(\d+)  (.+)$", re.MULTILINE)
 
 pytestmark = pytest.mark.skipif(os.name != "posix" or shutil.which("bash") is None, reason="bash is not there")
@@ -26,7 +26,8 @@ def ran(folder: Path, *arguments: str, **steps: str) -> subprocess.CompletedProc
 
     def stub(found: re.Match[str]) -> str:
         name = found[1].strip('"')
-        return f"step {found[1]} {steps.get(name, 'eval python=python3' if name == 'environment' else 'true')}"
+        command = steps.get(name, "eval python=python3" if name == "environment" else "true")
+        return f"step {found[1]} {found[2] or ''}{command}"
 
     script = folder / ".ci/run"
     script.parent.mkdir()
@@ -51,7 +52,7 @@ def test_the_parts_have_every_step_once(tmp_path: Path) -> None:
         "== all passed: full",
     ]
     assert both.stdout.splitlines()[-1].startswith("== all passed: quick full, ")
-    names = STEP.findall((ROOT / ".ci/run").read_text())
+    names = [found[1] for found in STEP.finditer((ROOT / ".ci/run").read_text())]
     assert set(rows(quick.stdout)) & set(rows(full.stdout)) == {"environment", "in all"}
     assert rows(both.stdout) == rows(quick.stdout)[:-1] + rows(full.stdout)[1:]
     assert {f'"{name}"' for name in rows(both.stdout)} == {*names, '"in all"'}
@@ -69,6 +70,16 @@ def test_a_step_beside_others_fails_where_it_is_waited_for(tmp_path: Path) -> No
     assert result.returncode == 1 and "all passed" not in result.stdout
     assert rows(result.stdout)[-3:] == ["newcomer: tools/demo", "mypy (failed)", "in all"]
     assert "an error" in result.stdout.splitlines() and "== FAILED: mypy (status 7 after " in result.stderr
+
+
+def test_a_step_is_beside_several_others_at_the_lowest_priority(tmp_path: Path) -> None:
+    result = ran(tmp_path, "full", **{"memory; GPUs, counted": "bash -c 'nice; sleep 0.2'", "wheel": "nice"})
+    assert rows(result.stdout)[1:-1] == [
+        *("analysers", "OpenCL drivers", "wheel", "browser", "other readers", "torch"),
+        *("tests", "memory; GPUs, counted", "machines", "digests"),
+    ]
+    assert re.search(r"^== memory; GPUs, counted, begun before\n19$", result.stdout, re.MULTILINE)
+    assert re.search(rf"^== wheel, begun before\n{os.nice(0)}$", result.stdout, re.MULTILINE)
 
 
 def test_a_step_beside_others_ends_with_the_run(tmp_path: Path) -> None:
@@ -93,7 +104,9 @@ def _wait_until_gone(process: int, seconds: float = 10) -> None:
 def test_a_run_that_is_cut_off_says_in_which_step(tmp_path: Path, command: str, status: int) -> None:
     result = ran(tmp_path, "full", browser=command)
     assert result.returncode == status and "all passed" not in result.stdout
-    assert rows(result.stdout) == ["environment", "OpenCL drivers", "browser (did not end)", "in all"]
+    assert rows(result.stdout) == [
+        *("environment", "analysers", "OpenCL drivers", "wheel", "browser (did not end)", "in all")
+    ]
 
 
 def test_its_processes_keep_what_python_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Groups of tests that run in the same process with `-n 2 --dist loadgroup`.
 
-Tests for the same driver are a group, so that its kernels are built only once, which takes most of the time. Other
-tests of a file are a group, because they share fixtures. Groups follow from the tests' identifiers. The marker of
-pytest-xdist 3.8 has no effect with pytest 9.2.
+Tests for the same driver in the same shape are a group, so that its kernels are built only once, which takes most of
+the time; each shape has builds of its own. Other tests of a file are a group, because they share fixtures.
+Groups follow from the tests' identifiers. The marker of pytest-xdist 3.8 has no effect with pytest 9.2.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path, PurePath
 from typing import Any
@@ -19,8 +20,12 @@ from xdist.scheduler import LoadScopeScheduling
 def group_of(identifier: str, drivers: Mapping[int, str]) -> str:
     """The group of a test. drivers: by index, the words that name a driver in the tests' identifiers."""
     file, _, rest = identifier.partition("::")
-    named = [index for index, words in drivers.items() if words in rest.partition("[")[2]]
-    return f"driver {max(named, key=lambda index: len(drivers[index]))}" if named else PurePath(file).stem
+    parameters = rest.partition("[")[2]
+    named = [index for index, words in drivers.items() if words in parameters]
+    if not named:
+        return PurePath(file).stem
+    driver, shape = max(named, key=lambda index: len(drivers[index])), re.match(r"\d+x\d+g?(?=-)", parameters)
+    return f"driver {driver} in {shape[0]}" if shape else f"driver {driver}"
 
 
 class ByDriver(LoadScopeScheduling):  # type: ignore[misc]  # it has no types

@@ -18,7 +18,8 @@ class Extent:
 
     frame: of six tiles, or of two, one above the other. view: of four, or of two. low: of two, or of one. picture: of
     six, or of one.
-    capacity: pairs of a band, of which `frame` then has several. steps: of each of training's methods.
+    capacity: pairs of a band, of which `frame` then has several. steps: of each of training's methods. missed: steps
+    that a chunk has missed at most, of which `catch_up` takes 16 at a time.
     """
 
     frame: tuple[int, int] = (33, 17)
@@ -27,12 +28,13 @@ class Extent:
     picture: tuple[int, int] = (33, 17)
     capacity: int = 70
     steps: int = 2
+    missed: int = 300
 
     def shorten(self) -> None:
         """The least with which every kernel has every build."""
         self.frame = self.view = 9, 17
         self.low = self.picture = 9, 7
-        self.capacity, self.steps = 40, 1
+        self.capacity, self.steps, self.missed = 40, 1, 40
 
 
 EXTENT = Extent()

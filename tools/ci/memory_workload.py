@@ -143,10 +143,10 @@ def cases(device: Device) -> None:
             given = case.random(np.random.default_rng([draw, *name.encode()]), size)
             if name == "adam":
                 given.rows = ("all", "sparse", "late")[draw]
-            if name == "settle":
-                given.all_rows = draw == 1
-            if name == "chunks":
-                given.sparse = draw == 1
+            given.all_rows = given.sparse = draw == 1  # of settle, and of chunks
+            if name == "catch_up":
+                given.rates = dict(sorted(given.rates.items())[: EXTENT.missed])
+                given.last = {chunk: min(step, max(given.rates) - 1) for chunk, step in given.last.items()}
             check(f"{name}, {size}", case, device, given)
     gradients, sums = (allocate_gaussians(device, 9, 4, zero=True) for _ in range(2))
     shown = upload(device, np.arange(9, dtype=np.uint32) % 3)

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import cache
 
 from gpu_assembly import Block, Instruction
 
@@ -43,11 +44,16 @@ class Chain:
     passes: float = 0.0
 
     def __add__(self, other: Chain) -> Chain:
-        return Chain(*(getattr(self, each.name) + getattr(other, each.name) for each in fields(Chain)))
+        return Chain(
+            self.cycles + other.cycles,
+            self.accesses + other.accesses,
+            self.lines + other.lines,
+            self.passes + other.passes,
+        )
 
     def times(self, rounds: float) -> Chain:
         """The chain of this number of rounds."""
-        return Chain(*(getattr(self, each.name) * rounds for each in fields(Chain)))
+        return Chain(self.cycles * rounds, self.accesses * rounds, self.lines * rounds, self.passes * rounds)
 
 
 NOTHING = Chain()
@@ -66,17 +72,27 @@ def chain_of(
     lines_of: cache lines that an instruction touches.
     passes_of: its passes through the banks of local memory, and how many of them are conflicts.
     """
-    weighted = [(each, share) for block, share in blocks if share for each in block.body]
+    weighted = [(each, share, *passes_of(each)) for block, share in blocks if share for each in block.body]
     now, ready = 0, [0] * 8
-    whole = Chain()
-    for _ in range(rounds):
-        whole = Chain()
-        for each, share in weighted:
-            before, (passes, conflicts) = now, passes_of(each)
+    for _ in range(rounds - 1):
+        for each, _, _, conflicts in weighted:
             now = _issued(each, now, ready, access, round(conflicts))
-            accesses = round((now - before) / ENDLESS)
-            whole += Chain(now - before - accesses * ENDLESS, accesses, lines_of(each), passes).times(share)
-    return whole
+    cycles = accesses = lines = passes = 0.0
+    for each, share, own_passes, conflicts in weighted:
+        before = now
+        now = _issued(each, now, ready, access, round(conflicts))
+        waits = round((now - before) / ENDLESS)
+        cycles += (now - before - waits * ENDLESS) * share
+        accesses += waits * share
+        lines += lines_of(each) * share
+        passes += own_passes * share
+    return Chain(cycles, accesses, lines, passes)
+
+
+@cache
+def _latency(name: str) -> int | None:
+    """The cycles of VARIABLE for an instruction."""
+    return next(cycles for pattern, cycles in VARIABLE if re.match(pattern, name))
 
 
 def _issued(each: Instruction, now: int, ready: list[int], access: int, conflicts: int) -> int:
@@ -85,12 +101,14 @@ def _issued(each: Instruction, now: int, ready: list[int], access: int, conflict
     ready: when each scoreboard is clear; changed in place.
     conflicts: cycles by which conflicts of banks delay its result.
     """
-    stall, result, operands, waits = (
-        each.control >> shift & mask for shift, mask in ((0, 15), (5, 7), (8, 7), (11, 63))
-    )
-    start = max([now, *(ready[board] for board in range(6) if waits >> board & 1)])
-    cycles = next(cycles for pattern, cycles in VARIABLE if re.match(pattern, each.name))
+    control = each.control
+    result, operands, waits = control >> 5 & 7, control >> 8 & 7, control >> 11 & 63
+    start = now
+    for board in range(6) if waits else ():
+        if waits >> board & 1:
+            start = max(start, ready[board])
+    cycles = _latency(each.name)
     ready[operands] = max(ready[operands], start + 20)
     ready[result] = max(ready[result], start + (access if cycles is None else cycles + conflicts))
     ready[7] = 0
-    return start + stall + (BARRIER if each.name.startswith("BAR") else 0)
+    return start + (control & 15) + (BARRIER if each.name.startswith("BAR") else 0)

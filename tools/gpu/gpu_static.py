@@ -31,7 +31,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from itertools import takewhile
@@ -175,7 +175,8 @@ def compiled(
         nvidia("ptxas")
         nvidia("nvdisasm")
     with tempfile.TemporaryDirectory(prefix="clsplat-gpu-") as scratch, ThreadPoolExecutor(jobs) as pool:
-        builtins = {target: build_builtins(target, Path(scratch)) for target in targets}
+        bitcode = pool.map(lambda target: build_builtins(target, Path(scratch)), targets)
+        builtins = dict(zip(targets, bitcode, strict=True))
         asked = {(source, target): (source.used, target) for target in targets for source in sources}
         new = {used: each for each, used in asked.items() if used not in _COMPILED}
         say(f"{len(new)} kernel files to compile")
@@ -356,10 +357,10 @@ def main(arguments: Sequence[str]) -> int:
             source: kernels for source, kernels in sources_of(asked).items() if not wanted or source.stem in wanted
         }
         if options.intel:
-            built = compiled_for_intel(sources, options.jobs, partial(note_of, shape))
+            built = compiled_for_intel(sources, options.jobs, partial(note, shape))
             print("\n".join(intel_lines(built)))
             continue
-        rows += compiled(sources, targets, options.jobs, partial(note_of, shape), trained[-1])
+        rows += compiled(sources, targets, options.jobs, partial(note, shape), trained[-1])
     if options.intel:
         return 0
     if options.json:
@@ -416,16 +417,16 @@ def counted(frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], 
     rows: list[Row] = []
     used: dict[str, set[Rule]] = {}
     works: dict[str, Works] = {}
-    trained, _ = trained_and_picture(frames)
-    for shape in SHAPES:
-        found, works[shape] = works_in(shape, frames, jobs)
-        rows += found
-        for row in found:
-            used.setdefault(row.built.kernel, set()).update(row.rules)
-    for shape in FORMS:
-        sources = sources_of(ask_package(shape, trained[-1:])[0])
-        formed = {source: kernels for source, kernels in sources.items() if source.shape == shape}
-        rows += compiled(formed, TARGETS, jobs, partial(note_of, shape), trained[-1])
+    # The compilers run in processes of their own, while this one counts the shape before.
+    with ThreadPoolExecutor(jobs) as asking, ThreadPoolExecutor(1) as compiling:
+        steps = {shape: asking.submit(ask_package, shape, frames_in(shape, frames)) for shape in SHAPES + FORMS}
+        made = [compiling.submit(rows_in, shape, asked, frames, jobs) for shape, asked in steps.items()]
+        for (shape, asked), found in zip(steps.items(), made, strict=True):
+            rows += found.result()
+            if shape in SHAPES:
+                works[shape] = works_in(found.result(), asked.result(), frames_in(shape, frames))
+                for row in found.result():
+                    used.setdefault(row.built.kernel, set()).update(row.rules)
     if unused := unused_rules(used):
         raise UnknownLoopError("; ".join(unused))
     now = on_each_gpu(works, frames)
@@ -459,32 +460,37 @@ def on_each_gpu(works: Mapping[str, Works], frames: Sequence[Mapping[str, Any]])
     return found
 
 
-def works_in(shape: str, frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], Works]:
-    """The rows of a step's and a picture's kernels in a shape for every target, and the work of each frame's launches.
-    In SHAPE also of those that only draw a frame which is trained."""
-    largest = trained_and_picture(frames)[0][-1]
-    if shape == SHAPE:
-        trained = (frame for frame in frames if not frame.get("picture"))
-        frames = [*frames, *({**frame, "name": frame["name"] + DRAWN, "picture": True} for frame in trained)]
-    steps = ask_package(shape, frames)
-    sources = sources_of(launch for step in steps for launch in step)
-    rows = compiled(sources, TARGETS, jobs, partial(note_of, shape), largest)
+def frames_in(shape: str, frames: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:
+    """The frames whose launches are counted in a shape: in SHAPE also those that only draw a frame which is trained."""
+    if shape in FORMS:
+        return trained_and_picture(frames)[0][-1:]
+    if shape != SHAPE:
+        return frames
+    trained = (frame for frame in frames if not frame.get("picture"))
+    return [*frames, *({**frame, "name": frame["name"] + DRAWN, "picture": True} for frame in trained)]
+
+
+def rows_in(shape: str, asked: Future[list[Any]], frames: Sequence[Mapping[str, Any]], jobs: int) -> list[Row]:
+    """The rows of a shape's kernels for every target, of FORMS those in that form. asked: launches of each frame."""
+    sources = sources_of(launch for step in asked.result() for launch in step)
+    if shape in FORMS:
+        sources = {source: kernels for source, kernels in sources.items() if source.shape == shape}
+    return compiled(sources, TARGETS, jobs, partial(note, shape), trained_and_picture(frames)[0][-1])
+
+
+def works_in(rows: Sequence[Row], steps: Sequence[Any], frames: Sequence[Mapping[str, Any]]) -> Works:
+    """The work of each frame's launches on every target. steps: the launches."""
     works = {}
     for target in TARGETS:
         built = {(row.source, row.built.kernel): row.built for row in rows if row.built.target == target}
         for frame, step in zip(frames, steps, strict=True):
             works[target, frame["name"]] = works_of(step, built, frame)
-    return rows, works
+    return works
 
 
-def note_of(shape: str, text: str) -> None:
-    """Print the progress of the work on a shape."""
-    note(f"{shape}: {text}")
-
-
-def note(text: str) -> None:
-    """Print a line to standard error."""
-    print(text, file=sys.stderr, flush=True)
+def note(*words: str) -> None:
+    """Print a line to standard error: words with colons between them."""
+    print(*words, sep=": ", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":
