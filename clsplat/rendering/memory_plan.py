@@ -105,7 +105,8 @@ class Plan:
         """The line that training prints."""
         how = []
         if self.streamed:
-            how.append(f"parameters are streamed, {self.rows:,} Gaussians at a time")
+            within = "" if self.need.pool is None else " within --max-host-mem"
+            how.append(f"parameters are streamed, {self.rows:,} Gaussians at a time{within}")
         if self.bands > 1:
             how.append(f"the image is rendered in about {self.bands} bands of tiles")
         needed, allowed = mebibytes(self.need.total), mebibytes(self.allowed)
