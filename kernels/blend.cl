@@ -208,7 +208,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     }
     BARRIER_LOCAL();
 
-#define ENTRY(j) ((j) | (popcount(FROM_OWN(staged[j].blocks) & OF_FIRST_WARP) > SPARSE(OWNED) ? DENSE : 0))
+#define ENTRY(j) ENTRY_OF(j, SPARSE(OWNED) - (int)popcount(FROM_OWN(staged[j].blocks) & OF_FIRST_WARP))
     LIST_MARKED(count, marks + WARP * BATCH / 4, list, ENTRY)
     for (int block = ITEM; block < BLOCKS; block += ITEMS) open_in[block] = 0;
     BARRIER_LOCAL();
@@ -217,7 +217,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     OF_PAIRS for (int k = 1; k <= count; ++k) {
       const uint entry = next;
       next = list[k]; // loaded before its use
-      const Staged s = staged[PAIR_OF(entry)];
+      const Staged s = STAGED_AT(staged, entry);
       const int i = KEPT(batch + PAIR_OF(entry), (int)s.kept);
       SPLAT_STAGED(s)
       NEAR_HERE(s.near)

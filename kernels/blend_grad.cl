@@ -42,21 +42,8 @@
 #define ADD_REACHED(mask, cell) reached |= RECORDED(mask) << FIRST_RECORDED(cell);
 #endif
 
-// 1 / x for x in [0.01, 1]. Groups take three steps of Newton's method from an estimate by its bits, which is off by up
-// to 5 %: a division takes twice as many instructions, and its rounding depends on the driver. The result is nearly
-// always the rounded one, and too large as often as too small, so that a long list's errors do not add up.
-#if ITEMS == 1
-#define INVERSE(x) (1.0f / (x))
-#else
-#define INVERSE(x) inverse_of(x)
-static inline float inverse_of(float x) {
-  float y = as_float(0x7ef311c7 - as_int(x));
-  for (int step = 0; step < 3; ++step) y = fma1(y, fma1(-x, y, 1.0f), y);
-  return y;
-}
-#endif
-
-// State of the cells' pixels during the walk to the front, and the image's gradient there.
+// State of the cells' pixels during the walk to the front, and the image's gradient there. behind: R of (48), in groups
+// D . B of (22), which takes fewer instructions.
 typedef struct {
   floatL t[OWNED], behind[OWNED], red[OWNED], green[OWNED], blue[OWNED];
   intL stop[OWNED];
@@ -70,11 +57,14 @@ typedef struct {
   floatL g, weight;
 } Share;
 
+#include "shared/behind.h"
+
 // Removes a pair from a cell's pixels. `uncapped` is its alpha before the cap, 0 in lanes that did not take it.
 static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red, float c_green,
                              float c_blue NEAR_PARAMETER) {
+#if ITEMS == 1
   const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
-  const floatL inverse = INVERSE(1.0f - alpha);
+  const floatL inverse = 1.0f / (1.0f - alpha);
   const floatL before = p->t[cell] * inverse;
   const floatL colour =
       fmaL(p->red[cell], (floatL)(c_red), fmaL(p->green[cell], (floatL)(c_green), p->blue[cell] * c_blue));
@@ -90,6 +80,16 @@ static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red,
   p->t[cell] = before;
   const Share share = {g, weight};
   return share;
+#else
+#ifdef NEARNESS
+  const float behind = fma1(p->near[cell], c_near, -p->behind[cell]);
+#else
+  const float behind = -p->behind[cell];
+#endif
+  const float of_blue = fma1(p->blue[cell], c_blue, behind);
+  const float difference = fma1(p->red[cell], c_red, fma1(p->green[cell], c_green, of_blue));
+  return take_out_of(p->t + cell, p->behind + cell, uncapped, difference);
+#endif
 }
 
 #ifdef RAYS
@@ -130,6 +130,15 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
   sums[SLOT_NEAR] = fmaS(weight, IN_PLACE(p->near, place), sums[SLOT_NEAR]);
 #endif
 }
+
+// The gradient with respect to a pixel's final transmittance. background: its part through the background's colour.
+#ifdef ALPHA_GRADIENT
+#define AT_END(background) ((background) + by_t)
+#define NEAR_PLANE 4
+#else
+#define AT_END(background) (background)
+#define NEAR_PLANE 3
+#endif
 
 #if ITEMS > 1 && !defined(BY_GAUSSIAN)
 #include "shared/strips.h"
@@ -201,15 +210,6 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
 #include "shared/walk.h"
 #endif
 
-// The gradient with respect to a pixel's final transmittance. background: its part through the background's colour.
-#ifdef ALPHA_GRADIENT
-#define AT_END(background) ((background) + by_t)
-#define NEAR_PLANE 4
-#else
-#define AT_END(background) (background)
-#define NEAR_PLANE 3
-#endif
-
 GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_x, const int height,
                                           __global const uint *ranges, __global const uint *gaussian_from_sorted,
                                           __global const uint *slot_from_sorted, __global const float *splats,
@@ -248,7 +248,7 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
 #ifdef ALPHA_GRADIENT
     const float by_t = stop >= 0 ? image_gradient[3 * plane + pixel] : 0.0f;
 #endif
-    passing[PLACE(x, y)] = (Passing)(t, t * AT_END(f.x * background[0] + f.y * background[1] + f.z * background[2]));
+    passing[PLACE(x, y)] = (Passing)(t, AT_END(f.x * background[0] + f.y * background[1] + f.z * background[2]));
     fixed[PLACE(x, y)] = f;
 #ifdef NEARNESS
     near[PLACE(x, y)] = stop >= 0 ? image_gradient[NEAR_PLANE * plane + pixel] : 0.0f;
@@ -274,7 +274,7 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
     const floatL by_t =
         AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + 3 * plane + pixel, stride) & inside);
 #endif
-    const floatL behind = t * AT_END(red * background[0] + green * background[1] + blue * background[2]);
+    const floatL behind = BEHIND(t, AT_END(red * background[0] + green * background[1] + blue * background[2]));
     pixels.t[cell] = t;
     pixels.behind[cell] = behind;
     pixels.red[cell] = red;
@@ -390,6 +390,11 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
   __local int lasts[BLOCKS];      // the largest stop of each block
   __local float rows[TEAMS * TOGETHER * PAIR_ROWS * ROW] __attribute__((aligned(16)));
   __local float totals[BLOCK_ROWS * SLOT_STRIDE * TOTALS]; // by strip, field and pair
+#if TEAM_WARPS > 1
+  Pixels strip_pixels[BLOCK_COLUMNS];
+  load_strip((__global const int *)image_gradient, stops,
+             stride * (tile_y + TEAM * BLOCK_H + LANE / BLOCK_W) + tile_x + LANE % BLOCK_W, plane, strip_pixels);
+#endif
   for (int block = ITEM; block < BLOCKS; block += ITEMS) lasts[block] = begin;
   BARRIER_LOCAL();
   ALL_CELLS(cell) atomic_max(lasts + OWN_BLOCK(cell), pixels.stop[cell]);
@@ -434,13 +439,13 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
           NEAR_HERE(s.near)
           const uint reach = absent ? 0 : FROM_OWN(s.blocks) >> k * BLOCK_COLUMNS;
           WHITENING_HERE
-          float sums[SLOT_STRIDE];
 #if TEAM_WARPS == 1
-          if (IS_WHOLE(reach)) { // alpha is 0 in pixels that do not take the pair
-            FOR_STRIP(c) TAKE_PIXEL(k * BLOCK_COLUMNS + c, c == 0, 1);
+          float sums[SLOT_STRIDE];
+          BEGIN_SUMS(sums)
+          if (IS_WHOLE(reach)) { // alpha is 0 in pixels that do not take the pair, as in the first cell below
+            FOR_STRIP(c) ADD_PIXEL(k * BLOCK_COLUMNS + c, 1);
           } else {
-            FOR_FIELDS(field) sums[field] = 0.0f;
-            FOR_STRIP(c) if (reach >> c & 1) { TAKE_PIXEL(k * BLOCK_COLUMNS + c, c == 0, taken); }
+            FOR_STRIP(c) if (reach >> c & 1) ADD_PIXEL(k * BLOCK_COLUMNS + c, c == 0 || taken);
           }
           const float v = l22 * (my - AT_Y(k * BLOCK_COLUMNS));
           j = next;
@@ -449,11 +454,7 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
           finish_row(v, sums);
           leave_sums(sums, pair_rows);
 #else
-          FOR_STRIP(c) if (reach >> c & 1) {
-            FOR_FIELDS(field) sums[field] = 0.0f;
-            TAKE_PIXEL(c, 1, taken);
-            leave_block(sums, pair_rows + (TEAM_WARP * STRIP_CELLS + c) * (CELL_FIELDS * ROW));
-          }
+          FOR_STRIP(c) if (reach >> c & 1) LEAVE_PIXEL(c, pair_rows + LEFT_ROWS(TEAM_WARP * STRIP_CELLS + c));
           j = next;
           s = staged[j];
           next = list[ACROSS_TEAMS ? min(turn + 2, own) : turn + 2];
@@ -463,7 +464,9 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
         BARRIER_LOCAL();
         for (int turn = first + TEAM_WARP; turn < stop_at; turn += TEAM_WARPS) {
           const Staged s = staged[list[turn]];
-          join_blocks(s.blocks >> strip * BLOCK_COLUMNS, s.l22 * (s.my - AT_Y(0)),
+          SPLAT_STAGED(s)
+          WHITENING_HERE
+          join_blocks(s.blocks >> strip * BLOCK_COLUMNS, strip_pixels, l22 * (my - AT_Y(0)), W11, W12, W22,
                       rows + (TEAM * TOGETHER + turn - first) * (PAIR_ROWS * ROW));
         }
 #endif

@@ -29,9 +29,9 @@ CPU_STEP_ROWS = 128
 """Number of Gaussians per group of `project_step` on a CPU. Their gradients, 30 KiB, stay in the cache, and each array
 is read in runs long enough for prefetching. With groups of a single vector a step takes 1.5 times as long."""
 
-STEP_REGISTERS = 96
+STEP_REGISTERS = 88
 """Maximum registers per item of `project_step`, where the driver accepts a limit. Adam is bound by memory latency, so
-more items at a time help more than registers. Code by clang for NVIDIA spills nothing even with 80."""
+more items at a time help more than registers. Code by clang for NVIDIA spills nothing with 88, and 8 bytes with 80."""
 
 SCREEN_GRADIENT_BYTES = 8
 """Bytes per Gaussian of the screen-space gradient; 4 more if contributions are kept."""

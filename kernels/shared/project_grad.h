@@ -13,6 +13,13 @@
 #define SH_IN_PLACE // the gradients overwrite the SH coefficients in local memory
 #endif
 
+// A GPU loads four addends of a Gaussian before it adds them up.
+#ifdef SH_IN_PLACE
+#define ADDENDS_AHEAD _Pragma("unroll 4")
+#else
+#define ADDENDS_AHEAD
+#endif
+
 // Loops over the SH coefficients after the first, up to `used`.
 #define SH_HIGHER 15
 #if LANES == 1
@@ -74,8 +81,9 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
     float sums[SLOT_STRIDE];
     for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] = 0.0f;
-    for (uint k = 0; k < addends; ++k, slot += SLOT_STRIDE)
+    ADDENDS_AHEAD for (uint k = 0; k < addends; ++k, slot += SLOT_STRIDE) {
       for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] += slot[field];
+    }
     for (int field = 0; field < SLOT_STRIDE; ++field) m[field].lane[lane] = sums[field];
 #ifndef RAYS
     __global const float *splat = splats + (size_t)SPLAT_SIZE * (first_row + lane);

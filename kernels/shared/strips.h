@@ -31,19 +31,15 @@
 #define FOR_FIELDS(field) _Pragma("unroll") for (int field = 0; field < SLOT_STRIDE; ++field)
 #define FOR_STRIP(c) _Pragma("unroll") for (int c = 0; c < STRIP_CELLS; ++c)
 
-// The fields that finish_row computes; the others have sums over pixels. With RAYS each pixel has its own v.
+// Rows of a pair: one for each field. If several warps share the strip, LEFT rows for each block come before them, in
+// the same memory.
 #ifdef RAYS
-#define OF_ROW(field) 0
-#define CELL_FIELDS SLOT_STRIDE
-#define PLACE_IN_CELL(field) (field)
+#define LEFT 4 // g, weight, u and v
 #else
-#define OF_ROW(field) ((field) == SLOT_GV || (field) == SLOT_GUV || (field) == SLOT_GVV)
-#define CELL_FIELDS (SLOT_STRIDE - 3)
-#define PLACE_IN_CELL(field) ((field) - ((field) > SLOT_GV) - ((field) > SLOT_GUV) - ((field) > SLOT_GVV))
+#define LEFT 3 // g, weight and u
 #endif
-
-// Rows of a pair: one for each field, or first one for each block and field if several warps share the strip.
-#define PAIR_ROWS (TEAM_WARPS == 1 ? SLOT_STRIDE : BLOCK_COLUMNS * CELL_FIELDS)
+#define LEFT_ROWS(block) ((block) * (LEFT * ROW))
+#define PAIR_ROWS (TEAM_WARPS == 1 || BLOCK_COLUMNS * LEFT < SLOT_STRIDE ? SLOT_STRIDE : BLOCK_COLUMNS * LEFT)
 #if TEAM_WARPS > 1
 #define TOGETHER (SLOT_STRIDE > 9 ? 1 : 2)
 #else
@@ -51,7 +47,10 @@
 #endif
 #define TOTALS (BATCH + 1) // pairs of which a strip's totals are kept, padded: a pair's totals are in different banks
 
-// Computes the fields of a lane that follow from the others.
+// A lane's sums begin at -0: a compiler then adds nothing to the first addend, which is the same but for a zero's sign.
+#define BEGIN_SUMS(sums) FOR_FIELDS(field) sums[field] = -0.0f;
+
+// Computes the fields of a lane that follow from the others. With RAYS each pixel has its own v.
 static inline void finish_row(float v, float *sums) {
 #ifndef RAYS
   sums[SLOT_GV] = v * sums[SLOT_G];
@@ -60,60 +59,69 @@ static inline void finish_row(float v, float *sums) {
 #endif
 }
 
-// Leaves a lane's sums over one block.
-static inline void leave_block(const float *sums, __local float *block_rows) {
-  FOR_FIELDS(field) if (!OF_ROW(field)) block_rows[PLACE_IN_CELL(field) * ROW + LANE] = sums[field];
+#define SHARE_IN(cell)                                                                                                 \
+  take_out(&pixels, cell, as_float(as_int(exp2_by(power, zero)) & taken), c_red, c_green, c_blue NEAR_ARGUMENT)
+
+// Adds a pixel of a lane to its sums.
+#define ADD_PIXEL(cell, where)                                                                                         \
+  {                                                                                                                    \
+    ALPHA_IN(cell)                                                                                                     \
+    if (where) {                                                                                                       \
+      const Share share = SHARE_IN(cell);                                                                              \
+      add_gradients(sums, &pixels, cell, share.g, share.weight, u, v, W11, W12, W22);                                  \
+    }                                                                                                                  \
+  }
+
+#if TEAM_WARPS > 1
+// Leaves what another lane needs to add a pixel to its sums.
+#define LEAVE_PIXEL(cell, block_rows)                                                                                  \
+  {                                                                                                                    \
+    ALPHA_IN(cell)                                                                                                     \
+    Share share = {0.0f, 0.0f};                                                                                        \
+    if (taken) share = SHARE_IN(cell);                                                                                 \
+    leave_pixel(share, u, v, block_rows);                                                                              \
+  }
+static inline void leave_pixel(Share share, float u, float v, __local float *block_rows) {
+  block_rows[LANE] = share.g;
+  block_rows[ROW + LANE] = share.weight;
+  block_rows[2 * ROW + LANE] = u;
+#ifdef RAYS
+  block_rows[3 * ROW + LANE] = v;
+#endif
 }
 
-// Adds up what the lane's items have left for a pair that reaches these blocks, and leaves it in the first rows.
-static inline void join_blocks(uint blocks, float v, __local float *pair_rows) {
+// Adds up what lanes have left for a pair that reaches these blocks, and leaves the sums in the pair's first rows.
+// strip: the image's gradient in the lane's pixel of each block.
+static inline void join_blocks(uint blocks, const Pixels *strip, float v, float l11, float l12, float l22,
+                               __local float *pair_rows) {
   float sums[SLOT_STRIDE];
-  FOR_FIELDS(field) sums[field] = 0.0f;
-  _Pragma("unroll") for (int c = 0; c < BLOCK_COLUMNS; ++c) if (blocks >> c & 1) FOR_FIELDS(field) if (!OF_ROW(field))
-      sums[field] += pair_rows[(c * CELL_FIELDS + PLACE_IN_CELL(field)) * ROW + LANE];
+  BEGIN_SUMS(sums)
+  _Pragma("unroll") for (int c = 0; c < BLOCK_COLUMNS; ++c) if (blocks >> c & 1) {
+    __local const float *left = pair_rows + LEFT_ROWS(c) + LANE;
+#ifdef RAYS
+    v = left[3 * ROW];
+#endif
+    add_gradients(sums, strip + c, 0, left[0], left[ROW], left[2 * ROW], v, l11, l12, l22);
+  }
   finish_row(v, sums);
   FOR_FIELDS(field) pair_rows[field * ROW + LANE] = sums[field];
 }
 
-// Adds the gradients of a pixel to a pair's sums, without the fields that finish_row computes. Products are rounded
-// before they are added, as items may leave them in local memory first. `begins`: the sums are those of this pixel
-// alone.
-static inline void add_pixel(float *sums, const Pixels *p, uint cell, float g, float weight, float u, float v,
-                             float l11, float l12, float l22, int begins) {
-  float own[SLOT_STRIDE];
-  FOR_FIELDS(field) own[field] = 0.0f;
-  own[SLOT_RED] = weight * p->red[cell];
-  own[SLOT_GREEN] = weight * p->green[cell];
-  own[SLOT_BLUE] = weight * p->blue[cell];
-#ifdef RAYS
-  add_ray_moments(g, u, v, l11, l12, l22, own);
-#else
-  own[SLOT_G] = g;
-  own[SLOT_GU] = g * u;
-  own[SLOT_GUU] = own[SLOT_GU] * u;
-#ifdef ABSOLUTE_GRADIENTS
-  own[SLOT_ABSX] = fabs(g * (l11 * u));
-  own[SLOT_ABSY] = fabs(g * fma1(l12, u, l22 * v));
-#endif
-#endif
-#ifdef CONTRIBUTIONS
-  own[SLOT_WEIGHT] = weight;
-#endif
+// Loads the image's gradient in the lane's pixel of each block of a strip; first_pixel: that of the first block.
+static inline void load_strip(__global const int *image_gradient, __global const int *stops, size_t first_pixel,
+                              size_t plane, Pixels *strip) {
+  _Pragma("unroll") for (int c = 0; c < BLOCK_COLUMNS; ++c) {
+    const size_t pixel = first_pixel + c * BLOCK_W;
+    const int inside = MASKL(stops[pixel] >= 0);
+    strip[c].red[0] = as_float(image_gradient[pixel] & inside);
+    strip[c].green[0] = as_float(image_gradient[plane + pixel] & inside);
+    strip[c].blue[0] = as_float(image_gradient[2 * plane + pixel] & inside);
 #ifdef NEARNESS
-  own[SLOT_NEAR] = weight * p->near[cell];
+    strip[c].near[0] = as_float(image_gradient[NEAR_PLANE * plane + pixel] & inside);
 #endif
-  FOR_FIELDS(field) if (!OF_ROW(field)) sums[field] = begins ? own[field] : sums[field] + own[field];
-}
-
-#define TAKE_PIXEL(cell, begins, where)                                                                                \
-  {                                                                                                                    \
-    ALPHA_IN(cell)                                                                                                     \
-    if (where) {                                                                                                       \
-      const float alpha = as_float(as_int(exp2_by(power, zero)) & taken);                                              \
-      const Share share = take_out(&pixels, cell, alpha, c_red, c_green, c_blue NEAR_ARGUMENT);                        \
-      add_pixel(sums, &pixels, cell, share.g, share.weight, u, v, W11, W12, W22, begins);                              \
-    }                                                                                                                  \
   }
+}
+#endif
 
 // Loads the Gaussian and the slot of an item's fetch number `fetch`. A batch's pairs run backwards from `batch` - 1.
 #define FETCH_INDICES(fetch, batch)                                                                                    \

@@ -57,20 +57,16 @@ static inline void take_chunk(const Walker *w, int chunk, __local Passing *passi
     const float power = log2_alpha(u, v, w->log2o);
     const int taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL(w->i < as_int(pixel.w));
     const float uncapped = as_float(as_int(exp2L(power)) & taken);
-    const float alpha = uncapped < ALPHA_MAX ? uncapped : ALPHA_MAX;
-    const float inverse = INVERSE(1.0f - alpha);
-    const float before = state.x * inverse;
-    const float colour = fmaL(pixel.x, w->red, fmaL(pixel.y, w->green, pixel.z * w->blue));
 #ifdef NEARNESS
-    const float shade = fmaL(near[place], w->near, colour);
+    const float behind = fmaL(near[place], w->near, -state.y);
 #else
-    const float shade = colour;
+    const float behind = -state.y;
 #endif
-    const float weight = alpha * before;
-    const float d_alpha = fmaL(before, shade, -(state.y * inverse));
-    const float g = uncapped < ALPHA_MAX ? alpha * d_alpha : 0.0f;
-    const float gu = g * u;
-    passing[place] = (Passing)(taken ? before : state.x, fmaL(weight, shade, state.y));
+    const float difference = fmaL(pixel.x, w->red, fmaL(pixel.y, w->green, fmaL(pixel.z, w->blue, behind)));
+    float t = state.x, light = state.y;
+    const Share share = take_out_of(&t, &light, uncapped, difference);
+    const float g = share.g, weight = share.weight, gu = g * u;
+    passing[place] = (Passing)(t, light);
     sums[SLOT_RED] = fmaL(weight, pixel.x, sums[SLOT_RED]);
     sums[SLOT_GREEN] = fmaL(weight, pixel.y, sums[SLOT_GREEN]);
     sums[SLOT_BLUE] = fmaL(weight, pixel.z, sums[SLOT_BLUE]);

@@ -27,7 +27,7 @@ from clsplat.models.edit import take
 from clsplat.reference import render as reference
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.stages.blend import frame_items
+from clsplat.stages.blend import frame_items, gradient_items
 from clsplat.stages.device_gaussians import upload_gaussians
 
 SIZES = ((1, 1), (15, 16), (16, 16), (17, 15), (33, 1), (1, 40), (64, 48))
@@ -116,14 +116,52 @@ def test_a_gpu_blends_few_tiles_in_larger_groups(default_device: Device, monkeyp
         assert_same_bits(plane.get(), wanted)
 
 
+@pytest.mark.parametrize(("kind", "group", "tiles", "shape", "items"), [
+    ("gpu", 1024, 1584, Shape(lanes=1, items=64, chunks=8), 256),
+    ("gpu", 1024, 1585, Shape(lanes=1, items=64, chunks=8), 64),
+    ("gpu", 1024, 1584, Shape(lanes=1, items=32, chunks=8), 256),
+    ("gpu", 1024, 1584, Shape(lanes=1, items=16, chunks=8), 16),
+    ("gpu", 1024, 1584, Shape(lanes=1, items=64, chunks=8, by_gaussian=True), 64),
+    ("gpu", 1024, 1584, Shape(lanes=8, items=1, chunks=8), 1),
+    ("gpu", 128, 1584, Shape(lanes=1, items=64, chunks=8), 64),
+    ("cpu", 1024, 1584, Shape(lanes=1, items=64, chunks=8), 64),
+])  # fmt: skip
+def test_the_gradient_of_few_tiles_is_shared_by_256_items(
+    kind: str, group: int, tiles: int, shape: Shape, items: int
+) -> None:
+    limits = SimpleNamespace(max_compute_units=132)
+    device = SimpleNamespace(kind=kind, max_group=group, cl_device=limits, shape=shape)
+    assert gradient_items(cast("Device", device), tiles) == items
+
+
+def test_a_gpu_takes_the_gradient_of_few_tiles_in_the_largest_group(
+    default_device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device, scene = shaped(default_device, 1, 64), HARD["cloud"]()
+    run = Pipeline.run(device, scene)
+    alone = run.slots(noise(run)) + np.float32(0)  # without the sign of zeros, which does not count
+    groups: list[int] = []
+
+    def launch(*arguments: Any) -> None:
+        groups.append(arguments[3])
+        launch_groups(*arguments)
+
+    monkeypatch.setattr(device, "kind", "gpu")
+    monkeypatch.setattr("clsplat.stages.blend.launch_groups", launch)
+    wide = Pipeline.run(device, scene)
+    groups.clear()
+    assert_same_bits(wide.slots(noise(wide)) + np.float32(0), alone)
+    assert groups == [256], "20 tiles for the units of a CPU"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("items", quick([16, 32, 64, 128, 256], 32, 128))
 def test_the_gradient_of_a_group_of_any_size(default_device: Device, items: int) -> None:
     scene = scenes.many_per_tile()
     d_image = np.random.default_rng(2).standard_normal((scene[1].height, scene[1].width, 3))
     alone, group = (Pipeline.run(shaped(default_device, 1, size), scene).backward(d_image)[0] for size in (1, items))
-    # two orders of adding up 256 numbers, sqrt(256) half ulp where nothing cancels, and three Newton steps for a
-    # division, an ulp more
+    # two orders of adding up 256 numbers, sqrt(256) half ulp where nothing cancels, and the light behind a Gaussian in
+    # two forms, an ulp more
     assert_close_gradients(group.arrays(), alone.arrays(), 2e-6)
 
 
@@ -149,16 +187,16 @@ def test_the_gradient_by_gaussian(device: Device, count: int) -> None:
     scene = stacked(count)
     d_image = np.random.default_rng(2).standard_normal((16, 16, 3))
     fields = SlotFields(absolute=True, contributions=True)
-    runs = [Pipeline.run(shaped(device, *shape), scene) for shape in ((1, 1), (1, 32, True), (1, 64, True))]
-    assert runs[0].frame.listed.lists.gaussian_from_sorted.shape == (count,)
-    found = []
-    for run in runs:
+    twin = reference.render_grad(*scene, d_image, BACKGROUND)
+    wanted = {**twin.parameters, "screen": twin.abs_means2d, "contributions": twin.contributions}
+    for items in (32, 64):
+        run = Pipeline.run(shaped(device, 1, items, True), scene)
+        assert run.frame.listed.lists.gaussian_from_sorted.shape == (count,)
         gradients, screen = run.screened(d_image, fields)
         assert screen.contributions is not None
         on_image = {"screen": screen.gradients.get(), "contributions": screen.contributions.get()}
-        found.append({**gradients.arrays(), **on_image})
-    for other in found[1:]:
-        assert_close_gradients(other, found[0], 2e-6)  # as of groups above
+        # as of groups above; a single item is up to 3.3e-6 off in lists of 300, where it takes out light by light
+        assert_close_gradients({**gradients.arrays(), **on_image}, wanted, 2e-6)
 
 
 @pytest.mark.parametrize("items", quick([32, 64, 128, 256], 64))

@@ -143,16 +143,19 @@ def test_a_present_frame_is_that_of_its_own_launches() -> None:
 def test_frames_of_few_tiles_have_larger_groups() -> None:
     """On the GPUs whose units would be idle, in the kernels whose groups follow the frame."""
     frames = [{"name": "small", "width": 16 * 1450, "height": 16}, {"name": "large", "width": 16 * 6700, "height": 16}]
+    frames.append({"name": "middling", "width": 16 * 2500, "height": 16})
+    kernels = ("blend", "sort_lists", "blend_grad", "adam")
     works = {
         f"1x{items}": {
-            ("sm_90", name): [None, *(Work(kernel, items, kernel=kernel) for kernel in ("blend", "sort_lists", "adam"))]
-            for name in ("small", "small" + DRAWN, "large")
+            ("sm_90", name): [None, *(Work(kernel, items, kernel=kernel) for kernel in kernels)]
+            for name in ("small", "small" + DRAWN, "middling", "large")
         }
         for items in (64, 128, 256)
     }
     found = on_each_gpu(works, frames)
     assert {gpu for gpu, _ in found} == {"H100 SXM", "H200"}
-    assert [work and work.bytes for work in found["H200", "small"]] == [None, 256, 256, 64]
+    assert [work and work.bytes for work in found["H200", "small"]] == [None, 256, 256, 256, 64]
+    assert [work and work.bytes for work in found["H200", "middling"]] == [None, 128, 128, 64, 64]
     assert found["H200", "small" + DRAWN] == found["H200", "small"]
     assert found["H200", "large"] == works["1x64"]["sm_90", "large"]
 

@@ -109,8 +109,11 @@ def _of_others(run: Run, others: float, all_pairs: float) -> float:
     return (others if run.team_waves == 1 else all_pairs) / BLOCKS
 
 
-def _of_turn(text: str, share: Rounds) -> Rule:
-    return Rule(text, lambda run: share(run) / run.turns_back * run.strips, part=True)
+def _of_turn(text: str, share: Rounds, inside: str = "") -> Rule:
+    return Rule(text, lambda run: share(run) / run.turns_back * run.strips, part=True, inside=inside)
+
+
+_TURNS, _JOINS = "for (int turn = first; turn < stop_at;", "for (int turn = first + TEAM_WARP;"
 
 
 BY_PAIR: dict[str, tuple[Rule, ...]] = {
@@ -135,24 +138,28 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
         Rule(
             "for (int first = 0; first < most; first += TOGETHER)",
             lambda run: run.rounds_back / run.strips,
-            ends=("for (int turn = first; turn < stop_at;",),
+            ends=(_TURNS,),
             holding="BARRIER_LOCAL();",
             copies=True,
         ),
         Rule(
-            "for (int turn = first; turn < stop_at;",
+            _TURNS,
             lambda run: run.turns_back / run.strips,
             lacking="BARRIER_LOCAL();",
             copies=True,
         ),
-        _of_turn("c == 0, 1);", lambda run: run.whole_back / run.strips),
+        _of_turn("ADD_PIXEL(k * BLOCK_COLUMNS + c, 1)", lambda run: run.whole_back / run.strips),
         *(
-            _of_turn(text, lambda run: _of_others(run, run.others_taken, run.taken))
-            for text in ("const floatL t = x + 12582912.0f;", "own[SLOT_RED] = weight")
+            _of_turn(text, lambda run: _of_others(run, run.others_reached, run.reached))
+            for text in ("l11 * dx);", "block_rows[LANE] = share.g;")
         ),
-        _of_turn("l11 * dx);", lambda run: _of_others(run, run.others_reached, run.reached)),
-        _of_turn("FOR_STRIP(c) if (reach >> c & 1) {", lambda run: (run.turns_back - run.whole_back) / run.strips),
-        Rule("for (int turn = first + TEAM_WARP;", lambda run: run.turns_back / run.team_waves),
+        _of_turn("const floatL t = x + 12582912.0f;", lambda run: _of_others(run, run.others_taken, run.taken)),
+        _of_turn("sums[SLOT_G] += g;", lambda run: _of_others(run, run.others_reached, run.reached), inside=_JOINS),
+        _of_turn(
+            "FOR_STRIP(c) if (reach >> c & 1) ADD_PIXEL(",
+            lambda run: (run.turns_back - run.whole_back) / run.strips,
+        ),
+        Rule(_JOINS, lambda run: run.turns_back / run.team_waves),
         Rule("return (four.x + four.y)", lambda run: 1 / run.team_waves, ends=("DOUBLED(",), part=True),
         Rule(
             "for (int j = ITEM / ABREAST; j < count;",

@@ -57,7 +57,7 @@ from measuring import plain_parser, require, tool
 from clsplat.files.atomic import atomic_write
 from clsplat.layouts.columns import LOSS_GROUP_COLUMNS, LOSS_GROUP_ROWS, LOSS_PARTS, TILE
 from clsplat.progress import aligned
-from clsplat.stages.blend import items_for
+from clsplat.stages.blend import gradient_items_for, items_for
 
 SHAPES = ("1x32", "1x64", "1x128", "1x256")
 FORMS = ("1x32g", "1x64g", "1x32s", "1x64s")
@@ -65,8 +65,8 @@ FORMS = ("1x32g", "1x64g", "1x32s", "1x64s")
 FRAMES = Path(__file__).with_name("gpu_frames.json")
 CHECKED = (("1x64", "1x32g"), ("sm_89", "sm_90", "gfx1100", "gfx90a"))
 """Shapes and targets that have ceilings."""
-BY_FRAME = ("blend", "sort_lists")
-"""Kernels whose groups follow the frame (`clsplat.stages.blend.frame_items`)."""
+BY_FRAME = {"blend": items_for, "sort_lists": items_for, "blend_grad": gradient_items_for}
+"""Kernels whose groups follow the frame, and how (`clsplat.stages.blend.frame_items` and `gradient_items`)."""
 NO_STACK = ("blend", "blend_grad", "project_grad", "sort_radix")
 """Kernel files that must use no stack memory and no spills on NVIDIA's GPUs."""
 NO_SCRATCH = ("blend", "blend_grad", "project_grad")
@@ -454,8 +454,14 @@ def on_each_gpu(works: Mapping[str, Works], frames: Sequence[Mapping[str, Any]])
         for (target, name), launches in works[SHAPE].items():
             if target == gpu.target:
                 frame = name.removesuffix(DRAWN)
-                shape = f"1x{items_for(sizes[frame], gpu.units, int(SHAPE[2:]), TILE * TILE)}"
-                wide = {work.kernel: work for work in works[shape][target, frame] if work and work.kernel in BY_FRAME}
+                of_tiles = (sizes[frame], gpu.units, int(SHAPE[2:]), TILE * TILE)
+                shapes = {kernel: f"1x{items(*of_tiles)}" for kernel, items in BY_FRAME.items()}
+                wide = {
+                    work.kernel: work
+                    for shape in set(shapes.values())
+                    for work in works[shape][target, frame]
+                    if work and shapes.get(work.kernel) == shape
+                }
                 found[gpu.name, name] = [work and wide.get(work.kernel, work) for work in launches]
     return found
 
