@@ -219,7 +219,7 @@ class Rasterizer:
             whose pool knows it, the chunks in view. With ChunkNumbers the pairs are counted first.
         """
         device, work = self.device_of(camera), self.work
-        if chunks is None and isinstance(gaussians, HostGaussians) and gaussians.pool is not None:
+        if chunks is None and isinstance(gaussians, HostGaussians) and gaussians.pool is not None and gaussians.culls:
             gaussians, chunks = self._in_view(gaussians, gaussians.pool, camera)
         sent = background if isinstance(background, tuple) else self.send(camera, background)
         camera_array, colours = sent

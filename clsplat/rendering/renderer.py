@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -315,6 +315,8 @@ class Renderer:
         planes: bytes per pixel in addition to the picture's.
         moved: number of further sets of means.
         """
+        if isinstance(gaussians, HostGaussians) and features:
+            return replace(gaussians, culls=False), camera
         if not isinstance(gaussians, Gaussians):
             return gaussians, camera
         if self._sh is None or self._sh[0] is not gaussians:

@@ -136,11 +136,13 @@ class HostGaussians(_ByGroup[Any]):
     rows: number of Gaussians that are on the device at once.
     kind: "" if the arrays are in main memory; else they are fields `kind`/GROUP of a store.
     pool: the chunks of that store that are on the device; None for the store of a checkpoint.
+    culls: False to project all chunks, for results by Gaussian of the whole model.
     """
 
     rows: int
     pool: ChunkPool | None = None
     kind: str = ""
+    culls: bool = True
 
     @cached_property
     def in_pool(self) -> DeviceGaussians:

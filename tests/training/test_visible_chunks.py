@@ -168,6 +168,11 @@ def test_a_streamed_model(
     assert not list(tmp_path.iterdir()), "the file of chunks is gone"
 
 
+def depth_of(trainer: Trainer, camera: Camera) -> Float32:
+    model, camera = trainer.complete_parameters, trainer.local(camera)
+    return trainer.renderer.render_channels(model, camera, ["depth"])[1]["depth"]
+
+
 @pytest.mark.parametrize("optimiser", ["dense", "sparse"])
 def test_a_look_at_a_streamed_model(
     scene: Scene, default_device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, optimiser: str
@@ -182,6 +187,10 @@ def test_a_look_at_a_streamed_model(
         if step % 4 == 0:
             camera = cameras()[step % 5]
             assert_same_bits(limited.draw(camera).image, free.draw(camera).image)
+            depths = [
+                t.renderer.render_channels(t.complete_parameters, t.local(camera), ["depth"]) for t in (limited, free)
+            ]
+            assert_same_bits(depths[0].channels["depth"], depths[1].channels["depth"])
         if step % 7 == 0:
             some = limited.rows()(100, 3000)
             assert_same_bits(some.sh, free.gaussians().sh[100:3000])

@@ -262,9 +262,9 @@ class VisibleChunks(Component):
         self._last, self.step = self._last.copy(), step.number
         self._last[chunks.numbers] = step.number
         self._note(step)
-        if chunks.whole:
-            return None
         work, pool = self._rasterizer.work, _pool_of(model)
+        if chunks.whole and pool is None:
+            return None
         if pool is not None and len(chunks.numbers) > pool.slots:
             return PlacedChunks(model, ChunkNumbers(chunks.numbers), None)
         listed = send_chunks(work, "chunks", chunks.numbers, model[0].count)
