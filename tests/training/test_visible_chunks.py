@@ -18,6 +18,8 @@ from same_bytes import State, make_too_small, outcome, stopped
 from tiny import cameras, run_steps, short
 from wide import ROWS, let_small_models_have_chunks, start_wide, wide_model
 
+from clsplat.arrays import Float32
+from clsplat.camera import Camera
 from clsplat.chunks.bounds import ChunkBounds
 from clsplat.chunks.culling import PictureBorders
 from clsplat.chunks.order import beside_parents, space_order
@@ -187,10 +189,7 @@ def test_a_look_at_a_streamed_model(
         if step % 4 == 0:
             camera = cameras()[step % 5]
             assert_same_bits(limited.draw(camera).image, free.draw(camera).image)
-            depths = [
-                t.renderer.render_channels(t.complete_parameters, t.local(camera), ["depth"]) for t in (limited, free)
-            ]
-            assert_same_bits(depths[0].channels["depth"], depths[1].channels["depth"])
+            assert_same_bits(depth_of(limited, camera), depth_of(free, camera))
         if step % 7 == 0:
             some = limited.rows()(100, 3000)
             assert_same_bits(some.sh, free.gaussians().sh[100:3000])
