@@ -221,8 +221,7 @@ class Rasterizer:
         device, work = self.device_of(camera), self.work
         if chunks is None and isinstance(gaussians, HostGaussians) and gaussians.pool is not None and gaussians.culls:
             gaussians, chunks = self._in_view(gaussians, gaussians.pool, camera)
-        sent = background if isinstance(background, tuple) else self.send(camera, background)
-        camera_array, colours = sent
+        camera_array, colours = background if isinstance(background, tuple) else self.send(camera, background)
         by_append = room is not None and self._appends(device, room, tiles_of(camera))
 
         def make() -> tuple[Projected, tuple[Band, ...], ListedBand, Blended, tuple[int, ...]]:
@@ -253,7 +252,7 @@ class Rasterizer:
             return ForwardPass(camera, camera_array, colours, *make())
         size, how = (camera.width, camera.height), (backward, thinning is not None, nearness)
         assert not isinstance(chunks, ChunkNumbers), "the host moves chunks in the middle of the pass"
-        rows = None if chunks is None else chunks.key
+        rows = chunks and chunks.key
         key = (self.readback, device, colours, *size, *how, room.pairs, room.turn, by_append, rows)
         made = work.replayed(gaussians, key, make, thinning_numbers(thinning), (camera_array,))
         return ForwardPass(camera, camera_array, colours, *made)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
-from clsplat.chunks.gathering import SourceList, row_entries
 from clsplat.chunks.manifest import Manifest
-from clsplat.chunks.order import ORDERED_ROWS, beside_parents, space_order
+from clsplat.chunks.order import ORDERED_ROWS, space_order
 from clsplat.chunks.store import ChunkStore
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
@@ -26,7 +25,6 @@ from clsplat.device.launch import only_tried
 from clsplat.errors import CapacityError
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, floats_of
 from clsplat.models.edit import take
-from clsplat.optimisation.density_rules import FRESH
 from clsplat.rendering.memory_needs import MODELS
 from clsplat.rendering.memory_plan import Plan
 from clsplat.runs.checkpoints import Checkpoint, unusable
@@ -35,7 +33,6 @@ from clsplat.stages.chunk_pool import ChunkPool
 from clsplat.stages.density import (
     DensityStatistics,
     DeviceMarker,
-    DeviceRowList,
     carried,
     gather,
     new_statistics,
@@ -67,44 +64,13 @@ from clsplat.stages.device_gaussians import (
     upload_gaussians,
 )
 from clsplat.training.density import RowPlan
+from clsplat.training.moved_rows import MovedRows, both, ordered, some_of
 from clsplat.training.stability.health import examine
 
 EXAMINED_CHUNKS = 64
 """Chunks whose numbers are examined at once."""
-
 HALVED_ROWS = 1 << 15
 """Split Gaussians of a model in a store whose halves are computed at a time."""
-Places = NDArray[np.integer[Any]] | slice
-
-
-@dataclass(frozen=True, eq=False)
-class MovedRows:
-    """The rows of a model after a move.
-
-    rows: (m,) uint32, a source row each, plus FRESH if new.
-    halves: number of halves of split Gaussians.
-    places: place of each row of the list that the plan has; None if they are the same, or as in `listed`.
-    listed: the list, if it is of a large streamed model.
-    """
-
-    rows: DeviceArray | NDArray[np.uint32]
-    halves: int = 0
-    places: NDArray[np.uint32] | None = None
-    listed: SourceList | None = None
-
-    def at(self, rows: NDArray[Any]) -> NDArray[Any]:
-        """Places in the model of rows of the plan's list."""
-        places = self.places if self.listed is None else self.listed.by_kind()
-        return rows if places is None else places[rows]
-
-    @property
-    def halves_at(self) -> tuple[Places, Places]:
-        """Places in the model of the first halves, and of the second halves."""
-        if self.listed is not None:
-            return self.listed.seconds - 1, self.listed.seconds
-        count = self.rows.shape[0]
-        first, second = slice(count - self.halves, count - self.halves // 2), slice(count - self.halves // 2, count)
-        return (first, second) if self.places is None else (self.places[first], self.places[second])
 
 
 class TrainedModel:
@@ -248,7 +214,7 @@ class TrainedModel:
         for begin in range(0, len(changed), EXAMINED_CHUNKS):
             numbers = changed[begin : begin + EXAMINED_CHUNKS]
             rows = store.rows_of(numbers, KINDS, PARAMETER_GROUPS)
-            if np.any(examine(**{kind: _host_arrays(arrays) for kind, arrays in rows.items()})):
+            if np.any(examine(*(_host_arrays(rows[kind]) for kind in KINDS))):
                 return False
         return True
 
@@ -272,7 +238,7 @@ class TrainedModel:
             and the moved rows have their memory. It may be called several times.
         Raises CapacityError, before any change, if there is too little memory for the moved rows.
         """
-        moved = self._ordered(plan)
+        moved = ordered(plan, self.parameters)
         if moved is not None:
             self._move(moved.rows, changes, new_statistics=plan.new_statistics)
             if moved.halves and plan.halves is not None:
@@ -434,33 +400,6 @@ class TrainedModel:
             )
         return model
 
-    def _ordered(self, plan: RowPlan) -> MovedRows | None:
-        """The rows of a plan in the model's order; None if no row moves.
-
-        In a large model new rows stand behind those that they come from. When a model becomes large, its rows are put
-        in order of their places in space.
-        """
-        listed, was_large = plan.listed, self.parameters.count > ORDERED_ROWS
-        if plan.rows is not None:
-            entries, halves = row_entries(plan.rows, plan.fresh), 0
-        elif isinstance(listed, SourceList):
-            if listed.count > ORDERED_ROWS and was_large:
-                return MovedRows(listed.rows, listed.halves, listed=listed)
-            entries, halves = listed.entries(), listed.halves
-        elif isinstance(listed, DeviceRowList):
-            if listed.count <= ORDERED_ROWS:
-                return MovedRows(listed.rows, listed.halves)
-            entries, halves = listed.entries(), listed.halves
-        else:
-            return None
-        sources = entries & ~FRESH
-        if len(entries) <= ORDERED_ROWS or (was_large and bool((sources[:-1] <= sources[1:]).all())):
-            return MovedRows(entries, halves)
-        order = beside_parents(sources) if was_large else space_order(self.parameters["means"].get()[sources])
-        places = np.empty_like(order)
-        places[order] = np.arange(len(order), dtype=np.uint32)
-        return MovedRows(entries[order], halves, places)
-
     def _halve(
         self,
         moved: MovedRows,
@@ -473,10 +412,12 @@ class TrainedModel:
             split = {group: rows_at(self.parameters[group], second) for group in halved}
             sides = [halves(split, later) for later in (False, True)]
             for group, values in sides[0].items():
-                set_rows_at(self.parameters[group], _both(first, second), np.concatenate([values, sides[1][group]]))
+                set_rows_at(self.parameters[group], both(first, second), np.concatenate([values, sides[1][group]]))
             return
         for places, begin in product((first, second), range(0, moved.halves // 2, HALVED_ROWS)):
-            copies, some = (_some(each, begin) for each in (second, places))  # second halves are still copies
+            copies, some = (
+                some_of(each, begin, HALVED_ROWS) for each in (second, places)
+            )  # second halves are still copies
             split = {group: rows_at(self.parameters[group], copies) for group in halved}
             for group, values in halves(split, places is second).items():
                 set_rows_at(self.parameters[group], some, values)
@@ -524,16 +465,3 @@ def _host_arrays(arrays: Mapping[str, NDArray[Any]]) -> dict[str, AnyArray]:
 
 def _on_host(rows: DeviceArray | NDArray[np.uint32]) -> NDArray[np.uint32]:
     return rows.get() if isinstance(rows, DeviceArray) else rows
-
-
-def _both(first: Places, second: Places) -> Places:
-    if isinstance(first, slice) or isinstance(second, slice):
-        return slice(first.start, second.stop)  # type: ignore[union-attr]  # both are
-    return np.concatenate([first, second])
-
-
-def _some(places: Places, begin: int) -> Places:
-    """HALVED_ROWS of the places, from the one of number `begin` on."""
-    if isinstance(places, slice):
-        return slice(places.start + begin, min(places.start + begin + HALVED_ROWS, places.stop))
-    return places[begin : begin + HALVED_ROWS]

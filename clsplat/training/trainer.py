@@ -188,7 +188,10 @@ class Trainer:
         result: Loss | Losses
         if self.batch is None:
             run = partial(self._run, step, inputs[0], needs, reads_loss)
-            result = self.pending.launch(run, self._room(factor, inputs[0]), number=self.step, reads_loss=reads_loss)
+            exactly = self._looks_at_steps or (inputs[0].chunks is not None and inputs[0].chunks.one_by_one)
+            counted = (self.rasterizer, (factor, self.rasterizer), self.parameters.count)
+            room = 0 if exactly else self.pending.room(*counted)
+            result = self.pending.launch(run, room, number=self.step, reads_loss=reads_loss)
             if self.position.queue:  # upload the next step's photograph, at this resolution
                 self.photographs.ahead(self.position.queue[-1], factor)
         else:
@@ -239,17 +242,6 @@ class Trainer:
         result = step.run(model, inputs, probe, self._view_gradients(inputs), reads_loss=reads_loss)
         self._after_adam()
         return result
-
-    def _room(self, factor: float, inputs: ViewInputs) -> int:
-        """Capacity, in pairs, with which the next step is launched.
-
-        0 if the pairs have to be counted first, for example if the strategy inspects the model after each step.
-        """
-        if inputs.chunks is not None and inputs.chunks.one_by_one:
-            return 0
-        if not self.pending.on or self._looks_at_steps or not self.rasterizer.takes_room:
-            return 0
-        return self.pending.room(self.rasterizer, (factor, self.rasterizer), self.parameters.count)
 
     def _begin_again(self, step: int) -> None:
         """Prepare for repeating step number `step`. This invalidates `mark`."""

@@ -14,7 +14,7 @@ from tiny import hidden_model
 
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import CHUNK_ROWS
-from clsplat.training import trained_model
+from clsplat.training import moved_rows, trained_model
 from clsplat.training.step import visible_chunks
 from clsplat.training.trainer import Trainer
 
@@ -45,7 +45,7 @@ def wide_model(rows: int = ROWS, *, around: bool = True) -> Gaussians:
 
 def let_small_models_have_chunks(patch: pytest.MonkeyPatch) -> None:
     """Let a model of more than two chunks be a large one."""
-    for module in (visible_chunks, trained_model):
+    for module in (visible_chunks, trained_model, moved_rows):
         patch.setattr(module, "ORDERED_ROWS", 2 * CHUNK_ROWS)
 
 

@@ -23,7 +23,7 @@ from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.stages.density import gather
 from clsplat.stages.device_gaussians import copy_to_store
-from clsplat.training import trained_model
+from clsplat.training import moved_rows, trained_model
 from clsplat.training.step.monitor import StepMonitor
 
 GROWING = short(random_points=400, report=False, density={"gradient_threshold": 1e-4, "opacity_reset_every": 35})
@@ -91,7 +91,8 @@ def test_a_buffer_that_the_driver_refuses_while_rows_move(
     large: the model's new rows are put behind those that they come from, and its chunks are streamed from a store.
     """
     if large:
-        monkeypatch.setattr(trained_model, "ORDERED_ROWS", 100)
+        for module in (trained_model, moved_rows):
+            monkeypatch.setattr(module, "ORDERED_ROWS", 100)
         whole = model_bytes(load_scene(folder), GROWING, default_device, tmp_path / "whole")
     run, arrays = Run.create(tmp_path / "run", GROWING, scene=folder), 0
 

@@ -29,7 +29,7 @@ from clsplat.gaussians import floats_of
 from clsplat.layouts.columns import CHUNK_ROWS, SPLAT
 from clsplat.scenes.scene import Scene
 from clsplat.stages import density
-from clsplat.training import trained_model
+from clsplat.training import moved_rows, trained_model
 from clsplat.training.density import ModelState, RowPlan, adaptive
 from clsplat.training.density.adaptive import Adaptive, weakest
 from clsplat.training.memory import UNLIMITED, HostMemory
@@ -59,7 +59,8 @@ SETTINGS = {
 def _small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small models have chunks, and a model of some thousand rows is many parts of each kind."""
     monkeypatch.setattr(visible_chunks, "ORDERED_ROWS", 2 * CHUNK_ROWS)
-    monkeypatch.setattr(trained_model, "ORDERED_ROWS", 2 * CHUNK_ROWS)
+    for module in (trained_model, moved_rows):
+        monkeypatch.setattr(module, "ORDERED_ROWS", 2 * CHUNK_ROWS)
     monkeypatch.setattr(trained_model, "HALVED_ROWS", 50)
     monkeypatch.setattr(density, "LISTED_ROWS", 640)
     monkeypatch.setattr(gathering, "BLOCK_CHUNKS", 1)
@@ -265,7 +266,7 @@ def test_rows_of_a_large_model_rise(scene: Scene, limits: Limits, monkeypatch: p
     noted(monkeypatch, type(trainer.components[-1]), "rows_moved", lambda _, listed: moved.append(listed.get()))
     run_steps(16, trainer)
     (entries,) = moved
-    sources = entries & ~trained_model.FRESH
+    sources = entries & ~moved_rows.FRESH
     assert (np.diff(sources.astype(np.int64)) >= 0).all()
     np.testing.assert_array_equal(beside_parents(sources), np.arange(len(sources)))
     assert len(sizes) > 1

@@ -30,7 +30,7 @@ from clsplat.errors import DriverError
 from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.scenes.scene import Scene
 from clsplat.stages.chunk_pool import ChunkPool
-from clsplat.training import trained_model
+from clsplat.training import moved_rows, trained_model
 from clsplat.training.density import ModelState, RowPlan
 from clsplat.training.density.adaptive import Adaptive
 from clsplat.training.learning_rates import largest_rates, rates_at
@@ -215,11 +215,11 @@ def test_a_model_that_grows_into_chunks(
 ) -> None:
     """The first chunks come in the middle of a training, and are caught up from there."""
     monkeypatch.setenv(BY_CAPACITY_VARIABLE, capacity)
-    for module in (visible_chunks, trained_model):
+    for module in (visible_chunks, trained_model, moved_rows):
         monkeypatch.setattr(module, "ORDERED_ROWS", ROWS + 20)
     wanted, _ = trained(scene, CONFIG, default_device, 32, whole=True)
     sorted_means: list[np.ndarray[Any, Any]] = []
-    noted(monkeypatch, trained_model, "space_order", sorted_means.append)
+    noted(monkeypatch, moved_rows, "space_order", sorted_means.append)
     got, trainer = trained(scene, CONFIG, default_device, 32)
     assert_same(got, wanted)
     assert [len(means) > ROWS + 20 for means in sorted_means] == [True], "its rows are put in order once"
@@ -300,7 +300,8 @@ def test_a_model_that_becomes_large(
     """The steps before ran over all rows. They are more than the table of missed steps holds."""
     monkeypatch.setattr(visible_chunks, "MOST_MISSED_STEPS", 1)
     monkeypatch.setattr(visible_chunks, "STEPS_PER_MEASUREMENT", 1)
-    monkeypatch.setattr(trained_model, "ORDERED_ROWS", ROWS)
+    for module in (trained_model, moved_rows):
+        monkeypatch.setattr(module, "ORDERED_ROWS", ROWS)
     wanted, _ = trained(scene, CONFIG, default_device, 32, whole=True)
     monkeypatch.setattr(visible_chunks, "ORDERED_ROWS", ROWS)
     got, trainer = trained(scene, CONFIG, default_device, 32)
@@ -445,10 +446,10 @@ def test_new_rows_stand_behind_their_parents(
     moved: list[np.ndarray[Any, Any]] = []
     monkeypatch.setattr(VisibleChunks, "rows_moved", lambda _, listed: moved.append(listed.get()))
     plans: list[np.ndarray[Any, Any]] = []
-    noted(monkeypatch, trained_model, "beside_parents", plans.append)
+    noted(monkeypatch, moved_rows, "beside_parents", plans.append)
     run_steps(16, trainer)
     (entries,), (sources,) = moved, plans
     assert (np.diff(sources.astype(np.int64)) < 0).any(), "density control adds new rows at the end"
-    old = entries & ~trained_model.FRESH
+    old = entries & ~moved_rows.FRESH
     assert (np.diff(old.astype(np.int64)) >= 0).all()
     np.testing.assert_array_equal(old, sources[beside_parents(sources)])

@@ -56,7 +56,7 @@ from clsplat.stages.density import DeviceMarker, DeviceRowList, carried, gather,
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, host_gaussians, upload_gaussians
 from clsplat.stages.peak import _splats
 from clsplat.stages.probe_atomics import atomics_fault
-from clsplat.training import trained_model
+from clsplat.training import moved_rows, trained_model
 from clsplat.training.step import visible_chunks
 from clsplat.training.step.visible_chunks import VisibleChunks
 from clsplat.training.trainer import Trainer
@@ -247,7 +247,7 @@ def methods(device: Device) -> None:
 
 def chunks(device: Device) -> None:
     """Steps over the chunk in view of a model that has two others, which then take the steps that they missed."""
-    for module in (visible_chunks, trained_model):
+    for module in (visible_chunks, trained_model, moved_rows):
         vars(module)["ORDERED_ROWS"] = CHUNK_ROWS
     low, short = camera(*EXTENT.low), replace(AHEAD, iterations=EXTENT.steps)
     every = replace(PAPER.density, start=3, absolute_gradients=True, min_contribution=1e-3)
@@ -262,7 +262,7 @@ def chunks(device: Device) -> None:
             raise SystemExit(f"last steps of the chunks: {component._last.tolist()}")  # noqa: SLF001
         trainer.catch_up()
         trainer.parameters["means"].get()
-    for module in (visible_chunks, trained_model):
+    for module in (visible_chunks, trained_model, moved_rows):
         vars(module)["ORDERED_ROWS"] = ORDERED_ROWS
 
 

@@ -194,7 +194,7 @@ def draw_halves(
     rng: np.random.Generator,
 ) -> dict[str, Float32]:
     """New means and log scales of a half of each split Gaussian, from the groups SPLIT_GROUPS."""
-    means, log_scales = split_halves(config, **{name: split[name] for name in SPLIT_GROUPS}, rng=rng)
+    means, log_scales = split_halves(config, split, rng)
     return {"means": means, "log_scales": log_scales}
 
 
@@ -223,10 +223,14 @@ def long_halves(split: Mapping[str, Float32], second: bool) -> dict[str, Float32
 
 
 def split_halves(
-    config: DensityConfig, *, means: Float32, quaternions: Float32, log_scales: Float32, rng: np.random.Generator
+    config: DensityConfig, split: Mapping[str, Float32], rng: np.random.Generator
 ) -> tuple[Float32, Float32]:
-    """Means (m, 3) and log scales (m, 3) of halves, which are drawn from their original Gaussians and smaller."""
-    offsets = draw_offsets(quaternions, log_scales, rng)
+    """Means (m, 3) and log scales (m, 3) of halves, which are drawn from their original Gaussians and smaller.
+
+    split: the groups SPLIT_GROUPS of the split Gaussians.
+    """
+    means, log_scales = split["means"], split["log_scales"]
+    offsets = draw_offsets(split["quaternions"], log_scales, rng)
     smaller = log_scales - np.float32(np.log(config.split_factor))
     return (means + offsets).astype(np.float32), smaller.astype(np.float32)
 

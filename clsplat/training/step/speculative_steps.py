@@ -99,8 +99,10 @@ class SpeculativeSteps:
         """Number of pairs to reserve: a quarter more than the most seen at this photograph size, scaled by the growth
         in Gaussians.
 
-        0 if no number is known yet, or if it exceeds the rasterizer's capacity.
+        0 if steps are not launched by capacity, if no number is known yet, or if it exceeds the rasterizer's capacity.
         """
+        if not self.on or not rasterizer.takes_room:
+            return 0
         if (before := self._of) != (size, gaussians):
             self._of, self._appends = (size, gaussians), True
             grown = max(gaussians / max(before[1], 1), 1.0)

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rows of a model after density control: their order, and the places of new ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.chunks.gathering import SourceList, row_entries
+from clsplat.chunks.order import ORDERED_ROWS, beside_parents, space_order
+from clsplat.device.buffers import DeviceArray
+from clsplat.optimisation.density_rules import FRESH
+from clsplat.stages.density import DeviceRowList
+from clsplat.stages.device_gaussians import AnyGaussians
+from clsplat.training.density import RowPlan
+
+Places = NDArray[np.integer[Any]] | slice
+
+
+@dataclass(frozen=True, eq=False)
+class MovedRows:
+    """The rows of a model after a move.
+
+    rows: (m,) uint32, a source row each, plus FRESH if new.
+    halves: number of halves of split Gaussians.
+    places: place of each row of the list that the plan has; None if they are the same, or as in `listed`.
+    listed: the list, if it is of a large streamed model.
+    """
+
+    rows: DeviceArray | NDArray[np.uint32]
+    halves: int = 0
+    places: NDArray[np.uint32] | None = None
+    listed: SourceList | None = None
+
+    def at(self, rows: NDArray[Any]) -> NDArray[Any]:
+        """Places in the model of rows of the plan's list."""
+        places = self.places if self.listed is None else self.listed.by_kind()
+        return rows if places is None else places[rows]
+
+    @property
+    def halves_at(self) -> tuple[Places, Places]:
+        """Places in the model of the first halves, and of the second halves."""
+        if self.listed is not None:
+            return self.listed.seconds - 1, self.listed.seconds
+        count = self.rows.shape[0]
+        first, second = slice(count - self.halves, count - self.halves // 2), slice(count - self.halves // 2, count)
+        return (first, second) if self.places is None else (self.places[first], self.places[second])
+
+
+def ordered(plan: RowPlan, parameters: AnyGaussians) -> MovedRows | None:
+    """The rows of a plan in the model's order; None if no row moves.
+
+    In a large model new rows stand behind those that they come from. When a model becomes large, its rows are put
+    in order of their places in space.
+    """
+    listed, was_large = plan.listed, parameters.count > ORDERED_ROWS
+    if plan.rows is not None:
+        entries, halves = row_entries(plan.rows, plan.fresh), 0
+    elif isinstance(listed, SourceList):
+        if listed.count > ORDERED_ROWS and was_large:
+            return MovedRows(listed.rows, listed.halves, listed=listed)
+        entries, halves = listed.entries(), listed.halves
+    elif isinstance(listed, DeviceRowList):
+        if listed.count <= ORDERED_ROWS:
+            return MovedRows(listed.rows, listed.halves)
+        entries, halves = listed.entries(), listed.halves
+    else:
+        return None
+    sources = entries & ~FRESH
+    if len(entries) <= ORDERED_ROWS or (was_large and bool((sources[:-1] <= sources[1:]).all())):
+        return MovedRows(entries, halves)
+    order = beside_parents(sources) if was_large else space_order(parameters["means"].get()[sources])
+    places = np.empty_like(order)
+    places[order] = np.arange(len(order), dtype=np.uint32)
+    return MovedRows(entries[order], halves, places)
+
+
+def both(first: Places, second: Places) -> Places:
+    """Places of first and second halves in one."""
+    if isinstance(first, slice) or isinstance(second, slice):
+        return slice(first.start, second.stop)  # type: ignore[union-attr]  # both are
+    return np.concatenate([first, second])
+
+
+def some_of(places: Places, begin: int, count: int) -> Places:
+    """So many of the places, from the one of number `begin` on, or as many as there are."""
+    if isinstance(places, slice):
+        return slice(places.start + begin, min(places.start + begin + count, places.stop))
+    return places[begin : begin + count]
