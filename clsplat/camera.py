@@ -76,8 +76,8 @@ JACOBIAN_CLAMP_HALF_FRAMES = 0.3
 DEFAULT_NEAR_PLANE = 0.01
 """Default near plane in world units, for cameras and models without their own."""
 MIN_SIZE_IN_NEAR_PLANES = 100.0
-"""Length unit of a scene, or size of a small model, in multiples of its near plane, if the default near plane would be
-too large for it."""
+"""Divisor of a scene's length unit, or of a small model's size. The quotient is the near plane if the default near
+plane would be too large."""
 ROTATION_TOLERANCE = 1e-2
 """Largest allowed entry of |R^T R - I|. It is this large because poses may be typed with few digits or be float32."""
 MAX_FOCAL_PX = 1e12

@@ -110,8 +110,8 @@ class CameraModel:
     self_tested: ClassVar[bool] = True
     """True if the self-test renders a picture with this model. It has an effect only on models with RAYS."""
     without_motion: ClassVar[str] = ""
-    """End of the error message if this camera model has no channel `motion`: its name, and what to use instead. Empty
-    if it has the channel."""
+    """End of the error message if this camera model has no channel `motion`: the model's name, and which cameras have
+    the channel. Empty if this model has it."""
     focal_keys: ClassVar[tuple[str, ...]] = ("fov_x", "fov_y")
     """Properties of a clsplat camera file that give a focal length, other than fx and fy."""
     whole_angles: ClassVar[tuple[float, float]] = (360.0, 180.0)

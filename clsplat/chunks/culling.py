@@ -39,8 +39,8 @@ _LEAST_AHEAD = 2e-4
 """Tangent of the angle to the plane z = 0 under which an end of a box along rays is infinite (LEAST_AHEAD in
 kernels/shared/camera/perspective_rays.h), doubled."""
 _POLE = 0.99
-"""Sine of a cone over that of its middle's angle to an axis, from which the cone counts as containing the axis. The
-kernels do so from 0.999."""
+"""Limit of sin(half angle of a cone) / sin(angle between its middle and an axis). From this value on, the cone counts
+as containing the axis. The kernels use 0.999."""
 
 
 @dataclass(frozen=True, eq=False)

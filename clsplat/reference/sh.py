@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The derivative of real spherical harmonics up to degree 4."""
+"""The derivative of real spherical harmonics up to degree 4. `clsplat.spherical_harmonics` has their values."""
 
 from __future__ import annotations
 

@@ -248,7 +248,7 @@ class Run:
         return replace(manifest, path=here) if here.is_file() else manifest
 
     def _verified(self, checkpoint: Checkpoint) -> Checkpoint:
-        """The checkpoint, if its chunks are as they were written. Raises ValueError and ScratchError."""
+        """The checkpoint, with its chunks verified. Raises ValueError or ScratchError if they are not as written."""
         if checkpoint.manifest is None:
             return checkpoint
         if SCRATCH_NAME.fullmatch(checkpoint.manifest.path.name) is None:

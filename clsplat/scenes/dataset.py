@@ -48,7 +48,7 @@ MAX_OCCLUSION_CELL_FRACTION = 1 / 25
 
 
 @cache
-def models() -> dict[int, tuple[str, int]]:
+def colmap_camera_models() -> dict[int, tuple[str, int]]:
     """Name and number of parameters of each camera model that pycolmap knows. The keys are COLMAP's ids."""
     known = {}
     for name, member in pycolmap.CameraModelId.__members__.items():
@@ -258,7 +258,7 @@ class DataSet:
 
 def check_lens(lens: Lens, where: str) -> Lens:
     """Return `lens`. Raises InputError, beginning with `where`, if it cannot be used."""
-    counts = dict(models().values())
+    counts = dict(colmap_camera_models().values())
     counts |= {name: 2 if model.wraps else 4 for name, (row, model) in lens_models().items() if not row.is_colmap}
     if lens.model not in counts:
         listed = ", ".join(counts)

@@ -170,7 +170,8 @@ def parts(
 
     Models on the device have a single part. Each part of another model is valid until the next part is requested.
 
-    models: all on the device, all on the host, or all in one pool, whose parts are as many chunks as it has slots.
+    models: all on the device, all on the host, or all in one pool. A part of a pool has at most as many chunks as
+    the pool has slots.
     keep: True keeps changes of the parts: they are copied back to the host, or noted in the pool.
     """
     on_device = tuple(model for model in models if isinstance(model, DeviceGaussians))

@@ -271,8 +271,8 @@ class TrainedModel:
     ) -> None:
         """Put Gaussians where the plan assigns them. The rows of a large streamed model are in a store of chunks.
 
-        models: parameters and moments, without a store; None for this model's, which have a store or get one.
-        rows: the source of each row; None for all as they are.
+        models: new parameters and moments, not in a store. None keeps this model's, which are or will be in a store.
+        rows: for each new row, the old row that it copies. None keeps all rows.
         coefficients: number of SH coefficients; 0 for as many as there are.
         changes: called before the first change of this model.
         """

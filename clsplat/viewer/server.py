@@ -184,10 +184,10 @@ def _quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _guarded(address: Address) -> Iterator[None]:
-    """Make servers that start inside the block refuse requests from pages of other servers.
+    """Inside the block, new servers refuse requests from pages of other servers.
 
-    An invalid message ends its connection, with a line on standard error.
-    viser has no settings for these, but its websocket library has.
+    An invalid message ends its connection, with a line on standard error. viser has no settings for either; its
+    websocket library has.
     """
     from websockets.asyncio import server
 

@@ -1,9 +1,9 @@
 // The gradient of blending with one Gaussian per item, BY_GAUSSIAN. The items of a group process the pixels of a tile
 // one after another. Each item has a Gaussian and its sums in registers; the state of the pixels is in local memory.
 //
-// The pixels are in ITEMS chunks, each a part of a row. In round r item j is at chunk (r - j) % ITEMS. So each chunk
-// gets the Gaussians in order, an item begins its next Gaussian right after its last chunk, and there is one barrier
-// per chunk. Values that are constant in a row are computed once per chunk.
+// The pixels are in ITEMS chunks, each a part of a row. In round r item j is at chunk (r - j) % ITEMS, and a barrier
+// ends the round. So each chunk gets the Gaussians in order. When an item has passed all chunks with a Gaussian, it
+// begins its next Gaussian in the next round. Values that are constant in a row are computed once per chunk.
 #if ITEMS < 16 || ITEMS > 128
 #error "a chunk is a row of a tile, or a part of one of two pixels or more"
 #endif

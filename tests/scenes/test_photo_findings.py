@@ -198,7 +198,7 @@ def test_a_sky() -> None:
         changed(scene, index, pixels=pixels)
     (found,) = findings(scene)
     assert found.kind == "sky"
-    assert found.text.startswith("32 photographs have a sky without points, 14 % of their area")
+    assert found.text.startswith("32 photographs have a sky without points, which covers 14 % of their area")
 
 
 def test_points_without_colours_say_nothing_of_exposures() -> None:

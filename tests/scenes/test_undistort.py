@@ -7,7 +7,7 @@ from calls import python
 from systems import posix
 
 from clsplat.camera import Camera
-from clsplat.scenes.dataset import Lens, models, undistort
+from clsplat.scenes.dataset import Lens, colmap_camera_models, undistort
 
 ZERO, EYE = np.zeros(3), np.eye(3)
 WIDTH, HEIGHT = 96, 64
@@ -45,8 +45,8 @@ def photograph(lens: Lens) -> np.ndarray:
 
 
 def test_every_model_of_pycolmap_is_known() -> None:
-    assert {"PINHOLE", "OPENCV", "FOV", "SIMPLE_DIVISION", "EUCM"} <= {name for name, _ in models().values()}
-    assert models()[4] == ("OPENCV", 8)
+    assert {"PINHOLE", "OPENCV", "FOV", "SIMPLE_DIVISION", "EUCM"} <= dict(colmap_camera_models().values()).keys()
+    assert colmap_camera_models()[4] == ("OPENCV", 8)
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.model)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float64
 from clsplat.files.atomic import atomic_writer
 from clsplat.rotations import quaternion_of
-from clsplat.scenes.dataset import Lens, models
+from clsplat.scenes.dataset import Lens, colmap_camera_models
 
 UNKNOWN_POINT = np.uint64(2**64 - 1)
 """Point number of an observation that belongs to no track."""
@@ -60,7 +60,7 @@ class ModelPoints:
 
 def write_cameras(path: Path, lenses: Sequence[Lens]) -> None:
     """Write cameras.bin. The cameras are numbered from 1."""
-    numbers = {name: number for number, (name, _) in models().items()}
+    numbers = {name: number for number, (name, _) in colmap_camera_models().items()}
     with atomic_writer(path) as file:
         file.write(_COUNT.pack(len(lenses)))
         for index, lens in enumerate(lenses, 1):

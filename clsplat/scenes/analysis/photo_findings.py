@@ -285,7 +285,7 @@ def _sky(visible: VisiblePoints) -> Finding | None:
     if len(with_sky) < max(3, MIN_SKY_VIEW_FRACTION * len(parts)) or not len(scene.points):
         return None
     many, area = _counted(scene, len(with_sky)), 100 * np.mean(with_sky)
-    return Finding("sky", f"{many} photographs have a sky without points, {area:.0f} % of their area")
+    return Finding("sky", f"{many} photographs have a sky without points, which covers {area:.0f} % of their area")
 
 
 def _sky_part(visible: VisiblePoints, view: View) -> float:

@@ -39,9 +39,9 @@ from clsplat.scenes.dataset import (
     Lens,
     PosedImage,
     check_lens,
+    colmap_camera_models,
     given_in_parts,
     in_pixels,
-    models,
 )
 from clsplat.scenes.photo_names import is_legible, legible, match, slashed
 
@@ -211,7 +211,8 @@ class _Binary:
         if len(raw) == min(MAX_NAME_BYTES, self.left):
             raise corrupt(self.path, f"{self.doing} has a name without an end")
         self.left -= len(raw) + 1
-        return raw.decode("utf-8", "surrogateescape")  # COLMAP on Windows writes the code page: see `photo_names`
+        # not always UTF-8: COLMAP on Windows writes names in the system's code page, see `photo_names`
+        return raw.decode("utf-8", "surrogateescape")
 
 
 def _records(path: Path, what: str, least: int) -> Iterator[_Binary]:
@@ -311,7 +312,7 @@ def _read_cameras(folder: Path) -> dict[int, Lens]:
 
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
-    layout, known = struct.Struct("<IiQQ"), models()
+    layout, known = struct.Struct("<IiQQ"), colmap_camera_models()
     for file in _records(path, "camera", layout.size):
         key, model, width, height = (int(value) for value in file.read(layout))
         if model not in known:

@@ -22,7 +22,7 @@ MAX_GATE_VIEWS = 8
 GATE_MEASUREMENTS = 10
 """Number of measurements in a training, after the measurement at the beginning of refinement."""
 LOW_MEASUREMENTS_IN_A_ROW = 2
-"""Number of consecutive low measurements that end refinement. Just one may be low because of a densification."""
+"""Number of consecutive low measurements that end refinement. A densification can make a single one low."""
 RESET_SETTLING_DIVISOR = 3
 """Divisor of the interval between opacity resets. The quotient is the number of steps in which a model recovers from a
 reset; until then its cameras cannot be validated."""

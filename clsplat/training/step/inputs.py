@@ -137,9 +137,9 @@ class ViewPart:
         return np.zeros(0, np.float32)
 
     def compare(self, work: Workspace, image: DeviceArray, target: DeviceArray, size: tuple[int, int]) -> DeviceArray:  # noqa: ARG002
-        """Give the image the photograph's colours, or give the photograph in `target` the image's colours, in place.
+        """Match the colours of image and photograph: return another image, or change `target` in place.
 
-        target: planes (3 or 4, rows, stride), if some part of the view changes them.
+        target: the photograph. It is planes (3 or 4, rows, stride) if any part of the view has `changes_target`.
         Returns the image to compare.
         """
         return image

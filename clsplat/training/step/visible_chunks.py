@@ -110,7 +110,7 @@ class VisibleChunks(Component):
         self._begin(count, 0)
 
     def _limit_movement(self, step: float) -> None:
-        """Set the most by which a step moves a parameter, as a multiple of the learning rate."""
+        """Set the limit of a parameter's movement in one step, as a multiple of the learning rate."""
         self._step_limit = step
         self._hidden_limit = 0.0 if self._config.optimiser.sparse else hidden_path(self._config.optimiser, step)
 
@@ -218,8 +218,10 @@ class VisibleChunks(Component):
         return self._found.seen(partial(visible, picture), hidden, most, MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
 
     def _hidden_movement(self, step: int) -> tuple[Movement, Float64]:
-        """The most by which means and log scales of some chunks move in the steps before number `step` that they have
-        missed, and (2, 1) the most for any chunk."""
+        """Limits of the movement of means and log scales in missed steps, those before number `step`.
+
+        Returns a function of chunks that gives their limits (2, n), and the largest limits of all chunks (2, 1).
+        """
         longest = np.argmin(self._last, axis=0, keepdims=True)
         rates = self._mean_and_scale_rates(range(min(int(self._last[longest[0]]), step - 1) + 1, step + 1))
 
