@@ -19,8 +19,11 @@ from clsplat.runs.run import OWNER_DIGITS, SCRATCH_SUFFIX, Run
 
 
 def owner_of(run: Run | None) -> str:
-    """The beginning of the names of a run's files, or of those of a training without a run."""
-    of = str(run.path.resolve()) if run is not None else f"{machine_mark()} {os.getpid()}"
+    """The beginning of the names of a run's files, or of those of a training without a run.
+
+    The folder's number (inode) tells a run from another that had its path, and was renamed or is in another container.
+    """
+    of = f"{run.path.resolve()} {run.path.stat().st_ino}" if run is not None else f"{machine_mark()} {os.getpid()}"
     return hashlib.sha256(of.encode("utf-8", "surrogatepass")).hexdigest()[:OWNER_DIGITS]
 
 
