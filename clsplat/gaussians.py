@@ -164,8 +164,12 @@ class GaussiansOfFile(Gaussians):
     """
 
     def __init__(self, path: Path, like: Gaussians) -> None:
-        self.path, self.origin, self.near = path, like.origin, like.near
+        self.path, self.origin, self.near = path.absolute(), like.origin, like.near
         self.antialiased, self.by_rays = like.antialiased, like.by_rays
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy, or what is pickled, has the arrays: the file may be gone when it is used."""
+        return {"means": self.means, **vars(self)}
 
     def __getattr__(self, name: str) -> Any:
         if name not in {group.field for group in PARAMETER_GROUPS.values()}:

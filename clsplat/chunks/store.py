@@ -107,6 +107,15 @@ class ChunkStore:
         sync_folder(self.path.parent)
         return Manifest(self.path, self.count, self.fields, self.slots.current.copy(), self._checksums.copy())
 
+    @property
+    def is_lost(self) -> bool:
+        """True if the scratch file has been removed, or another is in its place. What it has can still be read."""
+        assert self.path is not None
+        try:
+            return not os.path.samestat(os.fstat(self._file.fileno()), self.path.stat())
+        except OSError:
+            return True
+
     def verify(self) -> None:
         """Read all chunks. Raises ScratchError if one is not as it was written."""
         for numbers in self.blocks():

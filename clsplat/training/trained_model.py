@@ -22,7 +22,7 @@ from clsplat.chunks.store import ChunkStore
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
-from clsplat.errors import CapacityError
+from clsplat.errors import CapacityError, warn
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, floats_of
 from clsplat.models.edit import take
 from clsplat.rendering.memory_needs import MODELS
@@ -195,6 +195,10 @@ class TrainedModel:
         """Arrays and state of a checkpoint, without the statistics: a manifest if there is a scratch file."""
         if (store := self.store) is None or self._pool is None:
             return self.arrays(), {}
+        if store.is_lost:
+            warn(f"{store.path}: has been removed while it was in use; the Gaussians go to a new file")
+            self._place()
+            return self.record()
         self._pool.write_back()
         manifest = store.manifest()
         return manifest.arrays(), manifest.state()

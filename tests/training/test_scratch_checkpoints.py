@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from tiny import short
 from wide import flip, full, let_small_models_have_chunks, start_wide
@@ -25,6 +27,7 @@ from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError, WriteError
 from clsplat.files import atomic, mounts
+from clsplat.gaussians import GaussiansOfFile
 from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.runs.checkpoints import read_manifest
 from clsplat.runs.run import Run, owned_files
@@ -287,6 +290,37 @@ def test_a_file_that_is_damaged_while_it_is_trained_in(go: Train, tmp_path: Path
     assert steps_of(Run.open(tmp_path / "run"))[-1] == 8
 
 
+def test_a_file_that_is_removed_while_it_is_trained_in(go: Train, whole: Callable[[TrainConfig], bytes]) -> None:
+    """As by a program that clears temporary folders: the next checkpoint has the Gaussians in a new file."""
+    wanted = whole(STEADY)
+
+    def remove(trainer: Trainer) -> None:
+        if trainer.step in (6, 10) and (store := trainer.model.store) is not None and store.path is not None:
+            store.path.unlink()
+
+    with pytest.warns(UserWarning, match="has been removed while it was in use") as caught:
+        run = go(until=14, each=remove)
+    assert len(caught) == 2
+    assert len(files_of(run)) == 1
+    assert go().model_path.read_bytes() == wanted
+
+
+def test_the_model_of_a_file_stays_usable(
+    scene: Scene, default_device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`train` of a run with a relative path returns it: in another working folder, and copied, without the run."""
+    monkeypatch.chdir(tmp_path)
+    run = Run.create("relative", STEADY)
+    model = train(scene, STEADY, device=default_device, run=run, max_host_mem=LIMIT)
+    assert isinstance(model, GaussiansOfFile)
+    monkeypatch.chdir(tmp_path.parent)
+    copied = pickle.loads(pickle.dumps(model))
+    shutil.rmtree(tmp_path / "relative")
+    assert copied.arrays().keys() == model.arrays().keys()
+    for name, array in model.arrays().items():
+        assert np.array_equal(copied.arrays()[name], array)
+
+
 def test_a_move_that_fails_leaves_no_wrong_checkpoint(
     go: Train, whole: Callable[[TrainConfig], bytes], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -388,6 +422,14 @@ def test_the_file_of_another_run_is_only_read(go: Train, whole: Callable[[TrainC
     assert theirs.read_bytes() == before
     assert len(list(scratch.glob("*.chunks"))) == 2
     assert go(name="first", scratch=scratch).model_path.read_bytes() == wanted
+
+
+def test_a_new_run_where_a_renamed_one_was(go: Train, whole: Callable[[TrainConfig], bytes], tmp_path: Path) -> None:
+    """It leaves the other's file alone, although both runs have had one path."""
+    wanted, scratch = whole(STEADY), tmp_path / "scratch"
+    go(until=10, scratch=scratch).path.rename(tmp_path / "earlier")
+    go(until=5, scratch=scratch)
+    assert go(name="earlier", scratch=scratch).model_path.read_bytes() == wanted
 
 
 def test_what_a_killed_training_left_is_removed(go: Train, tmp_path: Path) -> None:
