@@ -170,8 +170,8 @@ def parts(
 
     Models on the device have a single part. Each part of another model is valid until the next part is requested.
 
-    models: all on the device, all on the host, or all in one pool. A part of a pool has at most as many chunks as
-    the pool has slots.
+    models: all on the device, or none: the first ones in one pool, if there is a pool, and the others in main memory. A
+        part of a pool has at most as many chunks as the pool has slots.
     keep: True keeps changes of the parts: they are copied back to the host, or noted in the pool.
     """
     on_device = tuple(model for model in models if isinstance(model, DeviceGaussians))
@@ -185,20 +185,24 @@ def parts(
         stop = min(start + rows, count)
         if pool is not None:
             pool.place_run(start // CHUNK_ROWS, chunks_of(stop - start), changes=keep)
-            yield start, stop, tuple(model.first_in_pool(stop - start) for model in streamed)
-            continue
-        uploaded = []
-        for index, model in enumerate(streamed):
-            arrays = {}
-            for name, whole in model.arrays.items():
-                values = whole.get_rows(start, stop)
-                arrays[name] = work.array(f"part{index}_{name}", values.shape, values.dtype)
-                arrays[name].set(values)
-            uploaded.append(DeviceGaussians(stop - start, model.coefficients, arrays))
-        yield start, stop, tuple(uploaded)
-        for model, part in zip(streamed, uploaded, strict=True) if keep else ():
-            for name, array in part.arrays.items():
+        there = [
+            model.first_in_pool(stop - start) if model.pool is not None else _uploaded(work, index, model, start, stop)
+            for index, model in enumerate(streamed)
+        ]
+        yield start, stop, tuple(there)
+        for model, part in zip(streamed, there, strict=True) if keep else ():
+            for name, array in part.arrays.items() if model.pool is None else ():
                 model[name].set_rows(start, array.get())
+
+
+def _uploaded(work: Workspace, index: int, model: HostGaussians, start: int, stop: int) -> DeviceGaussians:
+    """A copy on the device of the rows [start, stop) of model number `index` on the host."""
+    arrays = {}
+    for name, whole in model.arrays.items():
+        values = whole.get_rows(start, stop)
+        arrays[name] = work.array(f"part{index}_{name}", values.shape, values.dtype)
+        arrays[name].set(values)
+    return DeviceGaussians(stop - start, model.coefficients, arrays)
 
 
 def fields_of(coefficients: int) -> dict[str, tuple[int, ...]]:

@@ -272,3 +272,11 @@ def test_rows_of_a_large_model_rise(scene: Scene, limits: Limits, monkeypatch: p
     assert len(sizes) > 1
     assert sum(sizes) == len(entries)
     trainer.close()
+
+
+def test_batches_of_a_pooled_model(scene: Scene, default_device: Device) -> None:
+    """Sums over the views are in main memory, beside the chunks of the pool."""
+    config = short(iterations=8, batch=2, report=False, warmup=(), sh_degree_every=2, density={"every": 3, "start": 2})
+    wanted = after(4, trainer_of(scene, config, default_device))
+    limited = open_device(memory_limit=LITTLE)
+    assert_same(after(4, trainer_of(scene, config, lambda: (limited, UNLIMITED))), wanted)
