@@ -116,22 +116,27 @@ def frames(device: Device) -> None:
 
 
 def subgroups(device: Device) -> None:
-    """The probe of sub-groups, and the gradient of blending with them, where items are grouped. Oclgrind has none: an
-    item stands for what it should have got, so that the sums are wrong, but places and order of what is written are
-    those of sub-groups of 8."""
+    """The probe of sub-groups, and the gradient of blending with and without them in the shape's own groups, where
+    items are grouped: the few tiles of `frames` have the largest. Oclgrind has no sub-groups: an item stands for what
+    it should have got, so that the sums are wrong, but places and order of what is written are those of sub-groups
+    of 8."""
     if device.shape.items == 1:
         return
-    opened = device.with_shape(f"{device.shape.label}s")
+    opened, rows = (device.with_shape(f"{device.shape.label}{way}") for way in ("s", ""))
     opened._subgroups.append({"SUBGROUP": 8, "EXCHANGED(x,step)": "(x)"})  # noqa: SLF001
     items = opened.shape.items
     out = allocate(opened, (3, items), np.float32)
     launch.launch_groups(opened, opened.kernels("probe_subgroup").probe_subgroup, 1, items, out)
+    if not np.isfinite(out.get()).all():
+        raise SystemExit("the probe of sub-groups is not finite")
     view = camera(*EXTENT.frame)
-    rasterizer, held = Rasterizer(opened), upload_gaussians(opened, cloud(40, view))
-    frame = rasterizer.forward(held, view, upload(opened, np.zeros(3, np.float32)), nearness=True)
-    slots = rasterizer.pair_gradients(frame, image_gradient(opened, frame), fields=WIDEST_SLOTS)
-    if not (np.isfinite(out.get()).all() and np.isfinite(slots.values.get()).all()):
-        raise SystemExit("a sum by sub-groups is not finite")
+    for each in (opened, rows):
+        each.max_group = items
+        rasterizer, held = Rasterizer(each), upload_gaussians(each, cloud(40, view))
+        frame = rasterizer.forward(held, view, upload(each, np.zeros(3, np.float32)), nearness=True)
+        slots = rasterizer.pair_gradients(frame, image_gradient(each, frame), fields=WIDEST_SLOTS)
+        if not np.isfinite(slots.values.get()).all():
+            raise SystemExit("a sum by sub-groups or rows is not finite")
 
 
 def cases(device: Device) -> None:
