@@ -10,8 +10,8 @@
 //   over the tile's pixels, in the whitened units of (49).
 // Equations: docs/gradients.md, (14), (22) to (26), (48), (49), (55) and (122); with RAYS docs/cameras.md, (21).
 //
-// Each pixel goes from its last Gaussian to its first. Transmittance is recovered by division. `behind` is the sum of
-// weight times colour behind the current Gaussian, background included, dotted with the pixel's gradient. The sums over
+// Each pixel goes from its last Gaussian to its first. Transmittance is recovered by division. `behind` is the light
+// behind the current Gaussian, background included, dotted with the pixel's gradient (shared/behind.h). The sums over
 // pixels are moments of g = alpha * dL/dalpha in (u, v); with CONTRIBUTIONS also the sum of the weights (55).
 #include "shared/widened.h"
 #include "shared/math.h"
@@ -42,8 +42,7 @@
 #define ADD_REACHED(mask, cell) reached |= RECORDED(mask) << FIRST_RECORDED(cell);
 #endif
 
-// State of the cells' pixels during the walk to the front, and the image's gradient there. behind: R of (48), in groups
-// D . B of (22), which takes fewer instructions.
+// State of the cells' pixels during the walk to the front, and the image's gradient there.
 typedef struct {
   floatL t[OWNED], behind[OWNED], red[OWNED], green[OWNED], blue[OWNED];
   intL stop[OWNED];
@@ -81,13 +80,12 @@ static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red,
   const Share share = {g, weight};
   return share;
 #else
+  float difference = -p->behind[cell];
 #ifdef NEARNESS
-  const float behind = fma1(p->near[cell], c_near, -p->behind[cell]);
-#else
-  const float behind = -p->behind[cell];
+  difference = fma1(p->near[cell], c_near, difference);
 #endif
-  const float of_blue = fma1(p->blue[cell], c_blue, behind);
-  const float difference = fma1(p->red[cell], c_red, fma1(p->green[cell], c_green, of_blue));
+  difference = fma1(p->green[cell], c_green, fma1(p->blue[cell], c_blue, difference));
+  difference = fma1(p->red[cell], c_red, difference);
   return take_out_of(p->t + cell, p->behind + cell, uncapped, difference);
 #endif
 }

@@ -69,7 +69,7 @@ def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[De
     )
 
 
-_ROW_ITEMS = 32
+_MIN_STRIP_ITEMS = 32
 """The fewest work-items that share a tile for which sums over its pixels have the order of kernels/shared/strips.h."""
 _MIN_TILE_ITEMS = 8
 """The fewest work-items that share a tile, if several do: one row of a block of pixels (kernels/shared/blocks.h)."""
@@ -115,7 +115,7 @@ def items_for(tiles: int, units: int, items: int, most: int) -> int:
 def gradient_items(device: Device, tiles: int) -> int:
     """Number of work-items that share a tile in `blend_grad`, for so many tiles. No result depends on it from 32 on."""
     items = tile_items(device)
-    if device.kind != "gpu" or items < _ROW_ITEMS or device.shape.by_gaussian:
+    if device.kind != "gpu" or items < _MIN_STRIP_ITEMS or device.shape.by_gaussian:
         return items
     return gradient_items_for(tiles, int(device.cl_device.max_compute_units), items, device.max_group)
 

@@ -153,7 +153,8 @@ class TrainedModel:
         self.statistics.load(statistics)
 
     def free(self) -> None:
-        """Free all arrays."""
+        """Free all arrays, and close the file of chunks."""
+        self.close()
         del self.parameters, self.first, self.second, self.statistics
 
     def set(

@@ -119,14 +119,10 @@ class Trainer:
         chunks = VisibleChunks(self.config, self.rasterizer, self.scene.length_unit, len(initial))
         self.components: tuple[Component, ...] = (*late, mip_filter, self.appearance, self.cameras, self.depths, chunks)
         self._active = [component for component in self.components if component.on]
+        of, files = (self.device, self.rasterizer.work), (self.planner.scratch_file, self.planner.scratch_files)
+        contributions = self.strategy.needs().contributions
         self.model = TrainedModel(
-            self.device,
-            self.rasterizer.work,
-            self._make_plan,
-            self.planner.scratch_file,
-            self.planner.scratch_files,
-            sh_degree=self.config.sh_degree,
-            counts_contributions=self.strategy.needs().contributions,
+            *of, self._make_plan, *files, sh_degree=self.config.sh_degree, counts_contributions=contributions
         )
         self.model.begin(initial)
 
@@ -433,7 +429,7 @@ class Trainer:
         self._rearrange(self.strategy.at_end(self._state()))
 
     def close(self) -> None:
-        """End the threads of a batch, and those that read photographs; remove files of chunks."""
+        """End the threads of a batch, and those that read photographs; close the model's file of chunks."""
         self.photographs.host.close()
         self.model.close()
         if self.batch is not None:
@@ -465,9 +461,8 @@ class Trainer:
         The whole model is finite, unless `monitor.retries.lost`.
         """
         self.repair(look=True)
-        finite = self.model.changes_are_finite()
         arrays, state = self._arrays()
-        if not finite:  # there may be non-finite values in Gaussians that no step has visited
+        if not self.model.changes_are_finite():  # there may be non-finite values in Gaussians that no step has visited
             repair = self.monitor.examine_all(self.model.by_kind(arrays))
             if repair is not None:
                 self._apply(repair)
@@ -486,7 +481,6 @@ class Trainer:
     def restart(self) -> None:
         """Start again from step 0, with the rate factor of `monitor.retries`."""
         self.pending.forget()
-        self.model.close()
         self.model.free()
         self.monitor.forget()
         self._start()

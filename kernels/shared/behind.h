@@ -1,11 +1,11 @@
 // The light behind a pair in a pixel, as a scalar. A single item keeps R of (48) in docs/gradients.md. A group of items
 // keeps D . B of (22), which takes fewer instructions and is more precise.
 
-// That behind all pairs. t: final transmittance; at_end: gradient with respect to it.
+// BEHIND: the light behind all pairs. t: final transmittance; at_end: gradient with respect to it.
 #if ITEMS == 1
-#define BEHIND(t, at_end) t *at_end
+#define BEHIND(t, at_end) ((t) * (at_end))
 #else
-#define BEHIND(t, at_end) at_end
+#define BEHIND(t, at_end) (at_end)
 
 // t / x for x in [0.01, 1], and t itself for x = 1. An estimate of 1 / x by its bits is off by up to 5 %, and by 3.3e-5
 // after a step with e^2 + 1.001926 e + 1 for 1 / (1 - e). The quotient by it is then corrected by its own remainder. A

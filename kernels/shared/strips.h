@@ -31,8 +31,8 @@
 #define FOR_FIELDS(field) _Pragma("unroll") for (int field = 0; field < SLOT_STRIDE; ++field)
 #define FOR_STRIP(c) _Pragma("unroll") for (int c = 0; c < STRIP_CELLS; ++c)
 
-// Rows of a pair: one for each field. If several warps share the strip, LEFT rows for each block come before them, in
-// the same memory.
+// Rows of a pair: one for each field. If several warps share the strip, the same memory first holds LEFT rows for each
+// block.
 #ifdef RAYS
 #define LEFT 4 // g, weight, u and v
 #else
@@ -47,7 +47,7 @@
 #endif
 #define TOTALS (BATCH + 1) // pairs of which a strip's totals are kept, padded: a pair's totals are in different banks
 
-// A lane's sums begin at -0: a compiler then adds nothing to the first addend, which is the same but for a zero's sign.
+// A lane's sums begin at -0. As x + -0 is x for every x, a compiler leaves the first addition out; x + 0 is not -0.
 #define BEGIN_SUMS(sums) FOR_FIELDS(field) sums[field] = -0.0f;
 
 // Computes the fields of a lane that follow from the others. With RAYS each pixel has its own v.

@@ -57,16 +57,14 @@ static inline void take_chunk(const Walker *w, int chunk, __local Passing *passi
     const float power = log2_alpha(u, v, w->log2o);
     const int taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL(w->i < as_int(pixel.w));
     const float uncapped = as_float(as_int(exp2L(power)) & taken);
+    float t = state.x, behind = state.y, difference = -behind;
 #ifdef NEARNESS
-    const float behind = fmaL(near[place], w->near, -state.y);
-#else
-    const float behind = -state.y;
+    difference = fmaL(near[place], w->near, difference);
 #endif
-    const float difference = fmaL(pixel.x, w->red, fmaL(pixel.y, w->green, fmaL(pixel.z, w->blue, behind)));
-    float t = state.x, light = state.y;
-    const Share share = take_out_of(&t, &light, uncapped, difference);
+    difference = fmaL(pixel.x, w->red, fmaL(pixel.y, w->green, fmaL(pixel.z, w->blue, difference)));
+    const Share share = take_out_of(&t, &behind, uncapped, difference);
     const float g = share.g, weight = share.weight, gu = g * u;
-    passing[place] = (Passing)(t, light);
+    passing[place] = (Passing)(t, behind);
     sums[SLOT_RED] = fmaL(weight, pixel.x, sums[SLOT_RED]);
     sums[SLOT_GREEN] = fmaL(weight, pixel.y, sums[SLOT_GREEN]);
     sums[SLOT_BLUE] = fmaL(weight, pixel.z, sums[SLOT_BLUE]);

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 import scenes
-from compare import assert_close_gradient, assert_close_gradients, assert_same_arrays, assert_slopes
+from compare import assert_close_gradient, assert_close_gradients, assert_same_arrays, assert_same_bits, assert_slopes
 from pipeline import BACKGROUND, Pipeline, shaped, shapes_of
 from quick import quick
 from test_project_rays import all_around, fisheye, panorama, pinhole
@@ -18,8 +18,9 @@ from test_project_rays import all_around, fisheye, panorama, pinhole
 from clsplat.camera import Camera
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
-from clsplat.layouts.columns import SlotFields
+from clsplat.layouts.columns import PLAIN_SLOTS, WIDEST_SLOTS, SlotFields
 from clsplat.reference import every_pixel
+from clsplat.selftest.harness import planes_of
 
 BENT = (0.04, -0.012, 0.004, -0.0006)
 CAMERAS: dict[str, Camera] = {
@@ -107,6 +108,22 @@ def test_contributions(default_device: Device, name: str) -> None:
     assert screen.contributions is not None
     shown = exact.contributions > 0
     assert_close_gradient(screen.contributions.get()[shown], exact.contributions[shown], 1e-4, name=name)
+
+
+@pytest.mark.parametrize("items", quick([32, 128, 256], 128))
+@pytest.mark.parametrize("fields", quick([PLAIN_SLOTS, WIDEST_SLOTS], WIDEST_SLOTS), ids=["plain", "all"])
+@pytest.mark.parametrize("name", quick(["panorama", "bent fisheye", "perspective"], "bent fisheye"))
+def test_groups_of_32_to_256_items_have_one_order_of_sums(
+    default_device: Device, name: str, fields: SlotFields, items: int
+) -> None:
+    """Along rays each pixel has its own v, which warps that share half a tile leave each other."""
+    scene = subject(name, 200)
+    by_image = np.random.default_rng(2).standard_normal((scene[1].height, scene[1].width, 3 + fields.nearness))
+    wanted, got = (
+        Pipeline.run(shaped(default_device, 1, size), scene).slots(planes_of(by_image), fields) for size in (64, items)
+    )
+    assert np.count_nonzero(wanted.any(axis=1)) > 100, "pairs that have a gradient"
+    assert_same_bits(got, wanted)
 
 
 @pytest.mark.slow

@@ -163,6 +163,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         device: FakeDevice,
         max_host_mem: str | None,
         cache: str | None,
+        scratch: str | None,
         run: Run,
         resume: bool,
         on_step: Any,

@@ -148,7 +148,7 @@ class Pipeline:
         self, by_image: NDArray[np.float32], fields: SlotFields = PLAIN_SLOTS, blended: Blended | None = None
     ) -> NDArray[np.float32]:
         """Slots of the frame's pairs, from dL/dimage in planes. blended: used instead of the frame's."""
-        device, frame = self.rasterizer.device, self.frame
+        device, frame = self.rasterizer.device_of(self.camera), self.frame
         how = (frame.listed.lists, frame.inputs, blended or frame.blended, upload(device, by_image))
         values: NDArray[np.float32] = blend_grad(device, self.rasterizer.work, *how, fields=fields).get()
         return values

@@ -63,7 +63,7 @@ from clsplat.training.trainer import Trainer
 
 STAND_INS = (
     "arrays are filled by a copy from the host, as what clEnqueueFillBuffer writes counts as uninitialised there",
-    "rows are written with the whole of their array, as its shadow of a write begins where the buffer does",
+    "rows and views are written with the whole of their buffer, as its shadow of a write begins where that does",
     "no buffer is released, as what is written to memory that is used again counts as uninitialised at times",
     "vectors made of shorter vectors are made of their elements, as its shadow of such a shuffle reads past the end",
     "the padding of an image gradient is masked by a choice in each lane, as its shadow of x & 0 is that of x",
@@ -116,22 +116,27 @@ def frames(device: Device) -> None:
 
 
 def subgroups(device: Device) -> None:
-    """The probe of sub-groups, and the gradient of blending with them, where items are grouped. Oclgrind has none: an
-    item stands for what it should have got, so that the sums are wrong, but places and order of what is written are
-    those of sub-groups of 8."""
+    """The probe of sub-groups, and the gradient of blending with and without them in the shape's own groups, where
+    items are grouped: the few tiles of `frames` have the largest. Oclgrind has no sub-groups: an item stands for what
+    it should have got, so that the sums are wrong, but places and order of what is written are those of sub-groups
+    of 8."""
     if device.shape.items == 1:
         return
-    opened = device.with_shape(f"{device.shape.label}s")
+    opened, rows = (device.with_shape(f"{device.shape.label}{way}") for way in ("s", ""))
     opened._subgroups.append({"SUBGROUP": 8, "EXCHANGED(x,step)": "(x)"})  # noqa: SLF001
     items = opened.shape.items
     out = allocate(opened, (3, items), np.float32)
     launch.launch_groups(opened, opened.kernels("probe_subgroup").probe_subgroup, 1, items, out)
+    if not np.isfinite(out.get()).all():
+        raise SystemExit("the probe of sub-groups is not finite")
     view = camera(*EXTENT.frame)
-    rasterizer, held = Rasterizer(opened), upload_gaussians(opened, cloud(40, view))
-    frame = rasterizer.forward(held, view, upload(opened, np.zeros(3, np.float32)), nearness=True)
-    slots = rasterizer.pair_gradients(frame, image_gradient(opened, frame), fields=WIDEST_SLOTS)
-    if not (np.isfinite(out.get()).all() and np.isfinite(slots.values.get()).all()):
-        raise SystemExit("a sum by sub-groups is not finite")
+    for each in (opened, rows):
+        each.max_group = items
+        rasterizer, held = Rasterizer(each), upload_gaussians(each, cloud(40, view))
+        frame = rasterizer.forward(held, view, upload(each, np.zeros(3, np.float32)), nearness=True)
+        slots = rasterizer.pair_gradients(frame, image_gradient(each, frame), fields=WIDEST_SLOTS)
+        if not np.isfinite(slots.values.get()).all():
+            raise SystemExit("a sum by sub-groups or rows is not finite")
 
 
 def cases(device: Device) -> None:
@@ -396,12 +401,21 @@ def stand_in(lanes: int) -> None:
     def fill(self: DeviceArray, value: float) -> None:
         self.set(np.full(self.shape, value, self.dtype))
 
-    def set_rows(self: DeviceArray, start: int, values: NDArray[Any]) -> None:
-        whole = self.get()
-        whole[start : start + len(values)] = values
-        self.set(whole)
+    write_from_start = DeviceArray._write  # noqa: SLF001
 
-    DeviceArray.set_rows = set_rows  # type: ignore[method-assign]
+    def write(self: DeviceArray, values: NDArray[Any], start: int) -> None:
+        offset = self.buffer.get_info(cl.mem_info.OFFSET) + self._at(start)
+        if offset == 0 or values.size == 0:
+            write_from_start(self, values, start)
+            return
+        whole = self.buffer.get_info(cl.mem_info.ASSOCIATED_MEMOBJECT) or self.buffer
+        host = np.empty(whole.get_info(cl.mem_info.SIZE), np.uint8)
+        cl.enqueue_copy(self.device.queue, host, whole)
+        written = np.frombuffer(np.ascontiguousarray(values, self.dtype).tobytes(), np.uint8)
+        host[offset : offset + written.size] = written
+        cl.enqueue_copy(self.device.queue, whole, host)
+
+    DeviceArray._write = write  # type: ignore[method-assign]  # noqa: SLF001
     buffers._Buffer = Kept  # type: ignore[misc]  # noqa: SLF001
     DeviceArray.fill = fill  # type: ignore[method-assign]
     vars(program)["kernel_source"] = lambda stem: by_elements(kernel_source(stem), lanes)
