@@ -63,7 +63,7 @@ class ChunkPool:
 
     def __init__(self, device: Device, work: Workspace, store: ChunkStore, rows: int) -> None:
         self._device, self._work, self.store = device, work, store
-        self.slots = min(rows // CHUNK_ROWS, store.chunks)
+        self.slots = min(max(rows // CHUNK_ROWS, 1), store.chunks)
         self.arrays = {
             name: allocate(device, (CHUNK_ROWS * self.slots, *shape), np.float32)
             for name, shape in store.fields.items()
