@@ -223,6 +223,7 @@ class Rasterizer:
             gaussians, chunks = self._in_view(gaussians, gaussians.pool, camera)
         camera_array, colours = background if isinstance(background, tuple) else self.send(camera, background)
         by_append = room is not None and self._appends(device, room, tiles_of(camera))
+        records = backward and self._switches.record_cells
 
         def make() -> tuple[Projected, tuple[Band, ...], ListedBand, Blended, tuple[int, ...]]:
             projected = project(device, work, gaussians, camera, camera_array, thinning, chunks)
@@ -231,20 +232,18 @@ class Rasterizer:
                 assert room is not None
                 numbers = (self.readback, room.pairs, self._host(room.turn))
                 totals, lists = append(device, work, projected, tiles_of(camera), *numbers)
-                record = backward and self._switches.record_cells
-                blended = blend(device, work, lists, inputs, record=record, nearness=nearness)
+                blended = blend(device, work, lists, inputs, record=records, nearness=nearness)
                 return projected, (lists.band,), ListedBand(totals, None, lists), blended, ()
             if room is None:
                 counted = count(device, work, projected, all_bits=self._all_bits, readback=self.readback)
             else:
                 counted = count_by_capacity(device, work, projected, self.readback, room.pairs, self._host(room.turn))
             bands = plan_bands(device, work, projected, counted, tiles_of(camera), self.capacity)
-            record = backward and len(bands) == 1 and self._switches.record_cells
-            listed = None
+            listed, one = None, len(bands) == 1
             for band in bands:
                 del listed  # this band may need the memory for larger arrays
-                listed = self._list(device, projected, band, tiles_of(camera), counted if len(bands) == 1 else None)
-                blended = blend(device, work, listed.lists, inputs, record=record, nearness=nearness)
+                listed = self._list(device, projected, band, tiles_of(camera), counted if one else None)
+                blended = blend(device, work, listed.lists, inputs, record=records and one, nearness=nearness)
             assert listed is not None, "an image has a tile"
             return projected, bands, listed, blended, counted.refused
 

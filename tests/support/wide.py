@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -72,3 +74,31 @@ def flip(path: Path, at: int) -> None:
 def full(*_: object) -> None:
     """Fail as on a full disk."""
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+ONE_TRAINING = """
+import sys
+from pathlib import Path
+sys.path[:0] = sys.argv[3:]
+import pytest
+import wide
+from clsplat.api import train
+from clsplat.runs.run import Run
+from clsplat.scenes.loading import load_scene
+patch = pytest.MonkeyPatch()
+wide.let_small_models_have_chunks(patch)
+wide.start_wide(patch, around=False)
+run = Run.open(Path(sys.argv[2]))
+run.resuming = bool(run.checkpoints())
+print("ready", flush=True)
+sys.stdin.readline()
+train(load_scene(Path(sys.argv[1])), run.config, run=run, resume=run.resuming, max_host_mem=4 << 20,
+      scratch=run.path.parent / "scratch")
+"""
+"""A training, or its resume, that begins when it is told to."""
+
+
+def start_training(scene: Path, run: Path) -> subprocess.Popen[str]:
+    """A process that waits for a line before it trains."""
+    line = [sys.executable, "-c", ONE_TRAINING, str(scene), str(run), str(Path(__file__).parent)]
+    return subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)

@@ -162,13 +162,9 @@ def test_halves_are_smaller_by_the_factor_and_drawn_from_their_gaussian() -> Non
     """Their mean and covariance are those of the Gaussian that was split, within what chance allows."""
     count, q, scales = 40_000, np.array([2.0, 0.6, -0.9, 1.4]), np.array([0.5, 0.1, 0.02])  # raw: its length is 2.7
     centre = np.array([3.0, -2.0, 1.0])
-    means, log_scales = split_halves(
-        CONFIG,
-        means=np.tile(centre, (count, 1)).astype(np.float32),
-        quaternions=np.tile(q, (count, 1)).astype(np.float32),
-        log_scales=np.tile(np.log(scales), (count, 1)).astype(np.float32),
-        rng=np.random.default_rng(0),
-    )
+    rows = {"means": centre, "quaternions": q, "log_scales": np.log(scales)}
+    split = {group: np.tile(row, (count, 1)).astype(np.float32) for group, row in rows.items()}
+    means, log_scales = split_halves(CONFIG, split, np.random.default_rng(0))
     assert means.dtype == log_scales.dtype == np.float32
     np.testing.assert_allclose(np.exp(log_scales[7]), scales / 1.6, rtol=1e-6)
     rotation = Rotation.from_quat(q[[1, 2, 3, 0]]).as_matrix()
@@ -186,18 +182,17 @@ def test_the_same_seed_gives_the_same_halves() -> None:
         "quaternions": np.ones((3, 4), np.float32),
         "log_scales": np.zeros((3, 3), np.float32),
     }
-    first, again = (split_halves(CONFIG, **values, rng=np.random.default_rng(5))[0] for _ in range(2))
+    first, again = (split_halves(CONFIG, values, np.random.default_rng(5))[0] for _ in range(2))
     np.testing.assert_array_equal(first, again)
     assert len(np.unique(first, axis=0)) == 3, "two halves are drawn apart"
 
 
 def test_splitting_a_zero_quaternion_gives_finite_halves() -> None:
-    means, log_scales = split_halves(
-        CONFIG,
-        means=np.ones((4, 3), np.float32),
-        quaternions=np.array([[0, 0, 0, 0], [1e-42, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1e-20]], np.float32),
-        log_scales=np.zeros((4, 3), np.float32),
-        rng=np.random.default_rng(0),
-    )
+    split = {
+        "means": np.ones((4, 3), np.float32),
+        "quaternions": np.array([[0, 0, 0, 0], [1e-42, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1e-20]], np.float32),
+        "log_scales": np.zeros((4, 3), np.float32),
+    }
+    means, log_scales = split_halves(CONFIG, split, np.random.default_rng(0))
     assert np.isfinite(means).all()
     assert np.isfinite(log_scales).all()

@@ -7,8 +7,6 @@ import errno
 import os
 import pickle
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tiny import short
-from wide import flip, full, let_small_models_have_chunks, start_wide
+from wide import flip, full, let_small_models_have_chunks, start_training, start_wide
 
 from clsplat.api import train
 from clsplat.chunks import store as store_module
@@ -476,34 +474,6 @@ def test_a_network_disk_is_told_once(go: Train, tmp_path: Path, monkeypatch: pyt
     assert len([text for text in told if "--scratch DIR" in text]) == 1
 
 
-ONE_TRAINING = """
-import sys
-from pathlib import Path
-sys.path[:0] = sys.argv[3:]
-import pytest
-import wide
-from clsplat.api import train
-from clsplat.runs.run import Run
-from clsplat.scenes.loading import load_scene
-patch = pytest.MonkeyPatch()
-wide.let_small_models_have_chunks(patch)
-wide.start_wide(patch, around=False)
-run = Run.open(Path(sys.argv[2]))
-run.resuming = bool(run.checkpoints())
-print("ready", flush=True)
-sys.stdin.readline()
-train(load_scene(Path(sys.argv[1])), run.config, run=run, resume=run.resuming, max_host_mem=4 << 20,
-      scratch=run.path.parent / "scratch")
-"""
-"""A training, or its resume, that begins when it is told to."""
-
-
-def start_training(scene: Path, run: Path) -> subprocess.Popen[str]:
-    """A process that waits for a line before it trains."""
-    line = [sys.executable, "-c", ONE_TRAINING, str(scene), str(run), str(Path(__file__).parents[1] / "support")]
-    return subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-
-
 @pytest.mark.slow
 def test_two_trainings_in_one_folder(
     folder: Path, go: Train, whole: Callable[[TrainConfig], bytes], tmp_path: Path
@@ -517,14 +487,12 @@ def test_two_trainings_in_one_folder(
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
     for process in processes:
-        assert process.stdin is not None
-        process.stdin.write("\n")
-        process.stdin.flush()
+        print(file=process.stdin, flush=True)
     while not list((tmp_path / "one" / "checkpoints").glob("step-*.npz")) and processes[0].poll() is None:
         pass
     processes[0].kill()
-    processes[0].communicate()
-    processes[1].communicate()
+    for process in processes:
+        process.communicate()
     assert processes[1].returncode == 0
     again = start_training(folder, tmp_path / "one")
     again.communicate("\n")
