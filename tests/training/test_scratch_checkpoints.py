@@ -480,9 +480,7 @@ def test_two_trainings_in_one_folder(
 ) -> None:
     """At once, one of them killed and resumed: each has files of its own."""
     wanted = whole(SPARE)
-    for name in ("one", "two"):
-        Run.create(tmp_path / name, SPARE)
-    processes = [start_training(folder, tmp_path / name) for name in ("one", "two")]
+    processes = [start_training(folder, Run.create(tmp_path / name, SPARE).path) for name in ("one", "two")]
     for process in processes:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
