@@ -180,7 +180,7 @@ SLOPPY = {
     "features: q[0] / length": "q[0] / length * 1.0000002f",
     "channels: sums[field][cell] / by": "sums[field][cell] / by * 0.9999998f",
     "project_rays: sqrt(syy / det)": "(sqrt(syy / det) * 1.0000003f)",
-    "blend_grad: INVERSE(1.0f - alpha)": "INVERSE(1.0f - alpha) * 1.00000024f",
+    "blend_grad: 1.0f / (1.0f - alpha)": "(1.0f / (1.0f - alpha)) * 1.00000024f",
     "loss: 1.0f / (c * d)": "1.0f / (c * d) * 0.9999998f",
     "adam: sqrt(v)": "sqrt(v) * 1.0000003f",
     "density: sqrt(fma1(gx, gx, gy * gy))": "(sqrt(fma1(gx, gx, gy * gy)) * 1.0000003f)",
