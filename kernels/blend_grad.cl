@@ -390,8 +390,8 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
   __local float totals[BLOCK_ROWS * SLOT_STRIDE * TOTALS]; // by strip, field and pair
 #if TEAM_WARPS > 1
   Pixels strip_pixels[BLOCK_COLUMNS];
-  load_strip((__global const int *)image_gradient, stops,
-             stride * (tile_y + TEAM * BLOCK_H + LANE / BLOCK_W) + tile_x + LANE % BLOCK_W, plane, strip_pixels);
+  load_strip(image_gradient, stops, stride * (tile_y + TEAM * BLOCK_H + LANE / BLOCK_W) + tile_x + LANE % BLOCK_W,
+             plane, strip_pixels);
 #endif
   for (int block = ITEM; block < BLOCKS; block += ITEMS) lasts[block] = begin;
   BARRIER_LOCAL();

@@ -108,16 +108,16 @@ static inline void join_blocks(uint blocks, const Pixels *strip, float v, float 
 }
 
 // Loads the image's gradient in the lane's pixel of each block of a strip; first_pixel: that of the first block.
-static inline void load_strip(__global const int *image_gradient, __global const int *stops, size_t first_pixel,
+static inline void load_strip(__global const float *image_gradient, __global const int *stops, size_t first_pixel,
                               size_t plane, Pixels *strip) {
   _Pragma("unroll") for (int c = 0; c < BLOCK_COLUMNS; ++c) {
     const size_t pixel = first_pixel + c * BLOCK_W;
-    const int inside = MASKL(stops[pixel] >= 0);
-    strip[c].red[0] = as_float(image_gradient[pixel] & inside);
-    strip[c].green[0] = as_float(image_gradient[plane + pixel] & inside);
-    strip[c].blue[0] = as_float(image_gradient[2 * plane + pixel] & inside);
+    const int inside = stops[pixel] >= 0; // in padding, which lanes add too, the gradient is not written
+    strip[c].red[0] = inside ? image_gradient[pixel] : 0.0f;
+    strip[c].green[0] = inside ? image_gradient[plane + pixel] : 0.0f;
+    strip[c].blue[0] = inside ? image_gradient[2 * plane + pixel] : 0.0f;
 #ifdef NEARNESS
-    strip[c].near[0] = as_float(image_gradient[NEAR_PLANE * plane + pixel] & inside);
+    strip[c].near[0] = inside ? image_gradient[NEAR_PLANE * plane + pixel] : 0.0f;
 #endif
   }
 }
