@@ -217,7 +217,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     OF_PAIRS for (int k = 1; k <= count; ++k) {
       const uint entry = next;
       next = list[k]; // loaded before its use
-      const Staged s = STAGED_AT(staged, entry);
+      const Staged s = staged[PAIR_OF(entry)];
       const int i = KEPT(batch + PAIR_OF(entry), (int)s.kept);
       SPLAT_STAGED(s)
       NEAR_HERE(s.near)

@@ -179,12 +179,11 @@ static inline void mark(__local uint *marks, int j, uint blocks, int sets, int o
       (blocks >> set * own & FIRST_BLOCKS(own)) != 0;
 }
 
-// An entry of a list: the place of the pair's splat in its batch, in bytes, and DENSE if it reaches more than half of
-// the set's blocks, so that `spare` is negative. It is then quicker to take all of the item's cells without a branch.
+// An entry of a list: the pair's number in its batch, and DENSE if it reaches more than half of the set's blocks, so that
+// `spare` is negative. It is then quicker to take all of the item's cells without a branch.
 #define DENSE 0x80000000u
-#define ENTRY_OF(j, spare) ((uint)((j) * sizeof(Staged)) | ((uint)(spare) & DENSE))
-#define STAGED_AT(staged, entry) (*(__local const Staged *)((__local const char *)(staged) + ((entry) & ~DENSE)))
-#define PAIR_OF(entry) ((int)(((entry) & ~DENSE) / sizeof(Staged)))
+#define ENTRY_OF(j, spare) ((uint)(j) | ((uint)(spare) & DENSE))
+#define PAIR_OF(entry) ((int)((entry) & ~DENSE))
 #define SPARSE(own) (ALL_REACHED ? (own) : (own) / 2)
 #define IS_DENSE(entry, own) (SPARSE(own) == 0 || (SPARSE(own) < (own) && ((entry) & DENSE)))
 
