@@ -179,8 +179,8 @@ static inline void mark(__local uint *marks, int j, uint blocks, int sets, int o
       (blocks >> set * own & FIRST_BLOCKS(own)) != 0;
 }
 
-// An entry of a list: the pair's number in its batch, and DENSE if it reaches more than half of the set's blocks, so that
-// `spare` is negative. It is then quicker to take all of the item's cells without a branch.
+// An entry of a list: the pair's number in its batch, and DENSE if it reaches more than half of the set's blocks, so
+// that `spare` is negative. It is then quicker to take all of the item's cells without a branch.
 #define DENSE 0x80000000u
 #define ENTRY_OF(j, spare) ((uint)(j) | ((uint)(spare) & DENSE))
 #define PAIR_OF(entry) ((int)((entry) & ~DENSE))
