@@ -80,7 +80,7 @@ class ChunkPool:
         """Bytes of the records that have been fetched or written back."""
 
     def close(self) -> None:
-        """Free the device's memory, and remove the store's file."""
+        """Free the device's memory, and close the store."""
         self.arrays.clear()
         self.store.close()
 
