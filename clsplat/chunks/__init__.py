@@ -1,3 +1,3 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chunks of a model, neighbours in space: their order, their bounds and records, the chunks that a camera may see, and
-those that are on the device."""
+"""Chunks of a model, neighbours in space: their order, bounds and records; which of them a camera may see; which of
+them are on the device."""

@@ -23,8 +23,8 @@ _ROUNDING = 1e-6
 _SLACK = 1e-3
 """Relative slack of the bounds. It covers the rounding of a step, and second moments that underflow."""
 GROUP_FACTOR = 1.5
-"""Factor of the spheres around groups, so that they contain those of their chunks. A sphere around a part of a box
-reaches at most sqrt(2) half diagonals from the box's middle."""
+"""Factor of a group's radius, with which the group's sphere contains the spheres of its chunks. These reach at most
+sqrt(2) half diagonals of the group's box from its middle."""
 _LEAST_EPSILON = 1e-15
 """Smallest epsilon of Adam with which second moments that underflow move a parameter by less than _SLACK."""
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bounds of a model's chunks, and of groups of chunks, so that culling takes the time of what is near the view."""
+"""Bounds of a model's chunks and of groups of chunks. Culling tests groups first, then the chunks of groups in view."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Movement = Callable[[NDArray[np.integer]], Float64]
 class BoundsTable:
     """Bounds of a model's chunks as they were last measured, and the most by which Gaussians have moved since.
 
-    The bounds of a group are around those of its chunks. Where one of them is not finite, the group's are NaN.
+    The bounds of a group enclose the bounds of its chunks. They are NaN if a chunk's bounds are not finite.
 
     chunks: number of chunks. Their bounds are NaN, which leave nothing out, until they are measured.
     """
@@ -59,8 +59,7 @@ class BoundsTable:
         self._most_moved = np.maximum(self._most_moved, self._moved[:, numbers].max(axis=1, initial=0.0, keepdims=True))
 
     def seen(self, sees: Sees, hidden: Movement, most_hidden: Float64, updates: int) -> NDArray[np.uint32]:
-        """The chunks in view, in rising order: all those of which `sees` is True. Others are looked at only in groups
-        in view.
+        """The chunks for which `sees` is True, in rising order. Only chunks of groups in view are tested.
 
         hidden: further movements of chunks.
         most_hidden: (2, 1), the largest for any chunk.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows that density control keeps, copies and removes: their list in the model's order, and records of the new chunks.
 
-A record is made from those of a few old chunks, because new rows stand behind the rows that they come from.
+New rows stand behind the rows that they are copied from. So a new record needs only a few old ones.
 """
 
 from __future__ import annotations

@@ -144,12 +144,16 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
     streamed = made(rows, streamed=True)
     if streamed.pairs < 1:
         least = budget - room + alignment * need.model + max(need.gaussians // 8, 1) * need.pair
-        raise CapacityError(
-            f"{need.gaussians:,} Gaussians at this size of image need at least about {mebibytes(least)} of device "
-            f"memory, or {mebibytes(need.total)} to be processed at once, but {mebibytes(budget)} are allowed: allow "
-            "more (--max-device-mem), or use a smaller resolution or fewer Gaussians"
-        )
+        raise _too_little(need, least, budget)
     return streamed
+
+
+def _too_little(need: Need, least: int, budget: int) -> CapacityError:
+    return CapacityError(
+        f"{need.gaussians:,} Gaussians at this size of image need at least about {mebibytes(least)} of device memory, "
+        f"or {mebibytes(need.total)} to be processed at once, but {mebibytes(budget)} are allowed: allow more "
+        "(--max-device-mem), or use a smaller resolution or fewer Gaussians"
+    )
 
 
 def _plan_by_chunk(need: Need, held: int, budget: int, max_allocation: int) -> Plan:
@@ -165,10 +169,6 @@ def _plan_by_chunk(need: Need, held: int, budget: int, max_allocation: int) -> P
     rows = min(rows, max_allocation // need.widest, need.gaussians + CHUNK_ROWS - 1) // CHUNK_ROWS * CHUNK_ROWS
     if rows < CHUNK_ROWS:
         least = budget - room + CHUNK_ROWS * (in_view + PAIRS_IN_VIEW * need.pair)
-        raise CapacityError(
-            f"{need.gaussians:,} Gaussians at this size of image need at least about {mebibytes(least)} of device "
-            f"memory, or {mebibytes(need.total)} to be processed at once, but {mebibytes(budget)} are allowed: allow "
-            "more (--max-device-mem), or use a smaller resolution or fewer Gaussians"
-        )
+        raise _too_little(need, least, budget)
     pairs = min((room - rows * in_view) // need.pair, need.most_pairs)
     return Plan(need, rows, streamed=True, pairs=pairs, gathers=False, allowed=budget, bands=1)

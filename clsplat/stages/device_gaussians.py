@@ -192,14 +192,14 @@ def parts(
         yield start, stop, tuple(there)
         for model, part in zip(streamed, there, strict=True) if keep else ():
             for name, array in part.arrays.items() if model.pool is None else ():
-                model[name].set_rows(start, array.get())
+                array.read_into(model[name].values[start:stop])
 
 
 def _uploaded(work: Workspace, index: int, model: HostGaussians, start: int, stop: int) -> DeviceGaussians:
     """A copy on the device of the rows [start, stop) of model number `index` on the host."""
     arrays = {}
     for name, whole in model.arrays.items():
-        values = whole.get_rows(start, stop)
+        values = whole.values[start:stop]
         arrays[name] = work.array(f"part{index}_{name}", values.shape, values.dtype)
         arrays[name].set(values)
     return DeviceGaussians(stop - start, model.coefficients, arrays)

@@ -98,10 +98,8 @@ def test_few_tiles_are_shared_by_more_items(kind: str, group: int, units: int, t
     assert frame_items(cast("Device", device), tiles) == items
 
 
-def test_a_gpu_blends_few_tiles_in_larger_groups(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    device, scene = shaped(default_device, 1, 64), HARD["cloud"]()
-    frame = Pipeline.run(device, scene).frame.blended
-    alone = [plane.get() for plane in (frame.image, frame.transmittance, frame.stops)]
+def launched_as_on_a_gpu(device: Device, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Let a device count as a GPU. Returns a list to which each launch of blending adds the size of its groups."""
     groups: list[int] = []
 
     def launch(*arguments: Any) -> None:
@@ -110,6 +108,14 @@ def test_a_gpu_blends_few_tiles_in_larger_groups(default_device: Device, monkeyp
 
     monkeypatch.setattr(device, "kind", "gpu")
     monkeypatch.setattr("clsplat.stages.blend.launch_groups", launch)
+    return groups
+
+
+def test_a_gpu_blends_few_tiles_in_larger_groups(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    device, scene = shaped(default_device, 1, 64), HARD["cloud"]()
+    frame = Pipeline.run(device, scene).frame.blended
+    alone = [plane.get() for plane in (frame.image, frame.transmittance, frame.stops)]
+    groups = launched_as_on_a_gpu(device, monkeypatch)
     wide = Pipeline.run(device, scene).frame.blended
     assert groups == [256], "20 tiles for the units of a CPU"
     for plane, wanted in zip((wide.image, wide.transmittance, wide.stops), alone, strict=True):
@@ -140,14 +146,7 @@ def test_a_gpu_takes_the_gradient_of_few_tiles_in_the_largest_group(
     device, scene = shaped(default_device, 1, 64), HARD["cloud"]()
     run = Pipeline.run(device, scene)
     alone = run.slots(noise(run))
-    groups: list[int] = []
-
-    def launch(*arguments: Any) -> None:
-        groups.append(arguments[3])
-        launch_groups(*arguments)
-
-    monkeypatch.setattr(device, "kind", "gpu")
-    monkeypatch.setattr("clsplat.stages.blend.launch_groups", launch)
+    groups = launched_as_on_a_gpu(device, monkeypatch)
     wide = Pipeline.run(device, scene)
     groups.clear()
     assert_same_bits(wide.slots(noise(wide)), alone)
