@@ -10,7 +10,8 @@ import check_memory
 import pytest
 from calls import printed
 from check_memory import CHECKS, Finding, Result, findings, kernels, places, report, report_planted
-from memory_workload import WHOLE_ONLY, build_of, by_elements
+from memory_stand_ins import by_elements
+from memory_workload import WHOLE_ONLY, build_of
 
 from clsplat.config.colour_models import COLOUR_MODELS
 from clsplat.device.context import Device

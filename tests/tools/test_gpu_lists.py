@@ -19,7 +19,7 @@ from gpu_model import Constants, Work
 from gpu_page import now_table, wanted_table
 from gpu_rules import BY_ITEM
 from gpu_run import Run
-from gpu_static import on_each_gpu
+from gpu_shapes import on_each_gpu
 
 from clsplat.device.source import kernel_root
 from clsplat.stages.append import LOCAL_PAIRS

@@ -52,6 +52,7 @@ from gpu_page import PAGE, SHAPE, Predictions, missed_goals, stale_tables, table
 from gpu_recount import recount
 from gpu_rules import ABREAST, ADAM, BY_PAIR, WALK, Rule
 from gpu_run import Run
+from gpu_shapes import FORMS, SHAPES, frames_in, on_each_gpu
 from measuring import plain_parser, require, tool
 
 from clsplat.files.atomic import atomic_write
@@ -59,14 +60,9 @@ from clsplat.layouts.columns import LOSS_GROUP_COLUMNS, LOSS_GROUP_ROWS, LOSS_PA
 from clsplat.progress import aligned
 from clsplat.stages.blend import gradient_items_for, items_for
 
-SHAPES = ("1x32", "1x64", "1x128", "1x256")
-FORMS = ("1x32g", "1x64g", "1x32s", "1x64s")
-"""Shapes that differ only in the form of blending's gradient."""
 FRAMES = Path(__file__).with_name("gpu_frames.json")
 CHECKED = (("1x64", "1x32g"), ("sm_89", "sm_90", "gfx1100", "gfx90a"))
 """Shapes and targets that have ceilings."""
-BY_FRAME = {"blend": items_for, "sort_lists": items_for, "blend_grad": gradient_items_for}
-"""Kernels whose groups follow the frame, and how (`clsplat.stages.blend.frame_items` and `gradient_items`)."""
 NO_STACK = ("blend", "blend_grad", "project_grad", "sort_radix")
 """Kernel files that must use no stack memory and no spills on NVIDIA's GPUs."""
 NO_SCRATCH = ("blend", "blend_grad", "project_grad")
@@ -441,39 +437,6 @@ def counted(frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], 
         if gpu.target == target
     }
     return rows, predictions, (measured, constants, unread, now)
-
-
-def on_each_gpu(works: Mapping[str, Works], frames: Sequence[Mapping[str, Any]]) -> Works:
-    """The work of each frame's launches in SHAPE, by GPU and frame, with larger groups where a frame has few tiles.
-
-    works: of each shape, by target and frame.
-    """
-    sizes = {frame["name"]: tiles_of(frame) for frame in frames}
-    found = {}
-    for gpu in GPUS:
-        for (target, name), launches in works[SHAPE].items():
-            if target == gpu.target:
-                frame = name.removesuffix(DRAWN)
-                of_tiles = (sizes[frame], gpu.units, int(SHAPE[2:]), TILE * TILE)
-                shapes = {kernel: f"1x{items(*of_tiles)}" for kernel, items in BY_FRAME.items()}
-                wide = {
-                    work.kernel: work
-                    for shape in set(shapes.values())
-                    for work in works[shape][target, frame]
-                    if work and shapes.get(work.kernel) == shape
-                }
-                found[gpu.name, name] = [work and wide.get(work.kernel, work) for work in launches]
-    return found
-
-
-def frames_in(shape: str, frames: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:
-    """The frames whose launches are counted in a shape: in SHAPE also those that only draw a frame which is trained."""
-    if shape in FORMS:
-        return trained_and_picture(frames)[0][-1:]
-    if shape != SHAPE:
-        return frames
-    trained = (frame for frame in frames if not frame.get("picture"))
-    return [*frames, *({**frame, "name": frame["name"] + DRAWN, "picture": True} for frame in trained)]
 
 
 def rows_in(shape: str, asked: Future[list[Any]], frames: Sequence[Mapping[str, Any]], jobs: int) -> list[Row]:
