@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress on standard error: a live bar on a terminal, else a plain line every ten seconds. It also formats tables."""
+"""Progress on standard error: a live bar on a terminal, else a plain line every ten seconds. Also text tables."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Progress = Callable[[str, float | None], None]
 PLAIN_LINE_SECONDS = 10.0
 """Seconds between plain lines."""
 LIVE_TEXT_SECONDS = 1.0
-"""Seconds between changes of a live bar's text: a forecast takes several milliseconds, which is a GPU's step."""
+"""Seconds between updates of a live bar's text. Its forecast takes several milliseconds, as long as a GPU's step."""
 METRIC_SMOOTHING_WEIGHT = 0.1
 """Weight of the newest report in the displayed PSNR and loss, which are smoothed because views differ."""
 RATE_WINDOW_SECONDS = 20.0
@@ -64,8 +64,7 @@ class _Bar:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         if sys.stderr.isatty():
-            # Frames take similar times, so rich can estimate the remaining time. For training steps the description
-            # has it.
+            # rich can estimate the remaining time of frames, as they take similar times. Training has it in its text.
             more = [MofNCompleteColumn(), TimeRemainingColumn()] if counted else []
             columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), *more)
             self.live = Progress(
@@ -232,9 +231,9 @@ class FrameProgress(_Bar):
         print(text, file=self.lines, flush=True)
 
     def _left(self) -> str:
-        """The remaining time, if frames take as long as before; empty if it is less than half a second.
+        """Text of the remaining time, from the mean time of the written frames; empty if under half a second.
 
-        Once there is a second frame the first one no longer counts, since kernels may have been built during it.
+        From the second frame on, the mean leaves out the first, during which kernels may have been built.
         """
         now = time.monotonic()
         if self.written == 1:
@@ -245,14 +244,14 @@ class FrameProgress(_Bar):
 
 
 def duration(seconds: float) -> str:
-    """Seconds as h:mm:ss or m:ss."""
+    """Format a number of seconds as h:mm:ss or m:ss."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list[str]:
-    """One line per row. The columns `left` are left-aligned, the others right-aligned."""
+    """Format a table, one line per row. left: indices of the left-aligned columns; the others are right-aligned."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     sides = ["<" if index in left else ">" for index in range(len(widths))]
     line = "  ".join(f"{{:{side}{width}}}" for side, width in zip(sides, widths, strict=True))

@@ -119,7 +119,7 @@ def _check_counts(path: Path, points: int, triangles: int) -> None:
 
 
 def read_here(path: Path) -> Float64:
-    """Corners (T, 3, 3) of all meshes of a USD stage, read in this process. A damaged file may crash it (`survive`)."""
+    """Corners (T, 3, 3) of all triangles of a USD stage, without the test of `survive`: a damaged file may crash."""
     from pxr import UsdGeom, UsdUtils
 
     delegate = UsdUtils.CoalescingDiagnosticDelegate()  # suppresses the messages that USD would print

@@ -18,8 +18,8 @@ from clsplat.gaussians import Gaussians
 from clsplat.models.edit import take
 
 CACHED_SAMPLES_SINGLE, CACHED_SAMPLES_PAIR = 2, 3
-"""Number of samples kept in memory after a request for one sample, or for two neighbours. It is one more than
-requested, as the next sample is read ahead."""
+"""Number of samples kept in memory after a request for one sample, or for two neighbours. One of them is the next
+sample, which is read ahead."""
 MAX_TRACKED_CHANGE_RATIO = 0.25
 """Largest ratio at which rows count as tracked, that is, as the same Gaussian in two samples. The ratio is the median
 change of a row between the samples over the median difference of two rows.
@@ -34,9 +34,9 @@ TRACKING_TEST_ROWS = 10_000
 class ModelSeries:
     """A model that changes over time, given by samples at some frames. Thread-safe.
 
-    Between two samples Gaussians are interpolated, means linearly, if they keep their rows; otherwise the nearer sample
-    is used. Before the first and after the last sample, that sample is used. Unless `held` is set, its means continue
-    to move: their motion before the end is mirrored.
+    Between two samples Gaussians are interpolated, means linearly, if each row is the same Gaussian in both; otherwise
+    the nearer sample is used. Before the first and after the last sample, that sample is used. Unless `held` is set,
+    its means continue to move: the motion on the inner side of the sample is mirrored.
     """
 
     def __init__(

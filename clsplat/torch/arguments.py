@@ -29,7 +29,7 @@ def refuse(name: str, found: object, expected: str) -> InputError:
 
 @contextmanager
 def renamed(**names: str) -> Iterator[None]:
-    """Inside the block, replace the library's argument names in error messages: `library_name="name_here"`."""
+    """Context in which error messages use gsplat's argument names. names: gsplat's names, by clsplat's own."""
     try:
         yield
     except InputError as error:
@@ -51,7 +51,7 @@ def check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
 
 
 def _check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
-    """Like `check_shape`, but accept tensors of torch.func, for functions in pure PyTorch."""
+    """Check a tensor like `check_shape`, but accept tensors of torch.func, for functions in pure PyTorch."""
     expected = f"a tensor {' or '.join(_named(shape) for shape in shapes)}"
     if not isinstance(value, Tensor):
         raise refuse(name, f"a {type(value).__name__}", expected)
@@ -86,7 +86,7 @@ def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
 
 
 def check_size(name: str, value: object) -> int:
-    """A number of pixels, from an integer, a float or a tensor of one element. Raises InputError."""
+    """Convert an argument, a number or a tensor of one element, to a whole number of pixels. Raises InputError."""
     size = whole(value)
     if size is None or size < 1:
         raise refuse(name, repr(value), "a whole number of pixels, 1 or more")

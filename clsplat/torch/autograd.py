@@ -40,8 +40,9 @@ class Batches:
 
 
 class BatchResults:
-    """Results of a call: the library's result for each batch, and the indices of the splats in view.
+    """Results of a call of gsplat's function: the library's result for each batch, and the splats in view.
 
+    The layout of `meta` is (..., C, N, ...), where ... are batches; with `packed` it is (nnz, ...), the splats in view.
     A splat's index is its position in a flattened array (B, C, N): by batch, then camera, then Gaussian.
     """
 
@@ -75,7 +76,7 @@ class BatchResults:
         return means2d, conics, depths, opacities
 
     def radii(self) -> NDArray[np.int32]:
-        """A copy of the radii in the layout of `meta`; the gradient still reads the library's array."""
+        """A copy of the radii in the layout of `meta`, because the gradient reads the library's own array later."""
         radii = self.laid_out(self.stacked("radii"))
         return radii if self.packed else radii.copy()
 
@@ -141,7 +142,10 @@ class BatchResults:
         return rows.reshape(*self.sizes, *array.shape[1:])
 
     def gradient(self, each: list[dict[str, Any]], name: str, like: Tensor | None) -> Tensor | None:
-        """The gradient with respect to an argument, from all batches, in the argument's shape and dtype."""
+        """The gradient with respect to the argument `like`, in its shape and dtype; None if a batch has none.
+
+        each: gradients by name, for each batch.
+        """
         if like is None or any(found.get(name) is None for found in each):
             return None
         arrays = [found[name] for found in each]
@@ -233,7 +237,7 @@ class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torc
                 depths=item(depths, index),
                 cameras=cameras,
             )
-            if "covars" in found:  # an off-diagonal entry has half of its gradient in each of its two places
+            if "covars" in found:  # an off-diagonal entry is in two places, which share its gradient equally
                 found["covars"] = found["covars"][:, UPPER_TRIANGLE_INDICES[0], UPPER_TRIANGLE_INDICES[1]] * np.array(
                     [1, 2, 2, 1, 2, 1], np.float32
                 )
@@ -261,7 +265,7 @@ class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch ha
         """
         ctx.call = call
         images, alphas = call.pixels(means2d)
-        # the gradient reads these outputs; since they are saved, PyTorch reports changes in place
+        # the backward pass reads these outputs; as they are saved, PyTorch raises an error if they change in place
         read = (images, alphas) if call.expected_depth else (alphas,)
         ctx.save_for_backward(means2d, conics, depths, opacities, values, backgrounds, *read)
         ctx.set_materialize_grads(False)

@@ -59,7 +59,7 @@ def _plain(word: str) -> str:
 
 
 def _switch(word: str) -> bool | None:
-    """True or False if a word or number means it, otherwise None."""
+    """Boolean that a word such as "on", or a number 0 or 1, stands for; None for other words."""
     try:
         return {1.0: True, 0.0: False}.get(float(word))
     except ValueError:

@@ -30,6 +30,7 @@ from clsplat.models.codec.repair import Activated
 from clsplat.models.formats import compressed_ply, gltf, ksplat, ply, sog, splat, spz, usd, zipped
 
 FORMAT_HEAD_BYTES = 1 << 16
+"""Number of bytes at a file's beginning by which its format is recognised."""
 MODEL_SIZE_SAMPLES = 10_000
 """Number of means that are sampled to estimate a model's size."""
 SMALL_MODEL_NEAR_PLANES = 10.0

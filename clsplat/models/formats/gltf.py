@@ -62,7 +62,7 @@ MAX_GLB_BYTES = (1 << 32) - 1
 LOG_SCALE_WRITER, LOG_SCALE_WRITER_FIXED_VERSION = re.compile(r"splat-transform v?(\d+)\.(\d+)(?:\..*)?"), (2, 7)
 """Pattern of splat-transform's name and version, and its first version that writes scales. Earlier ones write logs."""
 Rows = Callable[[slice], Array]
-"""Function that returns rows of an attribute."""
+"""Function that returns the values of an attribute for a slice of Gaussians."""
 
 
 def recognises(head: bytes) -> bool:
@@ -244,7 +244,7 @@ class GaussianNode(TypedDict):
 def _document(
     path: Path, gaussians: Gaussians, spz_compression: bool, color_space: str
 ) -> tuple[dict[str, Any], Iterable[bytes | memoryview]]:
-    """The JSON object without its key `buffers`, and the contents of the only buffer."""
+    """The glTF file's JSON object, without its key `buffers`, and the parts of its only buffer in order."""
     count = len(gaussians)
     attributes = _attributes(gaussians, color_space)
     samples = {name: rows_of(slice(0, 1)) for name, rows_of in attributes.items()}

@@ -87,7 +87,7 @@ class UsdPlacement:
 
 @dataclass(frozen=True, eq=False)
 class PointInstance:
-    """An instance of a prototype.
+    """An instance of a prototype in a PointInstancer.
 
     root: the prim of the prototype.
     """
@@ -182,7 +182,7 @@ class Instancer:
         return places, frozenset(hidden)
 
     def _own(self, code: Any) -> list[Any]:
-        """USD's matrices of the instances relative to the instancer. Empty if its arrays have different lengths.
+        """USD's matrices of the instances relative to the instancer. Empty if the instancer's arrays differ in length.
 
         Rotations come from the quaternions, as for xformOp:orient. USD's ComputeInstanceTransformsAtTime shears if a
         quaternion's length is not exactly 1, as with half floats.
@@ -307,8 +307,8 @@ class _StageFindings:
 def find_places(stage: Any, where: object, kinds: Collection[str]) -> tuple[list[UsdPlacement], list[str]]:
     """Placements of all prims of the types `kinds`, in the stage's order, and descriptions of prims that are not drawn.
 
-    The latter are prims that another USD renderer would draw, or that refer to a file that cannot be opened. Raises
-    InputError, prefixed with `where`.
+    Prims that are not drawn are those that another USD renderer would draw, and those that refer to a file that cannot
+    be opened. Raises InputError, prefixed with `where`.
     """
     from pxr import Usd
 

@@ -46,7 +46,8 @@ def recognises(head: bytes) -> bool:
 
 @dataclass(frozen=True)
 class ZipReader:
-    """Reads the model in a zip archive. Its functions come from the table of formats, which has a row for archives.
+    """Reads the model in a zip archive. Its functions are passed in, since they use the table of formats, which imports
+    this module.
 
     is_model_name(path): True if a file has the name of a model.
     has_gaussians(path, head): True if the first bytes of such a file show Gaussians.
