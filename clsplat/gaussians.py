@@ -40,7 +40,8 @@ class Gaussians:
     near : float
         Near plane in world units, for cameras that do not set one (docs/decisions/0019).
     antialiased : bool
-        True for a model that was trained, and is drawn, with the filter of docs/gradients.md, section 13.
+        True for a model that was trained, and is drawn, with Mip-Splatting's low-pass filter (docs/gradients.md,
+        section 13).
     by_rays : bool
         True for a model that was trained along the rays of pixels, and that perspective cameras draw along them
         (`Camera.by_rays`).

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signals that end a process (Ctrl-C, SIGTERM, SIGHUP), child processes and closed standard streams, per system."""
+"""Signals that end a process (Ctrl-C, SIGTERM, SIGHUP), child processes, and standard streams that are closed."""
 
 from __future__ import annotations
 

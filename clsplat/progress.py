@@ -21,7 +21,8 @@ Progress = Callable[[str, float | None], None]
 PLAIN_LINE_SECONDS = 10.0
 """Seconds between plain lines."""
 LIVE_TEXT_SECONDS = 1.0
-"""Seconds between updates of a live bar's text. Its forecast takes several milliseconds, as long as a GPU's step."""
+"""Seconds between updates of a live bar's text. Its forecast takes several milliseconds, like a training step on a GPU.
+"""
 METRIC_SMOOTHING_WEIGHT = 0.1
 """Weight of the newest report in the displayed PSNR and loss, which are smoothed because views differ."""
 RATE_WINDOW_SECONDS = 20.0
@@ -64,7 +65,7 @@ class _Bar:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         if sys.stderr.isatty():
-            # rich can estimate the remaining time of frames, as they take similar times. Training has it in its text.
+            # Frames take similar times, so rich can estimate the remaining time. For training it is in the description.
             more = [MofNCompleteColumn(), TimeRemainingColumn()] if counted else []
             columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), *more)
             self.live = Progress(

@@ -309,7 +309,7 @@ def _forward(call: StaticArguments, arrays: dict[str, Any]) -> Any:
     shapes = call.shapes(arrays)
 
     def run(arrays: dict[str, Any]) -> Any:
-        # copies, since the gradient reads the arrays, and XLA may reuse their memory before
+        # copies, since the gradient reads the arrays later, when XLA may have reused their memory
         result = call.run({name: np.array(array) for name, array in arrays.items()})
         return _results(result, shapes), _kept.add(result)
 

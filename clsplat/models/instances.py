@@ -86,7 +86,7 @@ class Changing:
 
     @property
     def reach(self) -> tuple[float, float] | None:
-        """Reach of the inner track."""
+        """First and last frame for which the inner track's source has data; None for a static placement."""
         return self.inner.reach
 
 
@@ -126,9 +126,9 @@ def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
 def extrapolated(track: Track, frame: float, end: float) -> Placement:
     """Placement of a track at a frame beyond `end`, the last or first frame of its reach.
 
-    A fraction of a frame mirrors the motion just before the end. Each further whole frame repeats the last whole-frame
-    step, as for cameras (`shots.motion`). Opacity and colour come from the track itself. Raises InputError for a
-    transform that is no longer invertible.
+    Over the first fraction of a frame, the motion just before the end is mirrored. Over each further whole frame, the
+    motion of the last whole frame is repeated, as for cameras (`shots.motion`). Opacity and colour come from the track
+    itself. Raises InputError for a transform that is no longer invertible.
     """
     if (reach := track.reach) is None or reach[0] <= frame <= reach[1]:
         return track.at(frame)

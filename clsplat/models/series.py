@@ -24,11 +24,11 @@ MAX_TRACKED_CHANGE_RATIO = 0.25
 """Largest ratio at which rows count as tracked, that is, as the same Gaussian in two samples. The ratio is the median
 change of a row between the samples over the median difference of two rows.
 
-Means, scales and colours are tested separately. The ratio is a few hundredths in tracked models. It is about 1 in
-models trained separately, for scales even if Gaussians are sorted by position.
+Means, scales and colours are tested separately. The ratio is a few hundredths in tracked models, and about 1 in models
+trained separately. The ratio of scales is about 1 even if such models are sorted by position.
 """
 TRACKING_TEST_ROWS = 10_000
-"""Number of evenly spaced rows that the test of tracking compares."""
+"""Number of evenly spaced rows that `follows` compares."""
 
 
 class ModelSeries:
@@ -158,7 +158,7 @@ class ModelSeries:
                     f"{self.where}: frame {self.frames[index]:g} is {_alike(sample, what)}, frame {self.frames[0]:g} "
                     f"is {_alike(self.kind, what)}, expected models that are drawn alike"
                 )
-        # all frames have the same near plane
+        # all frames get the near plane of the first
         return sample if sample.near == self.kind.near else replace(sample, near=self.kind.near)
 
     def _follows(self, index: int) -> bool:

@@ -35,8 +35,8 @@ MAX_SCENE_REGION_RADIUS_RATIO = 0.2
 """A model is a scene around an object if the radius of its most detailed region is at most this fraction of the model's
 radius. Measured fractions are 0.3 or more for a single object, and 0.05 for a room with a table in the middle."""
 MIN_DETAIL_SIZE_QUANTILE, MIN_DETAIL_SIZE_RATIO = 0.02, 1e-4
-"""Smallest size that counts as more detail: this quantile of all sizes, but at least this fraction of the model's
-radius, since some files have Gaussians of size 0."""
+"""Lower limit of Gaussians' sizes in the measure of detail: this quantile of all sizes, but at least this fraction of
+the model's radius, since some files have Gaussians of size 0."""
 SCENE_RADIUS_MARGIN = 1.3
 """Radius that an orbit shows, relative to the radius of the scene's most detailed region."""
 ORBIT_FRAMING_MARGIN = 1.1
@@ -75,7 +75,7 @@ def cameras_around(
 
     The cameras face the centre of the model or region.
 
-    up: up direction (3,), of any length but 0. If it is along y, the first camera looks along z, as COLMAP's do.
+    up: up direction (3,), of any length but 0. If it is along y, the first camera looks along z.
     size: width and height in pixels; a side that is None follows from the other at the default aspect ratio.
     Raises InputError for a model without Gaussians.
     """
@@ -101,7 +101,7 @@ def cameras_around(
 
 
 def among(own: Sequence[Camera], size: tuple[int | None, int | None] = (None, None)) -> list[Camera]:
-    """The photographs' own cameras without strays, as pinholes, for a path within the photographed region.
+    """The photographs' own cameras as pinholes, without those far from the others, for a path among them.
 
     size: width and height in pixels. If both are given, the field of view is the largest that the photographs cover.
       Otherwise the pictures keep the photographs' aspect ratio.

@@ -82,7 +82,7 @@ def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     if 2 * np.pi - width <= MAX_AZIMUTH_GAP_RADIANS:
         angles = 2 * np.pi * time
     else:
-        # the phase puts the first frame at azimuth 0, the first camera's
+        # the phase puts the first frame at azimuth 0, that of the first camera
         middle, half = begin + width / 2, width / 2
         off = (-middle + np.pi) % (2 * np.pi) - np.pi
         phase = np.arcsin(np.clip(off / half, -1, 1)) if half > 1e-6 else 0.0

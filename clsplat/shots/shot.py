@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A shot: the frames to render, in order, each with its number, camera and name."""
+"""`Shot`: the frames to render, in order, each a `Frame` with its number, camera and name."""
 
 from __future__ import annotations
 

@@ -189,7 +189,7 @@ class Volume:
 class PlacedModel:
     """A model of a shot.
 
-    path: its model file or run.
+    path: its model file or run folder.
     volumes: regions with their own mattes; where they overlap, the first one counts.
     """
 

@@ -119,7 +119,7 @@ def read_here(path: Path) -> StageModels | None:
             elif place.instance is not None:
                 sums.update(f"again {list(known).index(own)}\n".encode())
         models = tuple(known[place.prim.GetPath()] for place in places)
-        if any(isinstance(model, ModelSeries) for model in models):  # time samples are read frame by frame later
+        if any(isinstance(model, ModelSeries) for model in models):  # samples are read later
             for name in sorted(str(layer.realPath) for layer in layers):
                 sums.update(digest(Path(name)).encode() if name else b"")
         tracks: list[Track] = [StageTrack(f"{path}: {place.name}", place, stage) for place in places]
@@ -162,7 +162,7 @@ def _sample_times(prim: Any) -> list[float]:
 
 
 def _add(sums: Any, prim: Any, time: Any) -> None:
-    """Add the attributes that a prim's Gaussians are read from to the digest."""
+    """Add to a digest the values, at a time code, of the attributes from which a prim's Gaussians are read."""
     for attribute in _attributes(prim):
         values = np.ascontiguousarray(np.asarray(attribute.Get(time)))
         sums.update(f"{attribute.GetName()} {values.dtype} {values.shape}\n".encode())

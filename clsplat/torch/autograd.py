@@ -136,7 +136,7 @@ class BatchResults:
         rows = array
         if len(array) < math.prod(self.sizes):
             rows = np.zeros((math.prod(self.sizes), *array.shape[1:]), np.float32)
-            # a copy of whole rows as single items takes half the time
+            # rows are copied as single items, which takes half the time
             one = np.dtype((np.void, array.itemsize * math.prod(array.shape[1:])))
             rows.reshape(-1).view(one)[self.in_view] = array.reshape(-1).view(one)
         return rows.reshape(*self.sizes, *array.shape[1:])
@@ -197,7 +197,7 @@ def _is_same(one: Tensor, other: Tensor) -> bool:
 
 
 class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
-    """Projection of Gaussians to splats in the layout of `meta`."""
+    """Projection of Gaussians to splats in the layout of `meta` (see `BatchResults`)."""
 
     @staticmethod
     def forward(ctx: Any, call: BatchResults, *inputs: Tensor | None) -> tuple[Tensor | None, ...]:
@@ -246,7 +246,7 @@ class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torc
 
 
 class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
-    """Blending of splats in the layout of `meta` to images and alphas."""
+    """Blending of splats in the layout of `meta` (see `BatchResults`) to images and alphas."""
 
     @staticmethod
     def forward(

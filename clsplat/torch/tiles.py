@@ -43,7 +43,7 @@ def isect_tiles(
     radii : (..., N, 2) Tensor
         Pixels; a splat with a radius of 0 has no pairs. With `packed` (nnz, 2).
     depths : (..., N) Tensor
-        With `packed` (nnz,).
+        World units. With `packed` (nnz,).
     tile_size : int
         Side of a tile in pixels.
     tile_width, tile_height : int

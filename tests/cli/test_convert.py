@@ -383,7 +383,7 @@ def test_info_counts_what_a_reader_leaves_out(model: Path, capsys: Capture) -> N
     assert "none.ply: no such file" in printed(capsys, ["info", model.with_name("none.ply")], status=2).err
     target = model.with_name("whole.ply")
     error = ran(capsys, convert, model, target).err
-    assert "3 of 300 Gaussians have a value that is not finite, the first is Gaussian 3 with a position" in error
+    assert "3 of 300 Gaussians have a value that is not finite, the first is a position of Gaussian 3" in error
     assert len(Gaussians.load(target)) == 297
 
 

@@ -133,8 +133,8 @@ def _direction(vectors: Float32) -> Float32:
 def _nearest_centres(vectors: Float32, centres: Float32) -> NDArray[np.int64]:
     """Index of each vector's nearest centre, which has the smallest |c|^2 / 2 - v c = (|v - c|^2 - |v|^2) / 2.
 
-    Tiles are so small that the BLAS library does not split them among threads. With threads, on a busy machine, this
-    took several times as long.
+    The computation goes by tiles so small that the BLAS library does not split them among threads, which makes it
+    several times slower on a busy machine.
     """
     halves = np.float32(0.5) * np.einsum("ij,ij->i", centres, centres)
     columns = [

@@ -123,7 +123,7 @@ class PlyHeader:
 
 
 def _header_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
-    """Complete lines of the header after the first. Raises InputError if the header exceeds its limits."""
+    """Yield the header's complete lines after the first. Raises InputError if the header exceeds its size limits."""
     for _ in range(MAX_PLY_HEADER_LINES):
         line = file.readline(MAX_PLY_LINE_BYTES + 1)
         if len(line) > MAX_PLY_LINE_BYTES or file.tell() > MAX_PLY_HEADER_BYTES:
@@ -221,7 +221,7 @@ def _binary_blocks(file: BinaryIO, header: PlyHeader, what: str) -> Iterator[Blo
 
 
 def _text_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
-    """Lines that are not blank. Raises InputError for a line that is too long to be a row."""
+    """Yield the lines of an ascii file that are not blank. Raises InputError for a line too long to be a row."""
     while line := file.readline(MAX_PLY_LINE_BYTES + 1):
         if len(line) > MAX_PLY_LINE_BYTES:
             raise InputError(f"{path}: has a line of more than {MAX_PLY_LINE_BYTES} bytes, expected rows of numbers")
@@ -245,7 +245,7 @@ def _parse_row(words: list[bytes], where: str) -> list[float]:
 
 
 def _ascii_blocks(file: BinaryIO, header: PlyHeader, what: str) -> Iterator[Block]:
-    """Yield blocks of float64 columns."""
+    """Yield the vertices of an ascii file in blocks of float64 columns."""
     path, vertex = header.path, header.vertex
     lines = _text_lines(file, path)
     # a value takes at least a character and a blank

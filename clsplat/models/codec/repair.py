@@ -60,7 +60,7 @@ about equal on both sides.
 
 
 def replace_infinities(gaussians: Gaussians) -> None:
-    """Replace the infinite logits and log scales that stand for finite values, in place."""
+    """Replace infinite logits, of opacities 0 and 1, and infinite log scales, of scales 0, by finite ones, in place."""
     logits, scales = gaussians.opacity_logits, gaussians.log_scales
     if not values.all_finite(logits):
         ends = values.logits(np.array([0.0, 1.0]))
@@ -103,7 +103,7 @@ def repaired(gaussians: Gaussians, where: Path | str, activated: Activated | Non
         )
         found = (
             f"{where}: {bad:,} of {len(good):,} Gaussians {values.have(bad)} a value that is not finite, the first is "
-            f"Gaussian {first} with {name}"
+            f"{name} of Gaussian {first}"
         )
         if bad == len(good):
             raise InputError(f"{found}; expected some that are finite; is it damaged?")

@@ -88,7 +88,7 @@ def side_files(path: Path) -> list[Path]:
 def read(path: Path) -> Gaussians:
     """Read all primitives with Gaussians in the scene, merged into one model. Raises InputError."""
     asset = Asset.open(path)
-    primitives = list(asset.primitives())  # a list, so that all are counted before any is read
+    primitives = list(asset.primitives())  # a list, so that their number is checked before any is read
     if not primitives:
         raise InputError(f"{path}: has no primitive with {GAUSSIAN_EXTENSION} in its scene, expected at least one")
     scaled: list[tuple[str, Gaussians]] = []
@@ -235,7 +235,7 @@ def _blocks(attributes: Iterable[Rows], count: int) -> Iterator[memoryview]:
 
 
 class GaussianNode(TypedDict):
-    """The node of the written mesh. translation: the model's origin, if it is not 0."""
+    """JSON object of the node that has the written mesh. translation: the model's origin, if it is not 0."""
 
     mesh: int
     translation: NotRequired[list[float]]

@@ -139,7 +139,8 @@ def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) 
         start = at + lengths + buckets
         end = start + kind.itemsize * head["room"]
         if head["count"] > head["room"] or end > size:
-            raise InputError(f"{name} ends at byte {end} of {size} with {head['count']} Gaussians")
+            found = f"has {head['count']} Gaussians, where {head['room']} fit"
+            raise InputError(f"{name} ends at byte {end} of {size}, and {found}; is the file damaged?")
         centres = ends = None
         if level:
             if head["buckets"] and head["bucket_bytes"] != BUCKET_CENTRE_BYTES:

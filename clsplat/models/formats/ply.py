@@ -210,7 +210,7 @@ def write_rows(
             block = np.zeros((len(some), len(names)), "<f4")
             block[:, 0:3] = some.means + model.origin if far else some.means
             block[:, 6:9] = some.sh[:, 0]
-            rest = block[:, 9 : 9 + 3 * padded].reshape(len(some), 3, padded)  # a view
+            rest = block[:, 9 : 9 + 3 * padded].reshape(len(some), 3, padded)  # a view of the block
             rest[:, :, :stored] = some.sh[:, 1:].transpose(0, 2, 1)
             block[:, -8] = some.opacity_logits
             block[:, -7:-4] = some.log_scales

@@ -239,6 +239,7 @@ class _Meta:
     def picture(self, section: str, index: int, channels: int, *, least: int | None = None) -> Bytes:
         """Bytes (height, width, channels) of an image.
 
+        section, index: key of meta.json, and the image's index in its list of files.
         least: required number of pixels; None requires one for each Gaussian.
         """
         names = self.section(section).get("files")
@@ -304,7 +305,7 @@ class _Meta:
         width = {"scales": (3, 3), "sh0": (4, 4), "shN": (1, 1)}[section]
         low, high = (self.numbers(section, key, *width)[:3] for key in ("mins", "maxs"))
         part = values / 255
-        with np.errstate(invalid="ignore"):  # infinite bounds
+        with np.errstate(invalid="ignore"):  # infinite bounds give NaN
             return packing.at_ends(low + (high - low) * part, low, high, part).astype(np.float32)
 
     def warn_of_nulls(self, entries: Float32, indices: Bytes) -> None:
@@ -383,7 +384,7 @@ def write(
 
 
 def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int, progress: Progress) -> dict[str, Any]:
-    """Write the images, and return the contents of meta.json."""
+    """Write a model's images to a folder, and return the contents of meta.json. order: Gaussian of each pixel."""
     count = len(gaussians)
     width = 4 * math.ceil(math.sqrt(count) / 4)
     height = 4 * math.ceil(count / width / 4)

@@ -144,7 +144,7 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
 
 
 def _open(file: BinaryIO, size: int, path: Path) -> tuple[SpzHeader, Any]:
-    """The header, and for versions 2 and 3 the stream that continues after it; None for version 4."""
+    """Read a file's header. Also returns the stream that continues after it in versions 2 and 3; None in version 4."""
     head = file.read(32)
     if head[:4] == SPZ_MAGIC and head[4:8] == struct.pack("<I", 4):
         if len(head) < 32:
@@ -374,7 +374,7 @@ def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: 
 def write_to(
     file: BinaryIO, gaussians: Gaussians, header: SpzHeader, sh_bits: tuple[int, int] = DEFAULT_SH_BITS
 ) -> None:
-    """Write an SPZ file at the current position of a seekable file."""
+    """Write an SPZ file at the current position of a seekable file. header: from `header_for`."""
     if header.version < 4:
         fields = (header.version, header.count, header.degree, header.fractional_bits, header.flags, 0)
         with gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=6, mtime=0) as stream:

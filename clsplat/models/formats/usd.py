@@ -71,8 +71,8 @@ def recognises(head: bytes) -> bool:
 def survive(path: Path, call: str = "clsplat.models.formats.usd:read_here", **arguments: Any) -> None:
     """Test in another process that USD's library does not crash on a file.
 
-    A damaged file can crash it, by invalid offsets or a stack overflow. Text files that cannot are not tested. Raises
-    InputError if the process crashes, or if usd-core or the file is missing.
+    A damaged file can crash the library, by invalid offsets or a stack overflow. Text files that cannot crash it are
+    not tested. Raises InputError if the process crashes, or if usd-core or the file is missing.
 
     call: MODULE:FUNCTION that the process calls with the path and `arguments`.
     """

@@ -28,7 +28,7 @@ from clsplat.errors import InputError
 MAX_PLACED_PRIMS = 1_000_000
 """Largest number of placements in a stage. More are a mistake or an attempt to exhaust memory."""
 _MAX_CACHED_TIMES = 16
-"""Number of times for which an instancer's transforms are cached."""
+"""Largest number of time codes for which an instancer's transforms are cached."""
 _TRANSFORM_ATTRIBUTES = ("positions", "orientations", "orientationsf", "scales")
 _VELOCITY_ATTRIBUTES = ("velocities", "angularVelocities")
 _MEMBERSHIP_ATTRIBUTES = ("protoIndices", "ids", "invisibleIds")
@@ -220,7 +220,7 @@ class Instancer:
                 f"{len(self.roots)} prototypes"
             )
         ids = [int(number) for number in self._instancer.GetIdsAttr().Get(code) or ()]
-        if len(ids) != len(indices) or len(set(ids)) != len(ids):  # USD ignores such ids too
+        if len(ids) != len(indices) or len(set(ids)) != len(ids):  # as USD does, ignore ids that are not unique
             ids = list(range(len(indices)))
         return dict.fromkeys(zip(ids, indices, strict=True))
 
@@ -242,7 +242,7 @@ class Instancer:
 
 @dataclass
 class _StageFindings:
-    """Results of a walk through a stage.
+    """Prims with Gaussians, and prims that are not drawn, which a traversal of a USD stage has found.
 
     where: prefix of errors.
     kinds: type names of prims with Gaussians.

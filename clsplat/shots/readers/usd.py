@@ -73,7 +73,7 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
 
         def moment(time: float) -> Camera:
             with readable(path):
-                prim = UsdGeom.Camera(stage.GetPrimAtPath(place))  # the stage has to live as long as this function
+                prim = UsdGeom.Camera(stage.GetPrimAtPath(place))  # the reference to the stage keeps it open
                 return _camera(f"{where} at {time:g}", prim, time, picture, settings)
 
         frames = numbered(map(moment, codes), codes[0], None if len(codes) == 1 or per_second <= 0 else per_second)
@@ -161,7 +161,7 @@ def _find(path: Path, cameras: list[Any], prim: str | None) -> Any:
 
 
 def _moved(camera: Any) -> Iterator[Any]:
-    """The camera and its ancestors, if they can have a transform."""
+    """Yield the camera and those of its ancestors that can have a transform."""
     from pxr import UsdGeom
 
     prim = camera.GetPrim()
