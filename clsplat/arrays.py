@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Array types, one per element type, and arrays from parsed JSON."""
+"""Types of NumPy arrays by element type, and conversion of parsed JSON to arrays."""
 
 from __future__ import annotations
 

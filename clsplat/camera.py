@@ -77,8 +77,8 @@ JACOBIAN_CLAMP_HALF_FRAMES = 0.3
 DEFAULT_NEAR_PLANE = 0.01
 """Default near plane in world units, for cameras and models without their own."""
 MIN_SIZE_IN_NEAR_PLANES = 100.0
-"""A scene's length unit, or a small model's size, divided by this number is its near plane, unless the default near
-plane is smaller."""
+"""Ratio of a scene's length unit, or of a small model's size, to its near plane, unless the default near plane is
+smaller."""
 ROTATION_TOLERANCE = 1e-2
 """Largest allowed entry of |R^T R - I|. It is this large because poses may be typed with few digits or be float32."""
 MAX_FOCAL_PX = 1e12

@@ -78,7 +78,7 @@ def terminable() -> AbstractContextManager[object]:
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Context in which signals that ask the process to end are delayed. Afterwards the first of them is raised.
+    """Context in which signals that ask the process to end are delayed. At its end, the first of them is raised.
 
     In the main thread, handlers that a library installs meanwhile are removed at the end. In threads that a library
     starts meanwhile, and in the programs that these threads run, the signals stay blocked.

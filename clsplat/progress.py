@@ -33,7 +33,7 @@ class RemainingTime(Protocol):
     """An estimator of the remaining time, for `TrainProgress` (`training.forecast.Forecast`)."""
 
     def see(self, report: Any) -> None:
-        """Update the estimate with a report."""
+        """Update the estimate with a `training.loop.StepReport`."""
 
     def left(self) -> float | None:
         """Seconds from the last report to the end, or None if they cannot be estimated yet."""
@@ -56,7 +56,7 @@ def no_progress(text: str, fraction: float | None = None) -> None:
 
 
 class _Bar:
-    """A context manager with a live bar if standard error is a terminal. Otherwise `live` is None."""
+    """A live progress bar, as a context manager. `live` is None if standard error is not a terminal."""
 
     live: RichProgress | None = None
 

@@ -75,7 +75,7 @@ def check_new(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> N
     if path.is_dir():
         raise InputError(f"{path}: is a folder, expected the name of a file to write")
     if not path.parent.is_dir():
-        raise InputError(f"{path.parent}: no such folder, expected one for {path.name}")
+        raise InputError(f"{path.parent}: no such folder, expected an existing one for {path.name}")
     if overwrite or not (path.exists() or path.is_symlink()):
         return
     if any(source.exists() and path.exists() and source.samefile(path) for source in sources):

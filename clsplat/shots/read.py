@@ -117,8 +117,8 @@ def _without_strays(frames: Sequence[Frame], source: Path) -> tuple[list[Camera]
     if not far.any():
         return near, ()
     names = examples(frame.name for frame, stray in zip(frames, far, strict=True) if stray)
-    text = f"{source}: the cameras of {names} are over {OUTLIER_DISTANCE_RATIO:g} times as far away as the others"
-    return near, (f"{text}, and the path is made without them",)
+    far_away = f"over {OUTLIER_DISTANCE_RATIO:g} times as far from the middle as the others"
+    return near, (f"{source}: the cameras of {names} are {far_away}, and the path is made without them",)
 
 
 def photographed(path: Path, size: tuple[int | None, int | None] = (None, None)) -> list[PosedImage]:

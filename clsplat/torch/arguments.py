@@ -65,7 +65,7 @@ def _check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
 def check(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
     """Raise InputError like `check_shape`, and for NaN. Tensors of torch.func are accepted."""
     _check_shape(name, value, *shapes)
-    # a NaN makes the sum NaN, and the sum needs no additional array
+    # the sum is NaN if a value is, and needs no additional array
     if torch.isnan(value.detach().sum()) and bool((broken := torch.isnan(value.detach())).any()):
         first = tuple(broken.nonzero()[0].tolist())
         raise InputError(f"{name} has {int(broken.sum())} NaN values, the first at {first}; expected numbers")

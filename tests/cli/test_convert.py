@@ -250,7 +250,7 @@ def test_wrong_calls_are_one_line_and_write_nothing(
 
 def test_a_folder_that_is_not_there(model: Path, capsys: Capture) -> None:
     target = model.parent / "none" / "out.ply"
-    said = f"clsplat: error: {target.parent}: no such folder, expected one for out.ply"
+    said = f"clsplat: error: {target.parent}: no such folder, expected an existing one for out.ply"
     assert fails(capsys, convert, model, target) == said
     assert not target.parent.exists()
 

@@ -114,7 +114,7 @@ def test_morton_order_interleaves_the_bits() -> None:
         ),
         (
             lambda data: data.replace(b"element chunk 1\n", b"element chunk 99999999999\n"),
-            "by its header",
+            "but its header announces",
         ),
         (lambda data: data.replace(b"element vertex 2", b"element vertex 255"), "sh has 2 rows, expected 255"),
         (lambda data: data.replace(b"element vertex 2", b"element vertex 0"), "0 Gaussians"),
@@ -125,7 +125,7 @@ def test_morton_order_interleaves_the_bits() -> None:
         (lambda data: data.replace(b"element sh 2", b"element sh 1"), "sh has 1 rows, expected 2"),
         (lambda data: data.replace(b"binary_little_endian", b"ascii"), "in ascii"),
         (lambda data: data.replace(b"element chunk", b"element lumps"), "0 elements 'chunk'"),
-        (lambda data: data[:-1], "by its header"),
+        (lambda data: data[:-1], "but its header announces"),
         (lambda data: data.replace(struct.pack("<f", -2.0), NAN), "2 of 2 Gaussians have a value"),
     ],
 )

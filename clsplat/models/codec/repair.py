@@ -47,8 +47,8 @@ CLIPPED_OPACITY_SHARE = (1e-3, 0.02)
 """A distance from 1, and a fraction. If at least this fraction of the values is within this distance of 1, the values
 are opacities that a neural network has clipped at 1. Logits do not cluster at 1."""
 PERCENTAGE_MAXIMA = (40.0, 100.0)
-"""Range of the largest number at which whole numbers are percentages. Were they levels up to 255, no opacity would
-exceed 0.4."""
+"""Whole numbers are percentages if the largest is in this range. If they were levels up to 255, no opacity would exceed
+0.4."""
 ZERO_SCALE_LOG_LIMIT = float(np.log(values.MIN_SCALE)) + 1
 """Log scales below this stand for scales of 0, and do not show how the other scales are encoded."""
 LENGTH_SKEW_RATIO = 3.0

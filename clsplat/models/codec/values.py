@@ -244,7 +244,7 @@ def read_rows(file: BinaryIO, kind: np.dtype[Any], count: int, path: Path) -> ND
 
 
 def all_finite(array: NDArray[Any]) -> bool:
-    """True if all values of a float32 array are finite. Takes one pass: the float64 sum of finite values is finite."""
+    """True if all values of a float32 array are finite. This is so if, and only if, their float64 sum is finite."""
     with np.errstate(invalid="ignore"):  # -inf + inf gives NaN
         return bool(np.isfinite(array.sum(dtype=np.float64)))
 

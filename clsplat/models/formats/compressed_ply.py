@@ -64,7 +64,7 @@ def read(path: Path) -> Gaussians:
         chunks, vertex, sh = _elements(header)
         end, have = header.start(len(header.elements)), os.fstat(file.fileno()).st_size
         if have < end:
-            raise InputError(f"{path}: truncated: has {have} bytes, but needs {end} by its header")
+            raise InputError(f"{path}: truncated: has {have} bytes, but its header announces {end}")
         bounds = _bounds(file, header, chunks)
         rest = [] if sh is None else [f"f_rest_{index}" for index in range(len(sh.properties))]
         result = packing.empty(vertex.count, {0: 0, 9: 1, 24: 2, 45: 3}[len(rest)])

@@ -179,7 +179,7 @@ def read_here(path: Path) -> Gaussians:
                 read[own] = gaussians_of(where, place.prim, time, space)
             parts.append(axes.place(read[own], matrix, where))
     if not parts:
-        raise InputError(f"{path}: shows none of its instances at its first time, expected at least one")
+        raise InputError(f"{path}: shows no instance of its Gaussians at its first time code, expected at least one")
     return merge(parts)
 
 

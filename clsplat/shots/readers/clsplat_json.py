@@ -79,7 +79,8 @@ def _known(where: str, values: dict[str, Any], names: tuple[str, ...]) -> None:
 def _frame(keys: Keys, fps: float | None, first: float) -> float:
     frame, seconds = keys.frame.get("frame"), keys.frame.get("seconds")
     if (frame is None) == (seconds is None):
-        raise InputError(f"{keys.where}: expected either 'frame' or 'seconds'")
+        found = "neither" if frame is None else "both"
+        raise InputError(f"{keys.where}: has {found}, expected either 'frame' or 'seconds'")
     if frame is not None:
         return keys.require("frame")
     if fps is None:
