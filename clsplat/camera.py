@@ -206,7 +206,7 @@ class Camera:
 
     @property
     def frustum_limits(self) -> Float64:
-        """Bounds to which the Jacobian clamps x/z and y/z: rows are lower, upper; eq. (3) of docs/gradients.md."""
+        """Lower (row 0) and upper bounds (row 1) of x/z and y/z in the Jacobian: eq. (3) of docs/gradients.md."""
         window = self.window or Window(0, 0, self.width, self.height)
         size = np.array([window.width, window.height], np.float64)
         focal = np.array([self.fx, self.fy], np.float64)
@@ -272,10 +272,10 @@ class Camera:
         return replace(self, translation=self.translation + self.rotation @ origin)
 
     def moved(self, motion: Float64) -> Camera:
-        """The camera after a motion (6,): a turn about its centre, in radians about the world's axes, then a shift
-        along them.
+        """The camera that sees what this camera would see if the world moved: (140) of docs/gradients.md.
 
-        The view is the same as if the world had made the opposite motion: (140) of docs/gradients.md.
+        motion: (6,), a rotation of the world about this camera's centre, as a rotation vector in radians, and then a
+        translation of the world in world units.
         """
         turn, shift = np.asarray(motion, np.float64).reshape(2, 3)
         x, y, z = turn
@@ -341,9 +341,9 @@ class Camera:
     def reshaped(self, width: int, height: int) -> Camera:
         """The camera with a picture of another size.
 
-        A change of shape, even by rounding, keeps the vertical field of view and the pixel aspect ratio.
-        The picture then shows more or less to the left and right, so all sizes of one shape show the same.
-        A panorama shows all directions in any shape.
+        If the aspect ratio changes, even by rounding, the vertical field of view and the shape of pixels stay. The
+        picture then shows more or less to the left and right, so all sizes of one aspect ratio show the same. A
+        panorama shows all directions at any aspect ratio.
         """
         if (width, height) == (self.width, self.height):
             return self

@@ -199,7 +199,7 @@ def scratch_folder(needs: int) -> Iterator[Path]:
     """Context manager that yields a temporary folder, for a library that writes files by name.
 
     Raises WriteError if the disk has less than `needs` bytes, or becomes full while the library writes. If the library
-    raises an exception without a reason, a test file is written to find out whether the disk is full.
+    raises an exception of its own, a test file is written to find out whether the disk is full.
     """
     # cleanup errors are ignored: the library may still have a file open, which Windows does not remove
     with tempfile.TemporaryDirectory(prefix="clsplat-", ignore_cleanup_errors=True) as name:

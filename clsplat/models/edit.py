@@ -169,7 +169,7 @@ def transform(gaussians: Gaussians, matrix: Float64, slack: float = _SIMILARITY_
         means, origin = means + origin, np.zeros(3)
     return Gaussians(
         means.astype(np.float32),
-        gaussians.quaternions if upright else _turned(gaussians.quaternions, turn),
+        gaussians.quaternions if upright else _rotated(gaussians.quaternions, turn),
         (gaussians.log_scales + np.log(scale)).astype(np.float32),
         gaussians.opacity_logits,
         gaussians.sh if upright else rotate_sh(gaussians.sh, turn),
@@ -211,14 +211,14 @@ def transform_camera(camera: Camera, matrix: Float64) -> Camera:
     return replace(camera, rotation=rotation, translation=translation, near=near, far=scale * camera.far)
 
 
-def _turned(quaternions: Float32, turn: Float64) -> Float32:
-    """Rotate quaternions w x y z (n, 4) by the matrix `turn`, without change of their lengths.
+def _rotated(quaternions: Float32, rotation: Float64) -> Float32:
+    """Rotate quaternions w x y z (n, 4) by a matrix (3, 3), without change of their lengths.
 
-    If `turn` has a reflection, -turn is used, which gives the same covariances.
+    If the matrix has a reflection, its negative is used, which gives the same covariances.
     """
     from scipy.spatial.transform import Rotation
 
-    proper = turn if np.linalg.det(turn) > 0 else -turn
+    proper = rotation if np.linalg.det(rotation) > 0 else -rotation
     x, y, z, w = Rotation.from_matrix(proper).as_quat()
     # Hamilton product of (w, x, y, z) and each quaternion
     product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])

@@ -26,7 +26,7 @@ ORBIT_FOV_RADIANS = math.radians(40.0)
 SUBJECT_SAMPLE_SIZE = 100_000
 """Number of Gaussians that are sampled to locate a model. A larger sample moves its centre by less than a pixel."""
 MIN_GAUSSIANS_FOR_STRAYS = 100
-"""In a model of at least this many Gaussians, the outermost ones are strays: they do not count for its size."""
+"""In a model of at least this many Gaussians, the outermost ones count as outliers, which do not affect its size."""
 BALL_SHRINK_FACTOR = 0.9
 """Ratio of successive ball radii in the search for the most detailed region."""
 REGION_DETAIL_FRACTION = 0.35
@@ -40,7 +40,7 @@ the model's radius, since some files have Gaussians of size 0."""
 SCENE_RADIUS_MARGIN = 1.3
 """Radius that an orbit shows, relative to the radius of the scene's most detailed region."""
 ORBIT_FRAMING_MARGIN = 1.1
-"""Radius that a picture shows, relative to the subject's radius. The margin is for strays."""
+"""Radius that a picture shows, relative to the subject's radius, which does not include outliers."""
 RING_ELEVATIONS_RADIANS = (math.radians(20.0), math.radians(5.0), math.radians(40.0))
 """Elevations of the camera rings, in radians. A turntable follows the first ring; a spiral rises and sinks between the
 other two."""
@@ -148,7 +148,7 @@ def _size(size: tuple[int | None, int | None]) -> tuple[int, int]:
 
 
 def _subject(gaussians: Gaussians) -> tuple[Float64, float]:
-    """Centre (3,) in the world and radius of the subject: all Gaussians but strays, or a scene's most detailed region.
+    """Centre (3,) in the world and radius of a scene's most detailed region, or of an object without its outliers.
 
     A ball shrinks towards the greatest detail, measured as opacity over size (mean shift, Fukunaga and Hostetler 1975),
     until it holds at most REGION_DETAIL_FRACTION of the detail.

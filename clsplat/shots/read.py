@@ -111,7 +111,7 @@ def choose_shot(
 
 
 def _without_strays(frames: Sequence[Frame], source: Path) -> tuple[list[Camera], tuple[str, ...]]:
-    """Cameras of the frames without strays, and a warning that names the strays."""
+    """Cameras of the frames without outliers, and a warning that names the outliers. source: file for the warning."""
     far = stray_cameras([frame.camera for frame in frames])
     near = [frame.camera for frame, stray in zip(frames, far, strict=True) if not stray]
     if not far.any():

@@ -79,8 +79,8 @@ def covered_arc(azimuths: Float64) -> tuple[float, float]:
 
 
 def extent_of(points: NDArray[Any], inside: float = 0.96) -> tuple[Float64, Float64]:
-    """Corners (3,) of the box that holds the fraction `inside` of the points (N, 3) along each axis. Strays, of which
-    models have many, are left out."""
+    """Corners (3,) of the box that holds the fraction `inside` of the points (N, 3) along each axis. The rest are
+    outliers, of which models have many."""
     if not len(points):
         return -np.ones(3), np.ones(3)
     some = points[:: max(1, len(points) // 100_000)]

@@ -133,7 +133,7 @@ def _direction(vectors: Float32) -> Float32:
 def _nearest_centres(vectors: Float32, centres: Float32) -> NDArray[np.int64]:
     """Index of each vector's nearest centre, which has the smallest |c|^2 / 2 - v c = (|v - c|^2 - |v|^2) / 2.
 
-    The computation goes by tiles so small that the BLAS library does not split them among threads, which makes it
+    The tiles are so small that the BLAS library does not split them among threads. Threads would make the search
     several times slower on a busy machine.
     """
     halves = np.float32(0.5) * np.einsum("ij,ij->i", centres, centres)

@@ -33,7 +33,7 @@ MIN_GAUSSIANS_FOR_ENCODING_WARNINGS = 100
 BYTE_LOGIT_ERROR = 0.02
 """Largest error of a logit between 0 and 1 after conversion to an 8-bit format."""
 LARGEST_USEFUL_LOGIT = 20.0
-"""Largest logit that is useful in float32. Opacities as levels from 0 to 255 exceed it."""
+"""Largest logit that changes an opacity in float32. Opacities stored as levels from 0 to 255 exceed it."""
 MAX_HANDMADE_LOGITS = 10
 """Largest number of distinct logits in a handmade model."""
 TRAINED_OPACITY_SPREAD = (0.35, 0.93)

@@ -4,7 +4,7 @@
 Specifications: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, and for Gaussians
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting (ratified).
 
-- Axes: x left, y up, z forward, as the base specification says; half a turn about z from clsplat's. The writer turns
+- Axes: x left, y up, z forward, as the base specification says; half a turn about z from clsplat's. The writer rotates
   the values and not a node, since not every viewer rotates spherical harmonics with their node. An `origin` becomes the
   node's translation. The reader applies the nodes' transforms.
 - Values are float32: linear scales, opacities in [0, 1], unit quaternions x y z w. Each SH coefficient has an

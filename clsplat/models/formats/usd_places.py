@@ -382,7 +382,7 @@ def _local(prim: Any, code: Any) -> Any:
 
 
 def _turn_of(matrix: Any, scales: Any) -> Any:
-    """The rotation nearest to USD's matrix divided by the scales, which may have a slight shear."""
+    """The rotation nearest to USD's matrix after division by the scales; the quotient may have a slight shear."""
     from pxr import Gf
 
     rows = np.array(matrix)[:3, :3] / np.array(scales, np.float64)[:, None]
