@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Progress = Callable[[str, float | None], None]
 """A progress callback. It takes the text of a stage and the fraction that is done, or None if that is unknown."""
 PLAIN_LINE_SECONDS = 10.0
-"""Seconds between plain lines."""
+"""Seconds between lines of progress if standard error is not a terminal."""
 LIVE_TEXT_SECONDS = 1.0
 """Seconds between updates of a live bar's text. Its forecast takes several milliseconds, like a training step on a GPU.
 """

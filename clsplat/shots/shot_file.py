@@ -248,7 +248,8 @@ def _volumes(reader: Keys) -> Iterator[Volume]:
         name = _text(volume, "name")
         kinds = [kind for kind in VOLUME_KINDS if kind in entry]
         if len(kinds) != 1:
-            raise InputError(f"{volume.where}: expected exactly one of 'box', 'sphere' and 'mesh'")
+            found = " and ".join(kinds) or "no region"
+            raise InputError(f"{volume.where}: has {found}, expected exactly one of 'box', 'sphere' and 'mesh'")
         (kind,) = kinds
         if kind == "mesh":
             yield Volume(name, mesh=read_mesh(reader.path.parent / _text(volume, "mesh")))
@@ -404,7 +405,7 @@ def _matrix(reader: Keys) -> Float64:
 
 
 def _value(reader: Keys, name: str) -> Float64:
-    """Value (d,) of a property. Raises InputError."""
+    """Value (d,) of the animated property `name` in a JSON object. Raises InputError."""
     if name == "matrix":
         return _matrix(reader)
     if name == "visible":

@@ -41,8 +41,8 @@ UNIT_COLOUR_SHARE = 0.95
 """Fraction of float colours. If at least so many are at most 1, white is taken to be 1, however bright the others are.
 """
 UNIT_RANGE_TOLERANCE = 1e-3
-"""How far colours may exceed white (relative), and opacities the range [0, 1], by rounding to half floats or averaging.
-"""
+"""Largest excess of colours over white (relative), and of opacities over [0, 1], from rounding to half floats or
+averaging."""
 GAUSSIAN_ARRAY_NOUNS = ("a position", "a rotation", "a scale", "an opacity", "a colour")
 """Nouns for the arrays of `Gaussians`, for messages."""
 

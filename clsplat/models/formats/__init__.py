@@ -50,7 +50,7 @@ class Format:
     loses: short description of the information that the format does not keep.
     floats: True if it stores values as floats.
     sh_degree: the highest SH degree that it stores.
-    describe(path): the format's part of `clsplat info`.
+    describe(path): details of a file for `clsplat info`, by name.
     order(gaussians): index (n,) of the Gaussian in each row of a written file; None if the order is kept.
     blocks(path): yields the Gaussians in world coordinates in blocks of rows; None if the file is read at once.
     side_files(path): the other files of the model at this path.

@@ -82,7 +82,7 @@ def read(path: Path) -> Gaussians:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: comments, `antialiased`, `by_rays`."""
+    """Details of a file for `clsplat info`: comments, `antialiased`, `by_rays`."""
     with open_input(path, "a compressed PLY") as file:
         header = ply_file.read_header(file, path)
     return {"comments": header.comments, "antialiased": header.is_antialiased(), "by_rays": header.by_rays}

@@ -71,7 +71,7 @@ def recognises(head: bytes) -> bool:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: colour space and compression of the first primitive with Gaussians."""
+    """Details of a file for `clsplat info`: colour space and compression of the first primitive with Gaussians."""
     asset = Asset.open(path)
     for _, _, primitive in asset.primitives():
         said = as_object(primitive["extensions"][GAUSSIAN_EXTENSION])

@@ -117,7 +117,7 @@ def read(path: Path) -> Gaussians:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: version and compression level."""
+    """Details of a file for `clsplat info`: version and compression level."""
     with open_input(path, "a .ksplat file") as file:
         header = packing.read_rows(file, KSPLAT_HEADER, 1, path)[0]
     return {"version": f"{header['major']}.{header['minor']}", "level": int(header["level"])}

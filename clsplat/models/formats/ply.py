@@ -137,7 +137,7 @@ def blocks(path: Path) -> Iterator[Gaussians]:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: encoding, comments, ignored properties, `near`, `antialiased`, `by_rays`."""
+    """Details for `clsplat info`: encoding, comments, ignored properties, `near`, `antialiased`, `by_rays`."""
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
     properties = header.vertex.properties

@@ -65,7 +65,7 @@ def recognises(head: bytes) -> bool:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: version and antialiasing."""
+    """Details of a file for `clsplat info`: version and antialiasing."""
     with _opened(path) as (file, meta, _):
         return {"version": meta.get("version", 1), "antialiased": _is_antialiased(file, meta)}
 

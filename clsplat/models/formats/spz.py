@@ -103,7 +103,7 @@ def recognises(head: bytes) -> bool:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: version, fractional bits and antialiasing."""
+    """Details of a file for `clsplat info`: version, fractional bits and antialiasing."""
     with open_input(path, "an SPZ file") as file:
         header, _ = _open(file, os.fstat(file.fileno()).st_size, path)
     antialiased = bool(header.flags & ANTIALIASED_FLAG)

@@ -109,7 +109,7 @@ def _lives(call: str, arguments: str, path: str, *_: int) -> bool:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: the stage's up axis and unit, which do not change the model."""
+    """Details of a file for `clsplat info`: the stage's up axis and unit, which do not change the model."""
     survive(path)
     stage = _open(path)
     from pxr import UsdGeom

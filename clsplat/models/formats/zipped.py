@@ -71,7 +71,7 @@ class ZipReader:
         return gaussians
 
     def describe(self, path: Path) -> dict[str, Any]:
-        """The model's part of `clsplat info`, including its format and what the format loses."""
+        """Details of the model for `clsplat info`, including its format and what the format loses."""
         with self.model(path) as (file, row):
             return {"format": f"{row.name} in a .zip", "loses": row.loses, **row.describe(file)}
 

@@ -22,7 +22,7 @@ from clsplat.scenes.camera_json import Keys, short
 from clsplat.shots.shot import MAX_SHOT_FRAMES, Frame, Shot
 
 CAMERAS_JSON_NAME = "cameras.json"
-"""Name of the file in a training's output folder."""
+"""Name of the cameras' file in the output folder of a 3DGS training."""
 CAMERAS_JSON_ROTATION_TOLERANCE = 1e-2
 """Largest deviation of a rotation's axes from right angles and unit length."""
 
