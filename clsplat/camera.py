@@ -314,7 +314,7 @@ class Camera:
     def cosines(self) -> Float32 | None:
         """Cosines (height, width) of the angles between a perspective camera's axis and the rays of its pixels.
 
-        None for other projections, whose depths are already measured along the rays.
+        None for other projections: orthographic rays are parallel to the axis, and the others have distances as depths.
         """
         if not self.is_pinhole:
             return None

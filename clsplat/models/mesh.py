@@ -119,7 +119,7 @@ def _check_counts(path: Path, points: int, triangles: int) -> None:
 
 
 def read_here(path: Path) -> Float64:
-    """Corners (T, 3, 3) of a USD stage's triangles. It skips the test of `survive`: a damaged file may crash the
+    """Corners (T, 3, 3) of a USD stage's triangles, without the test of `survive`. A damaged file may crash the
     process."""
     from pxr import UsdGeom, UsdUtils
 

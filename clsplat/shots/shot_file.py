@@ -177,7 +177,7 @@ class Volume:
     mesh: Mesh | None = None
 
     def holds(self, gaussians: Gaussians) -> NDArray[np.bool_]:
-        """Mask (n,) of the Gaussians whose mean is inside."""
+        """Mask (n,), True for Gaussians whose mean is inside the region."""
         if self.mesh is not None:
             return self.mesh.holds(gaussians.means + gaussians.origin)
         if len(self.numbers) == 6:

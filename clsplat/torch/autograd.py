@@ -217,7 +217,7 @@ class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torc
     @staticmethod
     @differentiable_once
     def backward(ctx: Any, *given: Tensor | None) -> tuple[Any, ...]:
-        """Gradients of the arguments of `forward`."""
+        """Gradients with respect to the arguments of `forward`."""
         call: BatchResults = ctx.call
         inputs = dict(zip(RASTERIZATION_INPUTS, ctx.saved_tensors, strict=True))
         if all(gradient is None for gradient in given):
@@ -274,7 +274,7 @@ class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch ha
     @staticmethod
     @differentiable_once
     def backward(ctx: Any, d_images: Tensor | None, d_alphas: Tensor | None) -> tuple[Any, ...]:
-        """Gradients of the arguments of `forward`."""
+        """Gradients with respect to the arguments of `forward`."""
         call: BatchResults = ctx.call
         means2d, conics, depths, opacities, values, backgrounds, *_ = ctx.saved_tensors
         if d_images is None and d_alphas is None:
