@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `clsplat` and `python -m clsplat`. Signals are already handled while it is imported."""
+"""Entry point of the command line, `clsplat` or `python -m clsplat`. It handles Ctrl-C even during imports."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def main() -> int:
             from clsplat.cli.main import main as run
 
             return run()
-    except KeyboardInterrupt as error:  # before the command line could catch it
+    except KeyboardInterrupt as error:  # raised before `run` could catch it
         print("clsplat: interrupted", file=sys.stderr)
-        return 128 + getattr(error, "number", 2)  # like `process.status_of`, which may not be imported yet
+        return 128 + getattr(error, "number", 2)  # as `process.status_of`, which may not be imported yet
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat.train` and `clsplat.devices`."""
+"""The public functions `clsplat.train`, which trains a model, and `clsplat.devices`, which lists OpenCL devices."""
 
 from __future__ import annotations
 
@@ -71,8 +71,8 @@ def train(
         Folder for decoded photographs, which stays and may be shared by trainings, or "none". None means the run's
         folder until the training has finished if `max_host_mem` is given, else no cache.
     scratch : str or Path, optional
-        Folder for the Gaussians that `max_host_mem` leaves no room for. The file that the run's checkpoints name stays
-        there. None means the run's folder.
+        Folder of the file with Gaussians that do not fit in `max_host_mem`. If the run's checkpoints refer to the file,
+        it is kept after training. None means the run's folder.
     run : Run, optional
         A folder for metrics, checkpoints, held-out renders and the model. With None nothing is written.
     resume : bool
@@ -124,7 +124,7 @@ def train(
 
 
 def _opened(device: Device | str | Sequence[Device] | None, limit: int | None) -> list[Device]:
-    """Open the devices, with at most `limit` bytes of memory each. Raises InputError if there is no such device."""
+    """Open the devices, with at most `limit` bytes of memory each. Raises InputError if no device matches `device`."""
     if device is None or isinstance(device, str):
         with of_argument():
             return open_devices(device, limit)

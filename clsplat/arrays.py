@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Array types, one per element type, and arrays from parsed JSON."""
+"""Types of NumPy arrays by element type, and conversion of parsed JSON to arrays."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Bool = NDArray[np.bool_]
 
 
 def numbers(given: Any) -> Float64:
-    """The array of a list of numbers, or of nested lists; (0,) for any other value. Booleans are not numbers."""
+    """Convert a list of numbers, or nested lists, to an array. Returns (0,) for other values, and for booleans."""
     rows = given if isinstance(given, list) else []
     if any(isinstance(value, bool) for row in rows for value in (row if isinstance(row, list) else [row])):
         return np.empty(0)

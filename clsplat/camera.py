@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera: COLMAP's axes (x right, y down, z forward), pixel centres at +0.5."""
+"""`Camera`: intrinsics, pose and projection, with COLMAP's axes (x right, y down, z forward), pixel centres at +0.5."""
 
 from __future__ import annotations
 
@@ -67,17 +67,18 @@ CAMERA_MODELS: tuple[CameraModel, ...] = (
     BentFisheye("fisheye", "radial", defines={"RAYS": True, "FISHEYE_RAYS": True, "BENT_FISHEYE": True}),
     PerspectiveByRays("perspective", "by_rays", defines={"RAYS": True, "PERSPECTIVE_RAYS": True}),
 )
-"""Every camera model. docs/cameras.md (Adding a camera model) lists the parts of a row."""
+"""Every camera model. docs/cameras.md (Adding a camera model) explains the fields of a row."""
 
 PROJECTIONS: dict[str, CameraModel] = {model.projection: model for model in CAMERA_MODELS if not model.option}
-"""The usual model of each projection, keyed by the projection. Messages and the self-test use this order."""
+"""The model of each projection without options (`radial`, `by_rays`). Messages and the self-test use this order."""
 
 JACOBIAN_CLAMP_HALF_FRAMES = 0.3
+"""Default of `Window.clamp`, in halves of the frame's size."""
 DEFAULT_NEAR_PLANE = 0.01
 """Default near plane in world units, for cameras and models without their own."""
 MIN_SIZE_IN_NEAR_PLANES = 100.0
-"""Divisor of a scene's length unit, or of a small model's size. The quotient is the near plane if the default near
-plane would be too large."""
+"""Ratio of a scene's length unit, or of a small model's size, to its near plane, unless the default near plane is
+smaller."""
 ROTATION_TOLERANCE = 1e-2
 """Largest allowed entry of |R^T R - I|. It is this large because poses may be typed with few digits or be float32."""
 MAX_FOCAL_PX = 1e12
@@ -91,7 +92,7 @@ class Window:
     x, y: frame coordinates of the picture's first pixel; negative if it lies left of or above the frame.
     width, height: size of the frame.
     clamp: distance beyond the frame's edges, in halves of the frame's size, up to which the projection's Jacobian
-    follows a Gaussian's mean. It is larger than the default only for a picture that shows more than that.
+    follows a Gaussian's mean. It is larger than the default only for a picture that extends further beyond its frame.
     """
 
     x: int
@@ -102,7 +103,7 @@ class Window:
 
 
 def _is_set(option: object) -> bool:
-    """True if a camera's option is True, or has a number that is not zero. A training step asks several times."""
+    """True if a camera's option is True, or has a number that is not zero. Fast, since every step calls it often."""
     if isinstance(option, bool):
         return option
     return any(option) if isinstance(option, tuple) else bool(np.any(option))  # type: ignore[call-overload]
@@ -181,12 +182,12 @@ class Camera:
     by_rays: bool = False
 
     def __getstate__(self) -> dict[str, object]:
-        """The fields alone: a copy in another process finds its model in that process's table."""
+        """Pickle the fields only, without the cached `model`: another process takes it from its own CAMERA_MODELS."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @cached_property
     def model(self) -> CameraModel:
-        """The camera model: properties, formulas and kernels."""
+        """The row of CAMERA_MODELS for this camera's projection and options: properties, formulas and kernels."""
         for model in CAMERA_MODELS:
             if model.option and model.projection == self.projection and _is_set(getattr(self, model.option)):
                 return model
@@ -199,13 +200,13 @@ class Camera:
 
     @property
     def fold(self) -> tuple[float, float]:
-        """The largest angle from the axis that a fisheye shows, in radians, and its distance from the principal point,
-        in focal lengths."""
+        """The largest angle from the axis that a fisheye shows, in radians, and the radius in the picture at which it
+        shows this angle, in focal lengths."""
         return self.model.fold(self.radial)
 
     @property
     def frustum_limits(self) -> Float64:
-        """Lower and upper bound of x/z and y/z in the Jacobian, ((x, y), (x, y)): eq. (3) of docs/gradients.md."""
+        """Lower (row 0) and upper bounds (row 1) of x/z and y/z in the Jacobian: eq. (3) of docs/gradients.md."""
         window = self.window or Window(0, 0, self.width, self.height)
         size = np.array([window.width, window.height], np.float64)
         focal = np.array([self.fx, self.fy], np.float64)
@@ -259,8 +260,8 @@ class Camera:
             raise InputError(f"camera: radial is {self.radial}, expected four finite numbers")
 
     def through(self, model: CameraModel, radial: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)) -> Camera:
-        """The same intrinsics and pose with another projection: the usual model of `model.projection`, with
-        coefficients `radial`."""
+        """The camera with another projection, `model.projection`, and fisheye coefficients `radial`, without `by_rays`.
+        Intrinsics and pose stay the same."""
         k1, k2, k3, k4 = radial
         return replace(self, projection=cast("Projection", model.projection), radial=(k1, k2, k3, k4), by_rays=False)
 
@@ -271,10 +272,10 @@ class Camera:
         return replace(self, translation=self.translation + self.rotation @ origin)
 
     def moved(self, motion: Float64) -> Camera:
-        """The camera after a motion (6,): a turn about its centre, in radians about the world's axes, then a shift
-        along them.
+        """The camera that sees what this camera would see if the world moved: (140) of docs/gradients.md.
 
-        The view is the same as if the world had made the opposite motion: (140) of docs/gradients.md.
+        motion: (6,), a rotation of the world about this camera's centre, as a rotation vector in radians, and then a
+        translation of the world in world units.
         """
         turn, shift = np.asarray(motion, np.float64).reshape(2, 3)
         x, y, z = turn
@@ -304,16 +305,16 @@ class Camera:
         return replace(self, by_rays=by_rays) if changes else self
 
     def depths_of_distances(self) -> Float32 | None:
-        """Factors (height, width) that turn a perspective camera's distances into depths z: the `cosines`.
+        """Factors (height, width) that convert distances along the rays of a `by_rays` camera to depths z: `cosines`.
 
-        None if the kernels compute depths.
+        None for all other cameras, for which the kernels compute the depths that files store.
         """
         return self.cosines() if self.by_rays else None
 
     def cosines(self) -> Float32 | None:
         """Cosines (height, width) of the angles between a perspective camera's axis and the rays of its pixels.
 
-        None for other projections, whose depths are already measured along the rays.
+        None for other projections: orthographic rays are parallel to the axis, and the others have distances as depths.
         """
         if not self.is_pinhole:
             return None
@@ -340,9 +341,9 @@ class Camera:
     def reshaped(self, width: int, height: int) -> Camera:
         """The camera with a picture of another size.
 
-        A change of shape, even by rounding, keeps the vertical field of view and the pixel aspect ratio.
-        The picture then shows more or less to the left and right, so all sizes of one shape show the same.
-        A panorama shows all directions in any shape.
+        If the aspect ratio changes, even by rounding, the vertical field of view and the shape of pixels stay. The
+        picture then shows more or less to the left and right, so all sizes of one aspect ratio show the same. A
+        panorama shows all directions at any aspect ratio.
         """
         if (width, height) == (self.width, self.height):
             return self
@@ -362,7 +363,10 @@ class Camera:
         return replace(self, width=width, height=height, window=replace(window, x=window.x + x, y=window.y + y))
 
     def reframed(self, like: Camera) -> Camera:
-        """This camera of a whole frame, with the size and window of another, whose frame may be larger or smaller."""
+        """This camera, which shows a whole frame, with the picture size and window of the camera `like`.
+
+        If the frame of `like` has another size, this camera is first resized to it.
+        """
         frame = like.window or like
         sized = self if (self.width, self.height) == (frame.width, frame.height) else None
         sized = sized or self.resized(frame.width, frame.height)
@@ -416,7 +420,7 @@ def model_with(column: str, value: object) -> CameraModel | None:
 
 
 def names_of(column: str) -> tuple[str, ...]:
-    """All names of a column of CAMERA_MODELS; the names of panoramas come last."""
+    """All names in a column of CAMERA_MODELS, such as "usd"; the names of panoramas come last."""
     return tuple(
         name for model in sorted(CAMERA_MODELS, key=lambda each: each.wraps) for name in getattr(model, column)
     )

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors that a user can meet. The command line turns them into one line and an exit status."""
+"""Exceptions for users, warnings, and texts for their messages. The command line prints an exception as one line, and
+ends with its exit status."""
 
 from __future__ import annotations
 
@@ -22,10 +23,7 @@ def plain(text: str) -> str:
 
 
 def warn(text: str) -> None:
-    """Warn in one line, attributed to the caller's line.
-
-    The command line shows the warnings of this package's modules.
-    """
+    """Issue a Python warning of one line, attributed to the caller. The command line prints warnings of clsplat."""
     warnings.warn(plain(text), stacklevel=2)
 
 
@@ -113,7 +111,7 @@ class DeviceError(InputError):
 
 @contextmanager
 def of_argument() -> Iterator[None]:
-    """Rename the flag --device to the Python argument `device` in errors that are raised inside."""
+    """Context in which the messages of DeviceErrors name the Python argument `device`, not the flag --device."""
     try:
         yield
     except DeviceError as error:
@@ -139,7 +137,7 @@ class KernelBuildError(ClsplatError):
 class DriverError(ClsplatError):
     """Error about a driver that aborted, hung, returned an invalid kernel or failed in a command.
 
-    It names the driver, and for a kernel also the shape and the kernel.
+    The message names the driver. If a kernel failed, it also names the kernel and its shape.
     """
 
 

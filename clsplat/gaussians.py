@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The model on the host: a structure of arrays, as stored (raw quaternions, log scales, opacity logits)."""
+"""`Gaussians`: a model in host memory, as arrays of raw quaternions, log scales, opacity logits and SH coefficients."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ class Gaussians:
     near : float
         Near plane in world units, for cameras that do not set one (docs/decisions/0019).
     antialiased : bool
-        True for a model that was trained, and is drawn, with the filter of docs/gradients.md, section 13.
+        True for a model that was trained, and is drawn, with Mip-Splatting's low-pass filter (docs/gradients.md,
+        section 13).
     by_rays : bool
         True for a model that was trained along the rays of pixels, and that perspective cameras draw along them
         (`Camera.by_rays`).
@@ -73,7 +74,7 @@ class Gaussians:
         return {group.field: getattr(self, group.field) for group in PARAMETER_GROUPS.values()}
 
     def local(self, camera: Camera) -> Camera:
-        """A camera in world coordinates, made relative to the model's origin, with the model's near plane and
+        """Adapt a camera in world coordinates to the model: relative to its origin, with its near plane and
         `by_rays`."""
         return camera.from_origin(self.origin).before(self.near).along_rays(self.by_rays)
 
@@ -152,13 +153,13 @@ class Gaussians:
 
 
 MAX_SH_COEFFICIENT = 1e7
-"""Largest SH coefficient. A colour too large for project.cl to draw has a coefficient above it."""
+"""Largest magnitude of an SH coefficient. Up to it, colours stay small enough for project.cl to draw the Gaussian."""
 MAX_PARAMETER = 1e19
-"""Largest parameter, so that its square fits in float32."""
+"""Largest magnitude of other parameters, so that their squares fit in float32."""
 
 
 class GaussiansOfFile(Gaussians):
-    """A model in a file, for which main memory may have no room: its arrays are read when they are first used.
+    """A model in a file. Its arrays are read on first use, since main memory may have no room for them.
 
     like: Gaussians with the model's origin, near plane and other properties.
     """
@@ -168,7 +169,7 @@ class GaussiansOfFile(Gaussians):
         self.antialiased, self.by_rays = like.antialiased, like.by_rays
 
     def __getstate__(self) -> dict[str, Any]:
-        """A copy, or what is pickled, has the arrays: the file may be gone when it is used."""
+        """Copy and pickle the arrays too, because the file may be gone when the copy is used."""
         return {"means": self.means, **vars(self)}
 
     def __getattr__(self, name: str) -> Any:
@@ -216,5 +217,5 @@ def group_shapes(count: int, coefficients: int) -> dict[str, tuple[int, ...]]:
 
 
 def floats_of(coefficients: int) -> int:
-    """Number of floats of one Gaussian's parameters."""
+    """Number of float32 parameters of one Gaussian with `coefficients` SH coefficients per channel."""
     return sum(prod(shape) for shape in group_shapes(1, coefficients).values())

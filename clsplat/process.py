@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How processes are started and asked to end, on each operating system."""
+"""Signals that end a process (Ctrl-C, SIGTERM, SIGHUP), child processes, and standard streams that are closed."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def endings() -> tuple[signal.Signals, ...]:
 
 
 class Interrupted(KeyboardInterrupt):
-    """Exception for Ctrl-C, or for the signal with this number."""
+    """Exception on Ctrl-C, or on another signal that asks the process to end. number: the signal's number."""
 
     def __init__(self, number: int = signal.SIGINT) -> None:
         super().__init__()
@@ -56,7 +56,7 @@ def interrupt(number: int, _frame: FrameType | None) -> None:
 
 @contextmanager
 def handled(numbers: Iterable[int], handler: Callable[[int, FrameType | None], object]) -> Iterator[dict[int, Any]]:
-    """Context in which `handler` handles these signals. Yields the previous handlers.
+    """Context in which `handler` handles the signals `numbers`. Yields the previous handlers.
 
     Outside the main thread it does nothing, since Python handles signals only there.
     """
@@ -78,7 +78,7 @@ def terminable() -> AbstractContextManager[object]:
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Context in which signals that ask the process to end are delayed. Afterwards the first of them is raised.
+    """Context in which signals that ask the process to end are delayed. At its end, the first of them is raised.
 
     In the main thread, handlers that a library installs meanwhile are removed at the end. In threads that a library
     starts meanwhile, and in the programs that these threads run, the signals stay blocked.
@@ -124,8 +124,8 @@ def fill_closed_streams() -> None:
 
 
 def reader_has_gone(error: OSError, *, windows: bool = sys.platform == "win32") -> bool:
-    """True if a write failed because the reader of our output has ended, as with `| head`.
+    """True if a write to standard output failed because the program that reads it has ended, as with `| head`.
 
-    Windows then reports an invalid argument, without a file name.
+    In this case Windows reports an invalid argument, without a file name.
     """
     return isinstance(error, BrokenPipeError) or (windows and error.errno == errno.EINVAL and error.filename is None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress on standard error: a live bar on a terminal, else a plain line every ten seconds. It also formats tables."""
+"""Progress on standard error: a live bar on a terminal, else a plain line every ten seconds. Also text tables."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ if TYPE_CHECKING:
 Progress = Callable[[str, float | None], None]
 """A progress callback. It takes the text of a stage and the fraction that is done, or None if that is unknown."""
 PLAIN_LINE_SECONDS = 10.0
-"""Seconds between plain lines."""
+"""Seconds between lines of progress if standard error is not a terminal."""
 LIVE_TEXT_SECONDS = 1.0
-"""Seconds between changes of a live bar's text: a forecast takes several milliseconds, which is a GPU's step."""
+"""Seconds between updates of a live bar's text. Its forecast takes several milliseconds, like a training step on a GPU.
+"""
 METRIC_SMOOTHING_WEIGHT = 0.1
 """Weight of the newest report in the displayed PSNR and loss, which are smoothed because views differ."""
 RATE_WINDOW_SECONDS = 20.0
@@ -32,7 +33,7 @@ class RemainingTime(Protocol):
     """An estimator of the remaining time, for `TrainProgress` (`training.forecast.Forecast`)."""
 
     def see(self, report: Any) -> None:
-        """Update the estimate with a report."""
+        """Update the estimate with a `training.loop.StepReport`."""
 
     def left(self) -> float | None:
         """Seconds from the last report to the end, or None if they cannot be estimated yet."""
@@ -55,7 +56,7 @@ def no_progress(text: str, fraction: float | None = None) -> None:
 
 
 class _Bar:
-    """A context manager with a live bar if standard error is a terminal. Otherwise `live` is None."""
+    """A live progress bar, as a context manager. `live` is None if standard error is not a terminal."""
 
     live: RichProgress | None = None
 
@@ -64,8 +65,7 @@ class _Bar:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         if sys.stderr.isatty():
-            # Frames take similar times, so rich can estimate the remaining time. For training steps the description
-            # has it.
+            # Frames take similar times, so rich can estimate the remaining time. For training it is in the description.
             more = [MofNCompleteColumn(), TimeRemainingColumn()] if counted else []
             columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), *more)
             self.live = Progress(
@@ -232,9 +232,9 @@ class FrameProgress(_Bar):
         print(text, file=self.lines, flush=True)
 
     def _left(self) -> str:
-        """The remaining time, if frames take as long as before; empty if it is less than half a second.
+        """Text of the remaining time, from the mean time of the written frames; empty if under half a second.
 
-        Once there is a second frame the first one no longer counts, since kernels may have been built during it.
+        From the second frame on, the mean leaves out the first, during which kernels may have been built.
         """
         now = time.monotonic()
         if self.written == 1:
@@ -245,14 +245,14 @@ class FrameProgress(_Bar):
 
 
 def duration(seconds: float) -> str:
-    """Seconds as h:mm:ss or m:ss."""
+    """Format a number of seconds as h:mm:ss or m:ss."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list[str]:
-    """One line per row. The columns `left` are left-aligned, the others right-aligned."""
+    """Format a table, one line per row. left: indices of the left-aligned columns; the others are right-aligned."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     sides = ["<" if index in left else ">" for index in range(len(widths))]
     line = "  ".join(f"{{:{side}{width}}}" for side, width in zip(sides, widths, strict=True))

@@ -33,7 +33,7 @@ SH_C4 = (
 
 
 def sh_basis(directions: Float64, degree: int) -> Float64:
-    """Y_k of eq. (12) in docs/gradients.md, (N, (degree + 1)^2).
+    """Values (N, (degree + 1)^2) of the spherical harmonics Y_k: eq. (12) of docs/gradients.md.
 
     directions: (N, 3), unit vectors from the camera to the mean.
     """

@@ -8,8 +8,8 @@ from functools import cache
 
 @cache
 def package_version() -> str:
-    """The version, such as "0.1.0". A checkout that is on the path but not installed has "0+unknown"."""
-    from importlib import metadata  # slow to import, and most verbs do not need the version
+    """The version, such as "0.1.0"; "0+unknown" if the package runs from a checkout that is not installed."""
+    from importlib import metadata  # slow to import, and most commands do not need the version
 
     try:
         return metadata.version("clsplat")

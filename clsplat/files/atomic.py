@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Atomic writes of files, temporary names, and errors of full disks."""
+"""Atomic writes of files by temporary files and renames, checks of disk space, and errors about full disks."""
 
 from __future__ import annotations
 
@@ -32,11 +32,12 @@ WINDOWS_RETRY_SECONDS = 2.0
 """Seconds during which an operation is repeated on Windows while another program has the file open. A virus scanner or
 an indexer closes a new file within one second."""
 TEMPORARY_NAME = re.compile(rf"\.(.+)\.([0-9a-f]{{20}}){re.escape(TEMPORARY_SUFFIX)}", re.DOTALL)
+"""Pattern of the names that `temporary_name` makes. Its groups are the target's name, and digits for the process."""
 
 
 @cache
 def machine_mark() -> str:
-    """Four hexadecimal digits of this machine's name."""
+    """Four hexadecimal digits that identify this machine: the beginning of a digest of its host name."""
     return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:4]
 
 
@@ -49,7 +50,9 @@ def temporary_name(target: Path) -> Path:
 def is_abandoned(path: Path, token: str) -> bool:
     """True if the process that made a temporary file has ended.
 
-    If that process is of another machine, or on Windows, True if the file is unchanged for ABANDONED_FILE_SECONDS.
+    This cannot be checked for a process on another machine, or on Windows. There, a process counts as ended if the file
+    has not changed for ABANDONED_FILE_SECONDS.
+
     token: the part of the file's name that identifies machine and process.
     """
     if token[:4] == machine_mark() and os.name == "posix":
@@ -72,7 +75,7 @@ def check_new(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> N
     if path.is_dir():
         raise InputError(f"{path}: is a folder, expected the name of a file to write")
     if not path.parent.is_dir():
-        raise InputError(f"{path.parent}: no such folder, expected one for {path.name}")
+        raise InputError(f"{path.parent}: no such folder, expected an existing one for {path.name}")
     if overwrite or not (path.exists() or path.is_symlink()):
         return
     if any(source.exists() and path.exists() and source.samefile(path) for source in sources):
@@ -104,10 +107,10 @@ def atomic_name(path: str | os.PathLike[str], needs: int | None = None) -> Itera
         written = 0
         with suppress(OSError):
             written = temporary.stat().st_size
-            temporary.unlink()  # removed before the message is made, which tells the free space
+            temporary.unlink()  # removed first, since the message may state the free space
         names = (None, str(temporary), str(path))
         if isinstance(error, OSError) and error.errno and not isinstance(error, WriteError) and error.filename in names:
-            # The error names the temporary file, which users do not know, or no file if the disk is full.
+            # The system's error names the temporary file, or no file if the disk is full. Users know only `path`.
             raise write_error(path, error, written, needs) from None
         raise
 
@@ -164,6 +167,7 @@ def room_error(folder: Path) -> OSError | None:
 
 
 _reserved: dict[int, int] = {}
+"""Bytes that `require_room` has reserved on each disk, by the disk's number (st_dev)."""
 _reserving = threading.Lock()
 
 
@@ -194,8 +198,8 @@ def require_room(path: str | os.PathLike[str], needs: int) -> Iterator[None]:
 def scratch_folder(needs: int) -> Iterator[Path]:
     """Context manager that yields a temporary folder, for a library that writes files by name.
 
-    Raises WriteError if the disk has less than `needs` bytes, or becomes full while the library writes. After other
-    exceptions of the library, a test file shows if the disk is full.
+    Raises WriteError if the disk has less than `needs` bytes, or becomes full while the library writes. If the library
+    raises an exception of its own, a test file is written to find out whether the disk is full.
     """
     # cleanup errors are ignored: the library may still have a file open, which Windows does not remove
     with tempfile.TemporaryDirectory(prefix="clsplat-", ignore_cleanup_errors=True) as name:

@@ -69,8 +69,8 @@ def is_file(path: str | os.PathLike[str]) -> bool:
 def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
     """Context manager that opens a file to read.
 
-    Raises InputError if the file is missing, cannot be read, or is no regular file. A pipe could block for ever. Also
-    raises InputError for a Git LFS pointer in place of a file that was not fetched.
+    Raises InputError if the file is missing, cannot be read, or is no regular file, such as a pipe, which could block
+    for ever. Also raises InputError for the pointer that Git LFS leaves in place of a file that was not fetched.
 
     expected: text that follows "expected" in error messages.
     """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Locks and claims by marker files: the process that creates the marker owns the file beside it.
+"""Locks and claims of files by marker files: the process that creates the marker owns the file beside it.
 
-`clsplat.runs.locks` has locks of the operating system, for run folders.
+For run folders, `clsplat.runs.locks` uses locks of the operating system.
 docs/decisions/0040-three-libraries-not-taken.md compares the two.
 """
 
@@ -110,9 +110,9 @@ def _take(lock: Path, token: bytes) -> bool:
 
 
 def abandoned(targets: Iterable[Path]) -> list[Path]:
-    """Temporary files and claims of the `targets` whose process has ended.
+    """Temporary files and claims that processes left beside the files `targets` before they ended.
 
-    A file of a process on another machine counts if it has not changed for ABANDONED_FILE_SECONDS.
+    A process on another machine counts as ended if its file has not changed for ABANDONED_FILE_SECONDS.
     """
     names: dict[Path, set[str]] = {}
     for target in targets:

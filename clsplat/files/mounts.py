@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detection of network file systems, and their rates."""
+"""Detection of network file systems, such as NFS, and measurement of their transfer rates."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def network_type(folder: Path) -> str:
 
 
 class NetworkRate:
-    """The rate of a folder on a network disk, which is told once.
+    """Measures the transfer rate of a folder, and reports it once if the folder is on a network disk.
 
-    flag: flag that names another folder.
+    flag: command-line flag by which the user can choose another folder.
     """
 
     def __init__(self, folder: Path, flag: str) -> None:
@@ -44,7 +44,7 @@ class NetworkRate:
         self._moved, self._seconds = 0, 0.0
 
     def count(self, nbytes: int, seconds: float) -> str:
-        """Count bytes that were read or written. Returns a line for the user, or ""."""
+        """Add bytes that were read or written in `seconds`. Returns the report for the user when it is due, else ""."""
         if not self._network:
             return ""
         self._moved += nbytes
@@ -54,6 +54,6 @@ class NetworkRate:
         network, self._network = self._network, ""
         rate = amount(int(self._moved / max(self._seconds, 1e-6)))
         return (
-            f"{self._folder}: is on a network disk ({network}), which moves {rate} a second: a local folder "
+            f"{self._folder}: is on a network disk ({network}), which moves {rate} a second; a local folder "
             f"({self._flag} DIR) may be faster"
         )

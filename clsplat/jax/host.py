@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calls of NumPy functions from JAX programs."""
+"""Calls of NumPy functions from JAX programs, by jax.pure_callback."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 
 SCHEDULABLE_CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 if SCHEDULABLE_CORES == 1:
-    # On a single core XLA has a single thread. A callback would block this thread, and wait for it to copy its
-    # arguments. XLA reads NPROC when JAX makes its first array.
+    # On a single core XLA has a single thread, which a callback would block while it waits for the same thread to copy
+    # the arguments. XLA reads NPROC, the number of threads, when JAX makes its first array.
     os.environ.setdefault("NPROC", "2")
 
 

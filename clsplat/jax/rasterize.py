@@ -26,7 +26,7 @@ from clsplat.library.rasterize import rasterize as rasterize_numpy
 from clsplat.stages.harmonics import MAX_SH_BASIS_DEGREE
 
 MAX_CACHED_FORWARD_PASSES = 8
-"""Maximum number of forward passes that are kept for their gradients. The gradient of an older pass repeats it."""
+"""Maximum number of forward passes that are kept for their gradients. An older pass is computed again for them."""
 
 
 class Rasterized(NamedTuple):
@@ -195,7 +195,7 @@ class StaticArguments:
     device: Device | str | None
 
     def run(self, arrays: dict[str, Any]) -> Rasterization:
-        """Call the NumPy function. arrays: by argument name, without arguments that are None."""
+        """Call `clsplat.rasterize`. arrays: NumPy arrays by argument name, without arguments that are None."""
         return rasterize_numpy(
             arrays["means"],
             arrays.get("quaternions"),
@@ -269,7 +269,7 @@ class StaticArguments:
 
 
 class PendingForwards:
-    """Forward passes that wait for their gradient, by number."""
+    """Results of forward passes, by number, which are kept until their gradients are computed."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -309,7 +309,7 @@ def _forward(call: StaticArguments, arrays: dict[str, Any]) -> Any:
     shapes = call.shapes(arrays)
 
     def run(arrays: dict[str, Any]) -> Any:
-        # copies, since the gradient reads the arrays, and XLA may reuse their memory before
+        # copies, since the gradient reads the arrays later, when XLA may have reused their memory
         result = call.run({name: np.array(array) for name, array in arrays.items()})
         return _results(result, shapes), _kept.add(result)
 

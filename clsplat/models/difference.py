@@ -58,7 +58,7 @@ def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
 
 
 def _scale_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:
-    """Errors (n,) of log scales `b` (n, 3) as scales, relative to the largest scale in each row of `a`."""
+    """Largest error (n,) of the scales of each Gaussian, relative to its largest scale. a, b: log scales (n, 3)."""
     largest = a.max(axis=1, keepdims=True).astype(np.float64)
     with np.errstate(over="ignore"):
         p, q = np.exp(a - largest), np.exp(b - largest)
@@ -66,7 +66,7 @@ def _scale_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:
 
 
 def _angles(a: NDArray[Any], b: NDArray[Any]) -> Float64:
-    """Angles (n,) in degrees between two rotations each, from the chord, which is accurate for small angles."""
+    """Angles (n,) in degrees between the rotations of quaternions `a` and `b` (n, 4), accurate for small angles."""
     p, q = packing.unit_quaternions(a), packing.unit_quaternions(b)
     q *= np.where((p * q).sum(axis=1) < 0, -1, 1)[:, None]
     chord = np.linalg.norm(p - q, axis=1)

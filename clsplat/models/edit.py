@@ -21,8 +21,8 @@ from clsplat.gaussians import Gaussians
 from clsplat.spherical_harmonics import SH_C0, sh_basis
 
 MAX_WORLD_OFFSET_SIZES = 64.0
-"""A transformed model's origin is added to its means if it is at most this many standard deviations of the means long
-(decision 0017)."""
+"""`transform` adds the model's origin to its means if the origin is at most this many standard deviations of the means
+away from 0. Beyond that, float32 means would be too coarse (decision 0017)."""
 TRANSFORM_SCALE_LIMITS = (1e-12, 1e12)
 """Smallest and largest scale of a transform; beyond them float32 means would be 0 or infinite."""
 _INVISIBLE_LOGIT = -80.0
@@ -62,7 +62,7 @@ def drop_sh(gaussians: Gaussians, degree: int) -> Gaussians:
 
 
 def without_empty_bands(gaussians: Gaussians) -> Gaussians:
-    """Drop the highest SH bands if all their coefficients are 0. A lossy format would store other values for them."""
+    """Drop the highest SH bands if all their coefficients are 0. A lossy format would not store exact zeros."""
     degree = gaussians.sh_degree
     while degree and not gaussians.sh[:, degree**2 :].any():
         degree -= 1
@@ -133,7 +133,7 @@ def decompose(matrix: Float64, slack: float = _SIMILARITY_TOLERANCE) -> tuple[fl
     """Scale s, rotation Q (3, 3) and translation t (3,) of a similarity (4, 4).
 
     slack: largest allowed difference of Q^T Q from the identity.
-    Raises InputError if the matrix is not a similarity. Its message is written to follow "has".
+    Raises InputError if the matrix is not a similarity. Callers put the file's name and "has" before its message.
     """
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"a transform of {matrix.shape}, expected 4 x 4 finite numbers")
@@ -169,7 +169,7 @@ def transform(gaussians: Gaussians, matrix: Float64, slack: float = _SIMILARITY_
         means, origin = means + origin, np.zeros(3)
     return Gaussians(
         means.astype(np.float32),
-        gaussians.quaternions if upright else _turned(gaussians.quaternions, turn),
+        gaussians.quaternions if upright else _rotated(gaussians.quaternions, turn),
         (gaussians.log_scales + np.log(scale)).astype(np.float32),
         gaussians.opacity_logits,
         gaussians.sh if upright else rotate_sh(gaussians.sh, turn),
@@ -211,12 +211,14 @@ def transform_camera(camera: Camera, matrix: Float64) -> Camera:
     return replace(camera, rotation=rotation, translation=translation, near=near, far=scale * camera.far)
 
 
-def _turned(quaternions: Float32, turn: Float64) -> Float32:
-    """Quaternions w x y z of the given rotations followed by `turn`, with the same lengths. A reflection is replaced by
-    -turn, which gives the same covariances."""
+def _rotated(quaternions: Float32, rotation: Float64) -> Float32:
+    """Rotate quaternions w x y z (n, 4) by a matrix (3, 3), without change of their lengths.
+
+    If the matrix has a reflection, its negative is used, which gives the same covariances.
+    """
     from scipy.spatial.transform import Rotation
 
-    proper = turn if np.linalg.det(turn) > 0 else -turn
+    proper = rotation if np.linalg.det(rotation) > 0 else -rotation
     x, y, z, w = Rotation.from_matrix(proper).as_quat()
     # Hamilton product of (w, x, y, z) and each quaternion
     product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Statistics of a model file, also of one with non-finite values. A PLY is read in blocks."""
+"""Statistics of a model file for `clsplat info`. The file may have non-finite values. A PLY is read in blocks."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def model_info(path: Path) -> dict[str, Any]:
     result |= {"loses": form.loses} | form.describe(path)
     result |= _summary(blocks, path)
     result["colorspace"] = form.space(path)
-    result["loses"] = result.pop("loses")  # the last key
+    result["loses"] = result.pop("loses")  # moves the key to the end
     return result
 
 
@@ -84,7 +84,7 @@ def size(path: Path, form: Format) -> int:
 
 
 def _summary(blocks: Iterator[Gaussians], path: Path) -> ModelStatistics:
-    """Statistics over all blocks. Warns about values that look wrongly encoded, like a load of the model.
+    """Statistics over all blocks. Warns about values that look wrongly encoded, as `load` would.
 
     Means, log scales and opacity logits stay in memory for the percentiles: 28 bytes per Gaussian.
     """
@@ -169,7 +169,7 @@ def text(info: dict[str, Any]) -> str:
     if info.get("antialiased"):
         lines.append(("antialiased", "yes: to be drawn with Mip-Splatting's low-pass filter"))
     if info.get("by_rays"):
-        lines.append(("perspective", "along rays, as a fisheye: other programs show a haze"))
+        lines.append(("perspective", "drawn along rays, like a fisheye; other programs would show a haze"))
     lines.append(("colour space", info["colorspace"]))
     lines += [("comment", line) for line in info.get("comments", [])]
     if info.get("ignored"):

@@ -32,7 +32,7 @@ class Placement:
     matrix: first three rows of the (4, 4) matrix from the model's world to the shot's, flattened.
     opacity: factor from 0 (hidden) to 1.
     colour: colour matrix (3, 3) with an offset as fourth column, flattened; empty if colours do not change.
-    frame: the frame of a `ModelSeries` to use; None for a static model.
+    frame: for a `ModelSeries`, the frame whose Gaussians are placed; None for a static model.
     """
 
     matrix: tuple[float, ...] = IDENTITY_ROWS
@@ -46,7 +46,7 @@ class Placement:
         return np.vstack([np.array(self.matrix).reshape(3, 4), (0.0, 0.0, 0.0, 1.0)])
 
     def within(self, outer: Placement) -> Placement:
-        """Placement in the shot's world of a model in a group, whose own placement is `outer`."""
+        """Placement of this model in the shot's world, if it is in a group that has the placement `outer`."""
         matrix = self.matrix
         if outer.matrix != IDENTITY_ROWS:
             matrix = rows_of(outer.transform @ self.transform)
@@ -76,7 +76,7 @@ class Track(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Changing:
-    """`Track` of a model that changes with time: places it as `inner` does, in its state at the shot's frame."""
+    """`Track` of a `ModelSeries`: has the placements of `inner`, with the series' Gaussians at the shot's frame."""
 
     inner: Track
 
@@ -86,13 +86,13 @@ class Changing:
 
     @property
     def reach(self) -> tuple[float, float] | None:
-        """Reach of the inner track."""
+        """First and last frame for which the inner track's source has data; None for a static placement."""
         return self.inner.reach
 
 
 def rows_of(matrix: Float64) -> tuple[float, ...]:
     """First three rows of (4, 4), flattened for `Placement.matrix`."""
-    return tuple(float(value) + 0.0 for value in matrix[:3].ravel())  # + 0.0 turns -0 into 0: one form for each state
+    return tuple(float(value) + 0.0 for value in matrix[:3].ravel())  # + 0.0 turns -0 into 0: equal matrices look alike
 
 
 def grade(gain: Float64, offset: Float64, saturation: float) -> tuple[float, ...]:
@@ -126,9 +126,9 @@ def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
 def extrapolated(track: Track, frame: float, end: float) -> Placement:
     """Placement of a track at a frame beyond `end`, the last or first frame of its reach.
 
-    A fraction of a frame mirrors the motion just before the end. Each further whole frame repeats the last whole-frame
-    step, as for cameras (`shots.motion`). Opacity and colour come from the track itself. Raises InputError for a
-    transform that is no longer invertible.
+    Over the first fraction of a frame, the motion just before the end is mirrored. Over each further whole frame, the
+    motion of the last whole frame is repeated, as for cameras (`shots.motion`). Opacity and colour come from the track
+    itself. Raises InputError for a transform that is no longer invertible.
     """
     if (reach := track.reach) is None or reach[0] <= frame <= reach[1]:
         return track.at(frame)
@@ -142,7 +142,7 @@ def extrapolated(track: Track, frame: float, end: float) -> Placement:
 
 
 def _step(now: Placement, before: Placement) -> Float64:
-    """Similarity (4, 4) from one placement to a later one, with exactly orthogonal axes."""
+    """Similarity (4, 4) that maps a model placed by `before` to the same model placed by `now`, without shear."""
     matrix = np.eye(4)
     if now.matrix != before.matrix:
         (scale, turn, shift), (scale_before, turn_before, shift_before) = (
@@ -154,7 +154,7 @@ def _step(now: Placement, before: Placement) -> Float64:
 
 
 def kind_of(model: Gaussians | ModelSeries) -> Gaussians:
-    """The model itself; for a `ModelSeries`, an empty model with its rendering flags and near plane."""
+    """The model itself; for a `ModelSeries`, an empty model with the series' rendering flags and near plane."""
     return model.kind if isinstance(model, ModelSeries) else model
 
 

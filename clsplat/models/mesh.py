@@ -25,7 +25,7 @@ MAX_MESH_POINTS = 1_000_000
 MAX_MESH_FILE_BYTES = 256 << 20
 _MAX_OBJ_LINE_BYTES = 1 << 16
 _MAX_POINT_TRIANGLE_PAIRS = 1 << 21
-"""Number of point-triangle pairs processed at once."""
+"""Largest number of point-triangle pairs that are processed at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,8 @@ def _check_counts(path: Path, points: int, triangles: int) -> None:
 
 
 def read_here(path: Path) -> Float64:
-    """Corners (T, 3, 3) of all meshes of a USD stage, read in this process. A damaged file may crash it (`survive`)."""
+    """Corners (T, 3, 3) of a USD stage's triangles, without the test of `survive`. A damaged file may crash the
+    process."""
     from pxr import UsdGeom, UsdUtils
 
     delegate = UsdUtils.CoalescingDiagnosticDelegate()  # suppresses the messages that USD would print

@@ -18,25 +18,25 @@ from clsplat.gaussians import Gaussians
 from clsplat.models.edit import take
 
 CACHED_SAMPLES_SINGLE, CACHED_SAMPLES_PAIR = 2, 3
-"""Number of samples kept in memory after a request for one sample, or for two neighbours. It is one more than
-requested, as the next sample is read ahead."""
+"""Number of samples kept in memory after a request for one sample, or for two neighbours. One of them is the next
+sample, which is read ahead."""
 MAX_TRACKED_CHANGE_RATIO = 0.25
 """Largest ratio at which rows count as tracked, that is, as the same Gaussian in two samples. The ratio is the median
 change of a row between the samples over the median difference of two rows.
 
-Means, scales and colours are tested separately. The ratio is a few hundredths in tracked models. It is about 1 in
-models trained separately, for scales even if Gaussians are sorted by position.
+Means, scales and colours are tested separately. The ratio is a few hundredths in tracked models, and about 1 in models
+trained separately. The ratio of scales is about 1 even if such models are sorted by position.
 """
 TRACKING_TEST_ROWS = 10_000
-"""Number of evenly spaced rows that the test of tracking compares."""
+"""Number of evenly spaced rows that `follows` compares."""
 
 
 class ModelSeries:
     """A model that changes over time, given by samples at some frames. Thread-safe.
 
-    Between two samples Gaussians are interpolated, means linearly, if they keep their rows; otherwise the nearer sample
-    is used. Before the first and after the last sample, that sample is used. Unless `held` is set, its means continue
-    to move: their motion before the end is mirrored.
+    Between two samples Gaussians are interpolated, means linearly, if each row is the same Gaussian in both; otherwise
+    the nearer sample is used. Before the first and after the last sample, that sample is used. Unless `held` is set,
+    its means continue to move: the motion on the inner side of the sample is mirrored.
     """
 
     def __init__(
@@ -158,7 +158,7 @@ class ModelSeries:
                     f"{self.where}: frame {self.frames[index]:g} is {_alike(sample, what)}, frame {self.frames[0]:g} "
                     f"is {_alike(self.kind, what)}, expected models that are drawn alike"
                 )
-        # all frames have the same near plane
+        # all frames get the near plane of the first
         return sample if sample.near == self.kind.near else replace(sample, near=self.kind.near)
 
     def _follows(self, index: int) -> bool:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera input: camera files and generated paths, read as one `Shot`. The world is never reoriented."""
+"""Camera input: camera files and generated camera paths become a `Shot`. The world is never reoriented."""
 
 from clsplat.shots.read import check_around, choose_shot, read_shot, shot_around
 from clsplat.shots.shot import Frame, Shot

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Default cameras for a model without camera files.
+"""Default cameras for a model without camera files: rings around the model, from its Gaussians' positions and sizes.
 
-The cameras are computed from the Gaussians' positions and detail. If a run has recorded its photographs' cameras, a
-path can go among those cameras instead.
+If a run has recorded its photographs' cameras, a path can go among these cameras instead.
 """
 
 from __future__ import annotations
@@ -27,21 +26,21 @@ ORBIT_FOV_RADIANS = math.radians(40.0)
 SUBJECT_SAMPLE_SIZE = 100_000
 """Number of Gaussians that are sampled to locate a model. A larger sample moves its centre by less than a pixel."""
 MIN_GAUSSIANS_FOR_STRAYS = 100
-"""In a model of at least this many Gaussians the outermost ones are treated as strays."""
+"""In a model of at least this many Gaussians, the outermost ones count as outliers, which do not affect its size."""
 BALL_SHRINK_FACTOR = 0.9
 """Ratio of successive ball radii in the search for the most detailed region."""
 REGION_DETAIL_FRACTION = 0.35
 """Largest fraction of a model's detail that its most detailed region may hold."""
 MAX_SCENE_REGION_RADIUS_RATIO = 0.2
 """A model is a scene around an object if the radius of its most detailed region is at most this fraction of the model's
-radius. The fraction is at least 0.3 for a single object, and 0.05 for a room with a table in the middle."""
+radius. Measured fractions are 0.3 or more for a single object, and 0.05 for a room with a table in the middle."""
 MIN_DETAIL_SIZE_QUANTILE, MIN_DETAIL_SIZE_RATIO = 0.02, 1e-4
-"""Sizes below which smaller Gaussians do not show more detail: this quantile of all sizes, and this fraction of the
-model's radius. Some files have Gaussians of size 0."""
+"""Lower limit of Gaussians' sizes in the measure of detail: this quantile of all sizes, but at least this fraction of
+the model's radius, since some files have Gaussians of size 0."""
 SCENE_RADIUS_MARGIN = 1.3
 """Radius that an orbit shows, relative to the radius of the scene's most detailed region."""
 ORBIT_FRAMING_MARGIN = 1.1
-"""Radius that a picture shows, relative to the subject's radius: a margin for strays."""
+"""Radius that a picture shows, relative to the subject's radius, which does not include outliers."""
 RING_ELEVATIONS_RADIANS = (math.radians(20.0), math.radians(5.0), math.radians(40.0))
 """Elevations of the camera rings, in radians. A turntable follows the first ring; a spiral rises and sinks between the
 other two."""
@@ -74,8 +73,9 @@ def cameras_around(
 ) -> list[Camera]:
     """Level pinhole cameras in three rings around a model, or around the most detailed region of a scene.
 
-    They face its centre.
-    up: up direction (3,), of any length but 0. With up along y, the first camera looks along z, as at a COLMAP scene.
+    The cameras face the centre of the model or region.
+
+    up: up direction (3,), of any length but 0. If it is along y, the first camera looks along z.
     size: width and height in pixels; a side that is None follows from the other at the default aspect ratio.
     Raises InputError for a model without Gaussians.
     """
@@ -101,10 +101,10 @@ def cameras_around(
 
 
 def among(own: Sequence[Camera], size: tuple[int | None, int | None] = (None, None)) -> list[Camera]:
-    """The photographs' own cameras without strays, as pinholes, for a path within the photographed region.
+    """The photographs' own cameras as pinholes, without those far from the others, for a path among them.
 
-    size: width and height in pixels. If both are given, the field of view is the largest that fits into the
-      photographs'. Otherwise the pictures keep the photographs' aspect ratio.
+    size: width and height in pixels. If both are given, the field of view is the largest that the photographs cover.
+      Otherwise the pictures keep the photographs' aspect ratio.
     Cameras that are not perspective are replaced by pinholes with the default field of view.
     """
     far = stray_cameras(own)
@@ -148,10 +148,10 @@ def _size(size: tuple[int | None, int | None]) -> tuple[int, int]:
 
 
 def _subject(gaussians: Gaussians) -> tuple[Float64, float]:
-    """Centre (3,) in the world and radius of the subject: all Gaussians but strays, or a scene's most detailed region.
+    """Centre (3,) in the world and radius of a scene's most detailed region, or of an object without its outliers.
 
-    Balls shrink towards the greatest detail, measured as opacity over size (mean shift, Fukunaga and Hostetler 1975).
-    The search ends when a ball holds no more than 35 % of the detail.
+    A ball shrinks towards the greatest detail, measured as opacity over size (mean shift, Fukunaga and Hostetler 1975),
+    until it holds at most REGION_DETAIL_FRACTION of the detail.
     """
     rows = slice(None, None, max(1, len(gaussians) // SUBJECT_SAMPLE_SIZE))
     means = gaussians.means[rows].astype(np.float64)

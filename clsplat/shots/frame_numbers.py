@@ -19,11 +19,11 @@ FRAME_FIELD_PATTERN = re.compile(
     r"|\$F(?P<houdini>\d+)?(?!\w)|<F(?P<angled>\d+)?>",
     re.ASCII,
 )
-"""A field for a frame's number or name in a file name, in the notations of renderers and compositors."""
+"""Pattern of a field for a frame's number or name in a file name, in the notations of renderers and compositors."""
 
 KNOWN_FRAME_FIELDS = "{name}, {frame}, ####, @@@@, %04d, $F4 or <F4>"
 UNKNOWN_FIELD_PATTERN = re.compile(r"%[-+ ]?\d*\.?\d*[diouxXeEfgGcsV]|[{}][^{}]*\}?|\$F\w*|<\w*>")
-"""Text that looks like a field but is not a known one."""
+"""Pattern of text that looks like a field but is not a known one."""
 
 
 def parse_frames(text: str) -> list[int]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera paths of any number of frames, generated from a scene's own cameras."""
+"""Generated camera paths, turntable, spiral and through, of any number of frames, from a scene's own cameras."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     if 2 * np.pi - width <= MAX_AZIMUTH_GAP_RADIANS:
         angles = 2 * np.pi * time
     else:
-        # the phase puts the first frame at azimuth 0, the first camera's
+        # the phase puts the first frame at azimuth 0, that of the first camera
         middle, half = begin + width / 2, width / 2
         off = (-middle + np.pi) % (2 * np.pi) - np.pi
         phase = np.arcsin(np.clip(off / half, -1, 1)) if half > 1e-6 else 0.0
@@ -96,7 +96,7 @@ MAX_SPIRAL_ELEVATION_RADIANS = np.deg2rad(85.0)
 """Largest elevation of a spiral, in radians. A level camera that looks straight up or down has no defined right
 axis."""
 SMOOTHING_NEIGHBOURS = 3
-"""Number of neighbours on each side that are used to smooth a camera, which removes the hand's jitter between
+"""Number of neighbours on each side of a camera from which `through` smooths it, to remove the jitter of hand-held
 photographs."""
 
 
@@ -105,8 +105,8 @@ def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
     Coordinates are spherical about `focus_point`. At the cameras' median distance, the path goes from the 10th to the
     90th percentile of their elevations and back. If the cameras leave a wide gap, the azimuth swings over the arc that
-    they cover, once per turn, a quarter turn behind the elevation. This gives an ellipse in front of the scene, on
-    which the distance also goes from the 10th to the 90th percentile and back. Intrinsics are the first camera's.
+    they cover, once per turn, a quarter turn behind the elevation. The path is then an ellipse in front of the scene,
+    and its distance, too, goes from the 10th to the 90th percentile and back. Intrinsics are the first camera's.
     Raises ValueError for no cameras or no frames.
     """
     _check("spiral", cameras, frames)
@@ -162,7 +162,7 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 
 def _in_medians(lengths: Float64, rounding: float) -> Float64:
-    """Lengths (n,) divided by the median of the lengths above the rounding error."""
+    """Divide lengths (n,) by the median of those that exceed the rounding error `rounding`."""
     clear = lengths[lengths > rounding]
     return lengths / np.median(clear) if len(clear) else np.zeros_like(lengths)
 
@@ -181,8 +181,10 @@ def _smoothed(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def parabola_weights(reach: int) -> Float64:
-    """Savitzky-Golay weights (2 reach + 1,): a weighted sum of evenly spaced values is the centre value of the parabola
-    fitted to them (1964)."""
+    """Savitzky-Golay weights (2 reach + 1,) for evenly spaced values (1964).
+
+    The weighted sum of the values is the value in the middle of the parabola that is fitted to them.
+    """
     offsets = np.arange(-reach, reach + 1)
     scale = 3 / ((2 * reach + 3) * (2 * reach + 1) * (2 * reach - 1))
     return np.asarray(scale * (3 * reach * reach + 3 * reach - 1 - 5 * offsets**2))

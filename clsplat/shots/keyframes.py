@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Key frames and smooth interpolation between them: cubic Hermite splines of positions and rotations, monotone cubics
-of scalars. docs/cameras.md (Between key frames) gives the reasons. `shots/readers` reads key frames from files."""
+"""Key frames of a camera and smooth interpolation between them.
+
+Positions and rotations follow cubic Hermite splines, scalars monotone cubics. docs/cameras.md (Between key frames)
+gives the reasons. `shots/readers` reads key frames from files.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +19,8 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 
 MAX_TANGENT_SLOPE_RATIO = 3.0
-"""Largest tangent, relative to the slope of an adjacent segment. At 3, a cubic's inner Bezier points are a chord's
-length from its ends. For a scalar it is the largest limit at which a cubic is always monotone."""
+"""Largest ratio of a tangent to the slope of an adjacent segment. At 3, a cubic's inner Bezier points are one chord
+length from its ends. Under any larger limit, a cubic of a scalar might not be monotone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +40,9 @@ def interpolate(keys: Sequence[Key], frames: Sequence[float], *, loop: float | N
 
     keys: key frames in increasing order of frame, with cameras of one size and projection.
     loop: number of frames after which the first key repeats; must exceed the span of the keys.
-    Rotations take the shorter arc from key to key; rolls turn through their full difference.
+    Rotations take the shorter arc from key to key. Rolls are interpolated as numbers, so they may make full turns.
 
-    Raises ValueError if there are no keys, if they are not in this order, or if they span `loop` frames or more.
+    Raises ValueError if there are no keys, if they are not in order, or if they span `loop` frames or more.
     """
     if not keys:
         raise ValueError("expected at least one key")
@@ -53,7 +56,7 @@ def interpolate(keys: Sequence[Key], frames: Sequence[float], *, loop: float | N
         [[key.roll, np.log(key.camera.fx), np.log(key.camera.fy), key.camera.cx, key.camera.cy] for key in keys]
     )
     if loop is not None:
-        # one period before and one after: a slope depends on at most two neighbours
+        # one period before and one after are enough, as a slope depends on at most two neighbours
         at = times[0] + np.mod(at - times[0], loop)
         closing = np.zeros(scalars.shape[1])
         closing[0] = 2 * np.pi * np.round((scalars[-1, 0] - scalars[0, 0]) / (2 * np.pi))
@@ -74,7 +77,7 @@ def interpolate(keys: Sequence[Key], frames: Sequence[float], *, loop: float | N
     roll = np.zeros((len(at), 3))
     roll[:, 2] = values[:, 0]
     cam_from_world = (turned * Rotation.from_rotvec(roll)).inv().as_matrix()
-    # a key keeps its own camera bit for bit, and so shows the recorded view
+    # at a key without roll, the key's camera is used bit for bit, so that it shows the recorded view
     exact = {key.frame: key.camera for key in keys if key.roll == 0}
     cameras = []
     for index, (rotation, position) in enumerate(zip(cam_from_world, path, strict=True)):
@@ -101,12 +104,12 @@ def _moved(camera: Camera, values: Float64, rotation: Float64, position: Float64
 
 
 def tangents(times: Float64, slopes: Float64) -> Float64:
-    """Velocities (N, D) at the keys, whose times are (N,), from the mean velocities (N - 1, D) between them."""
+    """Velocities (N, D) at the keys of a spline. times: (N,). slopes: mean velocities (N - 1, D) between the keys."""
     before, after = np.diff(times)[:-1, None], np.diff(times)[1:, None]
     result = np.concatenate([slopes[:1], slopes[-1:]])
     if len(slopes) > 1:
         inner = (after * slopes[:-1] + before * slopes[1:]) / (before + after)
-        # the tangent at an end is the slope of the same parabola, unless that points backwards
+        # an inner tangent is the slope of the parabola through three keys, as is an end's unless it points backwards
         first = ((2 * before[0] + after[0]) * slopes[0] - before[0] * slopes[1]) / (before[0] + after[0])
         last = ((2 * after[-1] + before[-1]) * slopes[-1] - after[-1] * slopes[-2]) / (before[-1] + after[-1])
         first = first if first @ slopes[0] > 0 else np.zeros_like(first)
@@ -121,7 +124,8 @@ def tangents(times: Float64, slopes: Float64) -> Float64:
 
 
 def _positions(times: Float64, keys: Float64, at: Float64, segment: NDArray[np.intp]) -> Float64:
-    """Positions (F, 3) at the times `at`."""
+    """Positions (F, 3) of the spline through `keys` (N, 3) at the times `at` (F,). segment: index (F,) of each time's
+    segment."""
     chords, lengths = np.diff(keys, axis=0), np.diff(times)
     velocity = tangents(times, chords / lengths[:, None])
     h = lengths[segment][:, None]
@@ -134,7 +138,7 @@ def _positions(times: Float64, keys: Float64, at: Float64, segment: NDArray[np.i
 
 def _rotations(times: Float64, keys: Rotation, at: Float64, segment: NDArray[np.intp]) -> Rotation:
     lengths = np.diff(times)
-    # a step's rotation vector is the same in the axes of both its keys
+    # the rotation vector from one key to the next is the same in the axes of both keys
     steps = (keys[:-1].inv() * keys[1:]).as_rotvec()
     velocity = tangents(times, steps / lengths[:, None])
     h = lengths[segment][:, None]

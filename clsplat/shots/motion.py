@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of a shot near a frame in time: of the next and the previous frame, and while the shutter is open."""
+"""Cameras for motion vectors and motion blur: those of the next and previous frame, and while the shutter is open."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from clsplat.errors import InputError
 from clsplat.shots.shot import Frame, Shot
 
 NEIGHBOUR_FRAMES = 2
-"""Number of frames on each side of a time that determine the camera there: a segment's end, and the neighbour that sets
-its tangent."""
+"""Number of frames on each side of a time that the interpolated camera depends on: a segment's end, and the neighbour
+that sets the tangent at this end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +43,8 @@ class Moments:
         for time, camera in zip(rising, cameras, strict=True):
             if camera.projection != cameras[0].projection:
                 raise InputError(
-                    f"an open shutter: {rising[0]:g} frames from the frame its camera is {cameras[0].projection}, and "
-                    f"{time:g} frames from it {camera.projection}; expected one projection"
+                    f"an open shutter: the camera is {cameras[0].projection} at {rising[0]:g} frames from the frame, "
+                    f"and {camera.projection} at {time:g}, expected one projection"
                 )
         return cls(cameras[0], rising, np.array([_values(camera) for camera in cameras]))
 
@@ -68,11 +68,11 @@ def _values(camera: Camera) -> Float64:
 
 
 def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, sampling: SamplingConfig) -> Moments | None:
-    """Cameras while the shutter of the frame `number` is open. None if the shot has no `moment`, or the shutter is
+    """Cameras while the shutter of the frame `number` is open; None if the shot has no `moment`, or the shutter is
     (0, 0).
 
-    They are at the shutter's opening, middle and closing, at the times of the frame's samples, and at the source's own
-    times in between.
+    The times are those at which the shutter opens, is half-way and closes, those of the frame's samples, and the times
+    in between at which the source has values.
     """
     if shot.moment is None or sampling.shutter == (0.0, 0.0):
         return None
@@ -89,7 +89,8 @@ def targets(
 ) -> tuple[Camera | None, Camera | None]:
     """Cameras of the next and the previous frame, which the motion channels point to; None unless requested.
 
-    They are one frame from the frame at this index; for a shot that has `moment`, from the middle of its shutter.
+    index: index of the frame in the shot.
+    middle: middle of the shutter, in frames. For a shot that has `moment`, the cameras are one frame from this time.
     """
     if shot.moment is not None:
         time = shot.frames[index].number + middle
@@ -156,13 +157,14 @@ def stretches(
     motion: bool = False,
     backward: bool = False,
 ) -> Callable[[int], Shot | None]:
-    """Function from a frame's number to the part of the shot while its shutter is open; None if nothing can move.
+    """Function that returns, for a frame's number, the frames of the shot that matter while its shutter is open.
+
+    It returns None for a shot of one frame, which does not move. The returned frames are numbered relative to the given
+    frame. The shot is extrapolated beyond its ends, as for motion channels.
 
     opens, closes: times at which the shutter opens and closes, in frames relative to the frame.
     motion, backward: also cover the middle of the next frame's shutter, or of the previous frame's.
-    The part's frame numbers count from the given frame. Before its first and after its last frame, the shot is
-    extrapolated, as for motion. Raises InputError if the frames' pictures differ in size or projection, because a
-    moving camera has only one of each.
+    Raises InputError if the frames' pictures differ in size or projection, between which a camera cannot move.
     """
     middle = 0.5 * (opens + closes)
     opens = min(opens, middle - 1) if backward else opens

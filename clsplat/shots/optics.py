@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shutter and lens settings that a USD stage gives for a frame."""
+"""Shutter and lens settings (f-stop, focus) from a USD stage, and the OpenEXR attributes made from them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Optics:
         return replace(self, shutter=(0.0, 0.0), f_stop=0.0)
 
     def named(self) -> Iterator[str]:
-        """USD names, with values, of the settings that would change a picture."""
+        """USD names and values, such as "fStop (2.8)", of the settings that would change a picture."""
         if self.f_stop:
             yield f"fStop ({self.f_stop:g})"
             if self.focus:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Selection of the shot that the arguments of `clsplat render` ask for."""
+"""Reading of camera files of any format, and choice of the shot that the arguments of `clsplat render` ask for."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def read_shot(
     formats.
 
     size: requested width and height, for formats without their own (USD; transforms.json without its pictures).
-    usd_camera: which camera of a USD stage to use.
+    usd_camera: path or name of the camera to use in a USD stage.
     lenses: how lenses of photographs are treated, as in `load_scene`.
     Raises InputError, naming the file, if it is missing, of an unknown kind, damaged or without frames.
     """
@@ -83,7 +83,7 @@ def choose_shot(
 
     path: turntable, spiral or through, for `count` frames of a path generated from the cameras; None for the cameras
       themselves.
-    applied: names of the stage's settings that the call applies elsewhere, so that they need no warning.
+    applied: names of the USD stage's settings that the caller applies itself, so that they need no warning.
     distort: use the photographs' own cameras, including the distortion of their lenses.
     Raises InputError.
     """
@@ -111,20 +111,21 @@ def choose_shot(
 
 
 def _without_strays(frames: Sequence[Frame], source: Path) -> tuple[list[Camera], tuple[str, ...]]:
-    """Cameras of the frames without strays, and a warning that names the strays."""
+    """Cameras of the frames without outliers, and a warning that names the outliers. source: file for the warning."""
     far = stray_cameras([frame.camera for frame in frames])
     near = [frame.camera for frame, stray in zip(frames, far, strict=True) if not stray]
     if not far.any():
         return near, ()
     names = examples(frame.name for frame, stray in zip(frames, far, strict=True) if stray)
-    text = f"{source}: the cameras of {names} are over {OUTLIER_DISTANCE_RATIO:g} times as far away as the others"
-    return near, (f"{text}, and the path is made without them",)
+    far_away = f"over {OUTLIER_DISTANCE_RATIO:g} times as far from the middle as the others"
+    return near, (f"{source}: the cameras of {names} are {far_away}, and the path is made without them",)
 
 
 def photographed(path: Path, size: tuple[int | None, int | None] = (None, None)) -> list[PosedImage]:
     """The photographs' own cameras, with their lenses, from a COLMAP model or a transforms.json.
 
-    Raises InputError for another source of cameras, for panoramas, which no pinhole shows, and like `read_shot`.
+    Raises InputError for other sources of cameras, for panoramas, which cannot be warped from a pinhole picture, and
+    like `read_shot`.
     """
     images: list[PosedImage] | None = None
     if path.is_dir():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A shot: the frames to render, in order, each with its number, camera and name."""
+"""`Shot`: the frames to render, in order, each a `Frame` with its number, camera and name."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class Shot:
     fps: frames per second, if the source gives it.
     unapplied: names of the source's settings that are not applied to the frames.
     moment: the camera at a time in frames, if the source defines one for every time.
-    authored: times at which the source has values, in increasing order.
-    reach: first and last time at which the source has values for the camera's transform.
+    authored: times in frames at which the source has values, in increasing order.
+    reach: first and last time in frames at which the source has values for the camera's transform.
     window: part of the frame that the source asks for, as in `usd_settings.Settings`.
     """
 
@@ -68,7 +68,7 @@ class Shot:
         return [frame.camera for frame in self.frames]
 
     def standing(self, numbers: Sequence[int]) -> Shot:
-        """The shot with its only frame repeated at these frame numbers. A shot of several frames is returned
+        """The shot with its only frame repeated at the frame numbers `numbers`. A shot of several frames is returned
         unchanged."""
         if len(self.frames) != 1 or not numbers:
             return self
@@ -96,14 +96,15 @@ class Shot:
     def without_optics(self) -> Shot:
         """The shot without the USD stage's shutter and lens, whose settings are added to `unapplied`."""
         named = [name for frame in self.frames if frame.optics for name in frame.optics.named()]
-        found = {name.partition(" ")[0]: name for name in reversed(named)}  # the first value of each
+        found = {name.partition(" ")[0]: name for name in reversed(named)}  # each setting with its first value
         frames = tuple(replace(frame, optics=frame.optics.still) if frame.optics else frame for frame in self.frames)
         return replace(self, frames=frames, unapplied=(*self.unapplied, *reversed(found.values())))
 
     def told(self, source: object, *more: str) -> tuple[str, ...]:
         """The warnings, one line each. The last line names all settings of the source that are not applied.
 
-        more: settings of the source that this call does not apply.
+        source: file or stage that the shot was read from, for the last line.
+        more: further settings of the source that the caller does not apply.
         """
         unapplied = (*self.unapplied, *more)
         return (*self.warnings, f"{source}: not applied: {', '.join(unapplied)}") if unapplied else self.warnings
@@ -139,7 +140,10 @@ def whole_frames(where: str, what: str, begin: float, end: float) -> list[int]:
 
 
 def numbered(cameras: Iterable[Camera], first: int = 1, fps: float | None = None) -> tuple[Frame, ...]:
-    """Frames numbered upwards from `first` and named after their numbers."""
+    """Frames with the given cameras, numbered upwards from `first` and named after their numbers.
+
+    fps: frames per second, which gives the frames' times; None for no times.
+    """
     return tuple(
         Frame(first + index, camera, f"{first + index:04d}", None if fps is None else index / fps)
         for index, camera in enumerate(cameras)
@@ -147,8 +151,8 @@ def numbered(cameras: Iterable[Camera], first: int = 1, fps: float | None = None
 
 
 def photographs(images: Iterable[PosedImage]) -> tuple[Frame, ...]:
-    """Frames of the photographs, numbered from 1 and named after their files: pinhole cameras, with the lens if it
-    distorts."""
+    """Frames with the photographs' pinhole cameras, numbered from 1 and named after the photographs' files. A frame has
+    the photograph's lens if the lens distorts."""
     frames = []
     for index, image in enumerate(images, 1):
         lens = None if image.lens.is_pinhole else image.lens

@@ -54,7 +54,7 @@ _TRANSFORM_STEPS: dict[str, tuple[int, Callable[[list[float]], Float64]]] = {
 
 @dataclass(frozen=True, eq=False)
 class AnimatedProperty:
-    """A property over time: frames (k,) in increasing order, and the values (k, d) at these."""
+    """An animated property: frames (k,) of its keys in increasing order, and its values (k, d) at the keys."""
 
     frames: Float64
     values: Float64
@@ -74,7 +74,7 @@ class KeyedTrack:
     """A `Track` from key frames.
 
     where: prefix of error messages.
-    channels: the given properties, by name.
+    channels: the model's animated properties by name; properties that are missing have their defaults.
     held: True if values stay the same from key to key. Otherwise they are interpolated linearly, and matrices by scale,
       rotation and translation.
     """
@@ -134,7 +134,7 @@ def _between(channel: AnimatedProperty, frame: float, *, held: bool) -> Float64:
     (scale, turn, shift), (scale_after, turn_after, shift_after) = (
         edit.decompose(matrices[index], NODE_SIMILARITY_TOLERANCE) for index in (after - 1, after)
     )
-    # two mirroring matrices also differ by a rotation
+    # also between two matrices that both mirror, the difference is a rotation
     way = Rotation.from_matrix(turn_after @ turn.T).as_rotvec()
     matrix = np.eye(4)
     size = scale ** (1 - share) * scale_after**share
@@ -145,7 +145,7 @@ def _between(channel: AnimatedProperty, frame: float, *, held: bool) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class Within:
-    """A `Track` relative to an outer track, which moves it along."""
+    """`Track` of a model in a group: the model's track `inner`, moved along by the group's track `outer`."""
 
     inner: Track
     outer: Track
@@ -169,7 +169,7 @@ VOLUME_KINDS = ("box", "sphere", "mesh")
 class Volume:
     """A region of a model with its own matte, in the model's world: a box, a sphere, or the inside of a mesh.
 
-    numbers: a box's two corners, or a sphere's centre and radius.
+    numbers: corners with the least and the largest coordinates of a box (6), or centre and radius of a sphere (4).
     """
 
     name: str
@@ -177,7 +177,7 @@ class Volume:
     mesh: Mesh | None = None
 
     def holds(self, gaussians: Gaussians) -> NDArray[np.bool_]:
-        """Mask (n,) of the Gaussians whose mean is inside."""
+        """Mask (n,), True for Gaussians whose mean is inside the region."""
         if self.mesh is not None:
             return self.mesh.holds(gaussians.means + gaussians.origin)
         if len(self.numbers) == 6:
@@ -189,7 +189,7 @@ class Volume:
 class PlacedModel:
     """A model of a shot.
 
-    path: its model file or run.
+    path: its model file or run folder.
     volumes: regions with their own mattes; where they overlap, the first one counts.
     """
 
@@ -248,7 +248,8 @@ def _volumes(reader: Keys) -> Iterator[Volume]:
         name = _text(volume, "name")
         kinds = [kind for kind in VOLUME_KINDS if kind in entry]
         if len(kinds) != 1:
-            raise InputError(f"{volume.where}: expected exactly one of 'box', 'sphere' and 'mesh'")
+            found = " and ".join(kinds) or "no region"
+            raise InputError(f"{volume.where}: has {found}, expected exactly one of 'box', 'sphere' and 'mesh'")
         (kind,) = kinds
         if kind == "mesh":
             yield Volume(name, mesh=read_mesh(reader.path.parent / _text(volume, "mesh")))
@@ -333,7 +334,7 @@ def _known(where: str, values: dict[str, Any], names: tuple[str, ...]) -> None:
 
 
 def _track(reader: Keys) -> KeyedTrack:
-    """The track of an object, from its own properties, which hold for all frames, and from its keys."""
+    """Read the track of a JSON object, from its own properties, which hold for all frames, and from its keys."""
     interpolation = reader.frame.get("interpolation", "linear")
     if interpolation not in ("linear", "hold"):
         raise reader.wrong("interpolation", "linear or hold")
@@ -404,7 +405,7 @@ def _matrix(reader: Keys) -> Float64:
 
 
 def _value(reader: Keys, name: str) -> Float64:
-    """Value (d,) of a property. Raises InputError."""
+    """Value (d,) of the animated property `name` in a JSON object. Raises InputError."""
     if name == "matrix":
         return _matrix(reader)
     if name == "visible":

@@ -62,7 +62,7 @@ def pair_of_stage(path: Path, prim: str | None = None) -> tuple[str, str]:
 
 
 def pair_here(path: Path, prim: str | None = None) -> tuple[str, str]:
-    """`pair_of_stage` for a file that is known not to crash USD's library."""
+    """Find the cameras like `pair_of_stage`, in a file that is known not to crash USD's library."""
     from pxr import UsdGeom, UsdUtils
 
     delegate = UsdUtils.CoalescingDiagnosticDelegate()  # captures the messages that USD would print

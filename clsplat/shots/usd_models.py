@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussians that a USD stage places: its prims, each with its world transform and visibility over time.
+"""Gaussians of a USD stage as models of a shot: each prim with its world transform and visibility over time.
 
 The time code is the frame's number, as for cameras (`shots.readers.usd`). References and payloads are always followed.
 metersPerUnit and upAxis are ignored.
@@ -39,10 +39,10 @@ GAUSSIAN_COLOUR_ATTRIBUTES = ("radiance:sphericalHarmonicsDegree", "primvars:dis
 
 @dataclass(frozen=True, eq=False)
 class StageTrack:
-    """The `Track` of a prim.
+    """The `Track` of a prim in a USD stage.
 
     where: prefix of error messages.
-    held: the stage, held here because USD closes it with its last reference.
+    held: the stage. USD closes a stage when its last reference is gone, so the track keeps one.
     """
 
     where: str
@@ -68,8 +68,9 @@ class StageModels:
     """The Gaussians of a stage in their own coordinates, one model per prim, and one per instance of an instanced prim.
 
     names: name of each model's prim or instance, as in `UsdPlacement`.
-    digest: SHA-256 of the data that they are read from.
-    space: their colour space.
+    tracks: placement of each model over time.
+    digest: SHA-256 of the data that the models are read from.
+    space: colour space of the models.
     """
 
     models: tuple[Gaussians | ModelSeries, ...]
@@ -89,7 +90,7 @@ def read_stage(path: Path) -> StageModels | None:
 
 
 def read_here(path: Path) -> StageModels | None:
-    """`read_stage` for a file that is known not to crash USD's library."""
+    """Read a stage like `read_stage`, from a file that is known not to crash USD's library."""
     from pxr import Usd, UsdUtils
 
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # captures the messages that USD would print
@@ -118,7 +119,7 @@ def read_here(path: Path) -> StageModels | None:
             elif place.instance is not None:
                 sums.update(f"again {list(known).index(own)}\n".encode())
         models = tuple(known[place.prim.GetPath()] for place in places)
-        if any(isinstance(model, ModelSeries) for model in models):  # time samples are read frame by frame later
+        if any(isinstance(model, ModelSeries) for model in models):  # samples are read later
             for name in sorted(str(layer.realPath) for layer in layers):
                 sums.update(digest(Path(name)).encode() if name else b"")
         tracks: list[Track] = [StageTrack(f"{path}: {place.name}", place, stage) for place in places]
@@ -161,7 +162,7 @@ def _sample_times(prim: Any) -> list[float]:
 
 
 def _add(sums: Any, prim: Any, time: Any) -> None:
-    """Add the attributes that a prim's Gaussians are read from to the digest."""
+    """Add to a digest the values, at a time code, of the attributes from which a prim's Gaussians are read."""
     for attribute in _attributes(prim):
         values = np.ascontiguousarray(np.asarray(attribute.Get(time)))
         sums.update(f"{attribute.GetName()} {values.dtype} {values.shape}\n".encode())

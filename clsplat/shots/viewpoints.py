@@ -14,7 +14,7 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 
 COLMAP_UP = (0.0, -1.0, 0.0)
-"""Up direction of a world with the axes of a level camera. In COLMAP's convention its y axis points down."""
+"""Up direction of a world that has the axes of a level camera, whose y axis points down in COLMAP's convention."""
 MAX_AZIMUTH_GAP_RADIANS = np.deg2rad(100.0)
 """Widest azimuth gap between cameras, in radians, that a turntable crosses. At wider gaps it swings back and forth."""
 
@@ -70,8 +70,8 @@ def focus_point(cameras: Sequence[Camera]) -> Float64:
 
 
 def covered_arc(azimuths: Float64) -> tuple[float, float]:
-    """Start and width, in radians, of the shortest arc that holds all azimuths (n,), in the direction of increasing
-    angles."""
+    """Start and width, in radians, of the shortest arc that holds all azimuths (n,). The arc goes from its start in the
+    direction of increasing angles."""
     ordered = np.sort(np.mod(azimuths, 2 * np.pi))
     gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
     widest = int(np.argmax(gaps))
@@ -79,8 +79,8 @@ def covered_arc(azimuths: Float64) -> tuple[float, float]:
 
 
 def extent_of(points: NDArray[Any], inside: float = 0.96) -> tuple[Float64, Float64]:
-    """Two corners (3,) of the box that holds this fraction of the points along each axis, since models have many
-    strays."""
+    """Corners (3,) of the box that holds the fraction `inside` of the points (N, 3) along each axis. The rest are
+    outliers, of which models have many."""
     if not len(points):
         return -np.ones(3), np.ones(3)
     some = points[:: max(1, len(points) // 100_000)]

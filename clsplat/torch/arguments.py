@@ -29,7 +29,7 @@ def refuse(name: str, found: object, expected: str) -> InputError:
 
 @contextmanager
 def renamed(**names: str) -> Iterator[None]:
-    """Inside the block, replace the library's argument names in error messages: `library_name="name_here"`."""
+    """Context in which error messages use gsplat's argument names. names: gsplat's names, by clsplat's own."""
     try:
         yield
     except InputError as error:
@@ -51,7 +51,7 @@ def check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
 
 
 def _check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
-    """Like `check_shape`, but accept tensors of torch.func, for functions in pure PyTorch."""
+    """Check a tensor like `check_shape`, but accept tensors of torch.func, for functions in pure PyTorch."""
     expected = f"a tensor {' or '.join(_named(shape) for shape in shapes)}"
     if not isinstance(value, Tensor):
         raise refuse(name, f"a {type(value).__name__}", expected)
@@ -65,7 +65,7 @@ def _check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
 def check(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
     """Raise InputError like `check_shape`, and for NaN. Tensors of torch.func are accepted."""
     _check_shape(name, value, *shapes)
-    # a NaN makes the sum NaN, and the sum needs no additional array
+    # the sum is NaN if a value is, and needs no additional array
     if torch.isnan(value.detach().sum()) and bool((broken := torch.isnan(value.detach())).any()):
         first = tuple(broken.nonzero()[0].tolist())
         raise InputError(f"{name} has {int(broken.sum())} NaN values, the first at {first}; expected numbers")
@@ -86,7 +86,7 @@ def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
 
 
 def check_size(name: str, value: object) -> int:
-    """A number of pixels, from an integer, a float or a tensor of one element. Raises InputError."""
+    """Convert an argument, a number or a tensor of one element, to a whole number of pixels. Raises InputError."""
     size = whole(value)
     if size is None or size < 1:
         raise refuse(name, repr(value), "a whole number of pixels, 1 or more")

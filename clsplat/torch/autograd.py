@@ -40,8 +40,9 @@ class Batches:
 
 
 class BatchResults:
-    """Results of a call: the library's result for each batch, and the indices of the splats in view.
+    """Results of a call of gsplat's function: the library's result for each batch, and the splats in view.
 
+    The layout of `meta` is (..., C, N, ...), where ... are batches; with `packed` it is (nnz, ...), the splats in view.
     A splat's index is its position in a flattened array (B, C, N): by batch, then camera, then Gaussian.
     """
 
@@ -75,7 +76,7 @@ class BatchResults:
         return means2d, conics, depths, opacities
 
     def radii(self) -> NDArray[np.int32]:
-        """A copy of the radii in the layout of `meta`; the gradient still reads the library's array."""
+        """A copy of the radii in the layout of `meta`, because the gradient reads the library's own array later."""
         radii = self.laid_out(self.stacked("radii"))
         return radii if self.packed else radii.copy()
 
@@ -135,13 +136,16 @@ class BatchResults:
         rows = array
         if len(array) < math.prod(self.sizes):
             rows = np.zeros((math.prod(self.sizes), *array.shape[1:]), np.float32)
-            # a copy of whole rows as single items takes half the time
+            # rows are copied as single items, which takes half the time
             one = np.dtype((np.void, array.itemsize * math.prod(array.shape[1:])))
             rows.reshape(-1).view(one)[self.in_view] = array.reshape(-1).view(one)
         return rows.reshape(*self.sizes, *array.shape[1:])
 
     def gradient(self, each: list[dict[str, Any]], name: str, like: Tensor | None) -> Tensor | None:
-        """The gradient with respect to an argument, from all batches, in the argument's shape and dtype."""
+        """The gradient with respect to the argument `like`, in its shape and dtype; None if a batch has none.
+
+        each: gradients by name, for each batch.
+        """
         if like is None or any(found.get(name) is None for found in each):
             return None
         arrays = [found[name] for found in each]
@@ -193,7 +197,7 @@ def _is_same(one: Tensor, other: Tensor) -> bool:
 
 
 class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
-    """Projection of Gaussians to splats in the layout of `meta`."""
+    """Projection of Gaussians to splats in the layout of `meta` (see `BatchResults`)."""
 
     @staticmethod
     def forward(ctx: Any, call: BatchResults, *inputs: Tensor | None) -> tuple[Tensor | None, ...]:
@@ -213,7 +217,7 @@ class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torc
     @staticmethod
     @differentiable_once
     def backward(ctx: Any, *given: Tensor | None) -> tuple[Any, ...]:
-        """Gradients of the arguments of `forward`."""
+        """Gradients with respect to the arguments of `forward`."""
         call: BatchResults = ctx.call
         inputs = dict(zip(RASTERIZATION_INPUTS, ctx.saved_tensors, strict=True))
         if all(gradient is None for gradient in given):
@@ -233,7 +237,7 @@ class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torc
                 depths=item(depths, index),
                 cameras=cameras,
             )
-            if "covars" in found:  # an off-diagonal entry has half of its gradient in each of its two places
+            if "covars" in found:  # an off-diagonal entry is in two places, which share its gradient equally
                 found["covars"] = found["covars"][:, UPPER_TRIANGLE_INDICES[0], UPPER_TRIANGLE_INDICES[1]] * np.array(
                     [1, 2, 2, 1, 2, 1], np.float32
                 )
@@ -242,7 +246,7 @@ class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torc
 
 
 class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
-    """Blending of splats in the layout of `meta` to images and alphas."""
+    """Blending of splats in the layout of `meta` (see `BatchResults`) to images and alphas."""
 
     @staticmethod
     def forward(
@@ -261,7 +265,7 @@ class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch ha
         """
         ctx.call = call
         images, alphas = call.pixels(means2d)
-        # the gradient reads these outputs; since they are saved, PyTorch reports changes in place
+        # the backward pass reads these outputs; as they are saved, PyTorch raises an error if they change in place
         read = (images, alphas) if call.expected_depth else (alphas,)
         ctx.save_for_backward(means2d, conics, depths, opacities, values, backgrounds, *read)
         ctx.set_materialize_grads(False)
@@ -270,7 +274,7 @@ class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch ha
     @staticmethod
     @differentiable_once
     def backward(ctx: Any, d_images: Tensor | None, d_alphas: Tensor | None) -> tuple[Any, ...]:
-        """Gradients of the arguments of `forward`."""
+        """Gradients with respect to the arguments of `forward`."""
         call: BatchResults = ctx.call
         means2d, conics, depths, opacities, values, backgrounds, *_ = ctx.saved_tensors
         if d_images is None and d_alphas is None:

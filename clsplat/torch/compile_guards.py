@@ -21,7 +21,7 @@ def differentiable_once(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def outside_graphs(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """The function, excluded from tracing by `torch.compile`.
+    """Exclude a function from tracing by `torch.compile`.
 
     `torch.compiler.disable` imports the compiler, which takes seconds. So it is called only after other code has
     imported the compiler.

@@ -101,7 +101,7 @@ class GivenTensors:
     def rasterized(
         self, settings: RasterizationSettings, batch: tuple[int, ...], *, differentiable: bool
     ) -> list[Rasterization]:
-        """The library's result for each batch."""
+        """Call `clsplat.rasterize` for each batch, and return the results."""
         means, quaternions, scales = Batches(self.means, batch), Batches(self.quats, batch), Batches(self.scales, batch)
         opacities, colors = Batches(self.opacities, batch), Batches(self.colors, batch)
         viewmats, intrinsics = Batches(self.viewmats, batch), Batches(self.Ks, batch)

@@ -112,7 +112,7 @@ def rasterize_to_pixels(
 
 
 def _check_splats(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, *, packed: bool) -> None:
-    """Raise InputError unless the shapes fit."""
+    """Raise InputError unless the shapes of the splats' tensors fit together."""
     leading = tuple(means2d.shape[:-1]) if isinstance(means2d, Tensor) and means2d.dim() > 1 else ("N",)
     if packed and len(leading) != 1:
         raise refuse("means2d", tuple(means2d.shape), "(nnz, 2), as packed is True")

@@ -306,7 +306,7 @@ def _meta(
     def all_splats() -> dict[str, Any]:
         return dict(zip(PROJECTED_SPLAT_NAMES, call.splats(like) if splats is None else splats, strict=True))
 
-    # `tiles` must not refer to the dictionary: this cycle would keep memory until the garbage collector runs.
+    # `tiles` must not refer to the dictionary: the cycle of references would keep memory until a garbage collection.
     def tiles() -> dict[str, Any]:
         batch_ids, camera_ids, gaussian_ids = (None, None, None) if call.in_view is None else call.ids(like.device)
         means2d, _, depths, _ = call.splats(like)

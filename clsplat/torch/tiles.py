@@ -43,7 +43,7 @@ def isect_tiles(
     radii : (..., N, 2) Tensor
         Pixels; a splat with a radius of 0 has no pairs. With `packed` (nnz, 2).
     depths : (..., N) Tensor
-        With `packed` (nnz,).
+        World units. With `packed` (nnz,).
     tile_size : int
         Side of a tile in pixels.
     tile_width, tile_height : int
@@ -102,7 +102,7 @@ def isect_tiles(
 
 
 def _check_splats(means2d: Tensor, radii: Tensor, depths: Tensor) -> None:
-    """Raise InputError unless the shapes fit."""
+    """Raise InputError unless the shapes of the splats' tensors fit together."""
     leading = tuple(means2d.shape[:-1]) if isinstance(means2d, Tensor) and means2d.dim() > 1 else ("N",)
     check_shape("means2d", means2d, (*leading, 2))
     if not isinstance(radii, Tensor) or radii.shape != means2d.shape:

@@ -250,7 +250,7 @@ def test_wrong_calls_are_one_line_and_write_nothing(
 
 def test_a_folder_that_is_not_there(model: Path, capsys: Capture) -> None:
     target = model.parent / "none" / "out.ply"
-    said = f"clsplat: error: {target.parent}: no such folder, expected one for out.ply"
+    said = f"clsplat: error: {target.parent}: no such folder, expected an existing one for out.ply"
     assert fails(capsys, convert, model, target) == said
     assert not target.parent.exists()
 
@@ -383,7 +383,7 @@ def test_info_counts_what_a_reader_leaves_out(model: Path, capsys: Capture) -> N
     assert "none.ply: no such file" in printed(capsys, ["info", model.with_name("none.ply")], status=2).err
     target = model.with_name("whole.ply")
     error = ran(capsys, convert, model, target).err
-    assert "3 of 300 Gaussians have a value that is not finite, the first is Gaussian 3 with a position" in error
+    assert "3 of 300 Gaussians have a value that is not finite, the first is a position of Gaussian 3" in error
     assert len(Gaussians.load(target)) == 297
 
 

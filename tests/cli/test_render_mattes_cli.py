@@ -241,7 +241,7 @@ def test_wrong_mattes_are_one_line(
     ("mattes", "message"),
     [
         ([], "'mattes' is [], expected a list of at least one object"),
-        ([{"name": "m"}], "model 'a': matte 0: expected exactly one of 'box', 'sphere' and 'mesh'"),
+        ([{"name": "m"}], "model 'a': matte 0: has no region, expected exactly one of 'box', 'sphere' and 'mesh'"),
         ([{"name": "m", "mesh": "none.obj"}], "none.obj: no such file"),
         ([{"name": "m", "box": [1, 0, 0, 0, 1, 1]}], "'box' is [1, 0, 0, 0, 1, 1], expected the least x, y and z"),
         ([{"name": "m", "sphere": [0, 0, 0, -1]}], "expected x, y, z and a radius of at least 0"),

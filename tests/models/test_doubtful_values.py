@@ -118,7 +118,7 @@ def test_numbers_are_those_of_the_file(tmp_path: Path) -> None:
     path = tmp_path / "model.ply"
     with_bad_rows(path)
     out, turned = warnings_of(lambda: formats.load(path))
-    assert "2 of 20 Gaussians have a value that is not finite, the first is Gaussian 2 with a position" in out
+    assert "2 of 20 Gaussians have a value that is not finite, the first is a position of Gaussian 2" in out
     assert "1 of 20 Gaussians has a quaternion of 0, the first is Gaussian 3; it is drawn unrotated" in turned
     for which, said in (
         ("opacities", "Gaussian 9 has an opacity of"),

@@ -253,7 +253,7 @@ def test_a_spoilt_file_is_one_line_in_bounded_memory(name: str, way: str, tmp_pa
 
 def test_no_such_ending_and_no_such_file(tmp_path: Path) -> None:
     refuses(r"x\.doc: does not have the suffix of a model .*\.ply", formats.save, tmp_path / "x.doc", asymmetric())
-    with pytest.raises(InputError, match=r"x\.ksplat: ksplat is read only, expected one of .*\.ply"):
+    with pytest.raises(InputError, match=r"x\.ksplat: ksplat files cannot be written, expected one of .*\.ply"):
         formats.save(tmp_path / "x.ksplat", asymmetric())
     for name in ("x.ply", "x.doc", "x.splat"):
         refuses(f"{name}: no such file, expected a model file .*ply", formats.load, tmp_path / name)

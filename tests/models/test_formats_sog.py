@@ -302,7 +302,7 @@ def test_null_is_what_json_has_no_number_for(tmp_path: Path) -> None:
     colour = int(np.abs(np.array(meta["sh0"]["codebook"]) - plain.sh[7, 0, 1]).argmin())
     change(tmp_path, lambda meta: meta["sh0"]["codebook"].__setitem__(colour, None))
     gone = (plain.sh[:, 0] == plain.sh[7, 0, 1]).any(axis=1)
-    with pytest.warns(UserWarning, match=rf"{gone.sum()} of 300 .* first is Gaussian {gone.argmax()} with a colour"):
+    with pytest.warns(UserWarning, match=rf"{gone.sum()} of 300 .* first is a colour of Gaussian {gone.argmax()}"):
         np.testing.assert_array_equal(formats.load(path).means, plain.means[~gone])
 
 

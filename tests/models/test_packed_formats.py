@@ -114,7 +114,7 @@ def test_morton_order_interleaves_the_bits() -> None:
         ),
         (
             lambda data: data.replace(b"element chunk 1\n", b"element chunk 99999999999\n"),
-            "by its header",
+            "but its header announces",
         ),
         (lambda data: data.replace(b"element vertex 2", b"element vertex 255"), "sh has 2 rows, expected 255"),
         (lambda data: data.replace(b"element vertex 2", b"element vertex 0"), "0 Gaussians"),
@@ -125,7 +125,7 @@ def test_morton_order_interleaves_the_bits() -> None:
         (lambda data: data.replace(b"element sh 2", b"element sh 1"), "sh has 1 rows, expected 2"),
         (lambda data: data.replace(b"binary_little_endian", b"ascii"), "in ascii"),
         (lambda data: data.replace(b"element chunk", b"element lumps"), "0 elements 'chunk'"),
-        (lambda data: data[:-1], "by its header"),
+        (lambda data: data[:-1], "but its header announces"),
         (lambda data: data.replace(struct.pack("<f", -2.0), NAN), "2 of 2 Gaussians have a value"),
     ],
 )
@@ -156,10 +156,10 @@ def test_a_splat_by_hand(tmp_path: Path) -> None:
     for data, message in (
         (record[:-1], "31 bytes"),
         (b"", "0 bytes"),
-        (struct.pack("<6f8B", 1, np.nan, 3, 1, 1, 1, *TURN), "Gaussian 0 with a position; expected some that"),
+        (struct.pack("<6f8B", 1, np.nan, 3, 1, 1, 1, *TURN), "a position of Gaussian 0; expected some that"),
         (record * 100 + struct.pack("<6f8B", 1, 2, 3, 1, -1, 1, *TURN), "Gaussian 100 has the scales 1 -1 1"),
         (bytes(64), r"not a \.splat file \(rotations of length 2\.00"),
-        (struct.pack("<6f8B", 1, 2, 3, 1, np.inf, 1, *TURN), "Gaussian 0 with a scale; expected some that"),
+        (struct.pack("<6f8B", 1, 2, 3, 1, np.inf, 1, *TURN), "a scale of Gaussian 0; expected some that"),
     ):
         assert_refused(path, data, message)
 
@@ -183,21 +183,19 @@ def test_records_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
     path = tmp_path / "a.splat"
     good, bad = (struct.pack("<6f8B", x, 2, 3, 1, 1, 1, *TURN) for x in (1, np.nan))
     path.write_bytes(good + bad + good + bad)
-    with pytest.warns(
-        UserWarning, match=r"2 of 4 Gaussians have .*, the first is Gaussian 1 with a position; they are"
-    ):
+    with pytest.warns(UserWarning, match=r"2 of 4 Gaussians have .*, the first is a position of Gaussian 1; they are"):
         np.testing.assert_array_equal(formats.load(path).means, [[1, 2, 3]] * 2)
     data, wanted = ksplat(random_gaussians(40, 1), 1, (17, 23))
     spoilt = bytearray(data)
     spoilt[4112:4116] = struct.pack("<f", np.nan)  # the size of the first section's blocks
     path = tmp_path / "a.ksplat"
     path.write_bytes(spoilt)
-    read = warned(r"17 of 40 Gaussians have .*, the first is Gaussian 0 with a position; they are", formats.load, path)
+    read = warned(r"17 of 40 Gaussians have .*, the first is a position of Gaussian 0; they are", formats.load, path)
     np.testing.assert_allclose(read.means, wanted.means[17:], atol=1e-5)  # as in the test of whole files
     path = tmp_path / "a.compressed.ply"
     both = compressed([(0, 0, 0, 0xFF00FF80), (2047 << 21, 0, 0, 0x00FF0080)], BOUNDS)
     path.write_bytes(both.replace(struct.pack("<f", 0.5), struct.pack("<f", -np.inf)))  # the least blue
-    with pytest.warns(UserWarning, match=r"1 of 2 Gaussians has .*, the first is Gaussian 1 with a colour; it is"):
+    with pytest.warns(UserWarning, match=r"1 of 2 Gaussians has .*, the first is a colour of Gaussian 1; it is"):
         np.testing.assert_allclose(0.5 + SH_C0 * formats.load(path).sh[:, 0], [[1, 0.25, 1.5]], atol=1e-6)
 
 

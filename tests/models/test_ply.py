@@ -184,13 +184,13 @@ def test_values_that_are_not_finite_are_left_out(tmp_path: Path, monkeypatch: py
     table, path = plain_table(9), tmp_path / "model.ply"
     table[3, 1], table[3, 2], table[7, 0] = np.nan, np.inf, -np.inf
     write_plain(path, table)
-    read = warned(r"model\.ply: 2 of 9 .* the first is Gaussian 3 with a position; they are left", Gaussians.load, path)
+    read = warned(r"model\.ply: 2 of 9 .* the first is a position of Gaussian 3; they are left", Gaussians.load, path)
     np.testing.assert_array_equal(read.means, table[[0, 1, 2, 4, 5, 6, 8], :3])
     for column, name in [(4, "a colour"), (6, "an opacity"), (8, "a scale"), (13, "a rotation")]:
         table = plain_table(9)
         table[5:, column] = np.nan
         write_plain(path, table)
-        with pytest.warns(UserWarning, match=rf"4 of 9 .* the first is Gaussian 5 with {name}; they are left out"):
+        with pytest.warns(UserWarning, match=rf"4 of 9 .* the first is {name} of Gaussian 5; they are left out"):
             assert len(Gaussians.load(path)) == 5
     wide = plain_table(1).astype(np.float64)
     wide[0, 0] = 1e300  # finite as a double, not as a float

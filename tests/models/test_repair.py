@@ -71,13 +71,13 @@ def test_gaussians_are_left_out(tmp_path: Path, file: str, name: str, value: flo
     getattr(model, name)[[4, 29]] = value
     path = written(tmp_path / file, model)
     read, texts = told(path)
-    said = f"2 of 30 Gaussians have a value that is not finite, the first is Gaussian 4 with {what}; they are left out"
+    said = f"2 of 30 Gaussians have a value that is not finite, the first is {what} of Gaussian 4; they are left out"
     assert texts == [said]
     assert len(read) == 28
     np.testing.assert_array_equal(read.means, np.delete(model.means, [4, 29], axis=0))
     getattr(model, name)[:] = np.nan
     written(path, model)
-    refuses(f"30 of 30 .* the first is Gaussian 0 with {what}; expected some that", formats.load, path)
+    refuses(f"30 of 30 .* the first is {what} of Gaussian 0; expected some that", formats.load, path)
 
 
 @pytest.mark.brings("splat-transform", "scales of -inf, opacities of -inf and inf", "0, and 0 or 1")
@@ -130,7 +130,7 @@ def test_infinite_bounds_of_chunks(tmp_path: Path) -> None:
     path.write_bytes(data)
     read, texts = told(path)
     assert texts[0].startswith(
-        "255 of 600 Gaussians have a value that is not finite, the first is Gaussian 0 with a pos"
+        "255 of 600 Gaussians have a value that is not finite, the first is a position of Gaussian 0"
     )
     at_the_other_end = plain.means[:256, 0].argmax()
     np.testing.assert_array_equal(read.means, plain.means[[at_the_other_end, *range(256, 600)]])
@@ -177,9 +177,7 @@ def test_prims_of_a_stage(tmp_path: Path) -> None:
     shift.Set(Gf.Vec3d(0, 0, 0), 1)
     shift.Set(Gf.Vec3d(1, 0, 0), 5)
     stage.Save()
-    models = warned(
-        f"{path}: {formats.usd.GAUSSIANS_PRIM_PATH}: 2 of 20 .* Gaussian 3 with a colour;", read_stage, path
-    )
+    models = warned(f"{path}: {formats.usd.GAUSSIANS_PRIM_PATH}: 2 of 20 .* a colour of Gaussian 3;", read_stage, path)
     np.testing.assert_array_equal(models.models[0].means, np.delete(model.means, [3, 4], axis=0))
 
 

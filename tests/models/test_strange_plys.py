@@ -144,7 +144,7 @@ def test_a_long_comment(tmp_path: Path, name: str, length: int) -> None:
 @pytest.mark.parametrize("word", ["-nan(ind)", "1.#QNAN", "-1.#IND", "1.#SNAN0", "nan(snan)", "-1.#IND00"])
 def test_words_for_no_number(tmp_path: Path, word: str) -> None:
     path = with_word(tmp_path, 2, word)
-    with pytest.warns(UserWarning, match="1 of 6 Gaussians has a value .* Gaussian 2 with a rotation; it is left out"):
+    with pytest.warns(UserWarning, match="1 of 6 Gaussians has a value .* a rotation of Gaussian 2; it is left out"):
         assert len(Gaussians.load(path)) == 5
 
 

@@ -72,7 +72,7 @@ def test_verbs_take_it(tmp_path: Path, capsys: Capture) -> None:
     assert printed(capsys, ["convert", archive, tmp_path / "again.ply"]).err == ""
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "model.ply").read_bytes()
     assert main(["convert", str(archive), str(tmp_path / "new.zip")]) == 2
-    assert "new.zip: zipped model is read only, expected one of " in error_line(capsys)
+    assert "new.zip: zipped model files cannot be written, expected one of " in error_line(capsys)
 
 
 def test_what_is_wrong_with_the_model_names_the_archive(tmp_path: Path) -> None:

@@ -329,7 +329,7 @@ def test_wrong_calls_are_one_line(reported: Path, tmp_path: Path, capsys: Captur
         (["report", str(tmp_path)], "not a run"),
         (["report", str(tmp_path / "none")], "no such folder, expected a run"),
         (["report", str(reported / "model.ply")], "no such folder, expected a run"),
-        (["report", str(reported), "-o", str(tmp_path / "a" / "b.html")], "no such folder, expected one for b.html"),
+        (["report", str(reported), "-o", str(tmp_path / "a" / "b.html")], "expected an existing one for b.html"),
         (["report", str(reported), "-o", str(tmp_path)], "is a folder, expected the name of a file"),
         (
             ["report", str(reported), "-o", str(tmp_path / "x.txt")],

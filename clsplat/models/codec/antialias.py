@@ -59,7 +59,7 @@ def _plain(word: str) -> str:
 
 
 def _switch(word: str) -> bool | None:
-    """True or False if a word or number means it, otherwise None."""
+    """Boolean that a word such as "on", or a number 0 or 1, stands for; None for other words."""
     try:
         return {1.0: True, 0.0: False}.get(float(word))
     except ValueError:
@@ -93,7 +93,7 @@ def of_line(line: str) -> bool | None:
 class AntialiasStatements:
     """Statements about antialiasing in a file's header.
 
-    antialiased: the last statement; False without statements.
+    antialiased: True if the last statement says antialiased; False without statements.
     contradiction: warning, without the file's name, about statements that disagree; "" if all agree.
     not_understood: warning about the first text that mentions antialiasing and does not count; "" if any text counts.
     """
@@ -125,11 +125,11 @@ class AntialiasStatements:
 
 
 def of_comments(comments: Iterable[str]) -> AntialiasStatements:
-    """Statements in a header's comments. The comments come without the word `comment`."""
+    """Statements about antialiasing in a header's comments, which are given without the word `comment`."""
     return AntialiasStatements((line[:80], of_line(line)) for line in comments)
 
 
 def of_object(document: Mapping[str, Any]) -> AntialiasStatements:
-    """Statements in the keys and values of a JSON object."""
+    """Statements about antialiasing in the keys and values of a JSON object."""
     pairs = ((key, value) for key, value in document.items() if isinstance(value, str | bool | int | float))
     return AntialiasStatements((f"{key[:40]}: {str(value)[:40]}", _meaning(key, value)) for key, value in pairs)

@@ -23,15 +23,15 @@ NODE_SIMILARITY_TOLERANCE = 1e-4
 
 
 def sh_signs(signs: Signs) -> Float32:
-    """Factors (16,) of the SH coefficients for a change of the signs of axes."""
+    """Factors (16,), 1 or -1, by which SH coefficients change if the axes x, y and z are multiplied by `signs`."""
     direction = np.array([[1.0, 2.0, 4.0]]) / 21**0.5  # a direction in which no basis function is 0
     return np.asarray(np.sign(sh_basis(direction, 3) * sh_basis(direction * signs, 3))[0], np.float32)
 
 
 def quaternion_signs(signs: Signs) -> Float32:
-    """Factors (4,) of quaternions w x y z for a change of the signs of axes.
+    """Factors (4,), 1 or -1, by which quaternions w x y z change if the axes are multiplied by `signs`.
 
-    The world's and the Gaussian's own axes change sign, so the result is a rotation even if an axis is mirrored. The
+    The Gaussian's own axes change sign too, so the result is a rotation even if `signs` mirrors the world. The
     covariance is exact.
     """
     handedness = int(np.prod(signs))

@@ -113,7 +113,8 @@ class Asset:
             assert isinstance(index, int)
             if index in seen or len(seen) >= MAX_SCENE_NODES:
                 raise InputError(
-                    f"{self.path}: node {index} is used twice, expected a tree of up to {MAX_SCENE_NODES} nodes"
+                    f"{self.path}: node {index} is used twice or one too many, expected a tree of at most "
+                    f"{MAX_SCENE_NODES:,} nodes"
                 )
             seen.add(index)
             matrix = parent @ self.matrix(node, index)
@@ -155,7 +156,7 @@ class Asset:
         count, offset = self.integer(said, "count"), self.integer(said, "byteOffset", 0)
         if kind is None:
             found = str(said["componentType"])[:20]
-            raise InputError(f"{self.path}: {semantic} has the componentType {found}, expected 5120 to 5126, not 5124")
+            raise InputError(f"{self.path}: {semantic} has the componentType {found}, expected 5120 to 5126 but 5124")
         if ACCESSOR_WIDTHS.get(str(said.get("type"))) != width:
             expected = next(name for name, numbers in ACCESSOR_WIDTHS.items() if numbers == width)
             raise InputError(f"{self.path}: {semantic} has the type {str(said.get('type'))[:20]}, expected {expected}")
@@ -243,7 +244,7 @@ def _map(path: Path, start: int, size: int) -> NDArray[np.uint8]:
         return np.empty(0, np.uint8)
     try:
         return np.memmap(path, np.uint8, "r", start, (size,))
-    except OSError as error:  # larger than the address space
+    except OSError as error:  # for example, the file is larger than the address space
         raise InputError(f"{path}: {size} bytes cannot be read ({error.strerror})") from None
 
 

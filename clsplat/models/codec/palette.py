@@ -23,8 +23,9 @@ PRINCIPAL_AXIS_SAMPLES, POWER_ITERATIONS = 128, 30
 def codebook(values: NDArray[np.float32], size: int = 256) -> Float32:
     """Codebook (size,) in ascending order that approximates values by their nearest entry with a small squared error.
 
-    If there are more distinct values than entries, the density of the initial entries is the cube root of the values'
-    density. This is optimal for many entries (Panter and Dite 1951). Lloyd iterations improve them.
+    If there are more distinct values than entries, the density of the initial entries is proportional to the cube root
+    of the density of the values. This is optimal for many entries (Panter and Dite 1951). Lloyd iterations improve the
+    entries.
     """
     ordered = np.sort(values.ravel())
     distinct = np.unique(ordered) if len(ordered) <= CODEBOOK_SAMPLES else _thinned(ordered)
@@ -58,8 +59,8 @@ def palette(
 ) -> tuple[Float32, NDArray[np.int64]]:
     """Palette (size, d) of vectors (n, d), and each vector's index (n,) in the palette.
 
-    Two-level k-means: first into clusters, then each cluster into its share of the palette, which grows with its
-    squared error. The cost is n d sqrt(size) instead of n d size.
+    k-means on two levels. The first divides the vectors into clusters. The second divides each cluster into its share
+    of the palette's entries, which grows with its squared error. The cost is n d sqrt(size) instead of n d size.
 
     progress: function that is called with the finished fraction.
     """
@@ -92,9 +93,10 @@ def palette(
 
 
 def _k_means(vectors: Float32, size: int, iterations: int) -> tuple[Float32, NDArray[np.int64]]:
-    """Centres (size, d) and each vector's nearest centre (n,), by Lloyd iterations; on a sample of many vectors.
+    """Centres (size, d), and the index (n,) of each vector's nearest centre, by Lloyd iterations.
 
-    The initial centres lie along the direction of largest variance. A centre without vectors stays unchanged.
+    If there are many vectors, the iterations use a sample of them. The initial centres lie along the direction of
+    largest variance. A centre without vectors stays unchanged.
     """
     if size <= 1 or not np.ptp(vectors, axis=0).any():
         return vectors.mean(axis=0, keepdims=True, dtype=np.float64).astype(np.float32), np.zeros(
@@ -131,8 +133,8 @@ def _direction(vectors: Float32) -> Float32:
 def _nearest_centres(vectors: Float32, centres: Float32) -> NDArray[np.int64]:
     """Index of each vector's nearest centre, which has the smallest |c|^2 / 2 - v c = (|v - c|^2 - |v|^2) / 2.
 
-    Tiles are so small that the BLAS library does not split them among threads. With threads, on a busy machine, this
-    took several times as long.
+    The tiles are so small that the BLAS library does not split them among threads. Threads would make the search
+    several times slower on a busy machine.
     """
     halves = np.float32(0.5) * np.einsum("ij,ij->i", centres, centres)
     columns = [

@@ -30,6 +30,7 @@ MAX_PLY_HEADER_LINES = 10_000
 MAX_PLY_HEADER_BYTES = 1 << 24
 """Largest size of the header in bytes, because it is held in memory."""
 MAX_BLOCK_BYTES, MAX_BLOCK_WORDS = 1 << 26, 1 << 21
+"""Largest size of a block of rows: bytes of a binary file, numbers of an ascii file."""
 MAX_NUMBER_TEXT_BYTES = 128
 """Longest text of a number, in bytes. It bounds the memory of a row: NumPy makes all texts as wide as the longest."""
 
@@ -112,7 +113,7 @@ class PlyHeader:
         return self.elements[: self.elements.index(self.vertex)]
 
     def start(self, index: int) -> int:
-        """Byte offset of the element `index` in a binary file; the end of the last element if there is none."""
+        """Byte offset of the element `index` in a binary file, or of the data's end if `index` is one past the last."""
         return self.size + sum(element.count * element.row_bytes for element in self.elements[:index])
 
     def row_type(self, element: Element) -> np.dtype[Any]:
@@ -122,7 +123,7 @@ class PlyHeader:
 
 
 def _header_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
-    """Complete lines of the header after the first. Raises InputError if the header exceeds its limits."""
+    """Yield the header's complete lines after the first. Raises InputError if the header exceeds its size limits."""
     for _ in range(MAX_PLY_HEADER_LINES):
         line = file.readline(MAX_PLY_LINE_BYTES + 1)
         if len(line) > MAX_PLY_LINE_BYTES or file.tell() > MAX_PLY_HEADER_BYTES:
@@ -181,7 +182,7 @@ Block = dict[str, NDArray[Any]]
 
 
 def read_vertices(file: BinaryIO, header: PlyHeader, what: str) -> Iterator[Block]:
-    """Yield the vertices in blocks of rows: the columns by name.
+    """Yield the vertices in blocks of rows. A block has the column of each property, by the property's name.
 
     The file's length is checked before the first block, so the caller may then allocate `count` rows. The check is
     exact for a binary file; an ascii file must have at least two bytes per number. Raises InputError.
@@ -220,7 +221,7 @@ def _binary_blocks(file: BinaryIO, header: PlyHeader, what: str) -> Iterator[Blo
 
 
 def _text_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
-    """Lines that are not blank. Raises InputError for a line that is too long to be a row."""
+    """Yield the lines of an ascii file that are not blank. Raises InputError for a line too long to be a row."""
     while line := file.readline(MAX_PLY_LINE_BYTES + 1):
         if len(line) > MAX_PLY_LINE_BYTES:
             raise InputError(f"{path}: has a line of more than {MAX_PLY_LINE_BYTES} bytes, expected rows of numbers")
@@ -229,7 +230,7 @@ def _text_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
 
 
 def _parse_row(words: list[bytes], where: str) -> list[float]:
-    """Numbers of a row that may have non-finite values as Microsoft's C library writes them, such as 1.#INF.
+    """Numbers of a row of text. They may be non-finite as Microsoft's C library writes them, such as 1.#INF.
 
     Raises InputError, prefixed with `where`.
     """
@@ -244,7 +245,7 @@ def _parse_row(words: list[bytes], where: str) -> list[float]:
 
 
 def _ascii_blocks(file: BinaryIO, header: PlyHeader, what: str) -> Iterator[Block]:
-    """Yield blocks of float64 columns."""
+    """Yield the vertices of an ascii file in blocks of float64 columns."""
     path, vertex = header.path, header.vertex
     lines = _text_lines(file, path)
     # a value takes at least a character and a blank

@@ -33,32 +33,34 @@ MIN_GAUSSIANS_FOR_ENCODING_WARNINGS = 100
 BYTE_LOGIT_ERROR = 0.02
 """Largest error of a logit between 0 and 1 after conversion to an 8-bit format."""
 LARGEST_USEFUL_LOGIT = 20.0
-"""Largest logit that is useful in float32. Opacities as levels from 0 to 255 exceed it."""
+"""Largest logit that changes an opacity in float32. Opacities stored as levels from 0 to 255 exceed it."""
 MAX_HANDMADE_LOGITS = 10
 """Largest number of distinct logits in a handmade model."""
 TRAINED_OPACITY_SPREAD = (0.35, 0.93)
 """Two bounds. In a trained model, 1 % of the opacities are below the first even after pruning, and the largest is above
 the second.
 
-Read as logits, such values would mean that no opacity is below 0.5 to 0.58, and that the largest is 0.717 to 0.735.
-Trained models reach 0.8 and more, except after short trainings.
+If such values were logits, no opacity would be below about 0.5, and the largest would be 0.717 to 0.735. But the
+largest opacity of a trained model is 0.8 or more, except after short trainings.
 """
 CLIPPED_OPACITY_SHARE = (1e-3, 0.02)
-"""A distance from 1, and a fraction. If at least this fraction of the values is within this distance, they are
-opacities, which a neural network has clipped at 1. Logits do not cluster there."""
+"""A distance from 1, and a fraction. If at least this fraction of the values is within this distance of 1, the values
+are opacities that a neural network has clipped at 1. Logits do not cluster at 1."""
 PERCENTAGE_MAXIMA = (40.0, 100.0)
-"""Whole numbers whose largest is in this range are percentages. As levels from 0 to 255, all would be below 0.4."""
+"""Whole numbers are percentages if the largest is in this range. If they were levels up to 255, no opacity would exceed
+0.4."""
 ZERO_SCALE_LOG_LIMIT = float(np.log(values.MIN_SCALE)) + 1
 """Log scales below this stand for scales of 0, and do not show how the other scales are encoded."""
 LENGTH_SKEW_RATIO = 3.0
 """Ratio of the spread above the median to the spread below it, above which values are lengths and not logs.
 
-Lengths vary by a factor of e or more on both sides of the median, which gives a ratio of 10. Their logs spread evenly.
+Lengths vary by a factor of e or more on both sides of the median, which gives a ratio of 10. The spread of logs is
+about equal on both sides.
 """
 
 
 def replace_infinities(gaussians: Gaussians) -> None:
-    """Replace the infinite logits and log scales that stand for finite values, in place."""
+    """Replace infinite logits, of opacities 0 and 1, and infinite log scales, of scales 0, by finite ones, in place."""
     logits, scales = gaussians.opacity_logits, gaussians.log_scales
     if not values.all_finite(logits):
         ends = values.logits(np.array([0.0, 1.0]))
@@ -82,7 +84,7 @@ def without_rotation(gaussians: Gaussians) -> NDArray[np.bool_]:
 
 
 def repaired(gaussians: Gaussians, where: Path | str, activated: Activated | None = None) -> Gaussians:
-    """Repair a model as the module's docstring says. Works in place unless Gaussians are left out.
+    """Repair or leave out Gaussians with invalid values (see the module). Works in place unless some are left out.
 
     activated: values to convert to logits or logs, because the file stores opacities or scales.
     where: prefix of messages.
@@ -101,7 +103,7 @@ def repaired(gaussians: Gaussians, where: Path | str, activated: Activated | Non
         )
         found = (
             f"{where}: {bad:,} of {len(good):,} Gaussians {values.have(bad)} a value that is not finite, the first is "
-            f"Gaussian {first} with {name}"
+            f"{name} of Gaussian {first}"
         )
         if bad == len(good):
             raise InputError(f"{found}; expected some that are finite; is it damaged?")
@@ -166,7 +168,7 @@ def _spread(opacities: Float32) -> bool:
 
 
 def _white(logits: Float32) -> float:
-    """The stored value that means an opacity of 1. It is 1, or for whole numbers 100, 255 or the maximum of a wider
+    """The stored value that stands for an opacity of 1: 1, or for whole numbers 100, 255 or the maximum of a wider
     type."""
     whole = (
         logits.max() > LARGEST_USEFUL_LOGIT

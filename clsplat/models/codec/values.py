@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Helpers for several formats: encoding in bytes, reading rows, spatial order, checks of file contents.
+"""Helpers of the model formats: conversion of values to bytes, reading of rows, Morton order, checks of contents.
 
 Byte formats store colours as 0.5 + C0 times SH coefficient 0, and opacities from 0 to 1 (Kerbl et al. 2023).
 """
@@ -38,9 +38,11 @@ OTHER_QUATERNION_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 
 MAX_FLOAT_HIGHLIGHT = 2.0
 """Largest float colour up to which white is taken to be 1, unless all colours are whole numbers."""
 UNIT_COLOUR_SHARE = 0.95
-"""Least fraction of float colours of at most 1 that makes white 1, however bright the others are."""
+"""Fraction of float colours. If at least so many are at most 1, white is taken to be 1, however bright the others are.
+"""
 UNIT_RANGE_TOLERANCE = 1e-3
-"""Tolerance of colours above white (relative) and of opacities outside [0, 1], because of half floats and averages."""
+"""Largest excess of colours over white (relative), and of opacities over [0, 1], from rounding to half floats or
+averaging."""
 GAUSSIAN_ARRAY_NOUNS = ("a position", "a rotation", "a scale", "an opacity", "a colour")
 """Nouns for the arrays of `Gaussians`, for messages."""
 
@@ -91,7 +93,7 @@ def byte_logits() -> Float32:
 
 
 def to_log_scales(gaussians: Gaussians, where: Path | str) -> None:
-    """`all_to_log_scales` for a file with one part."""
+    """Replace the linear scales of a file's Gaussians by their logs, in place (see `all_to_log_scales`)."""
     all_to_log_scales([(where, gaussians)])
 
 
@@ -99,12 +101,12 @@ def all_to_log_scales(parts: Sequence[tuple[Path | str, Gaussians]], writer: str
     """Replace the linear scales (standard deviations) of all parts of a file by their logs, in place.
 
     If at least LOG_SCALES_MIN_NEGATIVE_SHARE of all Gaussians have a negative scale, all scales are logs already. They
-    are kept, with a warning. Logs are in files by splat-transform before 22 June 2026, and in files after the review
-    draft of KHR_gaussian_splatting.
+    are kept, with a warning. splat-transform wrote logs before 22 June 2026, and the review draft of
+    KHR_gaussian_splatting asked for them.
 
-    parts: prefix of messages, and Gaussians, of each part.
-    writer: name of the writing program, if it is known to write logs; otherwise "".
-    Raises InputError if fewer Gaussians have a negative scale.
+    parts: for each part of the file, a prefix for messages and the Gaussians.
+    writer: name of the program that wrote the file, if it is known to write logs; otherwise "".
+    Raises InputError if some Gaussians have a negative scale, but fewer than that fraction.
     """
     with np.errstate(invalid="ignore"):
         negative = [np.asarray((gaussians.log_scales < 0).any(axis=1)) for _, gaussians in parts]
@@ -152,12 +154,12 @@ def logits_of(opacity: NDArray[Any], where: Path | str, numbers: int | NDArray[n
 
 
 def colours(dc: Float32) -> Float64:
-    """Colours from SH coefficients 0."""
+    """Colours from SH coefficients of degree 0, any shape."""
     return 0.5 + SH_C0 * dc.astype(np.float64)
 
 
 def coefficients(rgb: NDArray[Any]) -> Float64:
-    """SH coefficients 0 from colours."""
+    """SH coefficients of degree 0 from colours, any shape."""
     return (np.asarray(rgb, np.float64) - 0.5) / SH_C0
 
 
@@ -197,7 +199,7 @@ def unit_quaternions(quaternions: NDArray[Any]) -> Float64:
 
 
 def restore_largest(which: NDArray[Any], three: Float32) -> Float32:
-    """Unit quaternions (n, 4) from three components each.
+    """Unit quaternions (n, 4), of which a file stores all components but the largest.
 
     which (n,): index of the missing component, the largest.
     three (n, 3): the other components in their order.
@@ -220,9 +222,9 @@ def leave_out_largest(unit: Float64) -> tuple[NDArray[np.intp], Float64]:
 
 
 def at_ends(between: NDArray[Any], low: NDArray[Any], high: NDArray[Any], part: NDArray[Any]) -> NDArray[Any]:
-    """Correct an interpolation `between` whose bounds may be infinite, for which plain arithmetic gives NaN.
+    """Replace the NaNs of an interpolation that come from infinite bounds.
 
-    between: low + part * (high - low), with `part` from 0 to 1.
+    between: the interpolation, low + part * (high - low), with `part` from 0 to 1.
     If a bound is infinite, the result is `low` at 0, `high` at 1, and infinite between them.
     """
     finite = np.isfinite(low) & np.isfinite(high)
@@ -242,7 +244,7 @@ def read_rows(file: BinaryIO, kind: np.dtype[Any], count: int, path: Path) -> ND
 
 
 def all_finite(array: NDArray[Any]) -> bool:
-    """True if all values of a float32 array are finite. Takes one pass: the float64 sum of finite values is finite."""
+    """True if all values of a float32 array are finite. This is so if, and only if, their float64 sum is finite."""
     with np.errstate(invalid="ignore"):  # -inf + inf gives NaN
         return bool(np.isfinite(array.sum(dtype=np.float64)))
 

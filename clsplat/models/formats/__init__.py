@@ -30,10 +30,11 @@ from clsplat.models.codec.repair import Activated
 from clsplat.models.formats import compressed_ply, gltf, ksplat, ply, sog, splat, spz, usd, zipped
 
 FORMAT_HEAD_BYTES = 1 << 16
+"""Number of bytes at a file's beginning by which its format is recognised."""
 MODEL_SIZE_SAMPLES = 10_000
 """Number of means that are sampled to estimate a model's size."""
 SMALL_MODEL_NEAR_PLANES = 10.0
-"""Size of a model, in multiples of the default near plane, below which that near plane would clip too much of it."""
+"""Size of a model, in multiples of the default near plane, below which the default would clip too much of the model."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Format:
     loses: short description of the information that the format does not keep.
     floats: True if it stores values as floats.
     sh_degree: the highest SH degree that it stores.
-    describe(path): the format's part of `clsplat info`.
+    describe(path): details of a file for `clsplat info`, by name.
     order(gaussians): index (n,) of the Gaussian in each row of a written file; None if the order is kept.
     blocks(path): yields the Gaussians in world coordinates in blocks of rows; None if the file is read at once.
     side_files(path): the other files of the model at this path.
@@ -91,7 +92,7 @@ MODEL_FORMATS: tuple[Format, ...] = (
     Format("glTF", (".gltf", ".glb"), gltf.read, gltf.write, gltf.recognises,
            loses=UNIT_QUATERNION_LOSS, floats=True, describe=gltf.describe, side_files=gltf.side_files,
            marks=(GAUSSIAN_EXTENSION.encode(),)),
-    Format("ksplat", (".ksplat",), ksplat.read, loses="not written here", describe=ksplat.describe),
+    Format("ksplat", (".ksplat",), ksplat.read, loses="clsplat does not write this format", describe=ksplat.describe),
     Format("3DGS PLY", (".ply",), ply.read, ply.write, ply.recognises,
            loses="nothing", floats=True, describe=ply.describe, blocks=ply.blocks,
            marks=(ply.SCALE_PROPERTIES[0].encode(), b"packed_position")),
@@ -105,8 +106,8 @@ MODEL_FORMATS: tuple[Format, ...] = (
            describe=spz.describe),
     Format("OpenUSD", (".usda", ".usdc", ".usdz", ".usd"), usd.read, usd.write, usd.recognises,
            loses=UNIT_QUATERNION_LOSS, floats=True, describe=usd.describe, space=usd.recorded_space),
-    Format("zipped model", (ZIP_SUFFIX,), _ZIPPED_MODEL.read, recognises=zipped.recognises, loses="not written here",
-           describe=_ZIPPED_MODEL.describe, space=_ZIPPED_MODEL.space),
+    Format("zipped model", (ZIP_SUFFIX,), _ZIPPED_MODEL.read, recognises=zipped.recognises,
+           loses="clsplat does not write this format", describe=_ZIPPED_MODEL.describe, space=_ZIPPED_MODEL.space),
 )  # fmt: skip
 """All formats. The first format that recognises a file's first bytes is used."""
 
@@ -135,7 +136,7 @@ def format_of_name(path: str | os.PathLike[str], *, writable: bool = False) -> F
     if named is None:
         raise InputError(f"{path}: does not have the suffix of a model file, expected one of {known}")
     if writable and named.write is None:
-        raise InputError(f"{path}: {named.name} is read only, expected one of {known}")
+        raise InputError(f"{path}: {named.name} files cannot be written, expected one of {known}")
     return named
 
 

@@ -64,7 +64,7 @@ def read(path: Path) -> Gaussians:
         chunks, vertex, sh = _elements(header)
         end, have = header.start(len(header.elements)), os.fstat(file.fileno()).st_size
         if have < end:
-            raise InputError(f"{path}: truncated: has {have} bytes, but needs {end} by its header")
+            raise InputError(f"{path}: truncated: has {have} bytes, but its header announces {end}")
         bounds = _bounds(file, header, chunks)
         rest = [] if sh is None else [f"f_rest_{index}" for index in range(len(sh.properties))]
         result = packing.empty(vertex.count, {0: 0, 9: 1, 24: 2, 45: 3}[len(rest)])
@@ -82,7 +82,7 @@ def read(path: Path) -> Gaussians:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: comments, `antialiased`, `by_rays`."""
+    """Details of a file for `clsplat info`: comments, `antialiased`, `by_rays`."""
     with open_input(path, "a compressed PLY") as file:
         header = ply_file.read_header(file, path)
     return {"comments": header.comments, "antialiased": header.is_antialiased(), "by_rays": header.by_rays}
@@ -121,7 +121,7 @@ def write(path: Path, gaussians: Gaussians, *, comments: Sequence[str] = ()) -> 
 
 
 def order(gaussians: Gaussians) -> NDArray[np.int64]:
-    """Index (n,) of the Gaussian in each row of the file."""
+    """Index (n,) of the Gaussian in each row of a written file: along a Morton curve through the positions."""
     return packing.morton_order(gaussians.means)
 
 
@@ -195,7 +195,7 @@ def _unpack(block: NDArray[Any], bounds: NDArray[np.float32], result: Gaussians,
     def between(words: NDArray[Any], layout: tuple[tuple[int, int], ...], what: int) -> NDArray[np.float32]:
         part = _fields(words, layout)
         low, high = bounds[:, what, 0], bounds[:, what, 1]
-        with np.errstate(invalid="ignore"):  # infinite bounds
+        with np.errstate(invalid="ignore"):  # infinite bounds give NaN
             return packing.at_ends(low * (1 - part) + high * part, low, high, part)
 
     words = {name: block[name].astype(np.uint32) for name in PACKED_PROPERTIES}
@@ -209,7 +209,7 @@ def _unpack(block: NDArray[Any], bounds: NDArray[np.float32], result: Gaussians,
 
 
 def _values(gaussians: Gaussians, rows: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
-    """Position, log scale and colour, float64 (n, 3) each."""
+    """Values of Gaussians that a chunk has bounds of: position, log scale and colour, float64 (n, 3) each."""
     return (
         packing.world_means(gaussians, rows),
         np.clip(gaussians.log_scales[rows].astype(np.float64), -MAX_LOG_SCALE, MAX_LOG_SCALE),
@@ -225,7 +225,7 @@ def _ranges(*values: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def _pack(gaussians: Gaussians, rows: NDArray[np.int64], ranges: NDArray[np.float32]) -> NDArray[Any]:
-    """Pack Gaussians into rows of `vertex`, (n, 4) uint32."""
+    """Pack Gaussians into rows of `vertex`, (n, 4) uint32. ranges: bounds of their chunks, as in `_bounds`."""
     bounds = ranges[np.arange(len(rows)) // CHUNK_GAUSSIANS].astype(np.float64)
 
     def fields(parts: NDArray[Any], layout: tuple[tuple[int, int], ...]) -> NDArray[np.uint32]:

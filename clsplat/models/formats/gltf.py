@@ -4,7 +4,7 @@
 Specifications: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, and for Gaussians
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting (ratified).
 
-- Axes: x left, y up, z forward, as the base specification says; half a turn about z from clsplat's. The writer turns
+- Axes: x left, y up, z forward, as the base specification says; half a turn about z from clsplat's. The writer rotates
   the values and not a node, since not every viewer rotates spherical harmonics with their node. An `origin` becomes the
   node's translation. The reader applies the nodes' transforms.
 - Values are float32: linear scales, opacities in [0, 1], unit quaternions x y z w. Each SH coefficient has an
@@ -62,7 +62,7 @@ MAX_GLB_BYTES = (1 << 32) - 1
 LOG_SCALE_WRITER, LOG_SCALE_WRITER_FIXED_VERSION = re.compile(r"splat-transform v?(\d+)\.(\d+)(?:\..*)?"), (2, 7)
 """Pattern of splat-transform's name and version, and its first version that writes scales. Earlier ones write logs."""
 Rows = Callable[[slice], Array]
-"""Function that returns rows of an attribute."""
+"""Function that returns the values of an attribute for a slice of Gaussians."""
 
 
 def recognises(head: bytes) -> bool:
@@ -71,7 +71,7 @@ def recognises(head: bytes) -> bool:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: colour space and compression of the first primitive with Gaussians."""
+    """Details of a file for `clsplat info`: colour space and compression of the first primitive with Gaussians."""
     asset = Asset.open(path)
     for _, _, primitive in asset.primitives():
         said = as_object(primitive["extensions"][GAUSSIAN_EXTENSION])
@@ -88,7 +88,7 @@ def side_files(path: Path) -> list[Path]:
 def read(path: Path) -> Gaussians:
     """Read all primitives with Gaussians in the scene, merged into one model. Raises InputError."""
     asset = Asset.open(path)
-    primitives = list(asset.primitives())  # a list, so that all are counted before any is read
+    primitives = list(asset.primitives())  # a list, so that their number is checked before any is read
     if not primitives:
         raise InputError(f"{path}: has no primitive with {GAUSSIAN_EXTENSION} in its scene, expected at least one")
     scaled: list[tuple[str, Gaussians]] = []
@@ -235,7 +235,7 @@ def _blocks(attributes: Iterable[Rows], count: int) -> Iterator[memoryview]:
 
 
 class GaussianNode(TypedDict):
-    """The node of the written mesh. translation: the model's origin, if it is not 0."""
+    """JSON object of the node that has the written mesh. translation: the model's origin, if it is not 0."""
 
     mesh: int
     translation: NotRequired[list[float]]
@@ -244,7 +244,7 @@ class GaussianNode(TypedDict):
 def _document(
     path: Path, gaussians: Gaussians, spz_compression: bool, color_space: str
 ) -> tuple[dict[str, Any], Iterable[bytes | memoryview]]:
-    """The JSON object without its key `buffers`, and the contents of the only buffer."""
+    """The glTF file's JSON object, without its key `buffers`, and the parts of its only buffer in order."""
     count = len(gaussians)
     attributes = _attributes(gaussians, color_space)
     samples = {name: rows_of(slice(0, 1)) for name, rows_of in attributes.items()}

@@ -47,6 +47,7 @@ KSPLAT_SECTION_HEADER = np.dtype(
 )  # fmt: skip
 BUCKET_CENTRE_BYTES = 12
 DEFAULT_POSITION_RANGE = 32767
+"""Largest distance of a stored position from its bucket's centre, in steps, if the section's header stores 0."""
 DEFAULT_SH_BOUND = 1.5
 """Magnitude of both SH bounds if the header stores 0."""
 SH_VALUES_BY_DEGREE = (0, 9, 24, 45)
@@ -55,7 +56,7 @@ _POSITION_DTYPES, _FLOAT_DTYPES, _SH_DTYPES = ("<f4", "<u2", "<u2"), ("<f4", "<f
 
 @dataclass(frozen=True)
 class Section:
-    """Place and encoding of a section's Gaussians.
+    """A section of a .ksplat file: place and encoding of its Gaussians.
 
     count: number of Gaussians.
     start: byte offset of the first Gaussian.
@@ -78,7 +79,8 @@ class Section:
 def read(path: Path) -> Gaussians:
     """Read a .ksplat file.
 
-    Raises InputError for another version or level, a truncated file, inconsistent counts, or a few negative scales.
+    Raises InputError for another version or level, a truncated file, inconsistent counts, or negative scales of a few
+    Gaussians (`values.all_to_log_scales`).
     """
     with open_input(path, "a .ksplat file") as file:
         size = os.fstat(file.fileno()).st_size
@@ -115,7 +117,7 @@ def read(path: Path) -> Gaussians:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: version and compression level."""
+    """Details of a file for `clsplat info`: version and compression level."""
     with open_input(path, "a .ksplat file") as file:
         header = packing.read_rows(file, KSPLAT_HEADER, 1, path)[0]
     return {"version": f"{header['major']}.{header['minor']}", "level": int(header["level"])}
@@ -137,7 +139,8 @@ def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) 
         start = at + lengths + buckets
         end = start + kind.itemsize * head["room"]
         if head["count"] > head["room"] or end > size:
-            raise InputError(f"{name} ends at byte {end} of {size} with {head['count']} Gaussians")
+            found = f"has {head['count']} Gaussians, where {head['room']} fit"
+            raise InputError(f"{name} ends at byte {end} of {size}, and {found}; is the file damaged?")
         centres = ends = None
         if level:
             if head["buckets"] and head["bucket_bytes"] != BUCKET_CENTRE_BYTES:

@@ -121,8 +121,8 @@ def read_whole_numbers(path: Path, name: str) -> NDArray[np.int64]:
 def blocks(path: Path) -> Iterator[Gaussians]:
     """Yield the Gaussians in blocks of rows, in the file's order, with means in world coordinates.
 
-    `origin` of each block is the file's, for information. Non-finite values, and colours named as in
-    RGB_PROPERTY_NAMES, are not converted. Raises InputError like `read`.
+    Each block has the file's `origin`, although its means are not relative to it. Non-finite values, and colours named
+    as in RGB_PROPERTY_NAMES, are not converted. Raises InputError like `read`.
     """
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
@@ -137,7 +137,7 @@ def blocks(path: Path) -> Iterator[Gaussians]:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: encoding, comments, ignored properties, `near`, `antialiased`, `by_rays`."""
+    """Details for `clsplat info`: encoding, comments, ignored properties, `near`, `antialiased`, `by_rays`."""
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
     properties = header.vertex.properties
@@ -178,9 +178,9 @@ def write_rows(
     sh_degree: int | None = None,
     comments: Sequence[str] = (),
 ) -> None:
-    """Write as `write` does a model of `count` Gaussians, of which only some at a time are in memory.
+    """Write a model of `count` Gaussians like `write`, but with only some of them in memory at a time.
 
-    model: has the model's origin, near plane and other properties, and its SH degree.
+    model: Gaussians with the origin, near plane, SH degree and other properties of the whole model.
     rows: function that returns the Gaussians [start, stop).
     """
     check_comments(comments)
@@ -210,7 +210,7 @@ def write_rows(
             block = np.zeros((len(some), len(names)), "<f4")
             block[:, 0:3] = some.means + model.origin if far else some.means
             block[:, 6:9] = some.sh[:, 0]
-            rest = block[:, 9 : 9 + 3 * padded].reshape(len(some), 3, padded)  # a view
+            rest = block[:, 9 : 9 + 3 * padded].reshape(len(some), 3, padded)  # a view of the block
             rest[:, :, :stored] = some.sh[:, 1:].transpose(0, 2, 1)
             block[:, -8] = some.opacity_logits
             block[:, -7:-4] = some.log_scales
@@ -338,7 +338,7 @@ def _convert_colours(gaussians: Gaussians, vertex: Element) -> None:
 
 
 def _columns(gaussians: Gaussians, rest: int) -> dict[str, NDArray[Any]]:
-    """Views of the model's arrays, one for each property, by the property's name."""
+    """Views of the model's arrays by the names of the PLY properties. rest: number of f_rest properties."""
     columns: dict[str, NDArray[Any]] = {"opacity": gaussians.opacity_logits}
     arrays = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.sh[:, 0])
     for names, array in zip(

@@ -65,7 +65,7 @@ def recognises(head: bytes) -> bool:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: version and antialiasing."""
+    """Details of a file for `clsplat info`: version and antialiasing."""
     with _opened(path) as (file, meta, _):
         return {"version": meta.get("version", 1), "antialiased": _is_antialiased(file, meta)}
 
@@ -127,7 +127,10 @@ def _names(folder: Path) -> list[str]:
 
 
 def _match_case(name: str, names: Iterable[str]) -> str:
-    """`name` as spelt in `names`. Case may differ, as on Windows and macOS; without a single match, `name` itself."""
+    """Spelling of a file's name in the list `names`, which may differ in case, as Windows and macOS allow.
+
+    Returns `name` itself unless exactly one entry matches.
+    """
     names = list(names)
     alike = [other for other in names if other.lower() == name.lower()] if name not in names else []
     return alike[0] if len(alike) == 1 else name
@@ -236,6 +239,7 @@ class _Meta:
     def picture(self, section: str, index: int, channels: int, *, least: int | None = None) -> Bytes:
         """Bytes (height, width, channels) of an image.
 
+        section, index: key of meta.json, and the image's index in its list of files.
         least: required number of pixels; None requires one for each Gaussian.
         """
         names = self.section(section).get("files")
@@ -285,7 +289,7 @@ class _Meta:
         fine, coarse = (self.pixels("means", index, 3).astype(np.uint16) for index in (0, 1))
         low, high = (self.numbers("means", key, 3, 3) for key in ("mins", "maxs"))
         if not max(np.abs(low).max(), np.abs(high).max()) < 88:  # beyond 88, exp overflows float32
-            raise InputError(f"{self.path}: mins and maxs of means in {SOG_META_FILE} are too large")
+            raise InputError(f"{self.path}: mins or maxs of means in {SOG_META_FILE} are too large, expected under 88")
         folded = low + (high - low) * ((coarse << 8 | fine) / 65535)
         return (np.sign(folded) * np.expm1(np.abs(folded))).astype(np.float32)
 
@@ -293,19 +297,22 @@ class _Meta:
         if self.version == 2:
             entries = self.numbers(section, "codebook", 1, 256).astype(np.float32)
             if int(values.max()) >= len(entries):
-                raise InputError(f"{self.path}: {section} has an index {values.max()} into {len(entries)} entries")
+                found = f"the index {values.max()}, but its codebook has {len(entries)} entries"
+                raise InputError(f"{self.path}: {section} has {found}; is it damaged?")
             if section == "scales":
                 self.warn_of_nulls(entries, values)
             return entries[values]
         width = {"scales": (3, 3), "sh0": (4, 4), "shN": (1, 1)}[section]
         low, high = (self.numbers(section, key, *width)[:3] for key in ("mins", "maxs"))
         part = values / 255
-        with np.errstate(invalid="ignore"):  # infinite bounds
+        with np.errstate(invalid="ignore"):  # infinite bounds give NaN
             return packing.at_ends(low + (high - low) * part, low, high, part).astype(np.float32)
 
     def warn_of_nulls(self, entries: Float32, indices: Bytes) -> None:
-        """Warn of nulls in the codebook of scales, except at its beginning: the entries are in increasing order, so
-        that a null there stands for -inf."""
+        """Warn of nulls in the codebook of scales, except at its beginning.
+
+        The entries are in increasing order, so that nulls at the beginning stand for -inf, the log of a scale of 0.
+        """
         null = np.isinf(entries)
         if (count := int(null.sum())) and null[int((~null).argmax()) :].any():
             users = int(null[indices].any(axis=1).sum())
@@ -325,10 +332,12 @@ class _Meta:
         said = self.section("shN").get("bands") if self.version == 2 else None
         bands = next((degree for degree in range(1, MAX_SH_DEGREE + 1) if degree * (degree + 2) == width), 0)
         if table.shape[1] % PALETTE_COLUMNS or not bands or said not in (None, bands):
-            raise InputError(f"{self.path}: shN's palette is {table.shape[1]} pixels wide for {str(said)[:20]} bands")
+            found = f"{table.shape[1]} pixels wide for {'unstated' if said is None else str(said)[:20]} bands"
+            expected = ", ".join(f"{PALETTE_COLUMNS * d * (d + 2)} for {d}" for d in range(1, MAX_SH_DEGREE + 1))
+            raise InputError(f"{self.path}: shN's palette is {found}, expected {expected}")
         colours = table.reshape(-1, width, 3)
         if needed > len(colours):
-            raise InputError(f"{self.path}: shN has an index {needed - 1} into a palette of {len(colours)}")
+            raise InputError(f"{self.path}: shN has the index {needed - 1}, but its palette has {len(colours)} entries")
         return np.asarray(self.dequantised("shN", colours)[label])
 
 
@@ -367,14 +376,15 @@ def write(
                 path.with_name(name).unlink(missing_ok=True)
             return
         total = sum(picture.stat().st_size for picture in files)
-        with atomic_writer(path, total) as file, zipfile.ZipFile(file, "w") as archive:  # uncompressed, like WebP
+        # the archive is uncompressed, since WebP files would hardly shrink
+        with atomic_writer(path, total) as file, zipfile.ZipFile(file, "w") as archive:
             archive.writestr(zipfile.ZipInfo(SOG_META_FILE), text)
             for picture in files:
                 archive.writestr(zipfile.ZipInfo(picture.name), picture.read_bytes())
 
 
 def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int, progress: Progress) -> dict[str, Any]:
-    """Write the images, and return the contents of meta.json."""
+    """Write a model's images to a folder, and return the contents of meta.json. order: Gaussian of each pixel."""
     count = len(gaussians)
     width = 4 * math.ceil(math.sqrt(count) / 4)
     height = 4 * math.ceil(count / width / 4)
@@ -453,7 +463,7 @@ def _write_webp(path: Path, pixels: Bytes) -> None:
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
     spec.attribute("compression", "lossless")
-    spec.attribute("oiio:UnassociatedAlpha", 1)  # otherwise colours would be divided by alpha
+    spec.attribute("oiio:UnassociatedAlpha", 1)  # so that OpenImageIO does not divide colours by alpha
     name = native_name(path)
     output = oiio.ImageOutput.create(name)
     if output is None or not output.open(name, spec) or not output.write_image(pixels) or not output.close():

@@ -34,7 +34,11 @@ SPLAT_RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1
 
 
 def read(path: Path) -> Gaussians:
-    """Read a .splat file. Raises InputError for an empty file, a partial record, or a few negative scales."""
+    """Read a .splat file.
+
+    Raises InputError for an empty file, a partial record, or negative scales of a few Gaussians
+    (`values.all_to_log_scales`).
+    """
     with open_input(path, "a .splat file") as file:
         size = os.fstat(file.fileno()).st_size
         count, over = divmod(size, SPLAT_RECORD.itemsize)

@@ -47,7 +47,7 @@ SPZ_VERSIONS = (2, 3, 4)
 DEFAULT_SPZ_VERSION = 3
 """Version that most web readers accept (docs/formats.md). Niantic's library and splat-transform write 4."""
 DEFAULT_SH_BITS = (6, 6)
-"""Bits to which SH are rounded, in band 1 and in the higher bands. The file does not record them.
+"""Numbers of bits to which SH coefficients are rounded: in band 1, and in the higher bands. Files do not record them.
 
 Niantic's library keeps 5 and 4 bits. Its files are a fifth smaller, but renders of a trained model with strong view
 dependence are 11 dB worse, at 36 dB (docs/formats.md).
@@ -68,6 +68,13 @@ SQRT_HALF = 0.5**0.5
 
 @dataclass(frozen=True)
 class SpzHeader:
+    """Header of an SPZ file.
+
+    degree: SH degree.
+    fractional_bits: bits after the point of positions.
+    streams, table: number of Zstandard streams, and byte offset of their table; 0 before version 4.
+    """
+
     version: int
     count: int
     degree: int
@@ -96,7 +103,7 @@ def recognises(head: bytes) -> bool:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: version, fractional bits and antialiasing."""
+    """Details of a file for `clsplat info`: version, fractional bits and antialiasing."""
     with open_input(path, "an SPZ file") as file:
         header, _ = _open(file, os.fstat(file.fileno()).st_size, path)
     antialiased = bool(header.flags & ANTIALIASED_FLAG)
@@ -137,7 +144,7 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
 
 
 def _open(file: BinaryIO, size: int, path: Path) -> tuple[SpzHeader, Any]:
-    """The header, and for versions 2 and 3 the stream that continues after it; None for version 4."""
+    """Read a file's header. Also returns the stream that continues after it in versions 2 and 3; None in version 4."""
     head = file.read(32)
     if head[:4] == SPZ_MAGIC and head[4:8] == struct.pack("<I", 4):
         if len(head) < 32:
@@ -321,7 +328,7 @@ def write(
 ) -> None:
     """Write an SPZ file, atomically; equal Gaussians give equal bytes.
 
-    fractional_bits: number of fractional bits of positions; None as in `header_for`.
+    fractional_bits: number of fractional bits of positions; None lets `header_for` choose it.
     sh_bits: bits of band 1 and of the higher bands, 1 to 8.
     Means are relative to the world's origin, and lose precision far from it. Raises InputError for non-finite values,
     and for positions that are too large. Raises ValueError for settings out of range.
@@ -337,8 +344,8 @@ def write(
 def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: int | None = None) -> SpzHeader:
     """Header for `write_to`. The model must have at least one Gaussian.
 
-    fractional_bits: None for 12, as in Niantic's library, or more for a small model (measured without its farthest 1 %
-      of Gaussians), or fewer if the positions would not fit.
+    fractional_bits: None chooses 12, as Niantic's library does, but fewer if the positions would not fit, and more for
+      a small model. The model's size is measured without its farthest 1 % of Gaussians.
     Raises InputError if the positions do not fit.
     """
     low, high = (
@@ -367,7 +374,7 @@ def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: 
 def write_to(
     file: BinaryIO, gaussians: Gaussians, header: SpzHeader, sh_bits: tuple[int, int] = DEFAULT_SH_BITS
 ) -> None:
-    """Write an SPZ file at the current position of a seekable file."""
+    """Write an SPZ file at the current position of a seekable file. header: from `header_for`."""
     if header.version < 4:
         fields = (header.version, header.count, header.degree, header.fractional_bits, header.flags, 0)
         with gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=6, mtime=0) as stream:

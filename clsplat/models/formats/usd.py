@@ -45,7 +45,7 @@ USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 """File name extensions of USD stages."""
 GAUSSIAN_PRIM_TYPE = "ParticleField3DGaussianSplat"
 GAUSSIAN_PRIM_TYPES = (GAUSSIAN_PRIM_TYPE, "ParticleField_3DGaussianSplat")
-"""Type names of prims with Gaussians. The second is from a draft of the schema and in Nuke 17.0."""
+"""Type names of prims with Gaussians. The second is that of a draft of the schema, which Nuke 17.0 uses."""
 SH_COEFFICIENTS_ATTRIBUTE, SH_DEGREE_ATTRIBUTE = (
     "radiance:sphericalHarmonicsCoefficients",
     "radiance:sphericalHarmonicsDegree",
@@ -69,11 +69,12 @@ def recognises(head: bytes) -> bool:
 
 
 def survive(path: Path, call: str = "clsplat.models.formats.usd:read_here", **arguments: Any) -> None:
-    """Read a USD file in another process. Raises InputError if that crashes, or if usd-core or the file is missing.
+    """Test in another process that USD's library does not crash on a file.
 
-    A damaged file can crash USD's library, by invalid offsets or a stack overflow. Safe text files are not tried.
+    A damaged file can crash the library, by invalid offsets or a stack overflow. Text files that cannot crash it are
+    not tested. Raises InputError if the process crashes, or if usd-core or the file is missing.
 
-    call: MODULE:FUNCTION to run in that process, with the path and `arguments`.
+    call: MODULE:FUNCTION that the process calls with the path and `arguments`.
     """
     _require_pxr(path)
     with open_input(path, "a USD stage") as file:
@@ -108,7 +109,7 @@ def _lives(call: str, arguments: str, path: str, *_: int) -> bool:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: the stage's up axis and unit, which do not change the model."""
+    """Details of a file for `clsplat info`: the stage's up axis and unit, which do not change the model."""
     survive(path)
     stage = _open(path)
     from pxr import UsdGeom
@@ -135,7 +136,7 @@ def open_stage(path: Path, name: str | Path, *load: Any) -> Any:
     with suppress(Tf.ErrorException):
         if stage := Usd.Stage.Open(native_name(name), *load):
             return stage
-    raise InputError(f"{path}: cannot be opened as a USD stage; usdchecker may know why")
+    raise InputError(f"{path}: cannot be opened as a USD stage; run usdchecker to find out why")
 
 
 def _open(path: Path) -> Any:
@@ -160,7 +161,7 @@ def read(path: Path) -> Gaussians:
 
 
 def read_here(path: Path) -> Gaussians:
-    """Read a stage like `read`, in this process. A damaged file may crash it (`survive`)."""
+    """Read a stage like `read`, but without the test of `survive`: a damaged file may crash the process."""
     stage = _open(path)
     from pxr import Usd
 
@@ -178,7 +179,7 @@ def read_here(path: Path) -> Gaussians:
                 read[own] = gaussians_of(where, place.prim, time, space)
             parts.append(axes.place(read[own], matrix, where))
     if not parts:
-        raise InputError(f"{path}: shows none of its instances at its first time, expected at least one")
+        raise InputError(f"{path}: shows no instance of its Gaussians at its first time code, expected at least one")
     return merge(parts)
 
 

@@ -28,7 +28,7 @@ from clsplat.errors import InputError
 MAX_PLACED_PRIMS = 1_000_000
 """Largest number of placements in a stage. More are a mistake or an attempt to exhaust memory."""
 _MAX_CACHED_TIMES = 16
-"""Number of times for which an instancer's transforms are cached."""
+"""Largest number of time codes for which an instancer's transforms are cached."""
 _TRANSFORM_ATTRIBUTES = ("positions", "orientations", "orientationsf", "scales")
 _VELOCITY_ATTRIBUTES = ("velocities", "angularVelocities")
 _MEMBERSHIP_ATTRIBUTES = ("protoIndices", "ids", "invisibleIds")
@@ -87,7 +87,7 @@ class UsdPlacement:
 
 @dataclass(frozen=True, eq=False)
 class PointInstance:
-    """An instance of a prototype.
+    """An instance of a prototype in a PointInstancer.
 
     root: the prim of the prototype.
     """
@@ -182,7 +182,7 @@ class Instancer:
         return places, frozenset(hidden)
 
     def _own(self, code: Any) -> list[Any]:
-        """USD's matrices of the instances relative to the instancer. Empty if its arrays have different lengths.
+        """USD's matrices of the instances relative to the instancer. Empty if the instancer's arrays differ in length.
 
         Rotations come from the quaternions, as for xformOp:orient. USD's ComputeInstanceTransformsAtTime shears if a
         quaternion's length is not exactly 1, as with half floats.
@@ -220,7 +220,7 @@ class Instancer:
                 f"{len(self.roots)} prototypes"
             )
         ids = [int(number) for number in self._instancer.GetIdsAttr().Get(code) or ()]
-        if len(ids) != len(indices) or len(set(ids)) != len(ids):  # USD ignores such ids too
+        if len(ids) != len(indices) or len(set(ids)) != len(ids):  # as USD does, ignore ids that are not unique
             ids = list(range(len(indices)))
         return dict.fromkeys(zip(ids, indices, strict=True))
 
@@ -242,7 +242,7 @@ class Instancer:
 
 @dataclass
 class _StageFindings:
-    """Results of a walk through a stage.
+    """Prims with Gaussians, and prims that are not drawn, which a traversal of a USD stage has found.
 
     where: prefix of errors.
     kinds: type names of prims with Gaussians.
@@ -307,8 +307,8 @@ class _StageFindings:
 def find_places(stage: Any, where: object, kinds: Collection[str]) -> tuple[list[UsdPlacement], list[str]]:
     """Placements of all prims of the types `kinds`, in the stage's order, and descriptions of prims that are not drawn.
 
-    The latter are prims that another USD renderer would draw, or that refer to a file that cannot be opened. Raises
-    InputError, prefixed with `where`.
+    Prims that are not drawn are those that another USD renderer would draw, and those that refer to a file that cannot
+    be opened. Raises InputError, prefixed with `where`.
     """
     from pxr import Usd
 
@@ -382,7 +382,7 @@ def _local(prim: Any, code: Any) -> Any:
 
 
 def _turn_of(matrix: Any, scales: Any) -> Any:
-    """The rotation nearest to USD's matrix divided by the scales, which may have a slight shear."""
+    """The rotation nearest to USD's matrix after division by the scales; the quotient may have a slight shear."""
     from pxr import Gf
 
     rows = np.array(matrix)[:3, :3] / np.array(scales, np.float64)[:, None]

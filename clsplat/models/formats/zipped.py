@@ -26,7 +26,7 @@ from clsplat.gaussians import Gaussians
 MAX_ARCHIVE_FILES = 100_000
 MAX_UNCHECKED_UNPACKED_BYTES = 64 << 20
 MAX_UNPACK_RATIO = 100
-"""An archive may unpack to MAX_UNCHECKED_UNPACKED_BYTES, or to this many bytes for each of its bytes if that is more.
+"""Largest ratio of unpacked to packed bytes of an archive. Up to MAX_UNCHECKED_UNPACKED_BYTES, any ratio is allowed.
 
 The ratio of a PLY whose spherical harmonics are all 0 is about 5. A decompression bomb reaches deflate's limit, 1032.
 """
@@ -46,10 +46,11 @@ def recognises(head: bytes) -> bool:
 
 @dataclass(frozen=True)
 class ZipReader:
-    """Reads the model in a zip archive. Its functions come from the table of formats, which has a row for archives.
+    """Reads the model in a zip archive. Its functions are passed in, since they use the table of formats, which imports
+    this module.
 
     is_model_name(path): True if a file has the name of a model.
-    has_gaussians(path, head): True if the first bytes of such a file show Gaussians.
+    has_gaussians(path, head): True if `head`, the first bytes of a file with a model's name, shows Gaussians.
     resolve(path): the model's file and its `Format`.
     """
 
@@ -70,7 +71,7 @@ class ZipReader:
         return gaussians
 
     def describe(self, path: Path) -> dict[str, Any]:
-        """The model's part of `clsplat info`, including its format and what the format loses."""
+        """Details of the model for `clsplat info`, including its format and what the format loses."""
         with self.model(path) as (file, row):
             return {"format": f"{row.name} in a .zip", "loses": row.loses, **row.describe(file)}
 
@@ -176,7 +177,7 @@ def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo, folder: Path) -> 
 
 
 def _renamed(model: Path, name: str) -> Iterator[Path]:
-    """Yield the model's path. Warnings and InputErrors raised meanwhile show `name` instead of that path."""
+    """Yield a model's path, and replace it by `name` in the warnings and InputErrors of the code that uses it."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readers of camera files."""
+"""Readers of camera files: cameras.json, clsplat's own JSON, nerfstudio's camera_path.json and USD stages."""

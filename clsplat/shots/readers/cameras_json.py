@@ -22,14 +22,15 @@ from clsplat.scenes.camera_json import Keys, short
 from clsplat.shots.shot import MAX_SHOT_FRAMES, Frame, Shot
 
 CAMERAS_JSON_NAME = "cameras.json"
-"""Name of the file in a training's output folder."""
+"""Name of the cameras' file in the output folder of a 3DGS training."""
 CAMERAS_JSON_ROTATION_TOLERANCE = 1e-2
 """Largest deviation of a rotation's axes from right angles and unit length."""
 
 
 def read_cameras_json(path: Path, entries: list[Any], size: tuple[int | None, int | None]) -> Shot:
-    """Read frames numbered from 1, one for each entry, named by `img_name`.
+    """Read a cameras.json: a frame for each entry, numbered from 1 and named by `img_name`.
 
+    entries: the file's parsed list.
     size: width and height for entries that have none.
     In a Blender scene two frames may share a name, as training and test pictures do. Raises InputError, naming the file
     and the entry, for a list of other values, and for missing or invalid values.
@@ -89,7 +90,7 @@ def _camera(keys: Keys, size: tuple[int | None, int | None]) -> Camera:
 
 
 def _rotation(keys: Keys) -> Float64:
-    """`cam_from_world` (3, 3)."""
+    """Rotation (3, 3) of `cam_from_world`, made exactly orthogonal. Raises InputError if it is no rotation."""
     rows = numbers(keys.frame["rotation"])
     if rows.shape != (3, 3) or not np.isfinite(rows).all():
         raise keys.wrong("rotation", "three rows of three numbers")

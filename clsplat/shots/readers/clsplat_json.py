@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""clsplat's own camera files: key frames in JSON, described in docs/cameras.md."""
+"""Reader of clsplat's own camera files: key frames of a camera in JSON, described in docs/cameras.md."""
 
 from __future__ import annotations
 
@@ -39,7 +39,9 @@ KEY_FRAME_PROPERTIES = ("frame", "seconds", "position", "world_from_cam", *LENS_
 
 
 def read_keyed(path: Path, document: dict[str, Any]) -> Shot:
-    """Read the whole-numbered frames from the first key to the last, or one period of the loop, smoothly interpolated.
+    """Read a camera file: one frame for each whole number from the first key to the last, or for one period of a loop.
+
+    Cameras are interpolated smoothly between the keys (`interpolate`).
 
     Raises InputError, naming the file and the key, for another version, no keys, an unknown name, and missing or
     invalid values.
@@ -77,12 +79,13 @@ def _known(where: str, values: dict[str, Any], names: tuple[str, ...]) -> None:
 def _frame(keys: Keys, fps: float | None, first: float) -> float:
     frame, seconds = keys.frame.get("frame"), keys.frame.get("seconds")
     if (frame is None) == (seconds is None):
-        raise InputError(f"{keys.where}: expected either 'frame' or 'seconds'")
+        found = "neither" if frame is None else "both"
+        raise InputError(f"{keys.where}: has {found}, expected either 'frame' or 'seconds'")
     if frame is not None:
         return keys.require("frame")
     if fps is None:
         raise InputError(f"{keys.where}: has 'seconds', but the file has no 'fps', expected frames per second")
-    return round(first + keys.require("seconds") * fps, 6)  # so that 0.1 s at 30 fps is frame 3
+    return round(first + keys.require("seconds") * fps, 6)  # so that 0.1 s at 30 fps is exactly frame 3
 
 
 def _frames(path: Path, frames: list[float], loop: float | None) -> list[int]:

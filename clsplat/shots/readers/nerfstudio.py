@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""nerfstudio's camera_path.json, as its viewer and its Blender add-on write it: one camera per frame.
+"""Reader of nerfstudio's camera_path.json, as its viewer and its Blender add-on write it: one camera per frame.
 
 Formulas follow nerfstudio's `get_path_from_json`. Pixels are square, the principal point is the picture's centre, and
-`fov` is the vertical field of view in degrees. A fisheye's focal length follows from `fov` as a perspective camera's
-does.
+`fov` is the vertical field of view in degrees. A fisheye's focal length is computed from `fov` by the formula for
+perspective cameras.
 """
 
 from __future__ import annotations

@@ -33,8 +33,8 @@ SUPPORTED_PROJECTIONS = names_of("usd")
 
 
 def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), prim: str | None = None) -> Shot:
-    """Read the frames of a stage's camera, from the stage's start to its end time code. Without these, the frames span
-    the time samples.
+    """Read the frames of a stage's camera, from the stage's start to its end time code. If the stage has none, they go
+    from the first time sample to the last.
 
     The frame rate is the stage's timeCodesPerSecond; USD uses framesPerSecond if only that is authored. Each
     frame has the shutter and the lens of its time code. `Shot.moment` gives the camera at any time, with USD's own
@@ -53,7 +53,7 @@ def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), pri
 
 
 def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), prim: str | None = None) -> Shot:
-    """`read_usd` for a file that is known not to crash USD's library."""
+    """Read cameras like `read_usd`, from a file that is known not to crash USD's library."""
     from pxr import UsdGeom, UsdUtils
 
     # captures the messages that USD would print: an unresolved layer may not concern the camera
@@ -73,7 +73,7 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
 
         def moment(time: float) -> Camera:
             with readable(path):
-                prim = UsdGeom.Camera(stage.GetPrimAtPath(place))  # the stage has to live as long as this function
+                prim = UsdGeom.Camera(stage.GetPrimAtPath(place))  # the reference to the stage keeps it open
                 return _camera(f"{where} at {time:g}", prim, time, picture, settings)
 
         frames = numbered(map(moment, codes), codes[0], None if len(codes) == 1 or per_second <= 0 else per_second)
@@ -85,7 +85,7 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
         )
     lost = () if known or not asked else (f"camera ({asked}, which does not exist)",)
     unapplied = (*_unapplied(camera, codes), *settings.unapplied, *lost)
-    # the end of the line is cut, where USD prints the stage's address in memory
+    # cut the line's end, where USD prints the stage's address in memory
     lines = [message.commentary.split(" (instantiating")[0] for message in diagnostics.TakeUncoalescedDiagnostics()]
     warnings = tuple(f"{path}: USD says: {' '.join(line.split())}" for line in lines[:3])
     moved = [time for source in _moved(camera) for time in source.GetTimeSamples()]
@@ -161,7 +161,7 @@ def _find(path: Path, cameras: list[Any], prim: str | None) -> Any:
 
 
 def _moved(camera: Any) -> Iterator[Any]:
-    """The camera and its ancestors, if they can have a transform."""
+    """Yield the camera and those of its ancestors that can have a transform."""
     from pxr import UsdGeom
 
     prim = camera.GetPrim()
@@ -174,8 +174,8 @@ def _moved(camera: Any) -> Iterator[Any]:
 def _time_codes(where: str, stage: Any, camera: Any) -> tuple[list[int], tuple[float, ...]]:
     """Whole time codes to render, and the times of all values of the camera or of an ancestor's transform.
 
-    The codes are the stage's range, or go from the first of these times to the last if it has none. The values at all
-    of these times are read once, to find those that USD cannot read.
+    The codes are the stage's range. If it has none, they go from the first time that has a value to the last. All
+    values are read once, to find those that USD cannot read.
     """
     attributes = camera.GetPrim().GetAttributes()
     ops = [op for moved in _moved(camera) for op in moved.GetOrderedXformOps()]
@@ -253,7 +253,7 @@ def _check_turns(where: str, camera: Any, code: float) -> None:
 
 
 def _pose(where: str, camera: Any, code: float) -> tuple[Float64, Float64, float]:
-    # USD's vectors are rows, so its matrices are the transposes of ours
+    # USD multiplies row vectors: its matrices are transposes of clsplat's
     matrix = np.array(camera.ComputeLocalToWorldTransform(code), np.float64).T
     return opengl_pose(matrix, where, "transform")
 

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Render settings of USD stages: picture size, pixel aspect ratio, and how a camera's aperture is conformed to
-these."""
+"""Render settings of USD stages: picture size, pixel aspect ratio, and how a camera's aperture is adapted to them."""
 
 from __future__ import annotations
 
@@ -43,14 +42,14 @@ class Settings:
     unapplied: tuple[str, ...] = ()
 
     def aspect(self, aperture: tuple[float, float]) -> float:
-        """Ratio of width to height, in pixels, of a picture with only one given side."""
+        """Ratio of width to height in pixels, for a picture of which the user gives only one side."""
         if self.resolution is not None:
             return self.resolution[0] / self.resolution[1]
         pixels = 1.0 if self.policy == "adjustPixelAspectRatio" else self.pixel_aspect
         return aperture[0] / aperture[1] / pixels
 
     def conformed(self, aperture: tuple[float, float], size: tuple[int, int]) -> tuple[float, float]:
-        """Width and height of the aperture that a picture of this size in pixels shows, with the same centre."""
+        """Width and height of the camera's aperture after it is adapted to a picture of `size` pixels by `policy`."""
         across, down = aperture
         wanted = size[0] * self.pixel_aspect / size[1]
         if self.policy == "adjustPixelAspectRatio":
@@ -82,7 +81,7 @@ def camera_of_settings(stage: Any) -> str:
 
 
 def read_settings(path: Path, stage: Any, camera: Any) -> Settings:
-    """Read the render settings that the stage's metadata name, with the first product of this camera taking precedence.
+    """Read the render settings that the stage's metadata name. The first product of the camera overrides them.
 
     Raises InputError, naming the prim, for invalid values.
     """
@@ -124,7 +123,7 @@ def _stage_settings(stage: Any) -> Any:
 
 
 def _unnamed(stage: Any) -> tuple[str, ...]:
-    """At most three render settings that the stage's metadata do not point to, for a warning."""
+    """Names, for a warning, of at most three render settings that the stage's metadata do not point to."""
     from pxr import UsdRender
 
     paths = [str(prim.GetPath()) for prim in stage.Traverse() if prim.IsA(UsdRender.Settings)]
@@ -142,7 +141,7 @@ def _products(settings: Any) -> list[Any]:
 
 
 def _authored(prims: list[Any], name: str) -> Any:
-    """The attribute of the first prim with an authored value, else the last prim's attribute."""
+    """The attribute `name` of the first prim that has an authored value for it, else the last prim's attribute."""
     attributes = [prim.GetAttribute(name) for prim in prims]
     return next((attribute for attribute in attributes if attribute.HasAuthoredValue()), attributes[-1])
 

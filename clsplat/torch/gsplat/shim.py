@@ -177,7 +177,7 @@ def _make_package() -> list[str]:
         for ours in given:
             places = {home, "gsplat"} | ({home.rpartition(".")[0]} if "optimizers" in home else set())
             if ours is compute_relocation:
-                places.discard("gsplat")  # gsplat's top-level package does not have it
+                places.discard("gsplat")  # gsplat's top-level package lacks the function
             for place in places:
                 setattr(sys.modules[place], ours.__name__, ours)
                 names.append(f"{place}.{ours.__name__}")
