@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Masks and known depths of a scene's photographs."""
+"""Supervision beside colour: masks and known depths of a scene's photographs."""
