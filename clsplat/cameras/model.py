@@ -223,7 +223,12 @@ class CameraModel:
     def mean_grad(
         self, view: Intrinsics, points: Float64, plane: PlaneProjection, d_jacobian: Float64, d_means2d: Float64
     ) -> Float64:
-        """Return the gradient (N, 3) in the points, from the gradients in their Jacobians and image positions."""
+        """Return the gradient (N, 3) with respect to the points.
+
+        plane: the points' result of `projected`.
+        d_jacobian: (N, 2, 3), gradient with respect to the Jacobians.
+        d_means2d: (N, 2), gradient with respect to the positions in the image, in pixels.
+        """
         raise NotImplementedError(self.projection)
 
     # Methods for models with RAYS, which draw Gaussians on planes tangent to the sphere of directions.
@@ -237,7 +242,7 @@ class CameraModel:
         raise NotImplementedError(self.projection)
 
     def low_pass_grad(self, view: Intrinsics, directions: Float64, gradients: Float64, low_pass: float) -> Float64:
-        """Return the gradient (N, 2) in the mean's direction through the low-pass: B of eqs. (26) to (28).
+        """Return the gradient (N, 2) with respect to the mean's direction, through the low-pass: B of (26) to (28).
 
         The gradient's components are along the tangent plane's axes.
 

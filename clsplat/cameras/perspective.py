@@ -62,9 +62,9 @@ class Perspective(CameraModel):
     def mean_grad(
         self, view: Intrinsics, points: Float64, plane: PlaneProjection, d_jacobian: Float64, d_means2d: Float64
     ) -> Float64:
-        """Return the gradient (N, 3) in the points: eqs. (36), (37) of docs/gradients.md."""
+        """Return the gradient (N, 3) with respect to the points: eqs. (36), (37) of docs/gradients.md."""
         x, y, z = points.T
-        # (36): gradient through the Jacobian, in z and in the ratios. A clamped ratio does not depend on the mean.
+        # (36): gradient with respect to z and the ratios, through the Jacobian. A clamped ratio is constant.
         d00, d02, d11, d12 = d_jacobian[:, 0, 0], d_jacobian[:, 0, 2], d_jacobian[:, 1, 1], d_jacobian[:, 1, 2]
         d_z = (-view.fx * d00 + view.fx * plane.ratios[:, 0] * d02) / z**2
         d_z += (-view.fy * d11 + view.fy * plane.ratios[:, 1] * d12) / z**2

@@ -62,10 +62,10 @@ CHROMATICITIES: dict[str, tuple[float, ...]] = {
 }
 """Chromaticities x and y of red, green, blue and white of linear spaces, for EXR files.
 
-AP1 and AP0 follow SMPTE ST 2065-1 and the Academy's S-2014-004, the others their own standards.
+ACEScg and ACES2065-1 follow the Academy's S-2014-004 and SMPTE ST 2065-1, the others their own standards.
 """
 MAX_PLY_LINE_BYTES = 1 << 20
-"""Longest line, in bytes, at which the search in a PLY's header goes on."""
+"""Longest header line of a PLY in bytes. A longer line ends the search for the colour space."""
 _LINEAR_PHOTO_SUFFIXES = (".exr", ".hdr")
 
 
@@ -214,7 +214,7 @@ class Colours:
             if self._config.getColorSpaceIndex(self._config.resolve(name)) >= 0:
                 return str(self._config.resolve(name))
         raise InputError(
-            f"{self._source}: has none of {', '.join(_SPACE_ALIASES[space])}, expected one to convert through"
+            f"{self._source}: has none of {', '.join(_SPACE_ALIASES[space])}, expected one of them for conversions"
         )
 
     def convert(self, rgb: Float32, alpha: Float32 | None, source: str, target: str) -> Float32:
@@ -267,7 +267,10 @@ class Colours:
 
 
 def configuration_digest(source: str) -> str:
-    """Return the SHA-256 digests of an OpenColorIO file and of the tables it names; `source` itself if no file."""
+    """Return the SHA-256 digests of an OpenColorIO file and of the tables that it names.
+
+    Returns `source` itself if it is not a file.
+    """
     if not source or not is_file(source):
         return source
     patterns = _table_patterns(source, Path(source).stat().st_mtime_ns)
@@ -276,7 +279,7 @@ def configuration_digest(source: str) -> str:
 
 
 @lru_cache(maxsize=8)
-def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG001  # a cache key
+def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG001  # `changed` is a key of the cache
     """Return glob patterns of the files that a configuration's FileTransforms name, in its search_path's folders.
 
     Environment variables in the names become "*".

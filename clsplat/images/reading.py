@@ -285,7 +285,7 @@ def open_image(path: Path) -> Any:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """Yield OpenImageIO's input of a file, or None if it is not an image; a context manager. Discards its errors."""
+    """Open a file as a context manager: OpenImageIO's input, or None if it is not an image. Errors are discarded."""
     source = oiio.ImageInput.open(native_name(path))
     try:
         yield source

@@ -96,7 +96,7 @@ def read_stmap(path: Path) -> StMap:
 
 
 @lru_cache(maxsize=2)
-def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # a cache key: a changed file is read again
+def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # `changed` is a key of the cache
     source = open_image(path)
     spec = source.spec()
     names = [name.upper() for name in spec.channelnames]

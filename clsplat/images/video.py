@@ -297,7 +297,7 @@ class VideoWriter:
 
     @contextmanager
     def _refusals(self) -> Iterator[None]:
-        """Convert FFmpeg's errors in the block: to OSError for a full disk or a too large file, else ClsplatError."""
+        """Convert FFmpeg's errors in the block to OSError (disk full or file too large) or ClsplatError."""
         import av
 
         try:
@@ -321,5 +321,5 @@ class VideoWriter:
     def close(self) -> None:
         """Close the file, complete or not."""
         if self._container is not None:
-            with suppress(Exception):  # The container is closed after success; after a failure the cause is known.
+            with suppress(Exception):  # After a failure, an error in closing would hide the error that caused it.
                 self._container.close()

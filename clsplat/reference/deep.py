@@ -36,10 +36,14 @@ class Deep:
 
 
 class _Cut:
-    """Cuts layers, taken front to back, into slices: eq. (73).
+    """Cuts each pixel's layers, taken front to back, into slices: eq. (73).
 
-    slack: (H, W), s of each pixel.
+    slack: (H, W), the slack s of each pixel.
     whole: (H, W), transmittance before the first layer.
+    open: (H, W), transmittance before the current slice.
+    placed: (H, W), True if the current slice has its depth.
+    count: (H, W), number of slices.
+    margin: (H, W), as in `Deep`.
     """
 
     def __init__(self, slack: Float64, whole: Float64) -> None:

@@ -13,16 +13,16 @@ from clsplat.camera import Camera
 
 
 def depth_loss(nearness: Float64, aims: Float64, weights: Float64, factor: float) -> tuple[float, Float64]:
-    """Return the depth loss, `factor` times the weighted sum of |nearness - aims|, and its gradient in nearness.
+    """Return the depth loss and its gradient with respect to nearness: eq. (121) of docs/gradients.md.
 
-    Arrays are (H, W). Eq. (121) of docs/gradients.md.
+    The loss is `factor` times the weighted sum of |nearness - aims|. Arrays are (H, W).
     """
     difference = weights * (nearness - aims)
     return float(factor * np.abs(difference).sum()), factor * weights * np.sign(difference)
 
 
 def nearness_grad(means: Float64, camera: Camera, d_nearness: Float64) -> Float64:
-    """Return the gradient (N, 3) with respect to the means: eq. (122) of docs/gradients.md.
+    """Return the gradient (N, 3) of a loss with respect to the means, through nearness: (122) of docs/gradients.md.
 
     d_nearness: (N,), the gradient with respect to 1 / depth, or to 1 / distance for camera models along rays.
     """

@@ -32,6 +32,9 @@ def thinned_logits(opacity_logits: Float64, by: Float64) -> Float64:
 
 
 def logit_grad(opacity_logits: Float64, by: Float64, gradient: Float64) -> Float64:
-    """Return the gradient in the original logits, from the gradient in the `thinned_logits`: eq. (101)."""
+    """Return the gradient with respect to the original logits: eq. (101).
+
+    gradient: (n,), the gradient with respect to `thinned_logits`.
+    """
     opacities = 1 / (1 + np.exp(-opacity_logits))
     return np.where(by > 0, gradient * (1 - opacities) / (1 - by * opacities), 0.0)

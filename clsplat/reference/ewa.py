@@ -110,7 +110,10 @@ def covariances_of(quaternions: Float64, scales: Float64) -> Float64:
 
 
 def covariances_grad(quaternions: Float64, scales: Float64, gradients: Float64) -> tuple[Float64, Float64]:
-    """Return gradients in quaternions (N, 4) and scales (N, 3) from symmetric gradients in covariances (N, 3, 3)."""
+    """Return gradients with respect to quaternions (N, 4) and scales (N, 3).
+
+    gradients: (N, 3, 3), symmetric, with respect to the covariances.
+    """
     rotations = rotations_of(quaternions)
     d_m = 2 * gradients @ (rotations * scales[:, None, :])
     d_scales = (rotations * d_m).sum(axis=1)
@@ -138,7 +141,10 @@ def full_covariances(upper: Float64) -> Float64:
 
 
 def upper_gradients(full: Float64) -> Float64:
-    """Return gradients (N, 6) in upper triangles from symmetric gradients (N, 3, 3); off-diagonals count twice."""
+    """Return gradients (N, 6) with respect to upper triangles, whose off-diagonals count twice.
+
+    full: (N, 3, 3), the symmetric gradients with respect to full matrices.
+    """
     return np.asarray(full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]] * np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0]), np.float64)
 
 
@@ -256,10 +262,12 @@ def _pinhole_grad(
     d_means2d: Float64,
     d_j: Float64,
 ) -> tuple[Float64, Float64, Float64]:
-    """Return a pinhole camera's gradients with respect to points (N, 3), focal lengths (2,) and clamp limits.
+    """Return a pinhole camera's gradients as `_fisheye_grad`, and a correction (2,) of the principal point's gradient.
 
-    The third result (2,) is what clamped means subtract from the principal point's gradient. Arguments are those of
-    `EwaProjectedTwin`, and gradients as in `_fisheye_grad`.
+    The correction is to be subtracted. It comes from means that are clamped in the Jacobian.
+
+    points, jacobians, clamped: rows of `EwaProjectedTwin`.
+    d_means2d, d_j: as in `_fisheye_grad`.
     """
     z = points[:, 2]
     jx, jy = jacobians[:, 0, 0], jacobians[:, 1, 1]

@@ -12,7 +12,10 @@ LUMINANCE_WEIGHTS = np.array([0.299, 0.587, 0.114])
 
 
 def identity(shape: tuple[int, int, int]) -> Float64:
-    """Return the identity: a grid (levels, rows, columns, 3, 4) that changes no colour. shape: the first three."""
+    """Return the identity: a grid (levels, rows, columns, 3, 4) that changes no colour.
+
+    shape: number of levels, rows and columns.
+    """
     return np.broadcast_to(np.eye(3, 4), (*shape, 3, 4)).copy()
 
 
@@ -47,7 +50,10 @@ def apply(image: Float64, grid: Float64) -> Float64:
 
 
 def gradient(image: Float64, grid: Float64, by_seen: Float64) -> tuple[Float64, Float64]:
-    """Return gradients in the image and in the grid, from the gradient by_seen (H, W, 3) in the transformed image."""
+    """Return gradients with respect to the image and the grid.
+
+    by_seen: (H, W, 3), the gradient with respect to the transformed image.
+    """
     down, along, levels, slopes = _weights(image, grid.shape[:3])
     whole = np.concatenate([image, np.ones_like(image[..., :1])], axis=-1)
     by_grid: Float64 = np.einsum("yj,xi,yxl,yxa,yxb->ljiab", down, along, levels, by_seen, whole, optimize=True)

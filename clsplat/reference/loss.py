@@ -59,7 +59,7 @@ def ssim(x: Float64, y: Float64) -> tuple[Float64, Float64]:
 
 
 def l1_dssim(x: Float64, y: Float64, weight: float = 0.2) -> tuple[float, Float64]:
-    """Return the loss of a render x against a photograph y, both (H, W, C), and its gradient in x: eq. (19).
+    """Return the loss of a render x against a photograph y, (H, W, C), and its gradient with respect to x: eq. (19).
 
     The loss is (1 - weight) mean |x - y| + weight (1 - mean SSIM), with means over pixels and channels.
     """
@@ -82,9 +82,9 @@ def masked_l1_dssim(x: Float64, y: Float64, counts: Float64, weight: float = 0.2
 
 
 def alpha_loss(transmittance: Float64, alpha: Float64, counts: Float64, weight: float) -> tuple[float, Float64]:
-    """Return the alpha loss, weight * mean |1 - transmittance - alpha|, and its gradient in transmittance: eq. (81).
+    """Return the alpha loss and its gradient with respect to transmittance: eq. (81). Arrays are (H, W).
 
-    The mean is over the pixels whose mask `counts` is 1, not 0. Arrays are (H, W).
+    The loss is weight * mean |1 - transmittance - alpha| over the pixels whose mask `counts` is 1, not 0.
     """
     difference = counts * (1 - transmittance - alpha)
     scale = weight / max(counts.sum(), 1)

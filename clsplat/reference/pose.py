@@ -17,9 +17,10 @@ from clsplat.spherical_harmonics import SH_C0
 def pose_gradient(
     means: Float64, quaternions: Float64, sh: Float64, camera: Camera, sh_degree: int, gradients: Mapping[str, Float64]
 ) -> Float64:
-    """Return the gradient (6,) of a loss in the rotation and translation by which `Camera.moved` moves a camera.
+    """Return the gradient (6,) with respect to a motion of the camera by `Camera.moved`: rotation, then translation.
 
-    gradients: gradients in means (N, 3), quaternions (N, 4) and sh (N, K, 3); zero for Gaussians that are not visible.
+    gradients: gradients with respect to means (N, 3), quaternions (N, 4) and sh (N, K, 3), by name; zero for Gaussians
+    that are not visible.
     """
     directions, _ = view_directions(means, camera)
     of_direction = sh_basis_grad(directions, sh_degree)

@@ -41,7 +41,7 @@ def developed(photograph: Float64, entries: Float64, vignette: Float64, squared:
 
 
 def terms(image: Float64, by_image: Float64, squared: Float64) -> Float64:
-    """Return each pixel's terms (H, W, 12) of a loss's gradient with respect to entries and vignette, at zeros.
+    """Return each pixel's terms (H, W, 12) of a loss's gradient with respect to entries and vignette that are 0.
 
     by_image: (H, W, 3), the gradient of the loss with respect to the image with entries and vignette applied.
     """

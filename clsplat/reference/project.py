@@ -25,7 +25,7 @@ ALPHA_MIN = 1.0 / 255.0
 LOW_PASS_PX2 = 0.3
 """Variance added to the diagonal of projected covariances, in square pixels."""
 LOW_PASS_ANTIALIASED_PX2 = 0.1
-"""The same for antialiased models."""
+"""Variance added to the diagonal of projected covariances of antialiased models, in square pixels."""
 MIN_COMPENSATION = 0.005
 """Smallest factor by which an antialiased model's opacities are compensated for the low-pass."""
 COLOUR_LIMIT = 1e9
@@ -283,7 +283,7 @@ def compensation(det0: Float64, det: Float64) -> Float64:
 
 
 def compensation_grad(plain: Float64, filtered: Float64, d_logs: Float64) -> tuple[Float64, Float64]:
-    """Return gradients (N, 2, 2) through `compensation`, in the covariances without and with the low-pass: eq. (84).
+    """Return the gradients (N, 2, 2) with respect to both covariances that `compensation` adds: eq. (84).
 
     plain, filtered: (N, 2, 2), the covariances without and with the low-pass.
     d_logs: (N,), gradient of the loss with respect to ln(opacity).
@@ -296,10 +296,10 @@ def compensation_grad(plain: Float64, filtered: Float64, d_logs: Float64) -> tup
 
 
 def covariance_grad(conics: Float64, d_conics: Float64) -> Float64:
-    """Return the gradient (N, 3) in covariances, xx, xy, yy, from that in conics a, b, c: eq. (30).
+    """Return the gradient (N, 3) with respect to covariances: xx, xy, yy of dL/dSigma. Eq. (30).
 
-    dL/dSigma = -A G A, where A is the conic matrix and G the gradient with respect to it. The result has the entries of
-    this symmetric matrix, so the derivative with respect to the variable sxy is 2 xy.
+    dL/dSigma = -A G A, where A is the conic matrix and G the gradient with respect to it. As the matrix is symmetric,
+    the derivative with respect to the variable sxy is 2 xy.
 
     conics, d_conics: (N, 3), a, b, c, and the derivatives with respect to them. b occurs twice in A.
     """
@@ -312,9 +312,9 @@ def covariance_grad(conics: Float64, d_conics: Float64) -> Float64:
 
 
 def quaternion_grad(quaternions: Float64, d_rotations: Float64) -> Float64:
-    """Return the gradient (N, 4) in raw quaternions, orthogonal to them, from that in rotation matrices (N, 3, 3).
+    """Return the gradient (N, 4) with respect to raw quaternions, to which it is orthogonal: eqs. (34), (35).
 
-    Eqs. (34), (35).
+    d_rotations: (N, 3, 3), the gradient with respect to the rotation matrices.
     """
     norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
     unit = quaternions / norms
@@ -336,9 +336,10 @@ def quaternion_grad(quaternions: Float64, d_rotations: Float64) -> Float64:
 def colour_grad(
     means: Float64, sh: Float64, camera: Camera, sh_degree: int, colors: Float64, d_colors: Float64
 ) -> tuple[Float64, Float64, Float64]:
-    """Return the SH basis (N, K) and the gradients (N, 3) in colours before the clamp at 0, and in means.
+    """Return the SH basis (N, K), and the gradients (N, 3) with respect to unclamped colours and to means.
 
-    Means have an effect on colours through the viewing direction: eqs. (38) to (40).
+    Unclamped colours are those before the clamp at 0. Means act on colours through the viewing direction: eqs. (38) to
+    (40).
 
     colors, d_colors: (N, 3), the clamped colours, and the gradient of the loss with respect to them.
     """

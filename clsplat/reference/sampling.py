@@ -18,9 +18,9 @@ SAMPLING_WIDTH_FACTOR = np.sqrt(0.2)
 
 
 def sampling_limits(means: Float64, cameras: Sequence[Camera]) -> Float64:
-    """Return lower limits (N,) of log scales, as the cameras resolve no smaller Gaussians at means (N, 3): eq. (88).
+    """Return the log scales (N,) of the smallest Gaussians that the cameras resolve at means (N, 3): eq. (88).
 
-    The limit is -inf for a mean that no camera sees.
+    The result is -inf for a mean that no camera sees.
     """
     widths = np.min([pixel_widths(means, camera) for camera in cameras], axis=0)
     with np.errstate(divide="ignore"):
@@ -30,5 +30,5 @@ def sampling_limits(means: Float64, cameras: Sequence[Camera]) -> Float64:
 
 
 def pixel_widths(means: Float64, camera: Camera) -> Float64:
-    """Return the width (N,) of a pixel at each mean (N, 3), in world units; infinite where the camera sees none."""
+    """Return a pixel's width (N,) at each mean (N, 3), in world units; infinite where the camera sees no mean."""
     return camera.model.pixel_widths(camera, means @ camera.rotation.T + camera.translation)

@@ -41,7 +41,7 @@ class FlatGaussians:
 
     @property
     def order(self) -> list[int]:
-        """Indices of the drawn Gaussians, front to back, ties by index."""
+        """Indices of the drawn Gaussians, front to back, with equal depths by index."""
         return [int(i) for i in np.argsort(self.depths, kind="stable") if self.drawn[i]]
 
 
@@ -118,7 +118,7 @@ def _layers(gaussians: FlatGaussians, width: int, height: int, alpha_max: float)
 def blend_values(
     gaussians: FlatGaussians, width: int, height: int, background: Float64, alpha_max: float = BLEND_ALPHA_MAX
 ) -> ValuesBlended:
-    """Blend the values to a picture: eq. (177)."""
+    """Blend the Gaussians' values to a picture over the background (D,): eq. (177)."""
     image = np.zeros((height, width, gaussians.values.shape[1]))
     left, margin = np.ones((height, width)), np.full((height, width), MAX_VALUES_MARGIN)
     for layer in _layers(gaussians, width, height, alpha_max):

@@ -35,8 +35,8 @@ MIN_VISIBLE_POINT_FRACTION, MIN_VISIBLE_POINT_GAIN = 0.25, 4.0
 """Thresholds for suggesting another convention of the poses (POSE_MISREADINGS).
 
 With the other convention, views must show at least the first fraction of the points on average. This fraction must also
-be at least the second number times the fraction with the poses as given. A picture of an aerial survey shows about 1 %
-of the points with either convention.
+be at least the second number times the fraction with the poses as given. The first threshold excludes aerial surveys,
+where a picture shows about 1 % of the points with either convention.
 """
 BLIND_VIEW_POINT_FRACTION, MIN_BLIND_VIEW_FRACTION = 0.01, 0.2
 """Fraction of visible points below which a view is blind, and fraction of blind views that makes the poses doubtful.
@@ -50,7 +50,7 @@ given, and at least the second fraction does after inverting them."""
 PARALLEL_MEAN_AXIS_LENGTH = 0.7
 """Length of the mean optical axis above which the cameras look in the same direction, as along a facade.
 
-Inverted poses of such cameras may converge by chance.
+Such cameras are not checked without points, as they may converge by chance if their poses are inverted.
 """
 CENTRE_RATIO_TOLERANCE = 0.02
 """Relative tolerance between cx / width and cy / height. If these ratios agree but are not 1/2, (cx, cy) is the centre

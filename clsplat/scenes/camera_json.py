@@ -49,7 +49,7 @@ class Keys:
         return float(value)
 
     def require(self, key: str, default: float | None = None) -> float:
-        """Return the number under `key`, or the default. Raises InputError for an invalid value or if both lack."""
+        """Return the number under `key`, or the default. Raises InputError for an invalid value or without both."""
         value = self.number(key)
         if (value := default if value is None else value) is None:
             raise self.wrong(key, "a number")

@@ -25,7 +25,8 @@ from clsplat.images.alpha import associate, unassociate
 from clsplat.images.reading import downscale
 from clsplat.process import undisturbed
 
-with undisturbed():  # on Ctrl-C pycolmap's import says "not installed", and its SIGTERM handler prints a stack trace
+# On Ctrl-C during its import, pycolmap says "not installed". It also sets a SIGTERM handler that prints a stack trace.
+with undisturbed():
     import pycolmap
 
 

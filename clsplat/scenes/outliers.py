@@ -12,9 +12,9 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 
 OUTLIER_GAP_RATIO = 2.0
-"""Minimum ratio between successive distances, sorted, from the middle of all positions at which outliers may begin.
+"""Outliers may begin where a distance from the middle of all positions is over this many times the next smaller one.
 
-In captures without outliers the ratio is at most 1.7, and largest at the farthest positions.
+In captures without outliers this ratio is at most 1.7, and largest at the farthest positions.
 """
 OUTLIER_DISTANCE_RATIO = 5.0
 """Minimum distance of an outlier from the middle, relative to the farthest position that is not an outlier.

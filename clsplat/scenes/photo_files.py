@@ -117,7 +117,7 @@ def is_smaller_copy(folder: Path) -> bool:
 
 def has_pictures(folder: Path) -> bool:
     """Return True if a folder exists and has pictures in it or below it."""
-    return os.path.isdir(folder) and bool(find_images(folder))  # noqa: PTH112  # Path raises for names too long
+    return os.path.isdir(folder) and bool(find_images(folder))  # noqa: PTH112  # Path.is_dir raises for a long name
 
 
 def or_smaller(folder: Path) -> Path:

@@ -36,7 +36,8 @@ SOURCE_EXTENSIONS = (
     ".rw2",
     ".orf",
 )
-"""Extensions of camera files that users convert to an image format, so that a data set may list the other extension."""
+"""Extensions of photographs that users convert before training. A data set may list photographs with the old extension.
+"""
 NAME_ENCODINGS = ("utf-8", "gb18030", "cp932", "cp949", "big5", "cp1252", "cp1250", "cp1251", "cp1253", "cp1254",
                   "cp1255", "cp1256", "cp437", "cp850", "cp866", "mac_roman", "latin-1")  # fmt: skip
 """Encodings of names, in the order in which they are tried."""

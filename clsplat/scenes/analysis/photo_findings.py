@@ -91,7 +91,7 @@ BLUR_OUTLIER_SIGMAS = 3.5
 """The log sharpness of a blurred photograph must also lie this many standard deviations below the median. The standard
 deviation is estimated from quartiles."""
 DUPLICATE_RMS = 1.5 / 255
-"""Maximum RMS difference of two thumbnails that count as the same picture, twice the difference by JPEG rounding."""
+"""Maximum RMS difference of two thumbnails that count as the same picture. JPEG compression causes half of it."""
 FEATURELESS_THUMBNAIL_STD = 8 / 255
 """Standard deviation of a thumbnail up to which it is featureless and never counts as a duplicate."""
 MIN_SKY_PIXEL_FRACTION, MIN_SKY_VIEW_FRACTION = 0.06, 0.3
@@ -101,8 +101,8 @@ MAX_SKY_POINT_DENSITY_RATIO = 0.1
 MAX_SKY_PIXEL_STEP, MIN_SKY_LUMA = 0.025, 0.45
 """Maximum luma difference of neighbouring thumbnail pixels in a sky, and minimum luma of a sky."""
 MIN_SKY_BLUE_EXCESS = 0.02
-"""Minimum of blue minus red in a blue sky. For a wall in lamplight it is below 0. The luma of a white sky must exceed
-MAX_EXPOSURE_COLOUR instead."""
+"""Minimum of blue minus red in a blue sky; for a wall in lamplight it is below 0. A sky that is not blue must have a
+luma over MAX_EXPOSURE_COLOUR."""
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,7 @@ def _few(scene: Scene) -> Finding | None:
     count = len(scene.train_views)
     if count >= FEW_TRAINING_VIEWS:
         return None
-    return Finding("few views", f"there are only {count} training photographs, so that other views will show fog")
+    return Finding("few views", f"there are only {count} training photographs, so that other views will show floaters")
 
 
 def _some(scene: Scene, iterations: int) -> Finding | None:

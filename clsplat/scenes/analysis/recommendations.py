@@ -92,7 +92,7 @@ def flags(settings: Mapping[str, Any]) -> str:
 def answered(
     found: Sequence[Finding], config: TrainConfig, given: Collection[str] = (), photographs: int = 0
 ) -> tuple[list[Answer], TrainConfig]:
-    """Choose settings for each finding. Returns the answers, and the configuration with all their settings.
+    """Choose settings for each finding. Returns an answer for each, and the configuration with all these settings.
 
     given: names of settings that must not change.
     photographs: number of training photographs, for settings that count passes through them.
@@ -129,10 +129,11 @@ def _touched(option: Mapping[str, Any], given: Collection[str]) -> str:
 def with_settings(
     config: TrainConfig, settings: Mapping[str, Any], given: Collection[str] = (), photographs: int = 0
 ) -> TrainConfig:
-    """Apply the settings of an answer to a configuration.
+    """Apply recommended settings to a configuration.
 
     given, photographs: as for `answered`.
-    Raises InputError if they are incompatible, or if a schedule would override settings that differ from the paper's.
+    Raises InputError if the settings are incompatible, or if a schedule would override settings that differ from the
+    paper's.
     """
     changes = dict(settings)
     config = replace(config, iterations=changes.pop("iterations", config.iterations))

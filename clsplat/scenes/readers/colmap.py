@@ -251,11 +251,11 @@ def _file(folder: Path, stem: str) -> Path | None:
         path = folder / (stem + extension)
         if is_file(path):
             return path
-    if not os.path.isdir(folder):  # noqa: PTH112  # Path raises for names too long
+    if not os.path.isdir(folder):  # noqa: PTH112  # Path.is_dir raises for a long name
         return None
     lower = {
         f"{stem}{extension}".lower() for extension in (".bin", ".txt")
-    }  # hierarchical-3d-gaussians writes points3d
+    }  # hierarchical-3d-gaussians writes points3d in lower case
     return next((path for path in sorted(folder.iterdir()) if path.name.lower() in lower and is_file(path)), None)
 
 
@@ -349,7 +349,9 @@ def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[PosedImage]:
         quaternion, translation = np.array(pose[:4], np.float64), np.array(pose[4:], np.float64)
         norm = math.hypot(*pose[:4])
         if not (0.5 < norm < 2 and (np.abs(translation) < MAX_COORDINATE).all()):
-            raise corrupt(path, f"image {name} has the pose {list(pose)}, expected a unit quaternion, finite numbers")
+            raise corrupt(
+                path, f"image {name} has the pose {list(pose)}, expected a unit quaternion and a finite translation"
+            )
         images[name] = PosedImage(name, lenses[camera], rotation_from_quaternion(quaternion / norm), translation)
     if not images:
         raise InputError(f"{path}: holds no images, expected at least one")
@@ -469,7 +471,7 @@ def _text_tracks(path: Path) -> Iterator[tuple[tuple[float, ...], float, tuple[i
 def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str]]:
     """Yield numbers and text of a file's lines, without comments."""
     with open_input(path, COLMAP_FILE_KIND) as opened:
-        wide = opened.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)  # PowerShell redirects to UTF-16
+        wide = opened.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)  # PowerShell writes text in UTF-16
         opened.seek(0)
         encoding, errors = ("utf-16", "strict") if wide else ("utf-8-sig", "surrogateescape")
         file, number = io.TextIOWrapper(opened, encoding=encoding, errors=errors), 0

@@ -156,7 +156,7 @@ def read_poses(path: Path, size: tuple[int, int] | None = None, lenses: Lenses =
 def read_images(path: Path, size: tuple[int, int] | None = None) -> list[PosedImage]:
     """Read the images of a transforms.json, in the order of the file. Pictures need not exist, as for `read_poses`."""
     readers = _readers(path, load_document(path))
-    with warnings.catch_warnings():  # hide warnings of missing pictures, which are not needed
+    with warnings.catch_warnings():  # hide warnings of missing pictures: only their names are needed
         warnings.simplefilter("ignore")
         try:
             files = _pictures(path, readers, None, "skip")
@@ -399,7 +399,7 @@ def _distortion(keys: Keys) -> tuple[str, list[float]]:
             raise InputError(
                 f"{keys.where}: has 'k5' or 'k6' for a fisheye, expected k1 to k4 only; undistort the pictures first"
             )
-        if p1 or p2:  # the model with tangential terms; if they are 0, it equals OPENCV_FISHEYE
+        if p1 or p2:  # THIN_PRISM_FISHEYE has tangential terms; without them it equals OPENCV_FISHEYE
             return "THIN_PRISM_FISHEYE", [k1, k2, p1, p2, k3, k4, 0.0, 0.0]
         return "OPENCV_FISHEYE", [k1, k2, k3, k4]
     if named is None:
@@ -421,8 +421,8 @@ def opengl_pose(given: object, where: str, what: str) -> tuple[Float64, Float64,
     """Convert a `world_from_cam` matrix (4, 4) or (3, 4) in OpenGL's axes.
 
     where, what: the file with the frame in it, and the matrix's key, for messages.
-    Returns the rotation (3, 3) and translation (3,) of `cam_from_world`, and the scale of the matrix, which is removed
-    from both. Raises InputError for a matrix that is not a pose.
+    Returns the rotation (3, 3) and translation (3,) of `cam_from_world`, without scale, and the scale of the matrix.
+    Raises InputError for a matrix that is not a pose.
     """
     if given is None:
         raise InputError(f"{where}: has no {what} (the 4 x 4 pose); {EXPORT_AGAIN_ADVICE}")

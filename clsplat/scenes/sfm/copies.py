@@ -234,7 +234,7 @@ class _Staged:
 
     @property
     def kind(self) -> tuple[int, int]:
-        """Stage and factor, which differ between a photograph and its copies."""
+        """Stage of undistortion and factor of downscaling, which differ between a photograph and its copies."""
         return self.stage, self.factor
 
 

@@ -180,7 +180,7 @@ def _staged_photos(
     photos = [photo for photo in photos if photo.name not in copies]
     if copies:
         count = "1 photograph is a copy of another" if len(copies) == 1 else f"{len(copies):,} photographs are copies"
-        again = f"{count} and left out ({sfm_copies.listed(copies)}); to use copies, give only their folder"
+        again = f"{count} and left out ({sfm_copies.listed(copies)}); to use the copies instead, give only their folder"
         warn(f"{images}: {again}")
     _require_enough(images, len(photos))
     return photos
@@ -236,7 +236,7 @@ def _write_record(folder: Path, fingerprint: str, photos: list[sfm_photos.Photo]
 def _warn_of_losses(
     images: Path, photos: list[sfm_photos.Photo], registered: list[str], result: Path, masks: MaskUse | None
 ) -> None:
-    """Warn of photographs without a pose, and of those that lost their alpha.
+    """Warn of photographs without a pose, and of transparent photographs that lost their alpha.
 
     registered: names of the photographs with a pose.
     result: folder of the undistorted photographs.

@@ -104,9 +104,10 @@ def with_points(scene: Scene, start: StartPoints) -> Scene:
 
 
 def with_cloud_beside(scene: Scene) -> Scene:
-    """Return a scene that has no points with the points of a cloud in its folder, if one lies where its cameras look.
+    """Give a scene without points the points of a cloud in its folder. Returns a copy of the scene.
 
-    The first such cloud is used. Warns of the cloud that is used, and of clouds that cannot be read or lie elsewhere.
+    The first cloud that lies where the scene's cameras look is used. Warns of this cloud, and of clouds that cannot be
+    read or lie elsewhere.
     """
     for index, path in enumerate(scene.clouds):
         try:
@@ -302,8 +303,7 @@ def _skyline(points: Float64, camera: Camera, view: View) -> NDArray[np.int64]:
 
 
 def is_colourless(scene: Scene) -> bool:
-    """Return True if points lack colours: some are marked as colourless, or all have one colour as in an uncoloured
-    file."""
+    """Return True if points lack colours: if some are marked as colourless, or all have the same colour."""
     return scene.colourless is not None or of_one_colour(scene.point_colors)
 
 

@@ -186,7 +186,7 @@ def _areas(values: Float32, most: int) -> tuple[int, int] | None:
 
 
 def _like(path: Path) -> list[Path]:
-    """Return a sample of the masks in the folder of a mask, without photographs, which are told by their names."""
+    """Return a sample of the masks in the folder of a mask. Photographs there are recognised by their names."""
     named = "mask" in path.stem.lower()
     others = [other for other in find_images(path.parent, deep=False) if ("mask" in other.stem.lower()) == named]
     return others[:: max(len(others) // COMPARED_MASKS, 1)]
@@ -232,7 +232,7 @@ def _known(names: Iterable[str], *, plain: bool = True) -> dict[str, str]:
 
 
 def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path, *, strict: bool = True) -> dict[str, Mask]:
-    """Find the masks of a scene's photographs, by the photographs' names; none if masks and alpha mask nothing.
+    """Find the masks of a scene's photographs, by the photographs' names; none if masks and alpha are not used.
 
     where: the scene, for messages.
     strict: False if photographs are missing, as their masks may still exist.
