@@ -159,7 +159,7 @@ def rotation_matrices(quaternions: Float64) -> Float64:
 
 
 def _geometry(means: Float64, quaternions: Float64, log_scales: Float64, camera: Camera) -> _Geometry:
-    """Compute the `_Geometry`: eqs. (1), (3), (4), (5); orthographic: (16) of docs/cameras.md."""
+    """Compute the values that projection and its gradient share: eqs. (1), (3) to (5), or (16) of docs/cameras.md."""
     p = means @ camera.rotation.T + camera.translation
     plane = camera.model.projected(camera, p)
     rotations = rotation_matrices(quaternions)

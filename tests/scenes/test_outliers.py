@@ -59,10 +59,10 @@ def test_sizes_are_those_of_the_other_cameras(rows: dict[int, float], model: str
     assert scene.near == plain.near
     np.testing.assert_array_equal(scene.origin, plain.origin)
     np.testing.assert_allclose(scene.bounds, plain.bounds, rtol=1e-12)  # sums of as many, in another order
-    (warning,) = [text for text in scene.warnings if "far off" in text]
+    (warning,) = [text for text in scene.warnings if "times as far away" in text]
     assert f"{len(rows)} camera(s) are over 5 times as far away as the others" in warning
     assert NAMES[min(rows)] in warning
-    assert not [text for text in plain.warnings if "far off" in text]
+    assert not [text for text in plain.warnings if "times as far away" in text]
 
 
 def test_a_far_scene_has_its_own_origin(tmp_path: Path) -> None:
@@ -88,7 +88,7 @@ def test_captures_have_none(rows: dict[int, float], tmp_path: Path) -> None:
     assert not scene.stray_cameras
     centres = np.stack([view.camera.position for view in scene.train_views])
     assert scene.extent == 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-    assert not [text for text in scene.warnings if "far off" in text]
+    assert not [text for text in scene.warnings if "times as far away" in text]
 
 
 def test_a_tripod_and_a_walk_have_none() -> None:

@@ -77,8 +77,8 @@ FEW_STEPS_PER_VIEW = 60
 """Steps per training photograph below which high learning rates give better models
 (docs/decisions/0031-high-rates.md)."""
 SHORT_TRAINING_STEPS = range(1000, 10_001)
-"""Numbers of training steps for which high learning rates are recommended. Trainings of 2000 to 7000 steps were
-measured."""
+"""Numbers of training steps for which high learning rates are recommended, after measurements with 2000 to 7000 steps.
+"""
 RECOMMENDED_PASSES = 30
 """Number of passes through the training photographs below which a longer schedule is recommended. The paper's 30,000
 steps are 30 passes through 1000 photographs."""

@@ -222,7 +222,7 @@ def _records(path: Path, what: str, least: int) -> Iterator[_Binary]:
     """Yield a reader at the beginning of each record that the file's header announces.
 
     what: the kind of record, for messages.
-    least: least number of bytes of a record.
+    least: minimum number of bytes of a record.
     """
     with open_input(path, COLMAP_FILE_KIND) as opened:
         file = _Binary(path, opened)

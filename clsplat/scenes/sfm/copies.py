@@ -310,7 +310,7 @@ class _Pictures:
 
 
 def _staged(names: Iterable[str]) -> list[list[_Staged]]:
-    """Group photographs with the same stem in the same folders, but for folders that `_Staged` classifies.
+    """Group photographs with the same stem in the same folders, ignoring folders that `_Staged` classifies.
 
     Each group has at least two kinds (`_Staged.kind`). Folders above a folder of undistorted pictures are also ignored,
     as another program may have made them.
@@ -416,7 +416,7 @@ def _stage(folder: str) -> int:
 
 
 def _numbered(folder: str) -> tuple[str, int]:
-    """Split images_4 into images and 4. The factor is 1 if the name has none."""
+    """Split a folder's name such as images_4 into "images" and the factor 4. The factor is 1 in a name without one."""
     match = _NUMBERED_FOLDER.match(folder)
     return (match[1], int(match[2])) if match else (folder, 1)
 
