@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Base class of camera models whose image radius depends on the angle from the axis alone.
+"""Base class of camera models that are symmetric around the axis: fisheyes, and perspective along rays.
 
 Equation numbers refer to docs/cameras.md.
 """
@@ -13,12 +13,13 @@ from clsplat.cameras.model import CameraModel, Intrinsics
 
 
 class AroundAxis(CameraModel):
-    """Computes footprints on tangent planes from `angles_of_pixel`."""
+    """A camera model whose image radius depends only on the angle from the axis. Subclasses give `angles_of_pixel`."""
 
     def angles_of_pixel(self, view: Intrinsics, theta: Float64) -> tuple[Float64, Float64, Float64, Float64]:
-        """p, q, and their derivatives with respect to theta, each (N,), as in eqs. (10) and (27).
+        """Return p, q and their derivatives with respect to theta, each (N,): eqs. (10) and (27).
 
         fx pixels cover p radians in the direction away from the axis, and q radians around the axis.
+
         theta: (N,), angle from the axis in radians.
         """
         raise NotImplementedError(self.projection)

@@ -15,7 +15,7 @@ from clsplat.cameras.model import CameraModel, Intrinsics
 
 
 class Equirectangular(CameraModel):
-    """A panorama, eqs. (5), (6). Kernels: kernels/shared/camera/equirectangular.h."""
+    """A panorama in longitude and latitude, eqs. (5), (6). Kernels: kernels/shared/camera/equirectangular.h."""
 
     flat = False
     wraps = True

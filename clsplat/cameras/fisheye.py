@@ -22,9 +22,9 @@ a pixel's angle."""
 
 
 def radii(view: Intrinsics, theta: Float64) -> tuple[Float64, Float64, Float64]:
-    """Image radii, in focal lengths, of rays at angles `theta` from a fisheye's axis: eq. (18).
+    """Return image radii, in focal lengths, of rays at angles `theta` from a fisheye's axis: eq. (18).
 
-    Also returns the first and second derivatives with respect to theta. All arrays are (N,), angles in radians.
+    Also returns their first and second derivatives with respect to theta. Arrays are (N,), angles in radians.
     """
     powers, factors = 2 * np.arange(5), np.array([1.0, *view.radial])
     series = theta[:, None] ** powers
@@ -39,7 +39,7 @@ class Fisheye(AroundAxis):
     flat = False
 
     def angles(self, view: Intrinsics, radius: Float64) -> Float64:  # noqa: ARG002
-        """Angles (N,) from the axis, in radians, of pixels at image radii `radius` (N,), in focal lengths."""
+        """Return angles (N,) from the axis, in radians, of pixels at image radii `radius` (N,), in focal lengths."""
         return radius
 
     def ndc_from_cam(self, view: Intrinsics, width: int, height: int) -> Float64 | None:  # noqa: ARG002
@@ -73,7 +73,7 @@ class Fisheye(AroundAxis):
         return np.where(seen, depths / focal * np.minimum(along, around), np.inf)
 
     def angles_of_pixel(self, view: Intrinsics, theta: Float64) -> tuple[Float64, Float64, Float64, Float64]:
-        """Eqs. (10), (19), and their derivatives."""
+        """Return the angles of fx pixels away from the axis and around it, and their derivatives: eqs. (10), (19)."""
         radius, slope, bend = radii(view, theta)
         with np.errstate(all="ignore"):
             ratio = np.where(theta > 1e-6, np.sin(theta) / radius, 1.0)
@@ -86,14 +86,14 @@ class Fisheye(AroundAxis):
 class BentFisheye(Fisheye):
     """A fisheye with coefficients (Kannala and Brandt), eqs. (18), (19). Kernels: fisheye.h with bent_fisheye.h."""
 
-    self_tested = False  # it shares kernels and footprints with Fisheye
+    self_tested = False  # The self-test tests Fisheye, which has the same kernels and footprints.
     without_motion = "a fisheye with coefficients, expected a fisheye without them or a pinhole camera"
 
     def fold(self, radial: tuple[float, float, float, float]) -> tuple[float, float]:
         return _fold(tuple(radial))
 
     def angles(self, view: Intrinsics, radius: Float64) -> Float64:
-        """The inverse of `radii`, by bisection."""
+        """Return the angles of pixels at image radii `radius`: the inverse of `radii`, by bisection."""
         low, high = np.zeros_like(radius), np.full_like(radius, view.fold[0])
         for _ in range(50):
             middle = 0.5 * (low + high)
@@ -102,7 +102,7 @@ class BentFisheye(Fisheye):
         return 0.5 * (low + high)
 
     def shows(self, view: Intrinsics, points: Float64) -> Bool:
-        """True for points whose angle from the axis is smaller than the largest that the fisheye shows (`fold`)."""
+        """Return a mask of the points whose angle from the axis is less than the largest that the fisheye shows."""
         return np.asarray(np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]) < view.fold[0])
 
 

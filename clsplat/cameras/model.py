@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The base class of camera models, and the record of a lens model.
+"""CameraModel, the base class of projections (perspective, fisheye ...), and LensModel, a lens of photographs.
 
 Equation numbers refer to docs/cameras.md.
 """
@@ -49,9 +49,9 @@ class LensModel(NamedTuple):
     name: COLMAP's name, or clsplat's own if COLMAP does not have the lens.
     coefficients: number of distortion coefficients that `Camera.radial` takes.
     two_focal_model: for a model with one focal length, the name of its equivalent with fx and fy; "" for none.
-    two_focal_coefficients: number of coefficients of that equivalent; the first are the coefficients of this model.
-    is_colmap: False for a lens that only clsplat has. Its parameters are fx, fy, cx and cy; for a panorama width and
-        height.
+    two_focal_coefficients: number of the equivalent's coefficients, which begin with this model's.
+    is_colmap: False for a lens that only clsplat has. Such a lens has the parameters fx, fy, cx and cy, a panorama
+        width and height.
     """
 
     name: str
@@ -78,15 +78,15 @@ class PlaneProjection(NamedTuple):
 class CameraModel:
     """A camera model: a row of `clsplat.camera.CAMERA_MODELS`. Its kernels are a header of kernels/shared/camera/.
 
-    projection: its name in `Camera.projection` and in camera files.
-    option: the field of `Camera` that selects it among the models of its projection; "" for the default model.
-    defines: build defines of its kernels. With RAYS a Gaussian is evaluated along the ray of each pixel.
-    lenses: lens models whose photographs it can render, distorted or undistorted.
-    transforms: values of `camera_model` in a transforms.json.
-    nerfstudio: values of `camera_type` in nerfstudio's camera paths.
-    usd: values of a USD camera's `projection`.
-    gsplat: its name in gsplat, "" for none.
-    ewa: build define of the kernels with gsplat's projection.
+    projection: the model's name in `Camera.projection` and in camera files.
+    option: the field of `Camera` that selects this model among those with its projection; "" for the default model.
+    defines: build defines of the model's kernels. With RAYS a Gaussian is evaluated along the ray of each pixel.
+    lenses: lens models of photographs that this model can be trained on, either as they are or undistorted.
+    transforms: values of `camera_model` in a transforms.json that mean this model.
+    nerfstudio: values of `camera_type` in nerfstudio's camera paths that mean this model.
+    usd: values of a USD camera's `projection` that mean this model.
+    gsplat: the model's name in gsplat, "" if gsplat lacks it.
+    ewa: build define that selects the model in kernels/ewa.cl, gsplat's projection; "" if none is needed.
     """
 
     projection: str
@@ -100,18 +100,18 @@ class CameraModel:
     ewa: str = ""
 
     flat: ClassVar[bool] = True
-    """True if it has an image plane. Near, far and the depths in files are then z, otherwise distances."""
+    """True if the model has an image plane. Near, far and the depths in files are then z, otherwise distances."""
     is_pinhole: ClassVar[bool] = False
-    """True if the image is linear in x/z and y/z, as in an undistorted photograph."""
+    """True if pixel coordinates are linear in x/z and y/z, as in an undistorted photograph."""
     parallel: ClassVar[bool] = False
-    """True if its rays are parallel. Focal lengths are then in pixels per world unit, and there is no angle of view."""
+    """True if rays are parallel. Focal lengths are then in pixels per world unit, and there is no angle of view."""
     wraps: ClassVar[bool] = False
     """True for panoramas: the right edge continues at the left one, and nothing lies beyond the edges."""
     self_tested: ClassVar[bool] = True
-    """True if the self-test renders a picture with this model. It has an effect only on models with RAYS."""
+    """True if the self-test renders a picture with this model. Read only for models with RAYS."""
     without_motion: ClassVar[str] = ""
-    """End of the error message if this camera model has no channel `motion`: the model's name, and which cameras have
-    the channel. Empty if this model has it."""
+    """For a model without the channel `motion`, the end of the error message: this model, and the models with the
+    channel. Empty for a model with the channel."""
     focal_keys: ClassVar[tuple[str, ...]] = ("fov_x", "fov_y")
     """Properties of a clsplat camera file that give a focal length, other than fx and fy."""
     whole_angles: ClassVar[tuple[float, float]] = (360.0, 180.0)
@@ -131,7 +131,7 @@ class CameraModel:
         return f"{'an' if self.projection[0] in 'aeiou' else 'a'} {self.projection}"
 
     def focal_length(self, fov: float, size: float) -> float:
-        """Focal length in pixels of a picture whose `size` pixels show the angle `fov`, in radians: eq. (7).
+        """Return the focal length in pixels with which `size` pixels show the angle of view `fov`, in radians: eq. (7).
 
         Raises ValueError for an angle that the model cannot show.
         """
@@ -140,15 +140,15 @@ class CameraModel:
         return size / fov
 
     def wide_focal(self, width: int) -> float:
-        """Focal length in pixels for the self-test, with which `width` pixels show most directions of the model."""
+        """Return a focal length in pixels for the self-test, short enough that `width` pixels show a wide angle."""
         return 0.25 * width
 
     def fold(self, radial: tuple[float, float, float, float]) -> tuple[float, float]:  # noqa: ARG002
-        """The largest angle from the axis that the model shows, in radians, and its image radius in focal lengths."""
+        """Return the largest angle from the axis that the model shows, in radians, and its radius in focal lengths."""
         return math.pi, math.pi
 
     def turn(self, view: Intrinsics) -> float:
-        """Width of 360 degrees of a panorama in pixels; infinite for other models."""
+        """Return the width in pixels of 360 degrees of a panorama; infinite for other models."""
         return 2 * math.pi * view.fx if self.wraps else math.inf
 
     def wrapped(self, view: Intrinsics, u: Float64) -> Float64:
@@ -164,42 +164,45 @@ class CameraModel:
         return np.where(moved >= low + turn, low, moved)  # np.mod of a tiny negative number rounds up to `turn` itself
 
     def whole(self, width: int, height: int) -> tuple[float, float, float, float]:
-        """For panoramas: fx, fy, cx and cy of a full panorama of this size in pixels."""
+        """Return fx, fy, cx and cy of a full panorama of this size in pixels. Only for panoramas."""
         raise NotImplementedError(self.projection)
 
     def is_whole(self, view: Intrinsics) -> bool:  # noqa: ARG002
-        """True for a full panorama: every direction once, by longitude and latitude, with the axis in the middle."""
+        """Return True for a full panorama, which shows every direction once, with the camera's axis in the middle."""
         return False
 
     def ndc_from_cam(self, view: Intrinsics, width: int, height: int) -> Float64 | None:
-        """OpenEXR's projection matrix (4, 4): row vectors, y up. None if the model has no image plane.
+        """Return the matrix (4, 4) from the camera's axes, with y up, to OpenEXR's NDC, for row vectors.
 
-        width, height: size of the display window.
+        None if the model has no image plane.
+
+        width, height: size of the display window in pixels.
         """
         raise NotImplementedError(self.projection)
 
     def rays_of(self, view: Intrinsics, a: Float64, b: Float64) -> tuple[Float64, Float64]:
-        """Origins and unit directions of the rays of pixels, (N, 3), in the camera's axes. NaN for a pixel without ray.
+        """Return origins and unit directions (N, 3), in the camera's axes, of the rays of pixels; NaN without a ray.
 
-        a, b: (N,), distances of the pixels from the principal point in focal lengths.
+        a, b: (N,), horizontal and vertical offsets of the pixels from the principal point, in focal lengths.
         """
         raise NotImplementedError(self.projection)
 
     def places_of(self, view: Intrinsics, points: Float64) -> tuple[Float64, Float64, Float64]:
-        """Project points (N, 3) in the camera's axes. NaN for a point without a pixel.
+        """Project points (N, 3) in the camera's axes. Points without a pixel get NaN.
 
-        Returns a and b (N,), distances from the principal point in focal lengths, and depths (N,).
+        Returns a and b (N,), horizontal and vertical offsets from the principal point in focal lengths, and depths
+        (N,).
         """
         raise NotImplementedError(self.projection)
 
     def shows(self, view: Intrinsics, points: Float64) -> Bool:  # noqa: ARG002
-        """True (N,) for points (N, 3), in the camera's axes, whose direction a picture can show."""
+        """Return a mask (N,) of the points (N, 3), in the camera's axes, whose direction a picture can show."""
         return np.ones(len(points), np.bool_)
 
     def pixel_widths(self, view: Intrinsics, points: Float64) -> Float64:
-        """Width (N,) of a pixel in world units at points (N, 3) in the camera's axes: eq. (88) of docs/gradients.md.
+        """Return the width (N,) of a pixel, in world units, at points (N, 3) in the camera's axes.
 
-        Infinite for points outside the frame.
+        Infinite for points outside the frame. Eq. (88) of docs/gradients.md.
         """
         z, (low, high) = points[:, 2], view.frustum_limits
         with np.errstate(all="ignore"):
@@ -210,34 +213,40 @@ class CameraModel:
     # Methods for models that draw Gaussians on an image plane: those without the define RAYS.
 
     def divisors(self, z: Float64) -> Float64:
-        """Divisors (N,) of x and y in the projection of points of depth z (N,)."""
+        """Return the numbers (N,) by which x and y are divided in the projection of points with depth z (N,)."""
         raise NotImplementedError(self.projection)
 
     def projected(self, view: Intrinsics, points: Float64) -> PlaneProjection:
-        """The projection of points (N, 3) in the camera's axes."""
+        """Return the linearised projection of points (N, 3) in the camera's axes."""
         raise NotImplementedError(self.projection)
 
     def mean_grad(
         self, view: Intrinsics, points: Float64, plane: PlaneProjection, d_jacobian: Float64, d_means2d: Float64
     ) -> Float64:
-        """Gradient (N, 3) with respect to the points, from the gradients of Jacobian and image position."""
+        """Return the gradient (N, 3) with respect to the points.
+
+        plane: the points' result of `projected`.
+        d_jacobian: (N, 2, 3), gradient with respect to the Jacobians.
+        d_means2d: (N, 2), gradient with respect to the positions in the image, in pixels.
+        """
         raise NotImplementedError(self.projection)
 
     # Methods for models with RAYS, which draw Gaussians on planes tangent to the sphere of directions.
 
     def footprints(self, view: Intrinsics, directions: Float64) -> tuple[Float64, Float64, Float64]:
-        """Tangent planes at unit directions (N, 3), and the footprint of a pixel on each: eqs. (9), (10).
+        """Return tangent planes at unit directions (N, 3), and the footprint of a pixel on each: eqs. (9), (10).
 
-        Returns the planes' axes right and down, each (N, 3), and the footprints (N, 2, 2). The columns of a footprint
-        are the pixel's sides along u and v.
+        The results are the planes' axes right and down, each (N, 3), and the footprints (N, 2, 2), whose columns are
+        the pixel's sides along u and v in radians.
         """
         raise NotImplementedError(self.projection)
 
     def low_pass_grad(self, view: Intrinsics, directions: Float64, gradients: Float64, low_pass: float) -> Float64:
-        """Gradient (N, 2) of the low-pass term with respect to the mean's direction: B of eqs. (26) to (28).
+        """Return the gradient (N, 2) with respect to the mean's direction, through the low-pass: B of (26) to (28).
 
-        Its components are along the tangent plane's axes.
-        gradients: (N, 2, 2), with respect to the covariance.
+        The gradient's components are along the tangent plane's axes.
+
+        gradients: (N, 2, 2), with respect to the projected covariance.
         low_pass: variance in square pixels that is added to the projected covariance.
         """
         raise NotImplementedError(self.projection)

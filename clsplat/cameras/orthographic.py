@@ -52,5 +52,5 @@ class Orthographic(CameraModel):
         d_jacobian: Float64,  # noqa: ARG002
         d_means2d: Float64,
     ) -> Float64:
-        """Eq. (20)."""
+        """Return the gradient (N, 3) with respect to the points: eq. (20). The Jacobian is constant."""
         return np.concatenate([d_means2d * [view.fx, view.fy], np.zeros((len(points), 1))], axis=1)

@@ -26,7 +26,7 @@ class Perspective(CameraModel):
         return 0.5 * size / math.tan(0.5 * fov)
 
     def ndc_from_cam(self, view: Intrinsics, width: int, height: int) -> Float64 | None:
-        projection = np.zeros((4, 4))  # w = z
+        projection = np.zeros((4, 4))  # the homogeneous coordinate w is z
         projection[0, 0] = view.fx / width
         projection[1, 1] = -view.fy / height
         projection[2] = [view.cx / width, view.cy / height, 1.0, 1.0]
@@ -47,7 +47,7 @@ class Perspective(CameraModel):
         return z
 
     def projected(self, view: Intrinsics, points: Float64) -> PlaneProjection:
-        """Eqs. (3), (4) of docs/gradients.md."""
+        """Return the linearised projection, with clamped ratios: eqs. (3), (4) of docs/gradients.md."""
         z = points[:, 2]
         raw = points[:, :2] / z[:, None]
         low, high = view.frustum_limits
@@ -62,15 +62,15 @@ class Perspective(CameraModel):
     def mean_grad(
         self, view: Intrinsics, points: Float64, plane: PlaneProjection, d_jacobian: Float64, d_means2d: Float64
     ) -> Float64:
-        """Eqs. (36), (37) of docs/gradients.md."""
+        """Return the gradient (N, 3) with respect to the points: eqs. (36), (37) of docs/gradients.md."""
         x, y, z = points.T
-        # (36): through the Jacobian, with respect to z and the ratios; a clamped ratio does not depend on the mean
+        # (36): gradient with respect to z and the ratios, through the Jacobian. A clamped ratio is constant.
         d00, d02, d11, d12 = d_jacobian[:, 0, 0], d_jacobian[:, 0, 2], d_jacobian[:, 1, 1], d_jacobian[:, 1, 2]
         d_z = (-view.fx * d00 + view.fx * plane.ratios[:, 0] * d02) / z**2
         d_z += (-view.fy * d11 + view.fy * plane.ratios[:, 1] * d12) / z**2
         d_ratio_x = np.where(plane.unclamped[:, 0], -view.fx * d02 / z, 0.0)
         d_ratio_y = np.where(plane.unclamped[:, 1], -view.fy * d12 / z, 0.0)
-        # (37): the mean itself is projected unclamped
+        # (37): gradient through the mean on the image, which is not clamped.
         d_ratio_x = d_ratio_x + view.fx * d_means2d[:, 0]
         d_ratio_y = d_ratio_y + view.fy * d_means2d[:, 1]
         d_z -= (d_ratio_x * x + d_ratio_y * y) / z**2

@@ -14,12 +14,15 @@ Image = NDArray[Any]
 
 
 def background_colour(name: str) -> tuple[float, float, float]:
-    """Background colour (3,) for held-out views: white for "white", black for every other name, such as "random"."""
+    """Return the background colour of held-out views: white for "white", black for any other name such as "random"."""
     return (1.0, 1.0, 1.0) if name == "white" else (0.0, 0.0, 0.0)
 
 
 def composite(image: Image, background: ArrayLike) -> Image:
-    """Composite an image over the colour `background` (3,): float (H, W, 3). A fourth channel is straight alpha."""
+    """Composite an image over the colour `background` (3,), by straight alpha in its fourth channel if it has one.
+
+    Returns floats (H, W, 3); integers are scaled to [0, 1].
+    """
     pixels: Image = image
     if np.issubdtype(image.dtype, np.integer):
         pixels = image.astype(np.float32) / np.iinfo(image.dtype).max
@@ -36,6 +39,6 @@ def associate(image: Float32) -> Float32:
 
 
 def unassociate(image: Float32) -> Float32:
-    """Convert an image (H, W, 4) from premultiplied to straight alpha. Colours with an alpha of 0 do not change."""
+    """Convert an image (H, W, 4) from premultiplied to straight alpha. Colours with alpha 0 do not change."""
     alpha = image[:, :, 3:]
     return np.concatenate([image[:, :, :3] / np.where(alpha > 0, alpha, np.float32(1)), alpha], axis=2)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Conversion between a job's three colour spaces: of the model, linear, and of the output files.
+"""Colour spaces (sRGB, linear, OpenColorIO's): conversion between those of the model, of light and of output files.
 
 Gaussians are blended in the colour space of their training photographs. Operations that add light (filters, shutter,
 lens) work on linear values. OpenColorIO converts the output, by default with the configuration built into OpenImageIO.
-This module computes the sRGB curve itself: OpenColorIO's fast approximation is off by up to 3e-4.
+This module computes the sRGB curve itself, because OpenColorIO's fast approximation is off by up to 3e-4.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ SRGB = "sRGB"
 LINEAR = "lin_rec709"
 """Linear values with Rec.709 primaries."""
 BUILT_IN_OCIO_CONFIG = "ocio://studio-config-latest"
+"""OpenImageIO's name of its built-in OpenColorIO configuration."""
 
 _SPACE_COMMENT_PREFIX = "clsplat colorspace "
 _SPACE_ALIASES = {
@@ -61,24 +62,25 @@ CHROMATICITIES: dict[str, tuple[float, ...]] = {
 }
 """Chromaticities x and y of red, green, blue and white of linear spaces, for EXR files.
 
-AP1 and AP0 follow SMPTE ST 2065-1 and the Academy's S-2014-004, the others their own standards.
+ACEScg and ACES2065-1 follow the Academy's S-2014-004 and SMPTE ST 2065-1, the others their own standards.
 """
 MAX_PLY_LINE_BYTES = 1 << 20
-"""Longest header line of a PLY in bytes."""
+"""Longest header line of a PLY in bytes. A longer line ends the search for the colour space."""
 _LINEAR_PHOTO_SUFFIXES = (".exr", ".hdr")
 
 
 def comment(space: str) -> str:
-    """Comment line of a model file that records the model's colour space."""
+    """Return the comment for a model file's header that records the model's colour space."""
     return _SPACE_COMMENT_PREFIX + space
 
 
 def recorded_space(path: str | os.PathLike[str]) -> str:
-    """Colour space from a model file's header; sRGB if the header records none."""
+    """Return the colour space that a model file's header records; sRGB if it records none."""
     with open(path, "rb") as file:
         if file.readline(16).strip() != b"ply":
             return SRGB
-        for line in iter(lambda: file.readline(MAX_PLY_LINE_BYTES + 1), b""):  # not `in file`: binary data has no lines
+        # `for line in file` could read all binary data as one line.
+        for line in iter(lambda: file.readline(MAX_PLY_LINE_BYTES + 1), b""):
             words = line.decode("ascii", "replace").strip()
             if words == "end_header" or len(line) > MAX_PLY_LINE_BYTES:
                 break
@@ -89,7 +91,7 @@ def recorded_space(path: str | os.PathLike[str]) -> str:
 
 
 def photos_space(paths: Iterable[str | os.PathLike[str]]) -> str:
-    """Colour space of a model trained on these photographs: linear if all are EXR or HDR files, otherwise sRGB."""
+    """Return the colour space of a model trained on these photographs: linear if all are EXR or HDR, otherwise sRGB."""
     endings = {Path(path).suffix.lower() for path in paths}
     return LINEAR if endings and endings <= set(_LINEAR_PHOTO_SUFFIXES) else SRGB
 
@@ -101,7 +103,7 @@ def srgb_to_linear(values: Float32) -> Float32:
 
 
 def linear_to_srgb(values: Float32) -> Float32:
-    """Inverse of `srgb_to_linear`."""
+    """Encode linear values by the sRGB curve, the inverse of `srgb_to_linear`."""
     edge = np.float32(0.04045 / 12.92)
     curve = np.float32(1.055) * np.maximum(values, edge) ** np.float32(1 / 2.4) - np.float32(0.055)
     return np.where(values > edge, curve, values * np.float32(12.92)).astype(np.float32, copy=False)
@@ -118,21 +120,27 @@ def displayed(rgb: NDArray[Any], space: str) -> Float32:
 
 @lru_cache(maxsize=8)
 def _to_srgb(space: str, source: str) -> Colours:
-    """Conversion from a model's colour space to sRGB. Cached because a viewer shows many images."""
+    """Return the conversion from a model's colour space to sRGB. It is cached, because a viewer shows many images.
+
+    source: OpenColorIO configuration; "" for the built-in one.
+    """
     return Colours(ColourConfig(colorspace=SRGB, ocio_config=source), space)
 
 
 class Colours:
-    """The three colour spaces of a job, and conversions between them.
+    """The three colour spaces of a rendering job, and conversions between them.
 
-    model, light, output: of the model, of linear operations, and of the files; SRGB, LINEAR or OpenColorIO names.
+    model: the space in which the model's Gaussians are blended.
+    light: the linear space for operations that add light.
+    output: the space of the files.
+    Each is SRGB, LINEAR or a name of the OpenColorIO configuration.
     """
 
     def __init__(self, config: ColourConfig | None = None, recorded: str = SRGB) -> None:
         """Load the OpenColorIO configuration and look up the spaces.
 
-        recorded: `recorded_space` of the model.
-        Raises InputError if the configuration does not load, or lacks a space; the message lists similar names.
+        recorded: the model's colour space from `recorded_space`, unless `config` names another.
+        Raises InputError if the configuration does not load or lacks a space. The message lists similar names.
         """
         config = config or ColourConfig()
         self._source = config.ocio_config or os.environ.get("OCIO", "") or BUILT_IN_OCIO_CONFIG
@@ -147,12 +155,11 @@ class Colours:
             self._ocio_name(LINEAR)
 
     def is_linear(self, space: str) -> bool:
-        """True if `space`, a colour space of the job, is linear."""
+        """Return True if `space`, a colour space of the job, is linear."""
         return space == LINEAR or (space != SRGB and bool(self._config.isColorSpaceLinear(space)))
 
     def has_rec709(self, space: str) -> bool:
-        """True if `space`, a colour space of the job, has Rec.709's primaries and white point, with any transfer
-        curve."""
+        """Return True if `space`, one of the job's, has Rec.709's primaries and white point, with any curve."""
         if space in _SPACE_ALIASES:
             return True
         light = np.array([[[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]], np.float32)
@@ -202,19 +209,19 @@ class Colours:
         return str(resolved)
 
     def _ocio_name(self, space: str) -> str:
-        """The space's name in the configuration. Raises InputError if the configuration lacks linear Rec.709."""
+        """Return the space's name in the configuration. Raises InputError if it lacks linear Rec.709."""
         for name in _SPACE_ALIASES.get(space, (space,)):
             if self._config.getColorSpaceIndex(self._config.resolve(name)) >= 0:
                 return str(self._config.resolve(name))
         raise InputError(
-            f"{self._source}: has none of {', '.join(_SPACE_ALIASES[space])}, expected one to convert through"
+            f"{self._source}: has none of {', '.join(_SPACE_ALIASES[space])}, expected one of them for conversions"
         )
 
     def convert(self, rgb: Float32, alpha: Float32 | None, source: str, target: str) -> Float32:
         """Convert rgb (H, W, 3) from one of the job's spaces to another, without clipping.
 
-        alpha (H, W): alpha by which rgb is premultiplied; None for opaque images. The conversion needs straight
-          colours, so it divides rgb by alpha and multiplies the result by it. Where alpha is 0 the result is 0.
+        alpha: (H, W), by which rgb is premultiplied; None for opaque images. Conversion needs straight colours, so rgb
+          is divided by alpha before it and multiplied by alpha after it. Where alpha is 0 the result is 0.
         """
         if source == target:
             return rgb
@@ -240,9 +247,9 @@ class Colours:
         return np.asarray(red * matrix[0] + green * matrix[1] + blue * matrix[2], np.float32)
 
     def _matrix(self, source: str, target: str) -> Float32 | None:
-        """Matrix (3, 3) of a conversion, a row for each source channel; None if the conversion is not linear.
+        """Return the matrix (3, 3) of a conversion, a row for each source channel; None if it is not linear.
 
-        With a matrix, frames are converted without OpenImageIO. Its every call loads the configuration again, which
+        With a matrix, frames are converted without OpenImageIO, which would load the configuration in every call. That
         takes longer than rendering a frame.
         """
         light = np.array([[[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0], [4, -1, 2], [0.2, 0.01, 0.5]]], np.float32)
@@ -260,7 +267,10 @@ class Colours:
 
 
 def configuration_digest(source: str) -> str:
-    """SHA-256 digests of an OpenColorIO file and of the tables that it names; `source` itself if it is no file."""
+    """Return the SHA-256 digests of an OpenColorIO file and of the tables that it names.
+
+    Returns `source` itself if it is not a file.
+    """
     if not source or not is_file(source):
         return source
     patterns = _table_patterns(source, Path(source).stat().st_mtime_ns)
@@ -269,10 +279,10 @@ def configuration_digest(source: str) -> str:
 
 
 @lru_cache(maxsize=8)
-def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG001  # a cache key
-    """Glob patterns of the files that a configuration's FileTransforms name, in the folders of its search_path.
+def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG001  # `changed` is a key of the cache
+    """Return glob patterns of the files that a configuration's FileTransforms name, in its search_path's folders.
 
-    Environment variables in these names become "*".
+    Environment variables in the names become "*".
     """
     text = Path(source).read_text("utf-8", "replace")
     listed = re.search(r"^search_path:([^\n]*(?:\n[ \t]*- [^\n]*)*)", text, re.MULTILINE)

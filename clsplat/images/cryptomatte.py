@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cryptomatte (Friedman and Jones 2015; specification 1.2.0, https://github.com/Psyop/Cryptomatte).
+"""Cryptomatte channels and headers (Friedman and Jones 2015; version 1.2.0, https://github.com/Psyop/Cryptomatte).
 
 Each pixel stores the ids and coverages of the objects that cover the largest parts of it. The header maps names to ids.
 """
@@ -18,7 +18,7 @@ _UINT32_MASK = 0xFFFFFFFF
 
 
 def murmur3(data: bytes, seed: int = 0) -> int:
-    """MurmurHash3_x86_32 (Appleby 2011, public domain)."""
+    """Return the hash MurmurHash3_x86_32 of `data` (Appleby 2011, public domain)."""
     value, whole = seed, len(data) // 4 * 4
 
     def mixed(word: int) -> int:
@@ -39,13 +39,13 @@ def murmur3(data: bytes, seed: int = 0) -> int:
 
 
 def id_bits(name: str) -> int:
-    """Id of a name: 32 bits which, read as a float, are neither denormal, infinite nor NaN."""
+    """Return the Cryptomatte id of a name: 32 bits which, read as a float, are neither denormal, infinite nor NaN."""
     bits = murmur3(name.encode())
     return bits ^ (1 << 23) if bits >> 23 & 255 in (0, 255) else bits
 
 
 def header_of(layer: str, names: Sequence[str]) -> dict[str, str]:
-    """Header attributes of a layer: its name, the ids' hash and conversion, and the manifest (the id of each name)."""
+    """Return a layer's header attributes: name, hash and conversion of ids, and the manifest, with each name's id."""
     key = f"cryptomatte/{murmur3(layer.encode()):08x}"[: len("cryptomatte/") + 7]
     manifest = json.dumps({name: f"{id_bits(name):08x}" for name in names}, separators=(",", ":"))
     return {
@@ -57,7 +57,7 @@ def header_of(layer: str, names: Sequence[str]) -> dict[str, str]:
 
 
 def ranked(coverage: Float32, names: Sequence[str]) -> Float32:
-    """Ids and coverages (H, W, 4 CRYPTOMATTE_LAYERS) of the objects that cover most of each pixel, largest first.
+    """Return ids and coverages (H, W, 4 CRYPTOMATTE_LAYERS) of the objects that cover most of a pixel, largest first.
 
     coverage: (H, W, objects). Equal coverages keep the order of `names`. Unused entries are 0.
     """

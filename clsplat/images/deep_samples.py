@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Conversion of deep samples from arrays to OpenImageIO's deep data.
+"""Conversion of deep samples from arrays to OpenImageIO's deep data, by way of a scratch deep EXR.
 
-OpenImageIO's Python interface sets deep values one by one, which takes twenty times as long as the frame. It reads a
-deep file at once. So this module writes the samples to an uncompressed deep EXR, whose layout is simple
-(https://openexr.com/en/latest/OpenEXRFileLayout.html). OpenImageIO reads that scratch file and writes the final file
+OpenImageIO's Python interface sets deep values one by one, which takes twenty times as long as rendering the frame, but
+reads a deep file at once. So this module writes the samples to an uncompressed deep EXR, whose layout is simple
+(https://openexr.com/en/latest/OpenEXRFileLayout.html), and OpenImageIO reads it. OpenImageIO then writes the final file
 with its header and compression.
 """
 
@@ -27,16 +27,16 @@ _EXR_PIXEL_TYPES = {2: 1, 4: 2}
 
 
 def samples_bytes(pixels: int, most: int) -> int:
-    """Upper bound in bytes of `deep_data`'s scratch file, if each pixel has at most `most` samples."""
+    """Return an upper bound in bytes of `deep_data`'s scratch file, for at most `most` samples per pixel."""
     return pixels * (4 + 24 * most) + 40 * pixels + (1 << 12)
 
 
 def deep_data(scratch: Path, counts: NDArray[np.int32], columns: dict[str, NDArray[Any]]) -> Any:
-    """OpenImageIO's deep data of some rows of a frame.
+    """Return OpenImageIO's deep data of some rows of a frame.
 
     scratch: path of the scratch file to write and read.
     counts (H, W): number of samples of each pixel.
-    columns: half or float values (samples,) of each channel, ordered by row, pixel, and from front to back.
+    columns: half or float values (samples,) of each channel, ordered by row, by pixel, then front to back.
     Raises ClsplatError if OpenImageIO cannot read the scratch file.
     """
     _write(scratch, counts, columns)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading depth maps: integer PNG and TIFF, EXR, NPY."""
+"""Reading of depth maps from files: integer PNG and TIFF, EXR, NPY."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ DEPTH_MAP_KINDS = "a depth map: PNG or TIFF of whole numbers, EXR, or NPY"
 
 
 INTEGER_MAXIMA = {"uint8": 255, "uint16": 65535}
-"""Maxima of the integers that images store."""
+"""Largest value of each integer pixel type."""
 
 
 def map_header(path: Path) -> tuple[int, int, bool]:
-    """Width and height of a depth map, and True if it stores integers. Reads the header only.
+    """Return a depth map's width, height, and True if it stores integers. Reads only the header.
 
     Raises InputError like `read_map` for errors in the header.
     """
@@ -36,10 +36,10 @@ def map_header(path: Path) -> tuple[int, int, bool]:
 
 
 def read_map(path: Path) -> Float32:
-    """Values (H, W) of a depth map as stored; 8- and 16-bit integers are not scaled. Non-finite values become NaN.
+    """Read a depth map's values (H, W) as stored, without scaling of integers. Non-finite values become NaN.
 
-    Of several channels, reads the one called Z or depth, or else the first. Raises InputError with the file's name if
-    the file is missing, damaged, or not a depth map.
+    Of several channels, reads the channel called Z or depth, or else the first. Raises InputError with the file's name
+    if the file is missing, damaged, or not a depth map.
     """
     if path.suffix.lower() == ".npy":
         values = np.array(_numpy(path), np.float32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exposure of a photograph, from its EXIF data."""
+"""Exposure of a photograph (exposure time, ISO speed, f-number) from its EXIF data."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _EXIF_ISO_TAGS = ("Exif:PhotographicSensitivity", "Exif:ISOSpeedRatings", "Exif:
 
 
 def exposure_of(path: Path) -> float | None:
-    """log2(exposure time * ISO speed / f-number^2) of a photograph; time in seconds.
+    """Return log2(exposure time * ISO speed / f-number^2) of a photograph, with the time in seconds.
 
-    None if the file lacks one of these values or cannot be read.
+    Returns None if the file lacks one of these values or cannot be read.
     """
     try:
         source = open_image(path)

@@ -28,27 +28,31 @@ from clsplat.images.reading import decodes, image_size, opened
 from clsplat.images.writing import steps_of, write_spec
 
 MAX_HALF_FLOAT = np.float32(65504)
+"""Largest finite half float."""
 _PNG_LEVEL, _PNG_FILTER = 1, 0x40
 """PNG compression level, and the filter that predicts each pixel from the mean of its left and upper neighbours.
 
-They take a fifth of the time of level 6 with the best of five filters for each row; files are at most a tenth larger.
-On a CPU device, level 6 can take longer than the frame.
+Compared with level 6 and the best of five filters for each row, writing takes a fifth of the time, and files are at
+most a tenth larger. Level 6 can take longer than rendering the frame on a CPU.
 """
 _EXR_ZIP_LEVEL = 1
 """Level of zip and zips compression. It takes two thirds of the time of the default, 4, and 2 to 7 % more bytes."""
 _MAX_EXACT_FLOAT_INDEX = 2**24
+"""Integers up to this are exact in a 32-bit float."""
 _DISK_BLOCK_BYTES = 1 << 12
 """Bytes in a disk block."""
 
 FRAME_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".dpx")
+"""Lower-case extensions of the image files that frames are written to."""
 VIDEO_SUFFIXES = (".mp4", ".mov")
+"""Lower-case extensions of the videos that frames are written to."""
 MODEL_DIGEST_ATTRIBUTE, SETTINGS_DIGEST_ATTRIBUTE = "clsplat:model", "clsplat:settings"
-"""Attributes that record a frame's source: SHA-256 of the model file, and a digest of all other settings."""
+"""EXR attributes with a frame's provenance: SHA-256 of the model file, and a digest of all other settings."""
 RECORD_TAGS = {
     **dict.fromkeys((".tif", ".tiff", ".jpg", ".jpeg"), "ImageDescription"),
     ".dpx": "DocumentName",
 }
-"""Header text that holds the record. In a DPX it is the project name, which has 200 characters."""
+"""By extension, the header text with a frame's provenance. In a DPX it is the project name, of 200 characters."""
 _RECORD_PATTERN = re.compile(r"clsplat model ([0-9a-z]+) settings ([0-9a-z]+)", re.ASCII)
 
 
@@ -56,10 +60,12 @@ _RECORD_PATTERN = re.compile(r"clsplat model ([0-9a-z]+) settings ([0-9a-z]+)", 
 class FrameFileHeader:
     """Contents of a frame file other than pixels.
 
-    window: place of the image in the display window; None if the image fills it.
+    attributes: header attributes by name.
+    matrices: EXR attributes (4, 4) by name, for row vectors.
+    window: the image's position in the display window, and the window's size; None if the image fills it.
     chromaticities: x and y of red, green, blue and white; empty if unknown.
     is_srgb: True if the colours are in sRGB.
-    typed: EXR attributes, each with OpenImageIO's name of its type and its value.
+    typed: EXR attributes by name, each with OpenImageIO's name of its type and its value.
     view: "left" or "right" in a stereo pair, otherwise "".
     """
 
@@ -73,11 +79,12 @@ class FrameFileHeader:
 
 
 def camera_matrices(camera: Camera) -> dict[str, Float64]:
-    """OpenEXR's worldToCamera and worldToNDC for row vectors; empty for a camera without an image plane.
+    """Return OpenEXR's attributes worldToCamera and worldToNDC, for row vectors; none for a camera without image plane.
 
-    Camera space has x right, y up and z along the view, a left-handed frame. In NDC, (0, 0) is the upper left corner of
-    the display window and (1, 1) the lower right one. OpenEXR does not define z; here it is 0 at the near plane and 1
-    at infinity. For an orthographic camera it is 1 at the far plane; without one it grows by 1 per world unit.
+    Camera space has x right, y up and z along the view, so it is left-handed. In NDC, (0, 0) is the upper left corner
+    of the display window and (1, 1) the lower right. OpenEXR does not define z in NDC. Here z is 0 at the near plane
+    and 1 at infinity. For an orthographic camera it is 1 at the far plane. Without a far plane it grows by 1 per world
+    unit.
     """
     display = camera.window or camera
     projection = camera.model.ndc_from_cam(camera, display.width, display.height)
@@ -91,12 +98,15 @@ def camera_matrices(camera: Camera) -> dict[str, Float64]:
 
 
 def is_whole_panorama(camera: Camera) -> bool:
-    """True if the image is a full panorama with the camera's axis in the middle, as EXR's envmap requires."""
+    """Return True for a full panorama with the camera's axis in the middle, as EXR's attribute envmap requires."""
     return camera.window is None and camera.model.is_whole(camera)
 
 
 def parse_channels(text: str) -> tuple[str, ...]:
-    """Channel names from a comma-separated text, in the order of WRITABLE_CHANNELS. Raises InputError."""
+    """Return the channel names in a comma-separated text, in the order of WRITABLE_CHANNELS.
+
+    Raises InputError for an unknown name or an empty text.
+    """
     asked = [word.strip() for word in text.split(",") if word.strip()]
     unknown = [word for word in asked if word not in WRITABLE_CHANNELS]
     if unknown or not asked:
@@ -106,7 +116,7 @@ def parse_channels(text: str) -> tuple[str, ...]:
 
 
 def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> None:
-    """Raise InputError if a file of this name cannot hold the channels. video: accept names of videos too."""
+    """Raise InputError if a file with this name cannot hold the channels. video: accept names of videos too."""
     extension, known = Path(path).suffix.lower(), (*FRAME_SUFFIXES, *VIDEO_SUFFIXES) if video else FRAME_SUFFIXES
     if extension not in known:
         raise InputError(f"{path}: has the extension {extension or 'none'!r}, expected one of {', '.join(known)}")
@@ -135,8 +145,8 @@ def write_channels(
 ) -> None:
     """Write a frame, atomically.
 
-    channels: arrays (H, W) or (H, W, channels) by channel name. rgb is over black, so it is premultiplied by alpha. In
-      an integer part the id -1, for no Gaussian, becomes 4294967295.
+    channels: arrays (H, W) or (H, W, C) by channel name. rgb is over black, so it is premultiplied by alpha. In an EXR
+      part of integers, the id -1, for no Gaussian, becomes 4294967295.
     Raises InputError and ClsplatError like `writing.write_image`.
     """
     write_views(path, [(channels, header or FrameFileHeader())], encoding)
@@ -145,7 +155,10 @@ def write_channels(
 def write_views(
     path: Path, views: Sequence[tuple[Mapping[str, NDArray[Any]], FrameFileHeader]], encoding: Encoding | None = None
 ) -> None:
-    """Write several views to one EXR file, like `write_channels`. Each view has its own parts, which carry its name."""
+    """Write several views, such as a stereo pair, to one EXR file. Each view has parts of its own, named after it.
+
+    views: for each view its channels, as in `write_channels`, and its header.
+    """
     encoding = encoding or Encoding()
     check_target(path, views[0][0])
     extension = path.suffix.lower()
@@ -162,9 +175,9 @@ def encoded(
     *,
     several: bool = False,
 ) -> list[tuple[NDArray[Any], Any]]:
-    """Pixels and OpenImageIO specification of each part of a file, for one view.
+    """Return pixels and OpenImageIO specification of each part of a file, for one view.
 
-    several: True if the file has several views. Then the names of parts include the view.
+    several: True if the file has several views, so that the names of parts include the view.
     """
     channels = {name: channels[name] for name in WRITABLE_CHANNELS if name in channels}
     if extension != ".exr":
@@ -187,10 +200,10 @@ def is_whole(
     deep: bool = False,
     views: int = 1,
 ) -> bool:
-    """True if the file is complete and holds these channels as `write_channels` writes them.
+    """Return True if the file is complete and holds these channels as `write_channels` writes them.
 
-    The image must have this size, none of these attributes with another value, and a last row that decodes. If the file
-    contains a disk block of zeros, every row must decode.
+    The image must have this size and a last row that decodes. Attributes must have these values or be absent. If the
+    file contains a disk block of zeros, every row must decode.
 
     deep: expect a deep image, whose channels are DEEP_CHANNELS.
     views: number of views; each must have these channels.
@@ -228,26 +241,26 @@ def is_whole(
 
 
 def _has_zero_block(path: Path) -> bool:
-    """True if a disk block of the file has only zeros, as happens if the machine crashes before it writes the block."""
+    """Return True if a disk block of the file has only zeros, as after a crash before the block was written."""
     empty = bytes(_DISK_BLOCK_BYTES)
     with open(path, "rb") as file:
         return any(empty in block for block in iter(lambda: file.read(_DISK_BLOCK_BYTES << 8), b""))
 
 
 def is_foreign(path: Path) -> bool:
-    """True if a file is an image of another program than clsplat."""
+    """Return True if a file is an image that another program than clsplat wrote."""
     with opened(path) as source:
         return source is not None and "clsplat" not in str(source.spec().getattribute("Software"))
 
 
 def attribute(path: Path, name: str) -> Any:
-    """Attribute `name` of a file's first part; None if the file lacks it or is not an image."""
+    """Return the attribute `name` of a file's first part; None if the file lacks it or is not an image."""
     with opened(path) as source:
         return None if source is None else attribute_of(source.spec(), name)
 
 
 def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
-    """Names of the channels of each part of a file with several parts. Assumes the order of WRITABLE_CHANNELS."""
+    """Group channel names, in the order of WRITABLE_CHANNELS, by the EXR part that holds them."""
     return [tuple(group) for _, group in groupby(names, lambda name: WRITABLE_CHANNELS[name].part)]
 
 
@@ -285,7 +298,7 @@ def _check_floats(name: str, plane: NDArray[Any]) -> None:
     if WRITABLE_CHANNELS[name].kind == "whole" and plane.max(initial=0) > _MAX_EXACT_FLOAT_INDEX:
         raise InputError(
             f"--channels {name}: the largest value is {plane.max():,}, which a float cannot hold exactly; use --parts "
-            "several, which stores whole numbers"
+            "several, which stores integers"
         )
 
 
@@ -317,7 +330,7 @@ def _picture(
 
 
 def deep_spec(width: int, height: int, encoding: Encoding, header: FrameFileHeader) -> Any:
-    """OpenImageIO's specification of a deep EXR. Colours are half or float as in the encoding, depths are float."""
+    """Return OpenImageIO's specification of a deep EXR, with colours of the encoding's depth and depths as floats."""
     spec = _exr_spec((height, width, len(DEEP_CHANNELS)), DEEP_CHANNELS, [oiio.FLOAT], header)
     spec.deep = True
     spec.channelformats = (oiio.TypeDesc(encoding.depth),) * 4 + (oiio.TypeDesc("float"),) * 2
@@ -327,9 +340,11 @@ def deep_spec(width: int, height: int, encoding: Encoding, header: FrameFileHead
 
 
 def _exr_spec(shape: tuple[int, ...], names: Sequence[str], formats: Sequence[Any], header: FrameFileHeader) -> Any:
-    """OpenImageIO's specification of an EXR part.
+    """Return OpenImageIO's specification of an EXR part.
 
-    formats: a pixel format for each channel, or a single one for all channels.
+    shape: height, width and number of channels.
+    names: names of the channels.
+    formats: pixel formats of the channels, or a single format for all.
     """
     several = len(set(formats)) > 1
     spec = _spec(shape, names, oiio.FLOAT if several else formats[0], header)
@@ -363,20 +378,24 @@ def _spec(shape: tuple[int, ...], names: Sequence[str], kind: Any, header: Frame
 
 
 def record_text(attributes: Mapping[str, Any]) -> str:
-    """The provenance among a header's attributes as one text, for formats without custom attributes; '' if a digest is
-    missing."""
+    """Return the provenance record, a text with the digests of model and settings; '' if one of them is missing.
+
+    It is for file formats without custom attributes.
+
+    attributes: attributes of a frame's header.
+    """
     model, settings = attributes.get(MODEL_DIGEST_ATTRIBUTE), attributes.get(SETTINGS_DIGEST_ATTRIBUTE)
     return f"clsplat model {model} settings {settings}" if model and settings else ""
 
 
 def parse_record(text: object) -> dict[str, str]:
-    """Attributes in a record; empty for any other text."""
+    """Return the digest attributes in a provenance record from `record_text`; none for any other text."""
     match = _RECORD_PATTERN.search(str(text or ""))
     return {MODEL_DIGEST_ATTRIBUTE: match[1], SETTINGS_DIGEST_ATTRIBUTE: match[2]} if match else {}
 
 
 def attribute_of(spec: Any, name: str) -> Any:
-    """Attribute in OpenImageIO's specification of a file, or in the record there; None if neither has it."""
+    """Return an attribute from OpenImageIO's specification of a file, or from the provenance record there, or None."""
     value = spec.getattribute(name)
     for place in dict.fromkeys(RECORD_TAGS.values()) if value is None else ():
         value = parse_record(spec.getattribute(place)).get(name) if value is None else value

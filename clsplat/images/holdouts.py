@@ -23,10 +23,10 @@ from clsplat.images.reading import error_of, one_line, open_image
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """The surfaces in each pixel of an image.
+    """The surfaces in each pixel of an image, S in all.
 
-    counts (H, W): int64, number of surfaces of each pixel. rows (S, 4): float32, HOLDOUT_SURFACE_FIELDS of all S
-    surfaces, ordered by pixel and within a pixel by front depth.
+    counts: (H, W) int64, number of surfaces of each pixel.
+    rows: (S, 4) float32, HOLDOUT_SURFACE_FIELDS of each surface, ordered by pixel and within a pixel by front depth.
     """
 
     counts: NDArray[np.int64]
@@ -34,11 +34,11 @@ class Surfaces:
 
     @property
     def dense(self) -> int:
-        """Mean number of surfaces per pixel in the image row with most surfaces, rounded up."""
+        """Mean number of surfaces per pixel, rounded up, in the image row that has most surfaces."""
         return int(np.ceil(self.counts.mean(axis=1).max(initial=0)))
 
     def taken(self, across: NDArray[np.int64], down: NDArray[np.int64]) -> Surfaces:
-        """Resample: pixel (x, y) of the result has the surfaces of pixel (across[x], down[y]), if that is inside."""
+        """Resample: pixel (x, y) of the result gets the surfaces of pixel (across[x], down[y]); none if outside."""
         height, width = self.counts.shape
         if np.array_equal(across, np.arange(width)) and np.array_equal(down, np.arange(height)):
             return self
@@ -57,7 +57,7 @@ class Surfaces:
 
 @dataclass(frozen=True, eq=False)
 class Holdout:
-    """Holdout of a frame.
+    """Surfaces of CG elements that hold out the model in a frame.
 
     surfaces: surfaces in the file's data window.
     x, y: first pixel of the data window, in the frame.
@@ -71,7 +71,7 @@ class Holdout:
 
 
 def check_holdout(path: Path, size: tuple[int, int], channel: str = "") -> bool:
-    """Check the header of a holdout file. Returns True if its depths are half floats.
+    """Check the header of a holdout file. Return True if the file's depths are half floats.
 
     Raises InputError if the file cannot be a holdout of a frame of this size (width, height).
     """
@@ -104,7 +104,7 @@ def read_holdout(path: Path, size: tuple[int, int], channel: str = "", *, invers
     alpha = np.ones(len(begin), np.float32) if alpha is None else alpha
     for values, what in ((begin, name), (end, "ZBack"), (alpha, "A")):
         if odd := int(np.isnan(values).sum()):
-            raise InputError(f"{path}: {odd} values of {what} are not a number, expected depths and alpha of surfaces")
+            raise InputError(f"{path}: {odd} values of {what} are NaN, expected depths and alpha of surfaces")
     if odd := int((begin < 0).sum()):
         raise InputError(f"{path}: {odd} values of {name} are negative, expected depths along the camera's axis")
     if inverse:
@@ -114,7 +114,10 @@ def read_holdout(path: Path, size: tuple[int, int], channel: str = "", *, invers
 
 
 def surfaces_of(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Surfaces:
-    """Surfaces from front depths, back depths and alpha, each (H, W, count), without front depths of 0 or infinity."""
+    """Return surfaces from front depths, back depths and alpha, each (H, W, count).
+
+    Entries with a front depth of 0 or infinity, or an alpha of 0, are no surfaces.
+    """
     counts = np.full(begin.shape[0] * begin.shape[1], begin.shape[2])
     return _surfaces(begin.ravel(), end.ravel(), alpha.ravel(), counts, begin.shape[:2])
 
@@ -122,7 +125,10 @@ def surfaces_of(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> 
 def _surfaces(
     begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any], counts: NDArray[np.int64], shape: tuple[int, ...]
 ) -> Surfaces:
-    """Surfaces from values (S,) that are ordered by pixel. counts (H W,): number of values of each pixel."""
+    """Return surfaces from front depths, back depths and alpha (S,), ordered by pixel of an image of `shape` (H, W).
+
+    counts: (H W,), number of values of each pixel.
+    """
     alpha = np.clip(alpha, 0, 1)
     shown = (begin > 0) & (begin < np.inf) & (alpha > 0)
     pixels = np.repeat(np.arange(len(counts)), counts)[shown]
@@ -135,7 +141,7 @@ def _surfaces(
 
 
 def _rows(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Float32:
-    """HOLDOUT_SURFACE_FIELDS of each surface. The back depth of an opaque surface is set to its front depth."""
+    """Return HOLDOUT_SURFACE_FIELDS of each surface. An opaque surface's back depth is set to its front depth."""
     rows = np.zeros((len(begin), len(HOLDOUT_SURFACE_FIELDS)), np.float32)
     rows[:, 0], rows[:, 2] = begin, 1 - alpha
     rows[:, 1] = np.where((alpha < 1) & (end > begin), end, begin)
@@ -147,13 +153,13 @@ def _rows(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Float3
 
 @contextmanager
 def _part(path: Path, size: tuple[int, int], channel: str) -> Iterator[tuple[Any, int, list[int | None]]]:
-    """Context manager: OpenImageIO's input, the part with the depths, and its indices of depths, alpha, back depths."""
+    """Yield OpenImageIO's input, the part with the depths, and the channel indices of depths, alpha and back depths."""
     if not is_file(path):
-        raise InputError(f"{path}: no such holdout, expected a depth or deep EXR for each frame that is rendered")
+        raise InputError(f"{path}: no such holdout file, expected a depth or deep EXR for each rendered frame")
     source = open_image(path)
     try:
         if source.format_name() != "openexr":
-            raise InputError(f"{path}: is no EXR, expected a depth or deep EXR as a holdout")
+            raise InputError(f"{path}: is not an EXR file, expected a depth or deep EXR as a holdout")
         name, part, seen = channel or "Z", 0, []
         while source.seek_subimage(part, 0) and name not in (names := list(source.spec().channelnames)):
             seen += names
@@ -161,12 +167,13 @@ def _part(path: Path, size: tuple[int, int], channel: str) -> Iterator[tuple[Any
         spec = source.spec()
         if not source.seek_subimage(part, 0):
             raise InputError(
-                f"{path}: has the channels {examples(seen)}, expected {name}; name its depths with --holdout.channel"
+                f"{path}: has the channels {examples(seen)}, expected {name}; give the channel of its depths with "
+                "--holdout.channel"
             )
         if (spec.full_width, spec.full_height) != size:
             raise InputError(
-                f"{path}: holds a frame of {spec.full_width}x{spec.full_height}, expected {size[0]}x{size[1]} like the "
-                "frame that is rendered"
+                f"{path}: has a display window of {spec.full_width}x{spec.full_height} pixels, expected "
+                f"{size[0]}x{size[1]} like the rendered frame"
             )
         layer = name[: name.rfind(".") + 1]
         alpha, back = (names.index(layer + word) if layer + word in names else None for word in ("A", "ZBack"))

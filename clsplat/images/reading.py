@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading of images with OpenImageIO, and their resampling.
+"""Reading of images with OpenImageIO, resampling, and the search for images in folders.
 
 In memory an image is float32 (H, W, C), C = 3 (RGB) or 4 (RGBA), in the file's own colour space; nothing is linearised.
-Alpha in memory is always straight (unassociated). Files follow OpenImageIO: straight in PNG, premultiplied (associated)
-in EXR.
+Alpha in memory is always straight (unassociated). In files it is straight in PNG, premultiplied (associated) in EXR.
 """
 
 from __future__ import annotations
@@ -27,33 +26,37 @@ from clsplat.files.names import native_name
 from clsplat.images.alpha import associate, unassociate
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".hdr", ".tga", ".ppm", ".pgm")
-"""Lower-case extensions of images that a folder search finds. A file given by name may have any other."""
+"""Lower-case extensions of the images that a search in folders finds. A file given by name may have any extension."""
 
 T = TypeVar("T", bound=np.generic)
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_IMAGE_PIXELS = 1 << 28
+"""Largest number of pixels of an image that is read."""
 MAX_UNCHECKED_CHANNEL_VALUES, MAX_CHANNEL_VALUES_PER_BYTE = 48 << 20, 4096
-"""A file may decode to MAX_UNCHECKED_CHANNEL_VALUES, or to MAX_CHANNEL_VALUES_PER_BYTE for each of its bytes if more.
+"""Limits of the values (pixels times channels) to which a file may decode: a number, and a number per byte of the file.
 
-No real image has more: deflate expands a byte to at most 1032 bytes.
+The larger limit counts. No real image has more per byte, as deflate expands a byte to at most 1032 bytes.
 """
 _DECODE_CHECK_ROWS = 64
+"""Number of rows that `decodes` reads at a time."""
 MAX_IMAGE_FILE_BYTES, MAX_UNSIGNED_IMAGE_BYTES = 1 << 30, 1 << 26
+"""Largest image file in bytes, and largest file without one of IMAGE_SIGNATURES."""
 IMAGE_SIGNATURES = (
     *(PNG_SIGNATURE, b"\xff\xd8\xff", b"\x76\x2f\x31\x01", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"BM", b"#?"),
     *(b"SDPX", b"XPDS", b"RIFF", b"P1", b"P2", b"P3", b"P4", b"P5", b"P6", b"PF", b"Pf"),
 )
-"""First bytes, one of which a file over MAX_UNSIGNED_IMAGE_BYTES must have. Some decoders read a whole file before they
-find that it is not in their format."""
-# libjpeg's messages about superfluous data; every other message means lost pixels
+"""First bytes of image formats. A file over MAX_UNSIGNED_IMAGE_BYTES must start with one of them, because some decoders
+read a whole file before they find that it is not in their format."""
 HARMLESS_DECODER_NOTES = ("extraneous bytes",)
+"""Parts of libjpeg's messages about superfluous data. Every other message means lost pixels."""
 
 
 COMPANION_PATTERN = (
     r"(?:depths?|disp|disparity|normals?|alpha|albedo|masks?|mattes?|seg|segmentations?|semantics?|confidence|conf|flow"
     r"|edges?|silhouettes?|labels?)"
 )
+"""Words in names of files and folders that accompany photographs, such as masks and depth maps."""
 FOREGROUND_PATTERN = r"(?:fg|foreground)"
 """Words in names of masks that count only with a separator between them and the photograph's name."""
 _COMPANION_FOLDER = re.compile(rf"(?:\w+[_-])?{COMPANION_PATTERN}(?:[_-]\w+)?", re.IGNORECASE)
@@ -67,9 +70,9 @@ _COLOUR_SUFFIX = re.compile(r"[._-](?:colou?r|rgba?|image|img)\Z", re.IGNORECASE
 
 
 def companions(paths: Iterable[Path], pictures: Iterable[Path], folder: Path) -> set[Path]:
-    """Files among `paths` that accompany one of the pictures: masks, depths, normals and the like.
+    """Return the files among `paths` that accompany one of the pictures: masks, depths, normals and the like.
 
-    A file's name decides, by words such as mask or depth in upper or lower case. One of these must hold:
+    They are recognised by words such as mask or depth, in upper or lower case. One of these must hold:
 
     - The word follows a picture's name (r_0_depth_0001.png) or precedes it (mask_r_0.png).
     - The word replaces "color" (frame-1.color.jpg, frame-1.depth.png).
@@ -107,15 +110,15 @@ def _goes_with(path: Path, names: set[str], stems: set[str]) -> bool:
 
 
 def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
-    """Sorted paths of the images in `folder`, by extension. deep: search its sub-folders too.
+    """Return sorted paths of the images in `folder`, recognised by extension. deep: search its sub-folders too.
 
-    Hidden files and folders and broken links are left out. Links to folders are followed, but each folder is searched
-    once. Raises InputError for a folder that cannot be read.
+    Hidden files, hidden folders and broken links are left out. Links to folders are followed, but each folder is
+    searched only once. Raises InputError for a folder that cannot be read.
     """
     paths: list[Path] = []
     seen: set[str] = set()
     for root, folders, files in os.walk(folder, followlinks=True, onerror=cannot_be_searched):
-        real = os.path.realpath(root)  # not the inode: some file systems of Windows give 0 for every folder
+        real = os.path.realpath(root)  # An inode would not do: some file systems of Windows give 0 for every folder.
         if real in seen:
             folders.clear()
             continue
@@ -130,13 +133,13 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
 
 
 def cannot_be_searched(error: OSError) -> None:
-    """Raise InputError for a folder that cannot be read. A handler for `os.walk`, which by default skips the folder."""
+    """Raise InputError for a folder that cannot be read: the `onerror` of `os.walk`, which would skip the folder."""
     why = reason_of(error)
     raise InputError(f"{error.filename}: cannot be searched for pictures: {why}; make it readable or move it away")
 
 
 def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
-    """Width and height of `read_image`'s result, from the header alone.
+    """Return width and height of the image that `read_image` would return, from the header alone.
 
     Raises InputError if the file is missing, is not an image, or is a truncated PNG.
     """
@@ -152,7 +155,7 @@ def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
 
 
 def stored_range(path: Path) -> tuple[int, bool]:
-    """Largest integer of the file's pixel type, 0 for floats; and True if its compression is lossless.
+    """Return the largest integer of an image's pixel type, 0 for floats, and True if its compression is lossless.
 
     Raises InputError like `open_image`.
     """
@@ -165,8 +168,8 @@ def stored_range(path: Path) -> tuple[int, bool]:
 def read_image(path: Path, *, orient: bool = True) -> Float32:
     """Read an image as float32 (H, W, 3), or (H, W, 4) with straight alpha.
 
-    Integers of 8 or 16 bits are scaled to [0, 1]; floats are kept, also above 1. Grey becomes RGB. An EXR gives R, G, B
-    and A of its whole display window, without other channels.
+    Integers of 8 or 16 bits are scaled to [0, 1]; floats are kept, also above 1. Grey becomes RGB. Of an EXR, only R,
+    G, B and A are read, on the whole display window.
 
     orient: apply the EXIF orientation. Use False for photographs of a COLMAP model: COLMAP (pycolmap 4.2.1) ignores the
       orientation, so its keypoints and camera sizes refer to the pixels as stored.
@@ -184,8 +187,10 @@ def read_image(path: Path, *, orient: bool = True) -> Float32:
     if pixels is None or (reason and not any(harmless in reason for harmless in HARMLESS_DECODER_NOTES)):
         raise InputError(f"{path}: does not decode: {one_line(reason)}; copy the picture again or leave it out")
     pixels = np.asarray(pixels, np.float32)
-    if pixels.size != spec.height * spec.width * spec.nchannels:
-        raise InputError(f"{path}: does not decode: its header and its pixels differ in size; save it again")
+    if pixels.size != (expected := spec.height * spec.width * spec.nchannels):
+        raise InputError(
+            f"{path}: does not decode: has {pixels.size} values, expected {expected} as in its header; save it again"
+        )
     pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
     image = _as_rgb(path, pixels, spec)
     if not np.isfinite(image).all():
@@ -201,9 +206,9 @@ def read_image(path: Path, *, orient: bool = True) -> Float32:
 def downscale(image: Float32, width: int, height: int) -> Float32:
     """Resample an image (H, W, C) to (height, width, C): each new pixel is the mean of the area that it covers.
 
-    Fractions of pixels are weighted exactly, and the image's corners stay in place as in `Camera.resized`. An axis that
-    grows is interpolated linearly. The mean is of premultiplied colour, so that transparent pixels do not bleed in.
-    Alpha is straight in input and output.
+    Pixels that are partly covered count by their fraction. The image's corners stay in place, as in `Camera.resized`.
+    An axis that grows is interpolated linearly. The mean is of premultiplied colours, so that transparent pixels do
+    not bleed in; alpha is straight in input and output.
     """
     if image.shape[:2] == (height, width):
         return image
@@ -229,15 +234,15 @@ def turned(image: NDArray[T], orientation: int) -> NDArray[T]:
 
 
 def channels_of(spec: Any) -> list[str]:
-    """Upper-case name of each channel. A decoder's list may be too long or too short: missing names become ""."""
+    """Return the upper-case name of each channel, "" where the decoder's list of names is too short."""
     names = [name.upper() for name in spec.channelnames][: spec.nchannels]
     return names + [""] * (spec.nchannels - len(names))
 
 
 def alpha_of(spec: Any) -> int:
-    """Index of the alpha channel, -1 for none.
+    """Return the index of the alpha channel, -1 for none.
 
-    A decoder's index may be too large (OpenImageIO gives 4 for a GIF of 4 channels), or be that of a colour channel. In
+    The decoder's index may be too large (OpenImageIO gives 4 for a GIF of 4 channels) or point to a colour channel. In
     both cases the channel called A is used.
     """
     names, index = channels_of(spec), int(spec.alpha_channel)
@@ -272,15 +277,15 @@ def open_image(path: Path) -> Any:
         raise InputError(f"{path}: is {spec.width} x {spec.height} x {spec.depth} pixels, expected a flat picture")
     if max(shown) > MAX_IMAGE_PIXELS or floats > max(MAX_UNCHECKED_CHANNEL_VALUES, MAX_CHANNEL_VALUES_PER_BYTE * size):
         raise InputError(
-            f"{path}: says that it is {spec.width} x {spec.height} pixels of {spec.nchannels} channels, with a display "
-            f"window of {spec.full_width} x {spec.full_height}, in {size} bytes; is it damaged?"
+            f"{path}: its header gives {spec.width} x {spec.height} pixels of {spec.nchannels} channels and a display "
+            f"window of {spec.full_width} x {spec.full_height}, too many for a file of {size} bytes; is it damaged?"
         )
     return source
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """Context manager that yields OpenImageIO's input of a file, or None if it is not an image. Discards errors."""
+    """Open a file as a context manager: OpenImageIO's input, or None if it is not an image. Errors are discarded."""
     source = oiio.ImageInput.open(native_name(path))
     try:
         yield source
@@ -291,7 +296,7 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def decodes(source: Any, part: int, first: int) -> bool:
-    """True if the rows of a part decode from the row `first` on. Reads _DECODE_CHECK_ROWS rows at a time."""
+    """Return True if the rows of a part of an open image decode, from the row `first` to the last."""
     spec = source.spec()
     for top in range(spec.y + first, spec.y + spec.height, _DECODE_CHECK_ROWS):
         place = (part, 0, top, min(top + _DECODE_CHECK_ROWS, spec.y + spec.height), 0, 0, spec.nchannels)
@@ -302,7 +307,7 @@ def decodes(source: Any, part: int, first: int) -> bool:
 
 
 def error_of(source: Any) -> str:
-    """OpenImageIO's message of the last error."""
+    """Return OpenImageIO's message of the last error."""
     try:
         return str(source.geterror())
     except UnicodeDecodeError:
@@ -333,7 +338,7 @@ def _as_rgb(path: Path, pixels: Float32, spec: Any) -> Float32:
 
 
 def _display_window(image: Float32, spec: Any) -> Float32:
-    """The image extended or cropped from an EXR's data window to its display window; 0 outside the data window."""
+    """Extend or crop an image from an EXR's data window to its display window, with 0 outside the data window."""
     x, y = spec.x - spec.full_x, spec.y - spec.full_y
     width, height = spec.full_width, spec.full_height
     if (x, y, spec.width, spec.height) == (0, 0, width, height):
@@ -356,7 +361,7 @@ def _check_png_is_whole(path: Path) -> None:
 
 
 def png_is_whole(path: Path) -> bool:
-    """True if all chunks of a PNG are complete, up to the last chunk, IEND."""
+    """Return True if all chunks of a PNG are complete, up to the last chunk, IEND."""
     size = path.stat().st_size
     with open(path, "rb") as file:
         position = len(PNG_SIGNATURE) if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE else size
@@ -372,8 +377,8 @@ def png_is_whole(path: Path) -> bool:
 
 
 def _resampling(source: int, target: int) -> Any:
-    """Sparse matrix (target, source) that resamples an axis; each row's weights sum to 1."""
-    from scipy import sparse  # takes a quarter of a second, and most commands do not need it
+    """Return a sparse matrix (target, source) that resamples an axis; each row's weights sum to 1."""
+    from scipy import sparse  # Here, because the import takes a quarter of a second and most commands do not need it.
 
     if target >= source:
         centres = (np.arange(target) + 0.5) * (source / target) - 0.5

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""STMaps: images whose red and green values are the source position of each pixel in another image.
+"""Reading and writing of STMaps: images whose red and green give each pixel's source position in another image.
 
-Positions are fractions of that image's width and height, from its lower left corner, as in Nuke. At pixel (x, y) from
-the top left corner, the identity map is (x + 1/2) / width and 1 - (y + 1/2) / height.
+Positions are fractions of the source image's width and height, from its lower left corner, as in Nuke. At pixel (x, y)
+from the top left corner, the identity map is (x + 1/2) / width and 1 - (y + 1/2) / height.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from clsplat.images.reading import error_of, one_line, open_image
 from clsplat.images.writing import write_spec
 
 HALF_FLOAT_SIDE_LIMIT_PX = 2048
-"""Image side in pixels from which a position as half float may be off by more than half a pixel."""
+"""Image side in pixels from which positions in half floats may be off by more than half a pixel."""
 
 
 _ORIENTATION_CELLS_PER_SIDE = 32
-"""Number of grid cells along each side of a map in the test whether it is an STMap (`_oriented_share`)."""
+"""Number of grid cells along each side of an image in the test that it is an STMap (`_oriented_share`)."""
 _MIN_CELL_SINE = 0.05
-"""Smallest sine of the angle between a cell's mapped sides at which the cell has an orientation."""
+"""A cell has an orientation if the sine of the angle between its mapped sides is at least this, in magnitude."""
 _MIN_ORIENTED_SHARE = 0.7
-"""Least fraction of an STMap's cells that have the same orientation. In ordinary images about half do. The cells of a
-grey image have no orientation, because their mapped sides coincide."""
+"""Least fraction of an STMap's cells with the same orientation. In ordinary pictures about half the cells have it.
+Cells of a grey picture have none, because their mapped sides coincide."""
 
 
 @dataclass(frozen=True, eq=False)
 class StMap:
     """STMap from a file.
 
-    values (H, W, 2): float32, horizontal and vertical position.
+    values: (H, W, 2) float32, horizontal and vertical source position, as fractions.
     x, y: position of the map's first pixel in the frame; may be negative.
     width, height: size of the frame.
     digest: SHA-256 of the map's file.
@@ -51,15 +51,15 @@ class StMap:
     digest: str
 
     def covers(self, x: int, y: int, width: int, height: int) -> bool:
-        """True if the map has a value for each pixel of a window of the frame."""
+        """Return True if the map has a value for each pixel of a window of the frame."""
         rows, columns, _ = self.values.shape
         across = self.x <= x and x + width <= self.x + columns
         return across and self.y <= y and y + height <= self.y + rows
 
     def at(self, x: Float64, y: Float64) -> Float64:
-        """Values (h, w, 2) at positions x (w,), y (h,) of the frame, in pixels.
+        """Return the map's values (h, w, 2) at positions x (w,), y (h,) of the frame, in pixels.
 
-        They are interpolated linearly between pixel centres, and extrapolated linearly beyond the outermost centres.
+        Values are interpolated linearly between pixel centres, and extrapolated beyond the outermost centres.
         """
         rows, columns, _ = self.values.shape
 
@@ -76,14 +76,14 @@ class StMap:
         def line(row: np.ndarray) -> Float64:
             begin, end = (values[row[:, None], column[None, :]].astype(np.float64) for column in (left, right))
             mixed = begin + across * (end - begin)
-            return np.asarray(np.where(across == 0, begin, mixed))  # so that non-finite values do not spread
+            return np.asarray(np.where(across == 0, begin, mixed))  # 0 times a non-finite neighbour would be NaN
 
         upper, lower = line(above), line(below)
         return np.asarray(np.where(down == 0, upper, upper + down * (lower - upper)))
 
 
 def read_stmap(path: Path) -> StMap:
-    """Read an STMap. The last two are cached.
+    """Read an STMap. The last two maps read are cached.
 
     Raises InputError for a file that is missing, not an image, not of floats, or without two channels. Warns if a large
     map has half floats, which are too coarse for its positions.
@@ -96,7 +96,7 @@ def read_stmap(path: Path) -> StMap:
 
 
 @lru_cache(maxsize=2)
-def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # a cache key: a changed file is read again
+def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # `changed` is a key of the cache
     source = open_image(path)
     spec = source.spec()
     names = [name.upper() for name in spec.channelnames]
@@ -123,10 +123,10 @@ def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # a cache key: a 
 
 
 def _oriented_share(values: Float32) -> float:
-    """Fraction of a map's grid cells that have the more common orientation: mirrored or not mirrored.
+    """Return the fraction of a map's grid cells with the more common orientation, mirrored or not mirrored.
 
-    Only cells with finite and varying values count. The result is 1 for a map without finite values or too small to
-    judge, and 0 for a map whose positions lie on a line or in a point.
+    Only cells with finite and varying values count. The result is 1 for a map that is too small to judge or has no
+    finite values. It is 0 for a map whose positions lie on a line or in a point.
     """
     rows, columns = (np.arange(0, side, max(side // _ORIENTATION_CELLS_PER_SIDE, 1)) for side in values.shape[:2])
     if len(rows) < _ORIENTATION_CELLS_PER_SIDE // 2 or len(columns) < _ORIENTATION_CELLS_PER_SIDE // 2:
@@ -144,9 +144,9 @@ def _oriented_share(values: Float32) -> float:
 
 
 def write_stmap(path: Path, places: Float64, width: int, height: int) -> None:
-    """Write an STMap as a 32-bit float EXR, atomically: R, G, and zeros as B, which compositors expect.
+    """Write an STMap as a 32-bit float EXR, atomically. Its B is 0, because compositors expect three channels.
 
-    places (H, W, 2): source position of each pixel, in pixels from the source image's top left corner; NaN for none.
+    places: (H, W, 2), source position of each pixel, in pixels from the source image's top left corner; NaN for none.
     width, height: size of the source image in pixels.
     Raises ClsplatError if writing fails.
     """

@@ -24,17 +24,17 @@ from clsplat.images.colour import REC709_LUMA_WEIGHTS
 from clsplat.images.frame_files import VIDEO_SUFFIXES, parse_record
 
 _BLUE_CHROMA_RANGE, _RED_CHROMA_RANGE = (np.float32(2 * (1 - REC709_LUMA_WEIGHTS[index])) for index in (2, 0))
-"""Widths of the ranges of B - Y and R - Y (Rec.709), by which chroma is normalised."""
+"""Divisors of B - Y and R - Y (Rec.709) that make chroma range from -0.5 to 0.5."""
 
 
 VideoPlanes = NDArray[np.uint8] | tuple[NDArray[np.uint16], ...]
-"""A frame as the encoder takes it: the result of `frame_planes` or `prores_planes`."""
+"""Planes of luma, chroma and alpha of a frame to encode: the result of `frame_planes` or `prores_planes`."""
 _PRORES_PROFILES: dict[ProRes, str] = {"422": "standard", "hq": "hq", "4444": "4444"}
 """FFmpeg's names of the ProRes profiles."""
 
 
 def video_missing() -> str:
-    """Reason, in one line, why this installation cannot write videos; '' if it can."""
+    """Return the reason, in one line, why this installation cannot write videos; '' if it can."""
     try:
         import av  # noqa: F401
     except ImportError:
@@ -43,21 +43,22 @@ def video_missing() -> str:
 
 
 MBTREE_MIN_SIDE_PX = 128
-"""Shorter side in pixels below which x264's macroblock tree (mbtree) is off, because it makes small videos vary.
+"""Shorter side in pixels below which x264's macroblock tree (mbtree) is off, for the same bytes in every encoding.
 
-With the tree on a busy machine, up to 102 of 250 encodings of a 48x40 video differed, and none of 225 of a 320x240
-video. The tree saves a quarter of a larger video's bytes.
+With the tree on a busy machine, up to 102 of 250 encodings of a 48x40 video had other bytes, and none of 225 of a
+320x240 video. In a larger video the tree saves a quarter of the bytes.
 """
 
 
 MAX_VIDEO_SIDE_PX = 16384
-"""Largest side in pixels: x264's MAX_RESOLUTION."""
+"""Largest side of a video in pixels: x264's MAX_RESOLUTION."""
 MAX_VIDEO_MEGAPIXELS = 260
-"""Approximate largest frame: FFmpeg's av_image_check_size requires 8 (width + 128) (height + 128) < 2^31."""
+"""Largest frame of a video, for messages: FFmpeg (av_image_check_size) requires 8 (width + 128) (height + 128) < 2^31.
+"""
 
 
 def video_record(path: Path, frames: int | None = None) -> dict[str, str]:
-    """Provenance record of a video; empty if the file is not a video or has no record.
+    """Return the provenance attributes that a video records; empty if the file is not a video or has no record.
 
     frames: expected number of frames. The result is also empty if the video has another number or is incomplete.
     """
@@ -87,7 +88,10 @@ def check_video(path: Path) -> None:
 
 
 def check_codec(path: str, config: VideoConfig, channels: Collection[str]) -> None:
-    """Raise InputError for settings of a codec that `path` does not use, and for alpha if its codec has no alpha."""
+    """Raise InputError for settings of another codec than the video's, and for alpha that its codec cannot hold.
+
+    path: the video; its extension gives the codec.
+    """
     usual = VideoConfig()
     if Path(path).suffix.lower() == ".mp4":
         if config.prores != usual.prores:
@@ -106,18 +110,17 @@ def check_size(path: Path, width: int, height: int) -> None:
     if max(width, height) > MAX_VIDEO_SIDE_PX or 8 * (width + 128) * (height + 128) >= 1 << 31:
         raise InputError(
             f"{path}: its frames are {width}x{height}, expected at most {MAX_VIDEO_SIDE_PX:,} pixels a side and "
-            f"{MAX_VIDEO_MEGAPIXELS} "
-            "megapixels in a video; give a smaller --width, or write pictures"
+            f"{MAX_VIDEO_MEGAPIXELS} megapixels in a video; give a smaller --width, or write pictures"
         )
 
 
 def frame_planes(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """Planes (3 H / 2, W) of a frame for H.264: luma, and below it chroma at half the size, as PyAV expects.
+    """Return planes (3 H / 2, W) of a frame for H.264: luma, and below it chroma at half the size, as PyAV expects.
 
     H and W are rounded up to even numbers. Colours are Rec.709 in limited range, with chroma sited left as in H.264.
-    FFmpeg's own conversion is darker by one level.
+    FFmpeg's own conversion is not used, because its result is darker by one level.
 
-    image (H, W, 3): display values as floats, clipped to [0, 1], NaN as 0; or as uint8.
+    image: (H, W, 3), display values as floats, clipped to [0, 1], NaN as 0; or as uint8.
     Raises ValueError for another shape.
     """
     pixels = np.asarray(image)
@@ -136,13 +139,13 @@ def frame_planes(image: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def prores_planes(image: NDArray[Any], alpha: NDArray[Any] | None, prores: ProRes) -> tuple[NDArray[np.uint16], ...]:
-    """10-bit planes (H, W) of a frame for ProRes: luma, two planes of chroma, and alpha if it is given.
+    """Return 10-bit planes (H, W) of a frame for ProRes: luma, two planes of chroma, and alpha if it is given.
 
     Colours are Rec.709 in limited range, alpha is in full range. For 422 and hq, chroma has half the width and is sited
     left, and the width is rounded up to an even number.
 
-    image (H, W, 3): display values as floats, clipped to [0, 1], NaN as 0.
-    alpha (H, W): alpha by which `image` is premultiplied. The file stores straight alpha.
+    image: (H, W, 3), display values as floats, clipped to [0, 1], NaN as 0.
+    alpha: (H, W), by which `image` is premultiplied; None for opaque videos. The file stores straight alpha.
     """
     rgb = np.nan_to_num(np.asarray(image, np.float32))
     if alpha is not None:
@@ -161,18 +164,18 @@ def prores_planes(image: NDArray[Any], alpha: NDArray[Any] | None, prores: ProRe
 
 
 def _left_sited(chroma: NDArray[Any]) -> NDArray[Any]:
-    """Chroma at half the width (2, H, W / 2), sited left: weights 1/4, 1/2, 1/4 around every second sample."""
+    """Halve the width of chroma (2, H, W), sited left: weights 1/4, 1/2, 1/4 around every second sample."""
     left = np.concatenate([chroma[:, :, :1], chroma[:, :, 1:-1:2]], axis=2)
     return np.asarray(0.25 * (left + chroma[:, :, 1::2]) + 0.5 * chroma[:, :, 0::2])
 
 
 def planes_of(path: Path, image: NDArray[Any], alpha: NDArray[Any] | None, prores: ProRes) -> VideoPlanes:
-    """A frame as the encoder of the video `path` takes it."""
+    """Convert a frame to the planes of the codec that the extension of the video `path` gives."""
     return prores_planes(image, alpha, prores) if path.suffix.lower() == ".mov" else frame_planes(image)
 
 
 def rate_of(fps: float) -> Fraction:
-    """Exact frame rate for a file. Rounded NTSC rates become exact: 23.976 and 23.98 become 24000/1001."""
+    """Return the frame rate for a file as a fraction. Rounded NTSC rates become exact: 23.976 becomes 24000/1001."""
     whole = round(fps * 1.001)
     ntsc = Fraction(1000 * whole, 1001)
     near = 5e-3 if whole % 24 == 0 or whole % 30 == 0 else 1e-4
@@ -183,7 +186,7 @@ def rate_of(fps: float) -> Fraction:
 
 @contextmanager
 def video_writer(path: Path, config: VideoConfig | None = None, comment: str = "") -> Iterator[VideoWriter]:
-    """Context manager that yields a writer of a video. If the block succeeds, the video replaces the file `path`.
+    """Yield a writer of a video, as a context manager. If the block succeeds, the video replaces the file `path`.
 
     comment: provenance record for the header.
     Raises InputError for another extension, a missing folder, a video without frames, or if PyAV is not installed.
@@ -201,7 +204,7 @@ def video_writer(path: Path, config: VideoConfig | None = None, comment: str = "
 
 
 def _frame_of(planes: tuple[NDArray[np.uint16], ...], form: str) -> Any:
-    """PyAV frame from 16-bit planes. form: name of its pixel format."""
+    """Return a PyAV frame from 16-bit planes. form: FFmpeg's name of the frame's pixel format."""
     import av
 
     height, width = planes[0].shape
@@ -210,7 +213,7 @@ def _frame_of(planes: tuple[NDArray[np.uint16], ...], form: str) -> Any:
         lines = np.zeros((values.shape[0], plane.line_size // 2), np.uint16)
         lines[:, : values.shape[1]] = values
         plane.update(lines)
-    # ProRes stores these in each frame's header; the encoder reads them from the frame
+    # 1 is Rec.709, and limited range. ProRes stores these in each frame's header; the encoder reads them here.
     frame.colorspace = frame.color_primaries = frame.color_trc = frame.color_range = 1
     return frame
 
@@ -225,8 +228,9 @@ class VideoWriter:
     def __init__(self, path: Path, temporary: Path, config: VideoConfig, comment: str = "") -> None:
         """Prepare the writer; the first frame opens the file.
 
-        temporary: name of the file while it is written.
-        comment: text for its header.
+        path: final name of the video, for its codec and for messages.
+        temporary: name of the file while it is being written.
+        comment: text for the file's header.
         """
         self._path, self._temporary, self._config, self._comment = path, temporary, config, comment
         self._container: Any = None
@@ -270,7 +274,7 @@ class VideoWriter:
         if self._comment:
             self._container.metadata["comment"] = self._comment
         if kind == "mov":
-            # Apple's readers expect Apple's vendor code; 16-bit alpha loses nothing
+            # Apple's programs expect Apple's vendor code. Alpha of 16 bits keeps all 10 bits of the plane.
             options = {
                 "profile": _PRORES_PROFILES[config.prores],
                 "vendor": "apl0",
@@ -279,7 +283,7 @@ class VideoWriter:
             codec, form = "prores_ks", "yuv422p10le" if config.prores != "4444" else "yuv444p10le"
             form = "yuva444p10le" if alpha else form
         else:
-            # a fixed number of threads, so that every machine writes the same bytes
+            # The number of threads is fixed, so that every machine writes the same bytes.
             parameters = "threads=4:sliced-threads=0" + (":mbtree=0" if min(width, height) < MBTREE_MIN_SIDE_PX else "")
             options = {"crf": str(config.crf), "preset": config.preset, "x264-params": parameters}
             codec, form = "libx264", "yuv420p"
@@ -287,13 +291,13 @@ class VideoWriter:
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, form
         context = self._stream.codec_context
         context.time_base = 1 / rate
-        # Rec.709's matrix and transfer function, which is close to sRGB's, and limited range
+        # 1 is Rec.709 (its transfer function is close to sRGB's), and limited range.
         context.colorspace = context.color_primaries = context.color_trc = 1
         context.color_range = 1
 
     @contextmanager
     def _refusals(self) -> Iterator[None]:
-        """Turn FFmpeg's errors into OSError or ClsplatError."""
+        """Convert FFmpeg's errors in the block to OSError (disk full or file too large) or ClsplatError."""
         import av
 
         try:
@@ -317,5 +321,5 @@ class VideoWriter:
     def close(self) -> None:
         """Close the file, complete or not."""
         if self._container is not None:
-            with suppress(Exception):  # already closed after success; after a failure this error is not the cause
+            with suppress(Exception):  # After a failure, an error in closing would hide the error that caused it.
                 self._container.close()

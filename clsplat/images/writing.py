@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Atomic writing of image files."""
+"""Writing of image files (PNG, EXR and others) with OpenImageIO, atomically: a failure leaves the earlier file."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ from clsplat.images.alpha import associate
 from clsplat.images.reading import decodes, one_line, opened, png_is_whole
 
 CHANNEL_NAMES_BY_COUNT = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
+"""Names of the channels of an image in a file, keyed by their number."""
 
 
 def write_image(path: Path, image: NDArray[Any]) -> None:
     """Write an image, atomically: 8-bit PNG or float EXR, by the extension.
 
     image: (H, W) or (H, W, C), C = 1, 3 or 4, with straight alpha; uint8 or floats. For a PNG, floats are clipped to
-      [0, 1] and rounded. Values are written as they are; `images/colour.py` converts colours.
+      [0, 1] and rounded. The colour space is not converted (`images/colour.py` does that).
     Raises InputError for another extension or a missing folder, ClsplatError if writing fails, as on a full disk. After
     a failure an earlier file is intact, and no temporary file is left.
     """
@@ -58,9 +59,9 @@ def write_image(path: Path, image: NDArray[Any]) -> None:
 
 
 def steps_of(planes: Sequence[NDArray[Any]], bits: int) -> NDArray[Any]:
-    """Interleave planes and quantise them to integers: [0, 1] becomes 0 to 2^bits - 1, NaN becomes 0.
+    """Quantise planes (H, W, C) to integers and interleave them: [0, 1] becomes 0 to 2^bits - 1, NaN becomes 0.
 
-    Works on one channel at a time, because a pass over interleaved channels takes several times as long.
+    The loop is over channels, because a pass over interleaved channels takes several times as long.
     """
     height, width = planes[0].shape[:2]
     whole = np.empty((height, width, sum(plane.shape[2] for plane in planes)), np.uint8 if bits == 8 else np.uint16)
@@ -90,10 +91,11 @@ def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], 
 
 
 def write_rows(path: Path, spec: Any, kind: str, pieces: Iterable[tuple[Any, int]]) -> None:
-    """Write a file of one part atomically, row by row from the top.
+    """Write an image file of one part, atomically, in pieces of some rows from the top.
 
-    pieces: pixels, or OpenImageIO's deep data, each with its number of rows. The next piece is requested while deep
-      rows are being written.
+    kind: the file's extension without the dot.
+    pieces: pixels or OpenImageIO's deep data, each with its number of rows. The next piece is requested while the last
+      deep piece is being written.
     Raises ClsplatError if writing fails.
     """
     reasons: list[str] = []
@@ -112,7 +114,8 @@ def write_rows(path: Path, spec: Any, kind: str, pieces: Iterable[tuple[Any, int
                 reasons.append(file.geterror())  # OpenImageIO reports the error to this thread only
             return done
 
-        with ThreadPoolExecutor(1) as pool:  # for most frames, compression takes longer than rendering
+        # Write in a thread: compression of a piece takes longer than rendering the next one for most frames.
+        with ThreadPoolExecutor(1) as pool:
             under_way = None
             for pixels, count in pieces:
                 if under_way is not None:
@@ -132,22 +135,23 @@ def _write(
     steps: Callable[[Any, str], Iterable[bool]],
     reasons: Sequence[str] = (),
 ) -> None:
-    """Write a file with these parts.
+    """Write an image file with parts of these specifications, atomically, and check that it is complete.
 
+    kind: the file's extension without the dot.
     steps: function that writes pixels to OpenImageIO's open file, and yields True for each call that succeeds.
     reasons: messages of calls that failed in another thread.
     """
-    # libjpeg ends the process if it cannot write
+    # For JPEG, disk space is checked before: libjpeg ends the process if it cannot write.
     most = jpeg_room(specs[0]) if kind in ("jpg", "jpeg") else 0
     with atomic_name(path) as temporary:
         file: Any = oiio.ImageOutput.create(kind)
         name = native_name(temporary)
         try:
             with require_room(path, most):
-                # OpenImageIO needs the specifications of all parts to open the file
+                # OpenImageIO needs the specifications of all parts to open the file.
                 opens = file.open(name, specs[0] if len(specs) == 1 else tuple(specs))
                 written = opens and all(steps(file, name)) and file.close()
-            # a full disk may lose the last bytes without an error
+            # A full disk may lose the last bytes without an error.
             if written and _is_whole(temporary, kind, len(specs)):
                 if kind == "dpx":
                     _without_name(temporary)
@@ -174,7 +178,7 @@ def _without_name(path: Path) -> None:
 
 
 def _is_whole(path: Path, kind: str, parts: int) -> bool:
-    """True if a written image is complete at its end: the last chunk of a PNG, or the last row in other formats."""
+    """Return True if a written image is complete: all chunks of a PNG, or the last row in other formats."""
     if kind == "png":
         return png_is_whole(path)
     with opened(path) as source:
@@ -184,5 +188,5 @@ def _is_whole(path: Path, kind: str, parts: int) -> bool:
 
 
 def jpeg_room(spec: Any) -> int:
-    """Upper bound in bytes of a JPEG with this OpenImageIO specification."""
+    """Return an upper bound in bytes of a JPEG with this OpenImageIO specification."""
     return int(spec.width * spec.height * spec.nchannels * 5 // 4) + (1 << 16)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Float64 twins of the stages in NumPy, short and slow, for tests, tools, the self-test and the benchmark."""
+"""Reference implementations ("twins") of the OpenCL stages in float64 NumPy, for tests, self-test and benchmark."""

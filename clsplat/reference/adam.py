@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A step of Adam, and the sum of gradients over a batch: float64 twin of kernels/adam.cl."""
+"""The Adam optimiser's step, and the sum of gradients over a batch of views: float64 twin of kernels/adam.cl.
+
+Equation numbers refer to docs/gradients.md.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,10 @@ def adam(
     beta2: float = 0.999,
     epsilon: float = 1e-15,
 ) -> tuple[Float64, Float64, Float64]:
-    """Eq. (42): the new parameters and both moments, arrays of the same shape. `step` counts from 1."""
+    """Return parameters and both moments after step number `step` of Adam, counted from 1: eq. (42).
+
+    All arrays have the same shape.
+    """
     first = beta1 * first + (1 - beta1) * gradients
     second = beta2 * second + (1 - beta2) * gradients**2
     mean = first / (1 - beta1**step)
@@ -33,9 +39,10 @@ def adam(
 def missed_steps(
     parameters: Float64, first: Float64, second: Float64, step: int, rates: Sequence[float]
 ) -> tuple[Float64, Float64, Float64]:
-    """Eq. (42) without a gradient, once for each rate: the parameters and moments after the steps from `step` + 1 on.
+    """Return parameters and both moments after Adam steps with a zero gradient, one for each learning rate: eq. (42).
 
-    It is the twin of kernels/settle.cl, which has the closed form (190) to (192).
+    The first of these steps has the number `step` + 1. kernels/settle.cl computes the same by the closed form (190) to
+    (192).
     """
     none = np.zeros_like(parameters)
     for number, rate in enumerate(rates, step + 1):

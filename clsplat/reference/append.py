@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The lists of tiles, made by one sort of all pairs: the twin of kernels/append.cl, and of duplicate.cl with
-ranges.cl."""
+"""Lists of the Gaussians in each tile, by a sort of all pairs: twin of kernels/append.cl, duplicate.cl, ranges.cl."""
 
 from __future__ import annotations
 
@@ -15,11 +14,11 @@ from clsplat.arrays import Int64
 
 @dataclass(frozen=True, eq=False)
 class ListsTwin:
-    """The lists of all tiles, one after the other, and the first slot of each Gaussian.
+    """The Gaussian lists of all tiles, concatenated, and the first slot of each Gaussian.
 
-    first_slots: (N,), the number of pairs of earlier Gaussians.
-    ranges: (tiles, 2), begin and end of each tile's list; 0 and 0 if it is empty.
-    gaussian_from_sorted, slot_from_sorted: (pairs), Gaussian and slot of each entry of the lists.
+    first_slots: (N,), each Gaussian's first slot, which is the number of pairs of the Gaussians before it.
+    ranges: (tiles, 2), begin and end of each tile's list; 0 and 0 for an empty list.
+    gaussian_from_sorted, slot_from_sorted: (pairs,), Gaussian and slot of each entry of the lists.
     """
 
     first_slots: Int64
@@ -29,10 +28,11 @@ class ListsTwin:
 
 
 def lists_of(tiles_of: Sequence[Int64], depths: NDArray[np.float32], tiles: int) -> ListsTwin:
-    """The lists of `tiles` tiles, each in order of depth, ties by index.
+    """Return the Gaussian lists of all tiles, each sorted by depth, with Gaussians of equal depth sorted by index.
 
-    tiles_of: each Gaussian's tiles, ascending.
-    depths: (N,).
+    tiles_of: for each Gaussian, the ascending indices of the tiles that it reaches.
+    depths: (N,), depths of the Gaussians.
+    tiles: number of tiles.
     """
     counts = np.array([len(own) for own in tiles_of], np.int64)
     gaussian_from_slot = np.repeat(np.arange(len(counts)), counts)

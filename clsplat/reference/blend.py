@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blending front to back and its gradient, without tiles: float64 twin of kernels/blend*.cl.
+"""Alpha blending of Gaussians front to back and its gradient, without tiles: float64 twin of kernels/blend*.cl.
 
 Equation numbers refer to docs/gradients.md.
 """
@@ -16,21 +16,25 @@ from clsplat.arrays import Float64, Int64
 from clsplat.reference.project import ALPHA_MIN, BOX_SLACK, Footprint, Seen
 
 BLEND_ALPHA_MAX = float(np.float32(0.99))
+"""Largest alpha of a Gaussian in a pixel."""
 TRANSMITTANCE_MIN = float(np.float32(1e-4))
-"""The kernels' constants, in float32. In float64, two layers at the cap would leave (1 - 0.99)^2, exactly the limit."""
+"""A pixel ends before the Gaussian that would leave it this transmittance or less.
+
+This limit and the largest alpha are rounded to float32 as in the kernels. Unrounded, two Gaussians of alpha 0.99 would
+leave exactly 1e-4."""
 
 
 @dataclass(frozen=True, eq=False)
 class BlendedTwin:
-    """A blended picture.
+    """A picture blended from Gaussians.
 
     image: (H, W, 3).
     transmittance: (H, W), the fraction of the background's light that reaches the camera.
-    last: (H, W), position in `order` of the last Gaussian added; -1 if none is.
+    last: (H, W), position in `Seen.order` of the last Gaussian added; -1 if none is added.
     count: (H, W), number of Gaussians added.
-    nearness: (H, W), the sum of weight / depth.
-    margin: (H, W), the smallest relative distance of a compared value to its threshold, at most 0.05: of alpha to 1/255
-    and 0.99, of T to 1e-4. Where it is small, rounding may change the pixel.
+    nearness: (H, W), the sum over Gaussians of blending weight / depth.
+    margin: (H, W), the smallest relative distance of an alpha to 1/255 or 0.99, or of a transmittance to 1e-4; at most
+    0.05. Where the margin is small, rounding may change the pixel.
     """
 
     image: Float64
@@ -45,13 +49,13 @@ class BlendedTwin:
 class BlendGradients:
     """Gradients with respect to the projected Gaussians.
 
-    means2d: (N, 2), per pixel; for models along rays, per radian along the axes of the tangent plane.
-    abs_means2d: (N, 2), as means2d, but summed over pixels as absolute values.
+    means2d: (N, 2), per pixel; for camera models along rays, per radian along the axes of the tangent plane.
+    abs_means2d: (N, 2), sums over pixels of the absolute values of the gradients in means2d.
     conics: (N, 3), with respect to a, b, c.
     opacities: (N,).
     colors: (N, 3).
     contributions: (N,), each Gaussian's contribution to the image: eq. (55).
-    nearness: (N,), with respect to 1 / depth: (122).
+    nearness: (N,), with respect to 1 / depth: eq. (122).
     """
 
     means2d: Float64
@@ -65,11 +69,11 @@ class BlendGradients:
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """A Gaussian on the pixels of its box.
+    """A Gaussian's alpha on its box of pixels, and the transmittance there. Arrays have the box's shape.
 
-    position: position in the order of depth.
+    position: the Gaussian's position in the depth order, from the front.
     before, after: transmittance in front of the Gaussian and behind it.
-    added: mask of the pixels to which it is added.
+    added: mask of the pixels to which the Gaussian is added.
     margin: as in `BlendedTwin`; infinite in pixels that are already saturated.
     """
 
@@ -84,7 +88,7 @@ class Layer:
 
 
 def layers(projected: Seen, width: int, height: int) -> Iterator[Layer]:
-    """Yield the visible Gaussians front to back: eqs. (14) to (16)."""
+    """Yield the layers of the visible Gaussians, front to back: eqs. (14) to (16)."""
     transmittance, alive = np.ones((height, width)), np.ones((height, width), np.bool_)
     for position, gaussian in enumerate(projected.order):
         splat = projected.footprint(int(gaussian), width, height)
@@ -108,7 +112,7 @@ def blend(
     height: int,
     background: Sequence[float] | Float64 = (0.0, 0.0, 0.0),
 ) -> BlendedTwin:
-    """Blend the `layers`."""
+    """Blend the visible Gaussians front to back, then add the background: eqs. (14) to (16)."""
     image = np.zeros((height, width, 3))
     transmittance = np.ones((height, width))
     last = np.full((height, width), -1, np.int64)
@@ -136,11 +140,11 @@ def blend_grad(
     d_transmittance: Float64 | None = None,
     d_nearness: Float64 | None = None,
 ) -> BlendGradients:
-    """Gradients of blending, back to front: eqs. (22) to (29) and (55).
+    """Return the gradients of blending, computed back to front: eqs. (22) to (29) and (55).
 
-    d_image: (H, W, 3), dL/dC.
-    d_transmittance: (H, W), dL/dT at the end, (82).
-    d_nearness: (H, W), dL/dN, (122).
+    d_image: (H, W, 3), gradient of the loss with respect to the image.
+    d_transmittance: (H, W), the same for the final transmittance: eq. (82).
+    d_nearness: (H, W), the same for the nearness: eq. (122).
     """
     forward, order = blend(projected, width, height, background), projected.order
     transmittance = forward.transmittance.copy()
@@ -190,7 +194,7 @@ def blend_grad(
 def _set_shape_gradients(
     gradients: BlendGradients, projected: Seen, gaussian: int, splat: Footprint, d_alpha: Float64, alpha: Float64
 ) -> None:
-    """Eqs. (25) to (29): set the gradients of a Gaussian's mean, conic and opacity, from d_alpha (h, w) on its box."""
+    """Set the gradients of a Gaussian's mean, conic and opacity from d_alpha (h, w) on its box: eqs. (25) to (29)."""
     g = d_alpha * alpha
     dx, dy = splat.dx, splat.dy
     by_x, by_y = (g * along for along in projected.by_mean(gaussian, splat))

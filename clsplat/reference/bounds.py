@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Twin of kernels/bounds.cl."""
+"""Bounds of the means and scales in each chunk of a model: NumPy twin of kernels/bounds.cl."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from clsplat.layouts.columns import CHUNK_ROWS
 
 
 def bounds(means: Float32, log_scales: Float32) -> Float64:
-    """Bounds (chunks, 7) of means and log scales (n, 3): least and greatest coordinates, greatest log scale.
+    """Return the bounds (chunks, 7) of each chunk's Gaussians: least and greatest x y z, greatest log scale.
 
-    NaN counts as no value.
+    NaNs are ignored. A chunk in which a column has only NaNs gets inf as least value, -inf as greatest.
     """
     starts = np.arange(0, len(means), CHUNK_ROWS)
     least = np.fmin.reduceat(means, starts)

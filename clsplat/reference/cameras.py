@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rays of pixels and pixels of points in float64, as the camera's model (clsplat/cameras/) defines them.
+"""Rays through pixels and projection of points to pixels, in float64, by the formulas of clsplat/cameras/.
 
 Equation numbers refer to docs/cameras.md.
 """
@@ -13,11 +13,11 @@ from clsplat.camera import Camera
 
 
 def cam_from_pixel(camera: Camera, pixels: Float64) -> tuple[Float64, Float64]:
-    """Origins and unit directions (N, 3), in the camera's axes, of the rays of pixels (N, 2): eqs. (2) to (5).
-
-    pixels: (0.5, 0.5) is the centre of the first pixel.
+    """Return origins and unit directions (N, 3), in the camera's axes, of the rays through pixels: eqs. (2) to (5).
 
     Pixels beyond 180 degrees from a fisheye's axis, or beyond a pole of an equirectangular image, get NaN.
+
+    pixels: (N, 2); (0.5, 0.5) is the centre of the first pixel.
     """
     pixels = np.asarray(pixels, np.float64)
     a = (pixels[:, 0] - camera.cx) / camera.fx
@@ -26,7 +26,7 @@ def cam_from_pixel(camera: Camera, pixels: Float64) -> tuple[Float64, Float64]:
 
 
 def pixel_from_cam(camera: Camera, points: Float64) -> tuple[Float64, Float64]:
-    """Pixels (N, 2) and depths (N,) of points (N, 3) in the camera's axes: eqs. (2) to (5).
+    """Return pixels (N, 2) and depths (N,) of points (N, 3) in the camera's axes: eqs. (2) to (5).
 
     Points without a pixel get NaN: behind a perspective or orthographic camera, beyond the angle at which a fisheye
     folds over, or straight behind a fisheye. The near and far planes are ignored, and pixels may lie outside the image.
@@ -37,12 +37,15 @@ def pixel_from_cam(camera: Camera, points: Float64) -> tuple[Float64, Float64]:
 
 
 def pixel_from_world(camera: Camera, points: Float64) -> tuple[Float64, Float64]:
-    """Pixels (N, 2) and depths (N,) of points (N, 3) in the world: eq. (1), then `pixel_from_cam`."""
+    """Return pixels (N, 2) and depths (N,) of points (N, 3) in the world: eq. (1), then `pixel_from_cam`."""
     return pixel_from_cam(camera, np.asarray(points, np.float64) @ camera.rotation.T + camera.translation)
 
 
 def pixel_grid(camera: Camera) -> Float64:
-    """The centres of all pixels (height * width, 2), row by row. For a window, they are relative to the whole frame."""
+    """Return the centres of all pixels (height * width, 2), row by row.
+
+    For a camera with a window, centres are relative to the whole frame.
+    """
     x, y = (camera.window.x, camera.window.y) if camera.window else (0, 0)
     u, v = np.meshgrid(x + np.arange(camera.width) + 0.5, y + np.arange(camera.height) + 0.5)
     return np.stack([u.ravel(), v.ravel()], axis=1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Missed steps of chunks of a model: float64 twin of kernels/catch_up.cl."""
+"""Catching up on the steps of Adam that chunks of a model missed: float64 twin of kernels/catch_up.cl."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from clsplat.arrays import Float64
 from clsplat.reference.adam import missed_steps
 
 State = tuple[Float64, Float64, Float64]
-"""Parameters of a group and both moments."""
+"""Values of a parameter group, and Adam's first and second moments; arrays of the same shape."""
 
 
 def catch_up(
@@ -19,11 +19,15 @@ def catch_up(
     rates: Mapping[int, Mapping[str, float]],
     sh_rest_every: int,
 ) -> dict[str, State]:
-    """Eq. (42) without a gradient: the groups after the steps that these chunks missed.
+    """Return the parameter groups after chunks have taken the Adam steps that they missed, with zero gradients.
+
+    The step is eq. (42) of docs/gradients.md.
 
     groups: arrays (n, ...) of each parameter group.
-    last_by_chunk: the last step that each chunk of `chunk_rows` rows has taken.
-    rates: the learning rates of the groups, by number of the step. Its largest number is the last step that is taken.
+    chunk_rows: number of rows of a chunk.
+    last_by_chunk: number of the last step that each chunk has taken; other chunks are not changed.
+    rates: learning rates of the groups, by number of the step. The largest number is the last step to take.
+    sh_rest_every: the group `sh_rest` takes only steps whose number is a multiple of this.
     """
     caught: dict[str, State] = {}
     for group, before in groups.items():

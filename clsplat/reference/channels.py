@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The channels other than colour in float64: twin of kernels/features.cl and channels.cl.
+"""A frame's channels other than colour (depth, normals, motion, ...): float64 twin of features.cl and channels.cl.
 
 Equation numbers refer to docs/channels.md.
 """
@@ -21,12 +21,15 @@ from clsplat.reference.render import parameters
 
 @dataclass(frozen=True, eq=False)
 class ChannelsTwin:
-    """Channels, eqs. (60) to (67). In pixels without Gaussians, index is -1 and the others are 0.
+    """Channels of a frame: eqs. (60) to (67). In pixels without Gaussians, index is -1 and the others are 0.
 
-    features: the blended `features`, by the same names: (H, W), or (H, W, floats).
-    doubt: (H, W), a margin: the distance of the transmittance to one half, or of the largest weight to the second
-    largest, whichever is smaller. Where it is small, rounding may change depth_median or index.
-    The other arrays are (H, W).
+    features: by channel, the blended features, (H, W) or (H, W, 2 to 3).
+    median: (H, W), depth at which the transmittance falls to one half.
+    first: (H, W), depth of the first Gaussian.
+    count: (H, W), number of Gaussians.
+    index: (H, W), index of the Gaussian with the largest weight.
+    doubt: (H, W), the distance of the transmittance to one half, or of the largest weight to the second largest,
+    whichever is smaller. Where it is small, rounding may change median or index.
     """
 
     features: dict[str, Float64]
@@ -38,21 +41,27 @@ class ChannelsTwin:
 
 
 def normals(means: Float64, quaternions: Float64, log_scales: Float64, camera: Camera) -> Float64:
-    """Eq. (62): normals (N, 3), each along the axis of the smallest scale (the first of equals), towards the camera."""
+    """Return each Gaussian's normal (N, 3), its axis of smallest scale, pointing towards the camera: eq. (62).
+
+    Of axes with equal scales the first counts.
+    """
     axes = rotation_matrices(quaternions)[np.arange(len(means)), :, np.argmin(log_scales, axis=1)]
     away = (view_directions(means, camera)[0] * axes).sum(axis=1)
     return np.where(away[:, None] > 0, -axes, axes)
 
 
 def motions(means: Float64, camera: Camera, after: Camera, moved: Float64 | None = None) -> Float64:
-    """Eq. (64): motion (N, 2) in pixels, for any projection; in a panorama, the shorter way around.
+    """Return the motion (N, 2) in pixels of means from one camera to another, of any projection: eq. (64).
 
-    moved: the means after the motion; None if they are at rest.
+    In a panorama it is the shorter way around.
+
+    after: the camera after the motion.
+    moved: the means after the motion; None if only the camera moves.
     """
     to = means if moved is None else moved
     (here, _), (there, depths) = pixel_from_world(camera, means), pixel_from_world(after, to)
     if camera.model.wraps:
-        # a panorama wraps around the middle of the whole frame, even if only a window of the frame is rendered
+        # A panorama wraps around the middle of the whole frame, even if only a window of the frame is rendered.
         frame = camera.window or camera
         here[:, 0] = camera.model.wrapped(replace(camera, width=frame.width), here[:, 0])
         turned = (there[:, 0] - after.cx) / after.fx - (here[:, 0] - camera.cx) / camera.fx
@@ -64,10 +73,10 @@ def motions(means: Float64, camera: Camera, after: Camera, moved: Float64 | None
 def features(
     projected: Seen, gaussians: Gaussians, camera: Camera, after: Camera, before: Camera | None = None
 ) -> dict[str, Float64]:
-    """Features of each Gaussian, arrays (N, 1 to 3), keyed by channel.
+    """Return the values that each Gaussian brings to blended channels: arrays (N, 1 to 3), keyed by channel.
 
-    after: the camera to which forward motion leads.
-    before: the camera to which backward motion leads; None for `after`.
+    after: the camera at the end of the forward motion.
+    before: the camera at the end of the backward motion; None for `after`.
     """
     arrays = parameters(gaussians)
     means = arrays["means"]
@@ -85,7 +94,8 @@ def channels(
 ) -> ChannelsTwin:
     """Blend the channels front to back.
 
-    after, earlier: cameras, as `after` and `before` of `features`.
+    after: the camera at the end of the forward motion.
+    earlier: the camera at the end of the backward motion; None for `after`.
     """
     width, height = camera.width, camera.height
     by_name = features(projected, gaussians, camera, after, earlier)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Twin of kernels/chunk_records.cl: copies between records of chunks and the slots of a pool, word by word."""
+"""Copies between packed records of chunks and a pool, which has a slot per chunk: twin of kernels/chunk_records.cl."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ Words = NDArray[np.uint32]
 
 
 def to_slots(slots: NDArray[np.integer[Any]], records: Words, before: Mapping[str, Words]) -> dict[str, Words]:
-    """The fields of all slots after each record (k, words) has been copied to its slot.
+    """Return a pool's fields after the records of k chunks have been copied into k of its slots.
 
-    before: by field, (slots, words), in the order of a record.
+    slots: (k,), the slot of each record.
+    records: (k, words), the 32-bit words of all fields, one field after the other.
+    before: the fields before the copy, each (slots of the pool, words), in the same order.
     """
     after, begin = {}, 0
     for name, words in before.items():
@@ -26,5 +28,9 @@ def to_slots(slots: NDArray[np.integer[Any]], records: Words, before: Mapping[st
 
 
 def to_records(slots: NDArray[np.integer[Any]], fields: Mapping[str, Words]) -> Words:
-    """Records (k, words) of these slots. fields: (slots, words), in the order of a record."""
+    """Return the records (k, words) of k slots of a pool.
+
+    slots: (k,), numbers of the slots.
+    fields: the pool's fields, each (slots of the pool, words), in the order in which a record concatenates them.
+    """
     return np.concatenate([words[slots] for words in fields.values()], axis=1)

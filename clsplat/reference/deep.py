@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Deep pictures (frames in slices by depth): float64 twin of kernels/deep.cl. Equations are in docs/pictures.md."""
+"""Deep pictures, whose pixels are slices by depth: float64 twin of kernels/deep.cl.
+
+Equation numbers refer to docs/pictures.md.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +18,15 @@ from clsplat.reference.blend import Layer, layers
 from clsplat.reference.project import ProjectedTwin
 
 SLACKS_PER_WALK = 8
-"""Number of steps of the coarse search for a pixel's slack, and of the fine search."""
+"""Number of intervals of the coarse search for a pixel's slack, and of the fine search within one of them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Deep:
     """A deep picture.
 
-    slices: (bins, H, W, 5), eqs. (70) to (72): red, green, blue, alpha, depth.
-    slack: (H, W), the slack s of each pixel, (74).
+    slices: (bins, H, W, 5), red, green, blue, alpha and depth of each slice: eqs. (70) to (72).
+    slack: (H, W), how far a pixel's transmittance may deviate from the Gaussians' own: s of eq. (74).
     margin: (H, W), the smallest distance of a transmittance to the threshold that it is compared with.
     """
 
@@ -33,10 +36,14 @@ class Deep:
 
 
 class _Cut:
-    """State of the loop over layers that cuts them by (73) of docs/pictures.md.
+    """Cuts each pixel's layers, taken front to back, into slices: eq. (73).
 
-    slack: s of each pixel.
-    whole: transmittance before the first layer.
+    slack: (H, W), the slack s of each pixel.
+    whole: (H, W), transmittance before the first layer.
+    open: (H, W), transmittance before the current slice.
+    placed: (H, W), True if the current slice has its depth.
+    count: (H, W), number of slices.
+    margin: (H, W), as in `Deep`.
     """
 
     def __init__(self, slack: Float64, whole: Float64) -> None:
@@ -45,7 +52,7 @@ class _Cut:
         self.margin = np.full(slack.shape, np.inf)
 
     def begins(self, layer: Layer, may: NDArray[np.bool_] | bool = True) -> NDArray[np.bool_]:
-        """Mask of the pixels in which the layer begins a slice. may: False where it must not begin one."""
+        """Return the mask of pixels in which the next layer begins a slice. may: False where it must not."""
         box = layer.box
         opened, placed, slack, added = self.open[box], self.placed[box], self.slack[box], layer.added
         in_front = opened - layer.before - slack
@@ -63,10 +70,13 @@ class _Cut:
 
 
 def slacks(taken: Sequence[Layer], whole: Float64, total: Float64, bins: int) -> tuple[Float64, Float64]:
-    """Eq. (74): the smallest of DEEP_LEVELS slacks (H, W) that gives each pixel at most `bins` slices; and the margin.
+    """Return the smallest of DEEP_LEVELS slacks (H, W) that gives a pixel at most `bins` slices, and the margin.
 
-    whole: the light in front of the layers.
-    total: the light that the layers absorb.
+    Eq. (74); the margin is that of `Deep`.
+
+    taken: the layers, front to back.
+    whole: (H, W), the light in front of the layers.
+    total: (H, W), the light that the layers absorb.
     """
     unit, level, margin = total / (DEEP_LEVELS * bins), np.zeros(total.shape), np.full(total.shape, np.inf)
     for step in (DEEP_LEVELS // SLACKS_PER_WALK, 1):
@@ -111,7 +121,7 @@ def sliced(
 
 
 def deep(projected: ProjectedTwin, width: int, height: int, bins: int) -> Deep:
-    """The deep picture of a frame."""
+    """Return the deep picture of a frame, with at most `bins` slices per pixel."""
     taken = list(layers(projected, width, height))
     colours = [(layer.before * layer.alpha)[:, :, None] * projected.colors[layer.gaussian] for layer in taken]
     depths = [np.full(layer.alpha.shape, np.float64(np.float32(projected.depths[layer.gaussian]))) for layer in taken]

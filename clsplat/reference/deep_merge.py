@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The merge of several deep pictures: float64 twin of kernels/deep_merge.cl.
+"""The weighted mean of several deep pictures: float64 twin of kernels/deep_merge.cl.
 
 Equation numbers refer to docs/pictures.md.
 """
@@ -14,8 +14,9 @@ from clsplat.reference.deep import Deep, sliced
 
 
 def deep_merge(pictures: Float64, weights: Float64) -> Deep:
-    """Eq. (187): the weighted mean of deep pictures (P, bins, H, W, 5), cut into slices as in (73) and (74).
+    """Return the weighted mean of deep pictures, cut into slices again: eqs. (187), (73) and (74).
 
+    pictures: (P, bins, H, W, 5), the slices of P pictures as in `Deep.slices`.
     weights: (P, H, W).
     """
     count, bins, height, width, _ = pictures.shape

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scores and row lists of density control: NumPy twin of kernels/density.cl, in float32 like the kernel."""
+"""Density control: scores of Gaussians, and lists of the Gaussians to keep, clone and split.
+
+NumPy twin of kernels/density.cl, in float32 like the kernel.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +16,9 @@ from clsplat.optimisation.density_rules import FRESH, UNWANTED, USELESS, MarkRul
 
 
 def scores(rules: MarkRules, statistics: Mapping[str, Float32]) -> Float32:
-    """Mean gradient norms (n,) of the Gaussians that may be densified; UNWANTED or USELESS for the others.
+    """Return scores (n,): the mean gradient norm of Gaussians to densify, UNWANTED or USELESS for the others.
 
-    statistics: arrays by their names in a checkpoint.
+    statistics: the statistics of density control, arrays (n,) by their names in a checkpoint.
     """
     with np.errstate(all="ignore"):
         means = statistics["gradient_sums"] / np.maximum(statistics["seen"], np.float32(1))
@@ -34,9 +37,10 @@ def rows(
     log_scales: Float32,
     opacity_logits: Float32,
 ) -> tuple[NDArray[np.uint32], int]:
-    """The source rows of the new model, and the number of halves of split Gaussians. Clones and halves are FRESH.
+    """Return the old row that each Gaussian of the new model comes from, and the number of halves of split Gaussians.
 
-    The order is: remaining Gaussians, clones, first halves, second halves.
+    The order is: remaining Gaussians, clones, first halves, second halves. Rows of clones and halves have the bit
+    FRESH.
     """
     found, largest = scores(rules, statistics), log_scales.max(axis=1)
     value, row = rules.cut_off

@@ -13,15 +13,18 @@ from clsplat.camera import Camera
 
 
 def depth_loss(nearness: Float64, aims: Float64, weights: Float64, factor: float) -> tuple[float, Float64]:
-    """Eq. (121): the depth loss, factor times the weighted sum of |N - n|, and its gradient in N. Arrays are (H, W)."""
+    """Return the depth loss and its gradient with respect to nearness: eq. (121) of docs/gradients.md.
+
+    The loss is `factor` times the weighted sum of |nearness - aims|. Arrays are (H, W).
+    """
     difference = weights * (nearness - aims)
     return float(factor * np.abs(difference).sum()), factor * weights * np.sign(difference)
 
 
 def nearness_grad(means: Float64, camera: Camera, d_nearness: Float64) -> Float64:
-    """Eq. (122): the gradient (N, 3) with respect to the means.
+    """Return the gradient (N, 3) of a loss with respect to the means, through nearness: (122) of docs/gradients.md.
 
-    d_nearness: (N,), the gradient with respect to 1 / depth, or 1 / distance for models along rays.
+    d_nearness: (N,), the gradient with respect to 1 / depth, or to 1 / distance for camera models along rays.
     """
     local = means @ camera.rotation.T + camera.translation
     if not camera.model.along_rays:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of any projection in float64. Every Gaussian is evaluated at every pixel, without tiles or bounding boxes.
+"""Pictures of any camera projection in float64, with every Gaussian evaluated at every pixel, without tiles.
 
 Equation numbers refer to docs/gradients.md (14 to 16) and docs/channels.md (60 to 64).
 """
@@ -27,7 +27,7 @@ from clsplat.reference.render import BLACK_BACKGROUND, GradientsTwin, parameters
 class Picture(ChannelsTwin):
     """A picture with its channels: image (H, W, 3), alpha (H, W).
 
-    margin, nearness: (H, W), as in `reference.blend`.
+    margin, nearness: (H, W), as in `reference.blend.BlendedTwin`.
     """
 
     image: Float64
@@ -55,9 +55,9 @@ def render(
     background: Sequence[float] | Float64 = BLACK_BACKGROUND,
     after: Camera | None = None,
 ) -> Picture:
-    """The picture, blended front to back. A pixel without a ray shows the background.
+    """Render a picture with its channels, blended front to back. A pixel without a ray shows the background.
 
-    after: the camera after the motion, for the channel `motion`.
+    after: the camera after the motion, for the channel `motion`; None for no motion.
     """
     seen: Seen
     if not camera.model.along_rays:
@@ -80,12 +80,12 @@ def render_grad(
     background: Sequence[float] | Float64 = BLACK_BACKGROUND,
     d_nearness: Float64 | None = None,
 ) -> GradientsTwin:
-    """Gradients of a loss for a camera of any projection.
+    """Return the gradients of a loss for a camera of any projection.
 
-    d_image: (H, W, 3), dL/dimage.
-    d_nearness: (H, W), dL/dnearness.
+    For camera models along rays, `means2d` holds gradients per pixel along the axes of the tangent plane.
 
-    For models along rays, gradients with respect to means on the image are per pixel, along the tangent plane's axes.
+    d_image: (H, W, 3), gradient of the loss with respect to the image.
+    d_nearness: (H, W), the same for the nearness.
     """
     if not camera.model.along_rays:
         return on_plane.render_grad(gaussians, camera, d_image, background, d_nearness=d_nearness)

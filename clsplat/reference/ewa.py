@@ -19,11 +19,11 @@ from clsplat.reference.project import ALPHA_MIN
 BOX_STANDARD_DEVIATIONS = 3.33
 """Half size of a Gaussian's box in standard deviations, unless its opacity makes the box smaller."""
 TWIN_EWA_CLAMP_FRACTION = 0.15
-"""For the Jacobian, means are clamped this far beyond the image's edges: a fraction of its side.
+"""Distance beyond the image's edges at which means are clamped in the Jacobian, as a fraction of the image's side.
 
-`stages.ewa` has the same constant. A twin shares no constant of a formula with the code that it checks."""
+`stages.ewa` has its own copy: a twin shares no constant of a formula with the code that it checks."""
 SERIES_TANGENT_SQUARED = 1e-3
-"""Largest (r / z)^2 of a fisheye for which differences that cancel are computed as a series."""
+"""Below this (r / z)^2 a fisheye's formulas are computed as series, because their differences would cancel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,26 +50,26 @@ class EwaViewTwin:
 
     @property
     def focal(self) -> Float64:
-        """(fx, fy)."""
+        """Focal lengths fx and fy in pixels, (2,)."""
         return self.intrinsics[[0, 1], [0, 1]]
 
     @property
     def centre(self) -> Float64:
-        """(cx, cy)."""
+        """Principal point cx and cy in pixels, (2,)."""
         return self.intrinsics[:2, 2]
 
 
 @dataclass(frozen=True, eq=False)
 class EwaProjectedTwin:
-    """Projected Gaussians; rows of culled Gaussians are filled too.
+    """Projected Gaussians. Of culled Gaussians only the radii are 0.
 
-    radii: (N, 2) int32, 0 where culled.
+    radii: (N, 2) int32, half sides of the bounding box in pixels, 0 where culled.
     means2d: (N, 2), pixels.
     depths: (N,).
-    conics: (N, 3), a, b, c.
-    compensations: (N,).
-    points: (N, 3), in the camera's axes.
-    jacobians: (N, 2, 3).
+    conics: (N, 3), a, b, c of the inverse covariance.
+    compensations: (N,), factors of the opacities that make up for the low-pass.
+    points: (N, 3), the means in the camera's axes.
+    jacobians: (N, 2, 3), of the projection.
     clamped: (N, 2), True where x/z or y/z is clamped in the Jacobian.
     covariances: (N, 2, 2), with the low-pass.
     determinants: (N,), of the covariances without the low-pass.
@@ -88,12 +88,12 @@ class EwaProjectedTwin:
 
     @property
     def visible(self) -> NDArray[np.bool_]:
-        """(N,): True for Gaussians that are not culled."""
+        """Mask (N,) of the Gaussians that are not culled."""
         return self.radii[:, 0] > 0
 
 
 def rotations_of(quaternions: Float64) -> Float64:
-    """Rotation matrices (N, 3, 3) of quaternions (N, 4), w x y z, of any nonzero length."""
+    """Return rotation matrices (N, 3, 3) of quaternions (N, 4), w x y z, of any nonzero length."""
     w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -104,13 +104,16 @@ def rotations_of(quaternions: Float64) -> Float64:
 
 
 def covariances_of(quaternions: Float64, scales: Float64) -> Float64:
-    """Covariances R S S^T R^T, (N, 3, 3)."""
+    """Return covariances R S S^T R^T (N, 3, 3) of quaternions (N, 4) and scales (N, 3)."""
     m = rotations_of(quaternions) * scales[:, None, :]
     return m @ m.transpose(0, 2, 1)
 
 
 def covariances_grad(quaternions: Float64, scales: Float64, gradients: Float64) -> tuple[Float64, Float64]:
-    """Gradients with respect to quaternions (N, 4) and scales (N, 3), from symmetric ones of covariances (N, 3, 3)."""
+    """Return gradients with respect to quaternions (N, 4) and scales (N, 3).
+
+    gradients: (N, 3, 3), symmetric, with respect to the covariances.
+    """
     rotations = rotations_of(quaternions)
     d_m = 2 * gradients @ (rotations * scales[:, None, :])
     d_scales = (rotations * d_m).sum(axis=1)
@@ -132,18 +135,24 @@ def covariances_grad(quaternions: Float64, scales: Float64, gradients: Float64) 
 
 
 def full_covariances(upper: Float64) -> Float64:
-    """Full matrices (N, 3, 3) from upper triangles (N, 6): xx, xy, xz, yy, yz, zz."""
+    """Return symmetric matrices (N, 3, 3) from upper triangles (N, 6): xx, xy, xz, yy, yz, zz."""
     full: Float64 = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     return full
 
 
 def upper_gradients(full: Float64) -> Float64:
-    """Gradients (N, 6) with respect to upper triangles, whose off-diagonals count twice, from symmetric (N, 3, 3)."""
+    """Return gradients (N, 6) with respect to upper triangles, whose off-diagonals count twice.
+
+    full: (N, 3, 3), the symmetric gradients with respect to full matrices.
+    """
     return np.asarray(full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]] * np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0]), np.float64)
 
 
 def _fisheye(points: Float64) -> tuple[Float64, Float64, Float64]:
-    """Eqs. (157), (158): s = theta / r, h = (ds/dr) / r and (dh/dr) / r of points (N, 3) in the camera."""
+    """Return s = theta / r, h = (ds/dr) / r and (dh/dr) / r at points (N, 3) in the camera's axes.
+
+    Here r is the distance from the axis and theta the angle from it: eqs. (157), (158).
+    """
     x, y, z = points.T
     q = x * x + y * y
     r, d = np.sqrt(q), q + z * z
@@ -167,7 +176,8 @@ def project(
 ) -> EwaProjectedTwin:
     """Project means (N, 3) and covariances (N, 3, 3): equations (150) to (156).
 
-    opacities: (N,), 0 to 1, times the compensations if these are used. With opacities, boxes end where alpha is 1/255.
+    opacities: (N,), 0 to 1, multiplied by the compensations if these are used. With opacities, boxes end where alpha
+    is 1/255.
     """
     rotation, translation = view.viewmat[:3, :3], view.viewmat[:3, 3]
     fx, fy = view.focal
@@ -220,9 +230,11 @@ def project(
 
 
 def _fisheye_grad(view: EwaViewTwin, points: Float64, d_means2d: Float64, d_j: Float64) -> tuple[Float64, Float64]:
-    """For a fisheye, gradients with respect to the points in the camera's axes (N, 3) and, through the means on the
-    image, to the focal lengths (2,).
+    """Return a fisheye's gradients with respect to points (N, 3) in the camera's axes and focal lengths (2,).
 
+    The gradient of the focal lengths is only the part through the means on the image.
+
+    d_means2d: (N, 2), the gradient with respect to the means on the image.
     d_j: (N, 2, 3), the gradient with respect to the Jacobians.
     """
     x, y, z = points.T
@@ -250,8 +262,12 @@ def _pinhole_grad(
     d_means2d: Float64,
     d_j: Float64,
 ) -> tuple[Float64, Float64, Float64]:
-    """For a pinhole camera, the gradients of `_fisheye_grad`, and the part (2,) of the principal point's gradient that
-    the clamp removes.
+    """Return a pinhole camera's gradients as `_fisheye_grad`, and a correction (2,) of the principal point's gradient.
+
+    The correction is to be subtracted. It comes from means that are clamped in the Jacobian.
+
+    points, jacobians, clamped: rows of `EwaProjectedTwin`.
+    d_means2d, d_j: as in `_fisheye_grad`.
     """
     z = points[:, 2]
     jx, jy = jacobians[:, 0, 0], jacobians[:, 1, 1]
@@ -274,11 +290,11 @@ def project_grad(
     projected: EwaProjectedTwin,
     gradients: Mapping[str, Float64],
 ) -> dict[str, Float64]:
-    """Gradients of means (N, 3), covariances (N, 3, 3), viewmat (4, 4) and intrinsics (3, 3): equations (159) to (166).
+    """Return gradients with respect to means, covariances, viewmat and intrinsics, by name: eqs. (159) to (166).
 
-    gradients: gradients of means2d, depths, conics and compensations; each is optional.
+    Each has its argument's shape. The gradient of the covariances is symmetric. Culled Gaussians have zero gradients.
 
-    The gradient of the covariances is symmetric. Culled Gaussians have zero gradients.
+    gradients: gradients with respect to means2d, depths, conics and compensations, by name; each is optional.
     """
     seen = projected.visible
     p, j = projected.points[seen], projected.jacobians[seen]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bilateral grids of photographs, their gradient and their update by Adam: float64 twin of kernels/grid.cl."""
+"""Bilateral grids of photographs (colour transforms), their gradient and Adam's update: twin of kernels/grid.cl."""
 
 from __future__ import annotations
 
@@ -8,22 +8,28 @@ import numpy as np
 from clsplat.arrays import Float64
 
 LUMINANCE_WEIGHTS = np.array([0.299, 0.587, 0.114])
-"""Weights of red, green and blue in the luminance, by which a pixel's level is found."""
+"""Weights of red, green and blue in the luminance, which places a pixel between the grid's levels."""
 
 
 def identity(shape: tuple[int, int, int]) -> Float64:
-    """The identity, a grid (levels, rows, columns, 3, 4) that changes no colour."""
+    """Return the identity: a grid (levels, rows, columns, 3, 4) that changes no colour.
+
+    shape: number of levels, rows and columns.
+    """
     return np.broadcast_to(np.eye(3, 4), (*shape, 3, 4)).copy()
 
 
 def _hats(places: Float64, count: int) -> Float64:
-    """Weights (..., count) of the grid's vertices along an axis, for linear interpolation at each coordinate."""
+    """Return weights (..., count) of a grid's vertices along an axis, for linear interpolation at coordinates (...)."""
     weights: Float64 = np.maximum(1 - np.abs(places[..., None] - np.arange(count)), 0)
     return weights
 
 
 def _weights(image: Float64, shape: tuple[int, ...]) -> tuple[Float64, Float64, Float64, Float64]:
-    """For each pixel, the weights of rows, columns and levels, and the derivatives of the levels' in luminance."""
+    """Return interpolation weights of rows (H, rows), columns (W, columns) and levels (H, W, levels) for all pixels.
+
+    The fourth result is the derivative of the level weights with respect to luminance.
+    """
     (height, width, _), (levels, rows, columns) = image.shape, shape
     down = _hats((np.arange(height) + 0.5) / height * (rows - 1), rows)
     along = _hats((np.arange(width) + 0.5) / width * (columns - 1), columns)
@@ -36,7 +42,7 @@ def _weights(image: Float64, shape: tuple[int, ...]) -> tuple[Float64, Float64, 
 
 
 def apply(image: Float64, grid: Float64) -> Float64:
-    """The image (H, W, 3) with its colours transformed by the grid."""
+    """Transform the colours of an image (H, W, 3) by a grid."""
     down, along, levels, _ = _weights(image, grid.shape[:3])
     maps = np.einsum("yj,xi,yxl,ljiab->yxab", down, along, levels, grid, optimize=True)
     seen: Float64 = np.einsum("yxab,yxb->yxa", maps[..., :3], image) + maps[..., 3]
@@ -44,7 +50,10 @@ def apply(image: Float64, grid: Float64) -> Float64:
 
 
 def gradient(image: Float64, grid: Float64, by_seen: Float64) -> tuple[Float64, Float64]:
-    """Gradients with respect to the image and the grid, from that with respect to the transformed image."""
+    """Return gradients with respect to the image and the grid.
+
+    by_seen: (H, W, 3), the gradient with respect to the transformed image.
+    """
     down, along, levels, slopes = _weights(image, grid.shape[:3])
     whole = np.concatenate([image, np.ones_like(image[..., :1])], axis=-1)
     by_grid: Float64 = np.einsum("yj,xi,yxl,yxa,yxb->ljiab", down, along, levels, by_seen, whole, optimize=True)
@@ -57,12 +66,12 @@ def gradient(image: Float64, grid: Float64, by_seen: Float64) -> tuple[Float64, 
 
 
 def variation(grid: Float64) -> float:
-    """The mean squared difference between neighbouring vertices, summed over the three axes."""
+    """Return a grid's total variation: the mean squared difference of neighbouring vertices, summed over the axes."""
     return float(sum(np.square(np.diff(grid, axis=axis)).mean() for axis in range(3)))
 
 
 def variation_gradient(grid: Float64) -> Float64:
-    """The gradient of `variation` with respect to the grid."""
+    """Return the gradient of `variation` with respect to the grid."""
     total = np.zeros_like(grid)
     for axis in range(3):
         steps = np.diff(grid, axis=axis)
@@ -72,7 +81,7 @@ def variation_gradient(grid: Float64) -> Float64:
 
 
 def centre(grids: Float64) -> Float64:
-    """The grids (photographs, levels, rows, columns, 3, 4), shifted so that their mean is the identity."""
+    """Shift the grids (photographs, levels, rows, columns, 3, 4) so that their mean is the identity."""
     centred: Float64 = grids - grids.mean(axis=0) + np.eye(3, 4)
     return centred
 
@@ -80,7 +89,10 @@ def centre(grids: Float64) -> Float64:
 def step(
     grid: Float64, first: Float64, second: Float64, by_grid: Float64, visit: int, rate: float
 ) -> tuple[Float64, Float64, Float64]:
-    """Grid and moments after a step of Adam with the gradient by_grid. visit: number of the step, from 1."""
+    """Return a grid and both moments after a step of Adam with the gradient by_grid.
+
+    visit: number of the grid's steps so far, including this step.
+    """
     first, second = 0.9 * first + 0.1 * by_grid, 0.999 * second + 0.001 * by_grid**2
     change = rate * (first / (1 - 0.9**visit)) / (np.sqrt(second / (1 - 0.999**visit)) + 1e-15)
     return grid - change, first, second

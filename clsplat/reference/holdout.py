@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame without the parts behind surfaces: float64 twin of kernels/holdout.cl. Equations are in docs/pictures.md."""
+"""Holdouts: a frame without the parts of the model behind given surfaces. Float64 twin of kernels/holdout.cl.
+
+Equation numbers refer to docs/pictures.md.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +15,11 @@ from clsplat.reference.blend import layers
 from clsplat.reference.project import ProjectedTwin
 
 Surface = tuple[Float64, Float64, Float64]
-"""Depths (H, W) where a surface begins and ends, infinite in pixels that it does not cover; and its alpha (H, W)."""
+"""Depths (H, W) at which a surface begins and ends, and its alpha (H, W). Depths are infinite where it is absent."""
 
 
 def let_through(surfaces: Sequence[Surface], depth: float) -> Float64:
-    """Eq. (75): the fraction of the light (H, W) that passes the surfaces up to a depth."""
+    """Return the fraction of light (H, W) that passes all surfaces up to a depth: eq. (75)."""
     left = np.ones(surfaces[0][0].shape)
     for begin, end, alpha in surfaces:
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -33,7 +36,7 @@ def held_out(
     surfaces: Sequence[Surface],
     background: Sequence[float] | Float64 = (0.0, 0.0, 0.0),
 ) -> tuple[Float64, Float64]:
-    """Eqs. (76), (77): colour (H, W, 3) and alpha (H, W) of the frame without the parts behind the surfaces."""
+    """Return colour (H, W, 3) and alpha (H, W) of a frame without the parts behind the surfaces: eqs. (76), (77)."""
     image, seen, left = np.zeros((height, width, 3)), np.zeros((height, width)), np.ones((height, width))
     for layer in layers(projected, width, height):
         through = let_through(surfaces, float(np.float32(projected.depths[layer.gaussian])))[layer.box]

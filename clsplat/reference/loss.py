@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""L1 + D-SSIM and its gradient: float64 twin of kernels/loss*.cl. Equation numbers refer to docs/gradients.md."""
+"""The training loss, L1 + D-SSIM, the alpha loss, and their gradients: float64 twin of kernels/loss*.cl.
+
+Equation numbers refer to docs/gradients.md.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,17 @@ import numpy as np
 from clsplat.arrays import Float64
 
 LOSS_WINDOW_PX = 11
+"""Side of the SSIM window, in pixels."""
 LOSS_WINDOW_SIGMA_PX = 1.5
+"""Standard deviation of the Gaussian SSIM window, in pixels."""
 SSIM_C1 = 0.01**2
+"""Constant C1 of SSIM, for values from 0 to 1."""
 SSIM_C2 = 0.03**2
+"""Constant C2 of SSIM, for values from 0 to 1."""
 
 
 def window() -> Float64:
-    """The 11 weights of the Gaussian window, sigma 1.5, sum 1; the 2D window is their outer product."""
+    """Return the 11 weights of the Gaussian SSIM window, with sum 1; the 2D window is their outer product."""
     offsets = np.arange(LOSS_WINDOW_PX) - LOSS_WINDOW_PX // 2
     weights = np.exp(-(offsets**2) / (2 * LOSS_WINDOW_SIGMA_PX**2))
     normalised: Float64 = weights / weights.sum()
@@ -22,7 +29,7 @@ def window() -> Float64:
 
 
 def blur(image: Float64) -> Float64:
-    """The weighted mean in the window, zeros beyond the edge, (H, W, C) -> (H, W, C). It is its own adjoint."""
+    """Convolve an image (H, W, C) with the SSIM window, with zeros beyond its edge. The operation is self-adjoint."""
     height, width = image.shape[:2]
     reach = LOSS_WINDOW_PX // 2
     weights = window()
@@ -33,7 +40,7 @@ def blur(image: Float64) -> Float64:
 
 
 def ssim(x: Float64, y: Float64) -> tuple[Float64, Float64]:
-    """Eqs. (17), (18), (20), (21): the SSIM map (H, W, C), and the gradient of its SUM with respect to x."""
+    """Return the SSIM map (H, W, C) and the gradient, with respect to x, of its sum: eqs. (17), (18), (20), (21)."""
     mean_x, mean_y = blur(x), blur(y)
     var_x = blur(x * x) - mean_x**2
     var_y = blur(y * y) - mean_y**2
@@ -45,16 +52,16 @@ def ssim(x: Float64, y: Float64) -> tuple[Float64, Float64]:
     d_covariance = 2 * luminance / (luminance_norm * structure_norm)
     d_var = -values / structure_norm
     d_mean = 2 * mean_y * structure / (luminance_norm * structure_norm) - 2 * mean_x * values / luminance_norm
-    # the variances depend on the mean too
+    # The variances and the covariance depend on the mean too.
     d_mean = d_mean - 2 * mean_x * d_var - mean_y * d_covariance
     gradient = blur(d_mean) + 2 * x * blur(d_var) + y * blur(d_covariance)
     return values, gradient
 
 
 def l1_dssim(x: Float64, y: Float64, weight: float = 0.2) -> tuple[float, Float64]:
-    """Eq. (19): loss of the render x against the photograph y, both (H, W, C), and its gradient with respect to x.
+    """Return the loss of a render x against a photograph y, (H, W, C), and its gradient with respect to x: eq. (19).
 
-    L = (1 - weight) mean |x - y| + weight (1 - mean SSIM), means over pixels and channels.
+    The loss is (1 - weight) mean |x - y| + weight (1 - mean SSIM), with means over pixels and channels.
     """
     difference = x - y
     values, d_sum = ssim(x, y)
@@ -64,7 +71,7 @@ def l1_dssim(x: Float64, y: Float64, weight: float = 0.2) -> tuple[float, Float6
 
 
 def masked_l1_dssim(x: Float64, y: Float64, counts: Float64, weight: float = 0.2) -> tuple[float, Float64]:
-    """Eq. (80): `l1_dssim` over the pixels where counts (H, W) is 1. In other pixels counts is 0."""
+    """Return `l1_dssim` over the pixels whose mask `counts` (H, W) is 1, not 0: eq. (80)."""
     mask = counts[:, :, None]
     samples = max(3 * counts.sum(), 1)
     difference = (x - y) * mask
@@ -75,7 +82,10 @@ def masked_l1_dssim(x: Float64, y: Float64, counts: Float64, weight: float = 0.2
 
 
 def alpha_loss(transmittance: Float64, alpha: Float64, counts: Float64, weight: float) -> tuple[float, Float64]:
-    """Eq. (81): weight times the mean |1 - T - alpha| where counts is 1, and its gradient in T; arrays are (H, W)."""
+    """Return the alpha loss and its gradient with respect to transmittance: eq. (81). Arrays are (H, W).
+
+    The loss is weight * mean |1 - transmittance - alpha| over the pixels whose mask `counts` is 1, not 0.
+    """
     difference = counts * (1 - transmittance - alpha)
     scale = weight / max(counts.sum(), 1)
     return float(scale * np.abs(difference).sum()), -scale * np.sign(difference)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise on means, and penalties on opacity and scale: float64 twin of kernels/noise.cl and of the penalties in
-project_grad.cl."""
+"""Noise of MCMC training on means, and penalties on opacity and scale.
+
+Float64 twin of kernels/noise.cl and of the penalties in project_grad.cl. Equation numbers refer to docs/gradients.md.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +14,18 @@ from clsplat.optimisation.step_noise import Exploration
 from clsplat.reference.project import rotation_matrices
 
 HALF_WORDS_PER_NORMAL = 8
+"""Number of random 16-bit integers whose sum makes one normally distributed number."""
 
 
 def mixed(words: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Pseudorandom words, by a permutation of all 32-bit words (kernels/shared/random.h)."""
+    """Map words to pseudorandom words by a permutation of all 32-bit words, as in kernels/shared/random.h."""
     words = (words ^ (words >> np.uint32(16))) * np.uint32(0x7FEB352D)
     words = (words ^ (words >> np.uint32(15))) * np.uint32(0x846CA68B)
     return words ^ (words >> np.uint32(16))
 
 
 def normal_numbers(key: tuple[int, int], rows: NDArray[np.integer]) -> Float64:
-    """Eq. (93): three normally distributed numbers (n, 3) for each row (n,)."""
+    """Return three normally distributed numbers (n, 3) for each row (n,) of a model: eq. (93)."""
     of_row = mixed(rows.astype(np.uint32) ^ np.uint32(key[0])) + np.uint32(key[1])
     counters = np.arange(3 * HALF_WORDS_PER_NORMAL // 2, dtype=np.uint32) * np.uint32(0x9E3779B9)
     words = mixed(of_row[:, None] + counters)
@@ -35,7 +38,7 @@ def normal_numbers(key: tuple[int, int], rows: NDArray[np.integer]) -> Float64:
 def displacements(
     explore: Exploration, quaternions: Float64, log_scales: Float64, opacity_logits: Float64, first_row: int = 0
 ) -> Float64:
-    """Eq. (92): the displacements of the means, (n, 3)."""
+    """Return the random displacements (n, 3) of the means: eq. (92). first_row: row of the first Gaussian."""
     eta = normal_numbers(explore.key, first_row + np.arange(len(opacity_logits)))
     opacities = 1 / (1 + np.exp(-opacity_logits))
     weights = explore.amount / (1 + np.exp(100 * (opacities - explore.dead)))
@@ -46,12 +49,12 @@ def displacements(
 
 
 def penalty(explore: Exploration, log_scales: Float64, opacity_logits: Float64) -> float:
-    """The loss terms on opacities and scales of the Gaussians, all of which count as visible."""
+    """Return the penalty on opacities and scales, summed over all Gaussians as if all were visible."""
     opacities = 1 / (1 + np.exp(-opacity_logits))
     return float(explore.opacity * opacities.sum() + explore.scale * np.exp(log_scales).sum())
 
 
 def penalty_grad(explore: Exploration, log_scales: Float64, opacity_logits: Float64) -> tuple[Float64, Float64]:
-    """Gradients of the penalties with respect to log scales (n, 3) and opacity logits (n,): eq. (91)."""
+    """Return gradients of the penalty with respect to log scales (n, 3) and opacity logits (n,): eq. (91)."""
     opacities = 1 / (1 + np.exp(-opacity_logits))
     return explore.scale * np.exp(log_scales), explore.opacity * opacities * (1 - opacities)

@@ -17,9 +17,10 @@ from clsplat.spherical_harmonics import SH_C0
 def pose_gradient(
     means: Float64, quaternions: Float64, sh: Float64, camera: Camera, sh_degree: int, gradients: Mapping[str, Float64]
 ) -> Float64:
-    """Gradient (6,) with respect to a motion of the camera as in `Camera.moved`: rotation, then translation.
+    """Return the gradient (6,) with respect to a motion of the camera by `Camera.moved`: rotation, then translation.
 
-    gradients: gradients of means (N, 3), quaternions (N, 4) and sh (N, K, 3), zero where a Gaussian is not visible.
+    gradients: gradients with respect to means (N, 3), quaternions (N, 4) and sh (N, K, 3), by name; zero for Gaussians
+    that are not visible.
     """
     directions, _ = view_directions(means, camera)
     of_direction = sh_basis_grad(directions, sh_degree)

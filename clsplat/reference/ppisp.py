@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gains and colour mixes of a photograph, the vignette of its lens, and their gradient.
+"""Colour model `ppisp`: gains and colour mixes of a photograph, the vignette of its lens, and their gradient.
 
-Float64 twin of kernels/ppisp.cl. It is a part of PPISP (NVIDIA 2026), with a colour matrix that keeps grey.
+Float64 twin of kernels/ppisp.cl. The model is a part of PPISP (NVIDIA 2026), with a colour matrix that keeps grey.
 """
 
 from __future__ import annotations
@@ -12,7 +12,10 @@ from clsplat.arrays import Float64
 
 
 def unmixing(mixes: Float64) -> Float64:
-    """The matrix (3, 3) that removes the mixes (6,): for each channel c, the fractions of channels c + 1 and c + 2."""
+    """Return the colour matrix (3, 3) that removes the mixes (6,).
+
+    For each channel c, mixes has the fractions of channels c + 1 and c + 2, modulo 3.
+    """
     matrix = np.eye(3)
     for c in range(3):
         for k in range(2):
@@ -22,7 +25,10 @@ def unmixing(mixes: Float64) -> Float64:
 
 
 def light(vignette: Float64, squared: Float64) -> Float64:
-    """The fraction of light (H, W) that a lens with this vignette (3,) transmits at these squared distances."""
+    """Return the fraction of light (H, W) that a lens with this vignette (3,) transmits.
+
+    squared: (H, W), squared distances from the principal point (`reference.appearance.spread`).
+    """
     result: Float64 = np.exp2(squared * (vignette[0] + squared * (vignette[1] + squared * vignette[2])))
     return result
 
@@ -35,9 +41,9 @@ def developed(photograph: Float64, entries: Float64, vignette: Float64, squared:
 
 
 def terms(image: Float64, by_image: Float64, squared: Float64) -> Float64:
-    """Terms (H, W, 12) of a loss's gradient with respect to the entries and the vignette, at values of 0.
+    """Return each pixel's terms (H, W, 12) of a loss's gradient with respect to entries and vignette that are 0.
 
-    by_image: (H, W, 3), the gradient of the loss with respect to the image after they are applied.
+    by_image: (H, W, 3), the gradient of the loss with respect to the image with entries and vignette applied.
     """
     each = image * by_image
     others = [image[:, :, (c + 1 + k) % 3] - image[:, :, c] for c in range(3) for k in range(2)]

@@ -21,13 +21,18 @@ from clsplat.reference.sort import depth_order
 from clsplat.spherical_harmonics import sh_basis
 
 ALPHA_MIN = 1.0 / 255.0
+"""Smallest alpha with which a Gaussian is added to a pixel."""
 LOW_PASS_PX2 = 0.3
+"""Variance added to the diagonal of projected covariances, in square pixels."""
 LOW_PASS_ANTIALIASED_PX2 = 0.1
+"""Variance added to the diagonal of projected covariances of antialiased models, in square pixels."""
 MIN_COMPENSATION = 0.005
+"""Smallest factor by which an antialiased model's opacities are compensated for the low-pass."""
 COLOUR_LIMIT = 1e9
+"""Gaussians with a colour channel of this value or more are culled."""
 BOX_SLACK = 0.1
-"""Added to the bound q <= 2 ln(255 o) of a Gaussian's box. So alphas down to 5 % below 1/255 are evaluated, and the
-margins between alphas and 1/255 are correct up to 5 %."""
+"""Amount added to the bound q <= 2 ln(255 opacity) of a Gaussian's box. The box then holds alphas down to 5 % below
+1/255, and margins between alphas and 1/255 are correct up to 5 %."""
 
 PARAMETER_NAMES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 """The arrays of `Gaussians` that `project` takes, in its order."""
@@ -35,11 +40,12 @@ PARAMETER_NAMES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 @dataclass(frozen=True, eq=False)
 class Footprint:
-    """A Gaussian on a box of pixels, outside of which it has no effect.
+    """A Gaussian's falloff on a box of pixels, outside of which it has no effect.
 
-    dx, dy: broadcastable to (h, w), pixel centre minus mean; for models along rays, on the tangent plane.
+    box: rows and columns of the picture.
+    dx, dy: broadcastable to (h, w), pixel centre minus mean; for camera models along rays, on the tangent plane.
     falloff: (h, w), exp(-q / 2).
-    raw: (h, w), opacity times falloff, before the clamp.
+    raw: (h, w), opacity times falloff: alpha before it is limited to 0.99.
     """
 
     box: tuple[slice, slice]
@@ -53,10 +59,10 @@ class Footprint:
 class Seen(ABC):
     """N projected Gaussians, for a camera of any projection.
 
-    depths: (N,), z in the camera's axes, or the distance for models along rays.
+    depths: (N,), z in the camera's axes; for camera models along rays, the distance.
     opacities: (N,), 0 to 1.
     colors: (N, 3).
-    visible: (N,).
+    visible: (N,), False for culled Gaussians.
     """
 
     depths: Float64
@@ -66,19 +72,19 @@ class Seen(ABC):
 
     @property
     def order(self) -> Int64:
-        """Rows of the visible Gaussians, front to back."""
+        """Indices of the visible Gaussians, front to back."""
         return depth_order(self.depths, self.visible)
 
     @abstractmethod
     def footprint(self, gaussian: int, width: int, height: int) -> Footprint | None:
-        """The footprint of a Gaussian on the image; None if it is outside."""
+        """Return the footprint of a Gaussian on the image; None for a Gaussian outside the image."""
 
     @abstractmethod
     def conic(self, gaussian: int) -> Float64:
-        """Conic a, b, c of a Gaussian: q = a dx^2 + 2 b dx dy + c dy^2."""
+        """Return the conic a, b, c of a Gaussian: q = a dx^2 + 2 b dx dy + c dy^2."""
 
     def by_mean(self, gaussian: int, splat: Footprint) -> tuple[Float64, Float64]:
-        """Derivatives of -q / 2 at each pixel with respect to the mean, along the axes of dx and dy: eq. (25)."""
+        """Return derivatives of -q / 2 at each pixel with respect to the mean, along dx and dy: eq. (25)."""
         a, b, c = self.conic(gaussian)
         return a * splat.dx + b * splat.dy, b * splat.dx + c * splat.dy
 
@@ -106,13 +112,13 @@ class ProjectedTwin(Seen):
         return found
 
     def footprint(self, gaussian: int, width: int, height: int) -> Footprint | None:
-        """The footprint of a Gaussian, on the box in which its alpha can reach 1/255: eqs. (9) and (14)."""
+        """Return the footprint of a Gaussian on the box in which its alpha can reach 1/255: eqs. (9) and (14)."""
         opacity = self.opacities[gaussian]
         reach = 2 * np.log(opacity / ALPHA_MIN) + BOX_SLACK
         half = np.sqrt(reach * self.covariances[gaussian, [0, 2]])
         mean = self.means2d[gaussian]
         size = np.array([width, height])
-        # clipped before conversion: a mean far off the image may overflow an integer
+        # Clip before conversion: the mean of a Gaussian far off the image may overflow an integer.
         first = np.clip(np.ceil(mean - half - 0.5), 0, size).astype(np.int64)
         stop = np.clip(np.floor(mean + half - 0.5) + 1, 0, size).astype(np.int64)
         if (first >= stop).any():
@@ -129,9 +135,9 @@ class _Geometry:
     """Intermediate values that projection and its gradient share.
 
     p: (N, 3), the means in the camera's axes.
-    plane: ratios and Jacobian.
+    plane: the linearised projection of p.
     rotations, scales: (N, 3, 3) and (N, 3), of the Gaussians.
-    half: (N, 2, 3), M of eq. (5).
+    half: (N, 2, 3), M of eq. (5); the projected covariance without low-pass is M M^T.
     """
 
     p: Float64
@@ -142,7 +148,7 @@ class _Geometry:
 
 
 def rotation_matrices(quaternions: Float64) -> Float64:
-    """R(q / |q|): raw quaternions (N, 4), w x y z -> (N, 3, 3). A zero quaternion gives NaN."""
+    """Return rotation matrices (N, 3, 3) of raw quaternions (N, 4), w x y z. A zero quaternion gives NaN."""
     w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -153,7 +159,7 @@ def rotation_matrices(quaternions: Float64) -> Float64:
 
 
 def _geometry(means: Float64, quaternions: Float64, log_scales: Float64, camera: Camera) -> _Geometry:
-    """Compute the `_Geometry`: eqs. (1), (3), (4), (5); orthographic: (16) of docs/cameras.md."""
+    """Compute the values that projection and its gradient share: eqs. (1), (3) to (5), or (16) of docs/cameras.md."""
     p = means @ camera.rotation.T + camera.translation
     plane = camera.model.projected(camera, p)
     rotations = rotation_matrices(quaternions)
@@ -163,9 +169,9 @@ def _geometry(means: Float64, quaternions: Float64, log_scales: Float64, camera:
 
 
 def view_directions(means: Float64, camera: Camera) -> tuple[Float64, Float64]:
-    """Unit vectors (N, 3) from the camera to the means, and the distances (N, 1).
+    """Return unit vectors (N, 3) from the camera to the means, and distances (N, 1).
 
-    For parallel rays every direction is the camera's axis, as from infinitely far away: (17) of docs/cameras.md.
+    For a camera with parallel rays, all vectors are its axis and distances are infinite: eq. (17) of docs/cameras.md.
     """
     if camera.model.parallel:
         return np.tile(camera.rotation[2], (len(means), 1)), np.full((len(means), 1), np.inf)
@@ -175,7 +181,7 @@ def view_directions(means: Float64, camera: Camera) -> tuple[Float64, Float64]:
 
 
 def _pixels_of(p: Float64, camera: Camera) -> Float64:
-    """Eq. (2): pixels (N, 2) of points p (N, 3) in the camera's axes, relative to the window if there is one."""
+    """Return pixels (N, 2) of points p (N, 3) in the camera's axes, relative to the camera's window: eq. (2)."""
     focal = np.array([camera.fx, camera.fy])
     means2d: Float64 = focal * p[:, :2] / camera.model.divisors(p[:, 2])[:, None] + np.array([camera.cx, camera.cy])
     return means2d if camera.window is None else means2d - [camera.window.x, camera.window.y]
@@ -224,10 +230,10 @@ def project(
 
     The arrays are those of `Gaussians`, in float64.
 
-    sh_degree: the degree in use; higher bands are ignored.
-    antialiased: compensate opacities for the low-pass, (83).
+    sh_degree: the SH degree in use; higher degrees are ignored.
+    antialiased: compensate opacities for the low-pass, eq. (83).
     """
-    with np.errstate(all="ignore"):  # overflows and divisions by zero are culled below
+    with np.errstate(all="ignore"):  # Gaussians whose values overflow or are divided by zero are culled below
         geometry = _geometry(means, quaternions, log_scales, camera)
         z, means2d = geometry.p[:, 2], _pixels_of(geometry.p, camera)
         ellipses = _ellipses(geometry.half, LOW_PASS_ANTIALIASED_PX2 if antialiased else LOW_PASS_PX2)
@@ -269,14 +275,18 @@ def project(
 
 
 def compensation(det0: Float64, det: Float64) -> Float64:
-    """Eq. (83): factors of the opacities, from the determinants (N,) of the covariances without and with low-pass."""
+    """Return factors (N,) of the opacities that compensate for the low-pass: eq. (83).
+
+    det0, det: (N,), determinants of the projected covariances without and with the low-pass.
+    """
     return np.maximum(np.sqrt(det0 / det), MIN_COMPENSATION)
 
 
 def compensation_grad(plain: Float64, filtered: Float64, d_logs: Float64) -> tuple[Float64, Float64]:
-    """Eq. (84): terms of dL/dSigma (N, 2, 2) that the compensation adds, for the covariances without and with low-pass.
+    """Return the gradients (N, 2, 2) with respect to both covariances that `compensation` adds: eq. (84).
 
-    d_logs: (N,), dL/d(ln of the opacity).
+    plain, filtered: (N, 2, 2), the covariances without and with the low-pass.
+    d_logs: (N,), gradient of the loss with respect to ln(opacity).
     """
     free = np.linalg.det(plain) > MIN_COMPENSATION**2 * np.linalg.det(filtered)
     by_plain, by_filtered = np.zeros_like(plain), np.zeros_like(plain)
@@ -286,10 +296,12 @@ def compensation_grad(plain: Float64, filtered: Float64, d_logs: Float64) -> tup
 
 
 def covariance_grad(conics: Float64, d_conics: Float64) -> Float64:
-    """Eq. (30), dL/dSigma = -A G A with A the conic matrix: (N, 3), (N, 3) -> (N, 3).
+    """Return the gradient (N, 3) with respect to covariances: xx, xy, yy of dL/dSigma. Eq. (30).
 
-    d_conics is the derivative with respect to a, b and c (b occurs twice in the matrix). The result is xx, xy, yy of
-    the symmetric matrix G with dL = sum_ij G_ij dSigma_ij. So the derivative with respect to sxy as a variable is 2 xy.
+    dL/dSigma = -A G A, where A is the conic matrix and G the gradient with respect to it. As the matrix is symmetric,
+    the derivative with respect to the variable sxy is 2 xy.
+
+    conics, d_conics: (N, 3), a, b, c, and the derivatives with respect to them. b occurs twice in A.
     """
     a, b, c = conics.T
     matrix = np.stack([np.stack([a, b], axis=1), np.stack([b, c], axis=1)], axis=1)
@@ -300,7 +312,10 @@ def covariance_grad(conics: Float64, d_conics: Float64) -> Float64:
 
 
 def quaternion_grad(quaternions: Float64, d_rotations: Float64) -> Float64:
-    """Eqs. (34), (35): dL/dq (N, 4), orthogonal to q, from raw quaternions q (N, 4) and dL/dR (N, 3, 3)."""
+    """Return the gradient (N, 4) with respect to raw quaternions, to which it is orthogonal: eqs. (34), (35).
+
+    d_rotations: (N, 3, 3), the gradient with respect to the rotation matrices.
+    """
     norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
     unit = quaternions / norms
     w, x, y, z = unit.T
@@ -321,9 +336,12 @@ def quaternion_grad(quaternions: Float64, d_rotations: Float64) -> Float64:
 def colour_grad(
     means: Float64, sh: Float64, camera: Camera, sh_degree: int, colors: Float64, d_colors: Float64
 ) -> tuple[Float64, Float64, Float64]:
-    """Eqs. (38) to (40): the SH basis (N, K), and two gradients (N, 3).
+    """Return the SH basis (N, K), and the gradients (N, 3) with respect to unclamped colours and to means.
 
-    They are with respect to the colour before its clamp, and to the mean, through the viewing direction.
+    Unclamped colours are those before the clamp at 0. Means act on colours through the viewing direction: eqs. (38) to
+    (40).
+
+    colors, d_colors: (N, 3), the clamped colours, and the gradient of the loss with respect to them.
     """
     directions, distances = view_directions(means, camera)
     basis = sh_basis(directions, sh_degree)
@@ -339,7 +357,7 @@ class ProjectedGradients:
     """Gradients of a loss with respect to the results of `project`.
 
     means2d: (N, 2).
-    covariances: (N, 3), xx, xy, yy as in (28).
+    covariances: (N, 3), xx, xy, yy as from `covariance_grad`.
     opacities: (N,).
     colors: (N, 3).
     """
@@ -353,9 +371,9 @@ class ProjectedGradients:
 def _jacobian_grad(
     geometry: _Geometry, camera: Camera, d_covariances: Float64, by_log_opacity: Float64 | None
 ) -> tuple[Float64, Float64, Float64]:
-    """Eqs. (31), (32): dL/dM (N, 2, 3), the matrices R S of the Gaussians (N, 3, 3), and dL/dJ (N, 2, 3).
+    """Return dL/dM (N, 2, 3), the matrices R S (N, 3, 3) of the Gaussians, and dL/dJ (N, 2, 3): eqs. (31), (32).
 
-    by_log_opacity: (N,), dL/d(ln of the opacity) if opacities are compensated.
+    by_log_opacity: (N,), gradient with respect to ln(opacity) for compensated opacities; None for others.
     """
     gxx, gxy, gyy = d_covariances.T
     d_covariance = np.stack([np.stack([gxx, gxy], axis=1), np.stack([gxy, gyy], axis=1)], axis=1)
@@ -377,7 +395,10 @@ def lens_grad(
     *,
     antialiased: bool = False,
 ) -> Float64:
-    """Eqs. (144), (145): gradient (4,) with respect to ln fx, ln fy, cx and cy. Arguments are as in `project_grad`."""
+    """Return the gradient (4,) with respect to ln fx, ln fy, cx and cy of the camera: eqs. (144), (145).
+
+    by: gradients with respect to `projected`, the result of `project`.
+    """
     assert not camera.model.along_rays
     rows = np.flatnonzero(projected.visible)
     geometry = _geometry(means[rows], quaternions[rows], log_scales[rows], camera)
@@ -405,10 +426,11 @@ def project_grad(
     *,
     antialiased: bool = False,
 ) -> dict[str, Float64]:
-    """Gradients with respect to the five parameters, by name; zero where culled. Eqs. (31) to (41), and (84).
+    """Return gradients with respect to the five parameter arrays, by name; zero where culled: eqs. (31) to (41), (84).
 
     arrays: the parameters, keyed by their names in `project`.
     projected: the result of `project`.
+    by: gradients with respect to `projected`.
 
     For an orthographic camera J is constant, and colours do not depend on the means. `reference.rays` has the gradients
     for models along rays.

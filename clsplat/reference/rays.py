@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussians evaluated along the rays of pixels in float64, and their gradient.
+"""Gaussians projected to tangent planes and evaluated along the rays of pixels, and their gradient, in float64.
 
-Twin of kernels/project_rays.cl, and of blending and project_grad.cl with RAYS. Equation numbers refer to
+Twin of kernels/project_rays.cl, and of blending and project_grad.cl with the define RAYS. Equation numbers refer to
 docs/cameras.md.
 """
 
@@ -36,7 +36,7 @@ from clsplat.spherical_harmonics import sh_basis
 
 @dataclass(frozen=True, eq=False)
 class Tangents(Seen):
-    """Gaussians on tangent planes of the unit sphere around the camera, each at the direction of its mean.
+    """Gaussians on planes tangent to the unit sphere around the camera, each at the direction of its mean.
 
     directions: (N, 3), unit directions of the means in the camera's axes.
     right, down: (N, 3), the axes of the tangent planes.
@@ -51,7 +51,7 @@ class Tangents(Seen):
     rays: Float64
 
     def footprint(self, gaussian: int, width: int, height: int) -> Footprint:
-        """The footprint on the whole image: eq. (14)."""
+        """Return the Gaussian's footprint on the whole image: eq. (14)."""
         along = self.rays @ self.directions[gaussian]
         ahead = along > 0
         safe = np.where(ahead, along, 1.0)
@@ -66,7 +66,7 @@ class Tangents(Seen):
         return np.array([a, b, c])
 
     def by_mean(self, gaussian: int, splat: Footprint) -> tuple[Float64, Float64]:
-        """Derivatives as in `Seen.by_mean`: eq. (21). The tangent plane rotates with the mean."""
+        """Return the derivatives of -q / 2 as `Seen.by_mean`, for a tangent plane that rotates with the mean: (21)."""
         by_x, by_y = super().by_mean(gaussian, splat)
         q = splat.dx * by_x + splat.dy * by_y
         return by_x + q * splat.dx, by_y + q * splat.dy
@@ -100,13 +100,20 @@ def tangents(gaussians: Gaussians, camera: Camera) -> Tangents:
 
 
 def pixel_sides(pixels: Float64) -> Float64:
-    """Sides (N, 2) of a pixel on the tangent plane, in radians along its axes, from (10)."""
+    """Return the sides (N, 2) of a pixel along the tangent plane's axes, in radians.
+
+    pixels: (N, 2, 2), footprints of pixels as from `CameraModel.footprints`.
+    """
     sides: Float64 = np.linalg.norm(pixels, axis=2)
     return sides
 
 
 def tangents_grad(gaussians: Gaussians, camera: Camera, seen: Tangents, screen: BlendGradients) -> dict[str, Float64]:
-    """Eqs. (22) to (29): gradients with respect to the five parameters, by name; zero where culled."""
+    """Return gradients with respect to the five parameter arrays, by name; zero where culled: eqs. (22) to (29).
+
+    seen: the result of `tangents`.
+    screen: the gradients of blending.
+    """
     rows = np.flatnonzero(seen.visible)
     arrays = parameters(gaussians)
     means, quaternions = arrays["means"][rows], arrays["quaternions"][rows]

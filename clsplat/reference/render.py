@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The forward pass and its gradient in float64, to which the kernels are compared."""
+"""Rendering of a model (projection, sorting, blending) and its gradient in float64, to check the kernels with."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BLACK_BACKGROUND = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Forward:
-    """The results of the forward pass."""
+    """The forward pass's projected Gaussians and blended picture."""
 
     projected: ProjectedTwin
     blended: BlendedTwin
@@ -36,10 +36,10 @@ class Forward:
 
 @dataclass(frozen=True, eq=False)
 class GradientsTwin(BlendGradients):
-    """Gradients with respect to the projected Gaussians and to the parameters.
+    """Gradients with respect to the projected Gaussians and to the model's parameters.
 
-    parameters: gradients by the names of the arrays in `Gaussians`, with their shapes.
-    visible: (N,).
+    parameters: gradients with respect to the arrays of `Gaussians`, by their names and in their shapes.
+    visible: (N,), False for culled Gaussians.
     """
 
     parameters: dict[str, Float64]
@@ -47,14 +47,14 @@ class GradientsTwin(BlendGradients):
 
 
 def parameters(gaussians: Gaussians) -> dict[str, Float64]:
-    """The five parameter arrays by name, in float64, with means in world coordinates."""
+    """Return the model's five parameter arrays by name, in float64, with means in world coordinates."""
     fields = dict.fromkeys(group.field for group in PARAMETER_GROUPS.values())
     arrays = {name: np.asarray(getattr(gaussians, name), np.float64) for name in fields}
     return {**arrays, "means": arrays["means"] + gaussians.origin}
 
 
 def project_model(gaussians: Gaussians, camera: Camera, sh_degree: int) -> ProjectedTwin:
-    """Project a model, with the low-pass that it was trained with."""
+    """Project a model to the image plane, with the low-pass that it was trained with."""
     arrays = parameters(gaussians)
     return project(
         arrays["means"],
@@ -74,7 +74,7 @@ def forward(
     background: Sequence[float] | Float64 = BLACK_BACKGROUND,
     sh_degree: int | None = None,
 ) -> Forward:
-    """Project, sort and blend. sh_degree: None uses all bands of the model."""
+    """Project, sort and blend a model. sh_degree: degree of the SH to use; None for the model's degree."""
     degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
     projected = project_model(gaussians, camera, degree)
     return Forward(projected, blend(projected, camera.width, camera.height, background))
@@ -86,7 +86,7 @@ def render(
     background: Sequence[float] | Float64 = BLACK_BACKGROUND,
     sh_degree: int | None = None,
 ) -> tuple[Float64, Float64]:
-    """Render to image (H, W, 3) over the background, and alpha (H, W) = 1 - transmittance."""
+    """Render a model to an image (H, W, 3) over the background, and alpha (H, W)."""
     blended = forward(gaussians, camera, background, sh_degree).blended
     return blended.image, 1 - blended.transmittance
 
@@ -100,11 +100,11 @@ def render_grad(
     d_transmittance: Float64 | None = None,
     d_nearness: Float64 | None = None,
 ) -> GradientsTwin:
-    """Gradients of a loss.
+    """Return the gradients of a loss of a rendered picture.
 
-    d_image: (H, W, 3), dL/dimage.
-    d_transmittance: (H, W), dL/dT with T the transmittance behind all Gaussians.
-    d_nearness: (H, W), dL/dN with N the nearness.
+    d_image: (H, W, 3), gradient of the loss with respect to the image.
+    d_transmittance: (H, W), the same for the transmittance behind all Gaussians.
+    d_nearness: (H, W), the same for the nearness.
     """
     degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
     projected = project_model(gaussians, camera, degree)
@@ -116,7 +116,7 @@ def render_grad(
 
 
 def projected_gradients(projected: ProjectedTwin, screen: BlendGradients) -> ProjectedGradients:
-    """The gradients of blending, as the input of projection's gradient: covariances replace conics."""
+    """Convert the gradients of blending to the input of `project_grad`: conics become covariances."""
     by_covariance = covariance_grad(projected.conics, screen.conics)
     return ProjectedGradients(screen.means2d, by_covariance, screen.opacities, screen.colors)
 
@@ -124,7 +124,10 @@ def projected_gradients(projected: ProjectedTwin, screen: BlendGradients) -> Pro
 def render_lens_grad(
     gaussians: Gaussians, camera: Camera, d_image: Float64, background: Sequence[float] | Float64 = BLACK_BACKGROUND
 ) -> Float64:
-    """Gradient (4,) of a loss with respect to ln fx, ln fy, cx and cy. d_image: (H, W, 3), dL/dimage."""
+    """Return the gradient (4,) of a loss with respect to a lens: ln fx, ln fy, cx and cy.
+
+    d_image: (H, W, 3), gradient of the loss with respect to the image.
+    """
     arrays, camera = parameters(gaussians), camera.before(gaussians.near)
     projected = project_model(gaussians, camera, gaussians.sh_degree)
     screen = blend_grad(projected, camera.width, camera.height, background, d_image)

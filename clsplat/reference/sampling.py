@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lower limits of the scales, from the sampling rate of photographs: float64 twin of kernels/sampling.cl. Equation
-numbers refer to docs/gradients.md."""
+"""Lower limits of Gaussians' scales, from the sampling rate of photographs: float64 twin of kernels/sampling.cl.
+
+Equation numbers refer to docs/gradients.md.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +14,13 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 
 SAMPLING_WIDTH_FACTOR = np.sqrt(0.2)
+"""Lower limit of a standard deviation, in widths of a pixel."""
 
 
 def sampling_limits(means: Float64, cameras: Sequence[Camera]) -> Float64:
-    """Eq. (88): natural logs (N,) of the smallest standard deviations that the cameras resolve at the means (N, 3).
+    """Return the log scales (N,) of the smallest Gaussians that the cameras resolve at means (N, 3): eq. (88).
 
-    The result is -inf where no camera sees a mean.
+    The result is -inf for a mean that no camera sees.
     """
     widths = np.min([pixel_widths(means, camera) for camera in cameras], axis=0)
     with np.errstate(divide="ignore"):
@@ -27,5 +30,5 @@ def sampling_limits(means: Float64, cameras: Sequence[Camera]) -> Float64:
 
 
 def pixel_widths(means: Float64, camera: Camera) -> Float64:
-    """The width of a pixel at each mean (N, 3), in world units; infinite for means that the camera does not see."""
+    """Return a pixel's width (N,) at each mean (N, 3), in world units; infinite where the camera sees no mean."""
     return camera.model.pixel_widths(camera, means @ camera.rotation.T + camera.translation)

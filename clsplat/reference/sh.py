@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The derivative of real spherical harmonics up to degree 4. `clsplat.spherical_harmonics` has their values."""
+"""The derivative of real spherical harmonics up to degree 4. Their values are in `clsplat.spherical_harmonics`."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from clsplat.spherical_harmonics import SH_C1, SH_C2, SH_C3, SH_C4
 
 
 def sh_basis_grad(directions: Float64, degree: int) -> Float64:
-    """dY_k / d(x, y, z), with x, y, z as independent variables: (N, 3) -> (N, (degree + 1)^2, 3).
+    """Return dY_k / d(x, y, z) at directions (N, 3), with x, y, z as independent variables: (N, (degree + 1)^2, 3).
 
-    The polynomials are differentiated as `sh_basis` writes them. Off the unit sphere they could be written otherwise,
-    but the derivatives would differ only along the direction, and eq. (40) removes this component.
+    The polynomials are differentiated as `sh_basis` writes them. Other polynomials with the same values on the unit
+    sphere have derivatives that differ only along the direction, a component that eq. (40) of docs/gradients.md
+    removes.
     """
     x, y, z = directions.T
     zero = np.zeros_like(x)

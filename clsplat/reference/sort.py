@@ -10,10 +10,10 @@ from clsplat.arrays import Float64
 
 
 def depth_order(depths: Float64, visible: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Indices of the visible Gaussians front to back: by depth rounded to float32, ties by index.
+    """Return indices of the visible Gaussians front to back: by depth rounded to float32, equal depths by index.
 
-    depths: (N,), z in the camera's axes. Kernels compute depths in float32. Pass the kernels' depths to get their exact
-    order: rounded float64 depths may differ in the last bits, so that neighbours swap.
+    depths: (N,), z in the camera's axes. Pass a kernel's float32 depths to get the kernel's exact order: float64 depths
+    may round to other bits, so that neighbours swap.
     """
     rows = np.flatnonzero(visible)
     keys = depths[rows].astype(np.float32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splats from arrays of projected Gaussians, and the gradient.
+"""Splats, ready for blending, from arrays of projected Gaussians as in gsplat; and their gradient.
 
 Float64 twin of kernels/splats.cl and splats_grad.cl. Equation numbers refer to docs/gradients.md.
 """
@@ -17,7 +17,7 @@ from clsplat.reference.project import ALPHA_MIN
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """Splats. Rows of culled Gaussians are 0.
+    """Ellipses of projected Gaussians. Rows of culled Gaussians are 0.
 
     whitenings: (n, 3), w11, w12, w22 of W, where W^T W is the conic.
     half_extents: (n, 2), of the bounding box of the ellipse where alpha is 1/255.
@@ -30,7 +30,7 @@ class Splats:
 
 
 def splats(conics: Float64, opacities: Float64, radii: NDArray[np.int32]) -> Splats:
-    """Compute the splats, for positive definite conics (n, 3): eqs. (170) to (172)."""
+    """Compute splats from positive definite conics (n, 3), opacities (n,) and radii (n, 2): eqs. (170) to (172)."""
     a, b, c = conics.T
     det = a * c - b * b
     drawn = (radii > 0).all(axis=1) & (opacities > ALPHA_MIN)
@@ -50,10 +50,10 @@ class SplatGradients:
 
 
 def splats_grad(conics: Float64, opacities: Float64, moments: Float64) -> SplatGradients:
-    """Compute the gradients: eqs. (173) to (175).
+    """Compute the gradients of splats from sums over their pixels: eqs. (173) to (175).
 
-    moments: (n, 6), sums of g, g u, g v, g u^2, g u v, g v^2 over a Gaussian's pixels, where (u, v) = W d and d points
-    from the pixel to the mean.
+    moments: (n, 6), sums of g, g u, g v, g u^2, g u v, g v^2 over a Gaussian's pixels. g is alpha dL/dalpha; (u, v) is
+    W d, where d points from the pixel to the mean.
     """
     a, b, c = conics.T
     l11, l12, l22 = np.sqrt(a), b / np.sqrt(a), np.sqrt((a * c - b * b) / a)

@@ -13,12 +13,12 @@ from clsplat.reference.project import ALPHA_MIN, ProjectedTwin
 def touched_tiles(
     projected: ProjectedTwin, width: int, height: int, tile: int = 16, threshold: float = ALPHA_MIN
 ) -> list[Int64]:
-    """For each Gaussian, the ascending row-major indices of tiles that contain a pixel centre with alpha >= threshold.
+    """Return, for each Gaussian, the ascending indices of tiles with a pixel centre where alpha >= threshold.
 
-    The tiles that the kernels find must include these. A missing tile is a hole in the image; an additional tile only
-    costs time. The kernels test the ellipse against the rectangle of the tile's pixel centres, so it may reach a tile
-    between two centres. The float32 test may also err within 1e-5 of the threshold: compare with threshold = ALPHA_MIN
-    * (1 + 1e-5).
+    Tiles are numbered row by row. The kernels must find all tiles of the result: a missing tile is a hole in the image,
+    an additional tile only costs time. The kernels find more, because they test the ellipse against the rectangle of
+    a tile's pixel centres, which it may cross between two centres. Their float32 test may err within 1e-5 of the
+    threshold, so compare with threshold = ALPHA_MIN * (1 + 1e-5).
     """
     tiles_x = -(-width // tile)
     result = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blending of any number of values per Gaussian, and its gradient. Every Gaussian is evaluated at every pixel.
+"""Blending of any number of values (colours, features) per Gaussian and its gradient, evaluated at every pixel.
 
 Float64 twin of kernels/values.cl and values_grad.cl. Equation numbers refer to docs/gradients.md.
 """
@@ -17,19 +17,19 @@ from clsplat.reference.blend import BLEND_ALPHA_MAX, TRANSMITTANCE_MIN
 from clsplat.reference.project import ALPHA_MIN
 
 MAX_VALUES_MARGIN = 0.05
-"""Upper limit of the margin."""
+"""Upper limit of `ValuesBlended.margin`."""
 
 
 @dataclass(frozen=True, eq=False)
 class FlatGaussians:
-    """Projected Gaussians with values.
+    """Projected Gaussians with D values each.
 
     means2d: (n, 2), pixels.
     conics: (n, 3), a, b, c of the inverse covariance.
     opacities: (n,).
     values: (n, D).
     depths: (n,).
-    drawn: (n,).
+    drawn: (n,), False for culled Gaussians.
     """
 
     means2d: Float64
@@ -41,18 +41,18 @@ class FlatGaussians:
 
     @property
     def order(self) -> list[int]:
-        """Indices of the drawn Gaussians, front to back, ties by index."""
+        """Indices of the drawn Gaussians, front to back, with equal depths by index."""
         return [int(i) for i in np.argsort(self.depths, kind="stable") if self.drawn[i]]
 
 
 @dataclass(frozen=True, eq=False)
 class ValuesBlended:
-    """A blended picture.
+    """A picture of blended values.
 
     image: (H, W, D), over the background.
-    transmittance: (H, W).
-    margin: (H, W), the smallest relative distance of a compared value to its threshold, at most MAX_VALUES_MARGIN: of
-    alpha to 1/255 and to the cap, of T to 1e-4.
+    transmittance: (H, W), behind all Gaussians.
+    margin: (H, W), the smallest relative distance of an alpha to 1/255 or its maximum, or of a transmittance to 1e-4;
+    at most MAX_VALUES_MARGIN.
     """
 
     image: Float64
@@ -77,12 +77,13 @@ class ValueGradients:
 
 @dataclass(frozen=True, eq=False)
 class _Layer:
-    """A Gaussian on all pixels; arrays are (H, W).
+    """A Gaussian's alpha in all pixels; arrays are (H, W).
 
     dx, dy: the mean minus the pixel centre.
-    raw: alpha before the cap.
+    raw: alpha before it is limited to `alpha_max`.
     alpha: 0 where the Gaussian is not added.
     before: transmittance in front of the Gaussian.
+    margin: as in `ValuesBlended`.
     """
 
     gaussian: int
@@ -95,7 +96,7 @@ class _Layer:
 
 
 def _layers(gaussians: FlatGaussians, width: int, height: int, alpha_max: float) -> Iterator[_Layer]:
-    """Yield the Gaussians front to back: eqs. (14) to (16)."""
+    """Yield the layers of the drawn Gaussians, front to back: eqs. (14) to (16)."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     transmittance, alive = np.ones((height, width)), np.ones((height, width), np.bool_)
     for i in gaussians.order:
@@ -117,7 +118,7 @@ def _layers(gaussians: FlatGaussians, width: int, height: int, alpha_max: float)
 def blend_values(
     gaussians: FlatGaussians, width: int, height: int, background: Float64, alpha_max: float = BLEND_ALPHA_MAX
 ) -> ValuesBlended:
-    """Blend the values to a picture: eq. (177)."""
+    """Blend the Gaussians' values to a picture over the background (D,): eq. (177)."""
     image = np.zeros((height, width, gaussians.values.shape[1]))
     left, margin = np.ones((height, width)), np.full((height, width), MAX_VALUES_MARGIN)
     for layer in _layers(gaussians, width, height, alpha_max):
@@ -136,7 +137,11 @@ def blend_values_grad(
     d_alpha: Float64,
     alpha_max: float = BLEND_ALPHA_MAX,
 ) -> ValueGradients:
-    """Gradients of blending, back to front: eqs. (178) to (180). d_image: (H, W, D); d_alpha: (H, W)."""
+    """Return the gradients of blending, computed back to front: eqs. (178) to (180).
+
+    d_image: (H, W, D), gradient of the loss with respect to the image.
+    d_alpha: (H, W), the same for the alpha, 1 - transmittance.
+    """
     layers = list(_layers(gaussians, width, height, alpha_max))
     n, depth = gaussians.values.shape
     means2d, absolute, conics = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 3))

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs, their cameras and points: read from files, or made by structure from motion."""
+"""Scenes: photographs with their cameras and points, read from data sets or made by structure from motion."""

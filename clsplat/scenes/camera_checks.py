@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of images, and one-line warnings about implausible intrinsics, poses and numbers of visible points."""
+"""Checks of a data set's cameras: one-line warnings about implausible intrinsics, distortion and poses."""
 
 from __future__ import annotations
 
@@ -22,25 +22,27 @@ from clsplat.scenes.dataset import (
 )
 
 Named = tuple[str, Camera, Lens]
+"""Name, camera and lens of a photograph."""
 MIN_CHECKED_POSES = 4
 """Minimum number of cameras whose poses are checked."""
 MAX_CHECKED_POSES = 40
 """Maximum number of cameras whose poses are checked, evenly spaced."""
 MAX_POSE_CHECK_POINTS = 1000
-"""Maximum number of points that are checked, evenly spaced. If there are fewer than MIN_POSE_CHECK_POINTS, only the
-cameras are used."""
+"""Maximum number of points, evenly spaced, that the check of poses projects into the views."""
 MIN_POSE_CHECK_POINTS = 30
+"""Minimum number of points for a check of poses with points. With fewer, only the cameras are used."""
 MIN_VISIBLE_POINT_FRACTION, MIN_VISIBLE_POINT_GAIN = 0.25, 4.0
-"""Another convention of the poses is suggested if, with it, views show at least this fraction of the points on average,
-and at least this many times the fraction with the poses as given.
+"""Thresholds for suggesting another convention of the poses (POSE_MISREADINGS).
 
-Each picture of an aerial survey shows about 1 % of the points with either convention.
+With the other convention, views must show at least the first fraction of the points on average. This fraction must also
+be at least the second number times the fraction with the poses as given. The first threshold excludes aerial surveys,
+where a picture shows about 1 % of the points with either convention.
 """
 BLIND_VIEW_POINT_FRACTION, MIN_BLIND_VIEW_FRACTION = 0.01, 0.2
 """Fraction of visible points below which a view is blind, and fraction of blind views that makes the poses doubtful.
 
-Another convention of the poses is then suggested if it has no blind views. In the captures tried, each view shows at
-least a quarter of the points.
+For doubtful poses, another convention is suggested if it leaves no view blind. In the tested captures each view shows
+at least a quarter of the points.
 """
 MAX_CONVERGING_FRACTION_AS_GIVEN, MIN_CONVERGING_FRACTION_INVERTED = 0.2, 0.9
 """Inverted poses are reported if at most the first fraction of the cameras faces a common point with the poses as
@@ -48,11 +50,11 @@ given, and at least the second fraction does after inverting them."""
 PARALLEL_MEAN_AXIS_LENGTH = 0.7
 """Length of the mean optical axis above which the cameras look in the same direction, as along a facade.
 
-Inverted poses of such cameras may converge by chance.
+Such cameras are not checked without points, as they may converge by chance if their poses are inverted.
 """
 CENTRE_RATIO_TOLERANCE = 0.02
-"""Relative tolerance between cx / width and cy / height. If these agree and are not 1/2, (cx, cy) is the centre of a
-picture of another size."""
+"""Relative tolerance between cx / width and cy / height. If these ratios agree but are not 1/2, (cx, cy) is the centre
+of a picture of another size."""
 FACING_COSINE = np.cos(np.deg2rad(20.0))
 """Cosine of the maximum angle between the optical axis and a point that a camera faces."""
 MAX_EDGE_DISTORTION = 0.5
@@ -62,8 +64,7 @@ OPENGL_AXIS_SIGNS = np.array([1.0, -1.0, -1.0])
 
 
 def cameras_of(images: Sequence[PosedImage], lenses: Lenses = "undistort") -> dict[str, Camera]:
-    """Cameras of the images at full size, from `Lens.camera`. The keys are the images' names. Warns of implausible
-    cameras."""
+    """Return the images' cameras at full size (`Lens.camera`), keyed by image name. Warns of implausible cameras."""
     by_lens = {
         lens: lens.camera(np.eye(3), np.zeros(3), lenses) for lens in dict.fromkeys(image.lens for image in images)
     }
@@ -78,10 +79,10 @@ def cameras_of(images: Sequence[PosedImage], lenses: Lenses = "undistort") -> di
 
 
 def camera_checks(views: Sequence[Named], points: Float64 | None = None) -> list[str]:
-    """Warnings about implausible cameras. The pictures may have any size.
+    """Return warnings about implausible cameras.
 
-    views: names, cameras and lenses.
-    points: (N, 3), world coordinates.
+    views: photographs at any size.
+    points: (N, 3), the scene's points in world coordinates, if it has any.
     """
     flat = [(name, camera) for name, camera, _ in views if camera.is_pinhole]
     points = np.empty((0, 3)) if points is None else points[:: -(-len(points) // MAX_POSE_CHECK_POINTS) or 1]
@@ -109,7 +110,7 @@ def _corner(views: Sequence[Named]) -> str:
     for name, _, lens in views:
         x, y = (0.5 * lens.width, 0.5 * lens.height) if lens.is_panorama else lens.centre
         near = abs(x) < MIN_FOCAL_PER_SIDE * lens.width and abs(y) < MIN_FOCAL_PER_SIDE * lens.height
-        part = 0 <= x <= 1 or 0 <= y <= 1  # one of them is a fraction of the width or height
+        part = 0 <= x <= 1 or 0 <= y <= 1  # True if x or y may be a fraction of the width or height
         if (near or part) and min(lens.width, lens.height) >= MIN_CENTRE_CHECK_SIDE_PX:
             odd.append((name, x, y, lens))
     if not odd:
@@ -140,10 +141,10 @@ def _another_size(views: Sequence[Named]) -> str:
 
 
 def _poses(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
-    """Warning if the poses seem to follow another convention, else "".
+    """Return a warning if the poses seem to follow another convention than COLMAP's, else "".
 
-    With points, the test is the fraction of points in view with each convention. If no other convention fits better,
-    blind views are reported. Without points, the test is the fraction of cameras that face a common point.
+    With points, conventions are compared by the fraction of points in view. If none fits better than COLMAP's, blind
+    views are reported. Without points, conventions are compared by the fraction of cameras that face a common point.
     """
     flat = [camera for _, camera in views[:: -(-len(views) // MAX_CHECKED_POSES) or 1]]
     if len(flat) < MIN_CHECKED_POSES:
@@ -177,7 +178,7 @@ def _poses(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
 
 
 def _blind(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
-    """Warning about views that show almost no points while the others show many, else ""."""
+    """Return a warning about views that show almost no points while the others show many, else ""."""
     shares = _shares([camera for _, camera in views], points)
     blind = shares < BLIND_VIEW_POINT_FRACTION
     if (
@@ -236,7 +237,7 @@ def _transposed_in_place(camera: Camera) -> Camera:
 
 
 def _transposed_opengl(camera: Camera) -> Camera:
-    """Like `_transposed_in_place`, for a matrix in OpenGL's axes."""
+    """Camera with the correct pose if the rotation in its matrix, in OpenGL's axes, was transposed by mistake."""
     turn = OPENGL_AXIS_SIGNS[:, None] * camera.rotation.T * OPENGL_AXIS_SIGNS
     return replace(camera, rotation=turn, translation=-turn @ camera.position)
 
@@ -253,23 +254,23 @@ POSE_MISREADINGS: tuple[tuple[str, Callable[[Camera], Camera]], ...] = (
     (TRANSPOSED_ROTATIONS, _transposed_in_place),
     (TRANSPOSED_ROTATIONS, _transposed_opengl),
 )
-"""Common misreadings of poses: description of the poses in the file, and function that corrects a camera."""
+"""Common mistakes in poses: a description of the mistake, for messages, and a function that corrects a camera."""
 
 
 def _shares(cameras: Sequence[Camera], points: Float64) -> Float64:
-    """Fraction of the points that each camera sees, (cameras,)."""
+    """Return the fraction of the points that each camera sees, (cameras,)."""
     return np.array([pixels_of(points, camera)[2].mean() for camera in cameras])
 
 
 def _facing(cameras: Sequence[Camera]) -> float:
-    """Fraction of the cameras that face the point nearest to all optical axes.
+    """Return the fraction of the cameras that face a common point, the point nearest to all optical axes.
 
-    Cameras count only if the point is at least half the spread of the cameras away from them.
+    A camera much nearer to that point than half the cameras' spread does not count as facing it.
     """
     centres = np.stack([camera.position for camera in cameras])
     axes = np.stack([camera.rotation[2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    if np.linalg.eigvalsh(across.mean(axis=0))[0] < 1e-3:  # parallel axes meet nowhere
+    if np.linalg.eigvalsh(across.mean(axis=0))[0] < 1e-3:  # the axes are parallel, so that no point is nearest
         return 0.0
     focus = np.linalg.solve(across.sum(axis=0), (across @ centres[:, :, None]).sum(axis=0)[:, 0])
     away = focus - centres
@@ -281,7 +282,10 @@ def _facing(cameras: Sequence[Camera]) -> float:
 
 
 def absurd(lenses: Sequence[tuple[str, Lens]]) -> str:
-    """Warning about lenses with implausible distortion, or "". `lenses` has pairs of a picture's name and its lens."""
+    """Return a warning about lenses with implausible distortion, else "".
+
+    lenses: pairs of a picture's name and its lens.
+    """
     bend = {lens: _bends(lens) for lens in {lens for _, lens in lenses}}
     bent = [(name, lens) for name, lens in lenses if bend[lens]]
     if not bent:
@@ -295,9 +299,9 @@ def absurd(lenses: Sequence[tuple[str, Lens]]) -> str:
 
 
 def _bends(lens: Lens) -> bool:
-    """True if the lens distorts the picture's edge by more than MAX_EDGE_DISTORTION, compared with a pinhole camera.
+    """Return True if the lens moves the picture's edge by over MAX_EDGE_DISTORTION, compared with a pinhole camera.
 
-    False for fisheyes and similar models, which distort by design.
+    Returns False for fisheyes and similar models, which distort by design.
     """
     if lens.is_pinhole or lens.is_bent_by_design:
         return False

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Values of camera files in JSON, with errors that name the file and the key."""
+"""Reading of values from camera files in JSON, with errors that name the file and the key."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ EXPORT_AGAIN_ADVICE = "export the data set again or add the value"
 
 
 class Keys:
-    """Values of one frame or camera. Values that the frame lacks are taken from the file's top level.
+    """Values of one frame or camera in a JSON file. A value that the frame lacks is taken from the file's top level.
 
-    where: beginning of every error message.
+    where: the file, and the frame or camera in it, with which every error message begins.
     Each method raises InputError for an invalid value.
     """
 
@@ -49,35 +49,35 @@ class Keys:
         return float(value)
 
     def require(self, key: str, default: float | None = None) -> float:
-        """Number under `key`, or the default. Raises InputError for an invalid value, or if there is neither."""
+        """Return the number under `key`, or the default. Raises InputError for an invalid value or without both."""
         value = self.number(key)
         if (value := default if value is None else value) is None:
             raise self.wrong(key, "a number")
         return value
 
     def side(self, key: str) -> int:
-        """Width or height in pixels."""
+        """Return the value under `key`, a width or height in pixels."""
         side = self.number(key)
         if side is None or not 1 <= side <= MAX_IMAGE_SIDE_PX or side != round(side):
             raise self.wrong(key, f"a whole number of pixels from 1 to {MAX_IMAGE_SIDE_PX}")
         return round(side)
 
     def vector(self, key: str, size: int) -> Float64:
-        """Finite numbers (size,)."""
+        """Return the value under `key`, a list of `size` finite numbers."""
         vector = numbers(self.get(key))
         if vector.shape != (size,) or not np.isfinite(vector).all():
             raise self.wrong(key, f"a list of {size} numbers")
         return vector
 
     def focal(self, key: str, size: int, projection: Projection = Camera.projection) -> float:
-        """Focal length in pixels, from an angle of view in degrees across `size` pixels."""
+        """Return the focal length in pixels; the value under `key` is the angle of view of `size` pixels in degrees."""
         try:
             return focal_length(math.radians(self.require(key)), size, projection)
         except ValueError as error:
             raise InputError(f"{self.where}: '{key}': {error}") from None
 
     def wrong(self, key: str, expected: str) -> InputError:
-        """Error for a missing or invalid value."""
+        """Return the error for a missing or invalid value. expected: a noun phrase for valid values."""
         value = self.get(key)
         shown = f"{value:g}" if isinstance(value, float) else short(value)
         problem = f"has no '{key}'" if value is None else f"'{key}' is {shown}"
@@ -85,11 +85,11 @@ class Keys:
 
 
 def short(value: object) -> str:
-    """Value, shortened for an error message."""
+    """Return a value as text, shortened for an error message."""
     try:
         return repr(value)[:60]
     except ValueError:  # an integer of thousands of digits
-        return "an endless number"
+        return "a number of thousands of digits"
 
 
 def load_document(path: Path, expected: str = "a transforms.json", key: str = "'frames'") -> dict[str, Any]:
@@ -104,11 +104,11 @@ def load_document(path: Path, expected: str = "a transforms.json", key: str = "'
     except ValueError as error:
         raise InputError(f"{path}: is not JSON: {error}; expected {expected}") from None
     if not isinstance(document, dict):
-        raise InputError(f"{path}: holds no JSON object, expected one with {key}")
+        raise InputError(f"{path}: is not a JSON object, expected one with {key}")
     return document
 
 
 def objects(document: dict[str, Any], key: str) -> list[dict[str, Any]]:
-    """List of objects under a key; empty if there is no such list."""
+    """Return the list of JSON objects under a key; empty if the document has no such list."""
     given = document.get(key)
     return given if isinstance(given, list) and all(isinstance(entry, dict) for entry in given) else []

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contents of a data set in any layout: images with lenses and poses, and points.
+"""Contents of a data set in any layout: images with lenses and poses, and points. Undistortion of pictures.
 
-Also the pinhole camera that replaces each lens, and the resampling between the two. The camera models and their
-formulas are COLMAP's, evaluated by pycolmap (`Camera.img_from_cam`, `undistort_camera`).
+The camera models and their formulas are COLMAP's, evaluated by pycolmap (`Camera.img_from_cam`, `undistort_camera`).
 """
 
 from __future__ import annotations
@@ -26,30 +25,31 @@ from clsplat.images.alpha import associate, unassociate
 from clsplat.images.reading import downscale
 from clsplat.process import undisturbed
 
-with undisturbed():  # on Ctrl-C pycolmap's import says "not installed", and its SIGTERM handler prints a stack trace
+# On Ctrl-C during its import, pycolmap says "not installed". It also sets a SIGTERM handler that prints a stack trace.
+with undisturbed():
     import pycolmap
 
 
 MAX_IMAGE_SIDE_PX = 1 << 20
 """Maximum width or height in pixels. Larger values indicate a damaged file, and width times height could overflow."""
 MAX_COORDINATE = 1e30
-"""Coordinates must be smaller than this, so that their squares are finite. Larger ones indicate a damaged file."""
+"""Limit of coordinates in files, so that their squares are finite. Larger ones indicate a damaged file."""
 MIN_FOCAL_PER_SIDE = 1 / 20
 """Minimum plausible focal length, as a fraction of the longer side. A fisheye of 220 degrees has 1/4."""
 MIN_CENTRE_CHECK_SIDE_PX = 16
 """Minimum shorter side, in pixels, of pictures whose principal point is checked: it must not lie in the first pixel."""
 POINTS_PER_OCCLUSION_CELL = 16
-"""Mean number of points in an occlusion cell.
+"""Mean number of points in an occlusion cell, a square of pixels in which the nearest point hides farther ones.
 
 With fewer points, occluded points show through the gaps. With more, cells are so wide that they cover adjacent objects.
 """
 MAX_OCCLUSION_CELL_FRACTION = 1 / 25
-"""Maximum side of an occlusion cell, relative to the picture's longer side. It keeps cells small if points are few."""
+"""Maximum side of an occlusion cell, relative to the picture's longer side. It limits cells where points are few."""
 
 
 @cache
 def colmap_camera_models() -> dict[int, tuple[str, int]]:
-    """Name and number of parameters of each camera model that pycolmap knows. The keys are COLMAP's ids."""
+    """Return name and number of parameters of each camera model that pycolmap knows. The keys are COLMAP's ids."""
     known = {}
     for name, member in pycolmap.CameraModelId.__members__.items():
         if int(member) >= 0:
@@ -60,7 +60,7 @@ def colmap_camera_models() -> dict[int, tuple[str, int]]:
 
 @cache
 def lens_models() -> dict[str, tuple[LensModel, CameraModel]]:
-    """Lenses of all camera models, each with its camera model. The keys are the names of the lenses."""
+    """Return the lens models of all camera models, each with its camera model. The keys are the lens models' names."""
     return {lens.name: (lens, model) for model in CAMERA_MODELS for lens in model.lenses}
 
 
@@ -81,8 +81,7 @@ class Lens:
 
     @property
     def native(self) -> CameraModel | None:
-        """Camera model that renders through this lens without undistortion. None if no model does, and for a pinhole
-        lens."""
+        """Camera model other than the pinhole that renders through this lens without undistortion, or None."""
         camera_model = lens_models().get(self.model, (None, None))[1]
         return camera_model if camera_model is not None and not camera_model.is_pinhole else None
 
@@ -103,7 +102,7 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """True if pictures need no undistortion: also for a distortion model whose coefficients are all 0."""
+        """True if pictures need no undistortion, as with a distortion model whose coefficients are all 0."""
         if self.model in ("PINHOLE", "SIMPLE_PINHOLE"):
             return True
         camera = self._camera()
@@ -121,7 +120,7 @@ class Lens:
         return x, y
 
     def pinhole(self, rotation: Float64, translation: Float64) -> Camera:
-        """Pinhole camera of the undistorted picture, with the pose of the original.
+        """Return the pinhole camera of the undistorted picture, with the given pose.
 
         Size and focal length follow COLMAP's image undistorter. It keeps the focal length and crops so that no pixel
         lies outside the source picture, if this leaves at least a fifth of its size. The result for a fisheye of 180
@@ -142,8 +141,7 @@ class Lens:
         )
 
     def camera(self, rotation: Float64, translation: Float64, lenses: Lenses) -> Camera:
-        """Camera for training: the lens itself for a panorama, or for a fisheye that is not undistorted, else
-        `pinhole`."""
+        """Return the camera for training: panoramas and, with lenses "native", fisheyes as they are; else `pinhole`."""
         native = self.native
         if native is None or (lenses == "undistort" and not native.wraps):
             return self.pinhole(rotation, translation)
@@ -155,13 +153,13 @@ class Lens:
         return self.bare(rotation, translation).through(native, (*given, *[0.0] * (4 - count)))
 
     def bare(self, rotation: Float64, translation: Float64) -> Camera:
-        """Pinhole camera with the same size, focal lengths and principal point, without the distortion."""
+        """Return a pinhole camera with this lens's size, focal lengths and principal point, without its distortion."""
         of = self._camera()
         focal, centre = (of.focal_length_x, of.focal_length_y), (of.principal_point_x, of.principal_point_y)
         return Camera(self.width, self.height, *focal, *centre, rotation, translation)
 
     def resized(self, width: int, height: int) -> Lens:
-        """Same lens on another pixel grid. The result has two focal lengths if width and height scale differently."""
+        """Return the lens on another pixel grid, with two focal lengths if width and height scale differently."""
         if self.is_panorama:
             return Lens(self.model, width, height, (float(width), float(height)))
         sx, sy = width / self.width, height / self.height
@@ -180,8 +178,7 @@ class Lens:
         return replace(self, width=width, height=height, params=tuple(params))
 
     def refocused(self, log: float, x: float, y: float) -> Lens:
-        """The same lens with its focal lengths multiplied by exp(log), and its principal point shifted by x and y, in
-        focal lengths."""
+        """Return the lens with focal lengths times exp(log), and principal point shifted by x and y focal lengths."""
         camera, params = self._camera(), list(self.params)
         shift = (x * camera.focal_length_x, y * camera.focal_length_y)
         for index, by in zip(camera.principal_point_idxs(), shift, strict=True):
@@ -200,11 +197,12 @@ class Lens:
         return np.asarray(self._camera().img_from_cam(np.ascontiguousarray(points, np.float64)))
 
     def cam_from_img(self, pixels: Float64) -> Float64:
-        """Points (N, 2) where the rays of pixels (N, 2) meet the plane z = 1; NaN for pixels without a ray."""
+        """Return points (N, 2) where the rays of pixels (N, 2) meet the plane z = 1; NaN for pixels without a ray."""
         return np.asarray(self._camera().cam_from_img(np.ascontiguousarray(pixels, np.float64)))
 
     def _camera(self) -> pycolmap.Camera:
-        model = self.model if self.is_colmap else "PINHOLE"  # enough for the focal lengths and the principal point
+        # For a lens that COLMAP lacks, only focal lengths and principal point are read, which PINHOLE has.
+        model = self.model if self.is_colmap else "PINHOLE"
         camera = pycolmap.Camera(model=model, width=self.width, height=self.height, params=list(self.params))
         camera.camera_id = 1
         return camera
@@ -282,7 +280,7 @@ def check_lens(lens: Lens, where: str) -> Lens:
     focal = [lens.params[index] for index in camera.focal_length_idxs()]
     if not all(math.isfinite(value) for value in lens.params) or min(focal) <= 0:
         raise InputError(
-            f"{where}: the parameters are {list(lens.params)}, expected finite ones, focal lengths above 0"
+            f"{where}: the parameters are {list(lens.params)}, expected finite numbers and focal lengths above 0"
         )
     return lens
 
@@ -303,7 +301,7 @@ def in_pixels(lens: Lens) -> tuple[Lens, bool]:
     if all(params[index] < MIN_FOCAL_PER_SIDE * max(sides) for index in focal):
         given = [params[index] for index in focal]
         alike = len(given) == 2 and abs(given[0] / given[1] - 1) < abs(given[0] * sides[0] / given[1] / sides[1] - 1)
-        # alike focal lengths are both fractions of the width, as pixels are square
+        # Pixels are square, so focal lengths that are nearly equal are both fractions of the width.
         by = (sides[0],) * 2 if alike else sides
         for index, side in zip(focal, by if len(focal) == 2 else (max(sides),), strict=True):
             params[index] *= side
@@ -313,7 +311,7 @@ def in_pixels(lens: Lens) -> tuple[Lens, bool]:
 
 
 def given_in_parts(names: Iterable[object]) -> str:
-    """Warning that `in_pixels` has converted the lenses of these cameras."""
+    """Return the warning that `in_pixels` has converted the lenses of these cameras."""
     return (
         f"the principal point (cx cy) of {examples(names)} is given as fractions of the picture's width and height, "
         "not in pixels; it is read as fractions, and so are focal lengths below a twentieth of the longer side"
@@ -354,10 +352,11 @@ The fraction is 0.4 for an undistorted fisheye of 200 degrees. It was 0.001 for 
 
 
 def tracked_in_view(tracked: Iterable[tuple[Camera, Lens | None, Float64]]) -> tuple[int, int, bool]:
-    """Numbers of tracked points that their photographs show, and of all, and whether enough of them are shown.
+    """Return how many tracked points their photographs show, how many there are, and True if enough are shown.
 
-    tracked: camera, lens and points (k, 3) of each photograph. If hardly any point is shown, the cameras have another
-    world frame than the points.
+    If hardly any point is shown, the cameras have another world frame than the points.
+
+    tracked: camera, lens and points (k, 3) of each photograph.
     """
     seen = whole = 0
     for camera, lens, points in tracked:
@@ -367,13 +366,13 @@ def tracked_in_view(tracked: Iterable[tuple[Camera, Lens | None, Float64]]) -> t
 
 
 def occlusion_cell(camera: Camera, points: int) -> float:
-    """Side in pixels of a cell for `nearest_around`, for so many points in the camera's picture."""
+    """Return the side in pixels of an occlusion cell for this number of points in the camera's picture."""
     cell = np.sqrt(POINTS_PER_OCCLUSION_CELL * camera.width * camera.height / max(points, 1))
     return float(max(min(cell, MAX_OCCLUSION_CELL_FRACTION * max(camera.width, camera.height)), 1.0))
 
 
 def nearest_around(rows: NDArray[np.int64], columns: NDArray[np.int64], depths: Float64, cell: float) -> Float64:
-    """Least depth (N,) among the points in each point's cell of `cell` x `cell` pixels."""
+    """Return, for each point, the least depth (N,) among the points in its cell of `cell` x `cell` pixels."""
     across, down = (columns // cell).astype(np.int64), (rows // cell).astype(np.int64)
     cells = down * (across.max(initial=0) + 1) + across
     nearest = np.full(cells.max(initial=0) + 1, np.inf)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depths of what a scene's photographs show: known depths for training, from COLMAP's tracks or from depth maps, and
-the scene's length unit."""
+"""Depths in a scene's photographs: known depths for the depth loss, from COLMAP's tracks or depth maps, and the scene's
+length unit."""
 
 from __future__ import annotations
 
@@ -32,20 +32,21 @@ MIN_DEPTH_FIT_POINTS = 10
 MAX_DEPTH_SCALE_RATIO = 5.0
 """Largest factor by which the scale fitted to a relative depth map may differ from the median scale of all maps."""
 DEPTH_TO_UNIT = 1.4
-"""The largest length unit, as a multiple of the median depth.
+"""Largest length unit, as a multiple of the median depth.
 
-The extent of the orbited scenes that were tried is at most 1.29 times the median depth. They keep it.
+In scenes that are photographed from all around, the extent is at most 1.29 times the median depth, so that it remains
+the length unit.
 """
 NEAR_PER_EXTENT = 1e-6
-"""Least depth of a point that counts, as a fraction of the extent."""
+"""Least depth at which points count for the length unit, as a fraction of the extent."""
 MAX_SAMPLED_VIEWS = 200
-"""Maximum number of sampled photographs, spread evenly over the training photographs."""
+"""Maximum number of training photographs, evenly spaced, whose depths give the length unit."""
 MAX_SAMPLED_POINTS = 100_000
-"""Maximum number of a scene's points that are projected, if it is not known which photographs show them."""
+"""Maximum number of points that are projected into each photograph for the length unit, in scenes without tracks."""
 
 
 def with_depths(scene: Scene, use: DepthUse) -> Scene:
-    """Copy of the scene with known depths in its training views; `scene` itself if it already has them.
+    """Return a copy of the scene with known depths in its training views; `scene` itself if it already has them.
 
     Warns of photographs without known depths. Raises InputError for points without tracks. Also raises it for maps that
     are missing, do not decode, have another shape than their photograph, or fit no photograph.
@@ -66,7 +67,10 @@ def with_depths(scene: Scene, use: DepthUse) -> Scene:
 
 
 def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
-    """Points that COLMAP observed in each photograph. Their weight is 1/(1 + e^2), with the error e in pixels."""
+    """Return the points that COLMAP observed in each photograph, with weights 1/(1 + e^2) for errors of e pixels.
+
+    asked: the option that needs tracks, for messages.
+    """
     if (read := _tracks_of(scene)) is None:
         raise InputError(f"{scene.name}: {asked} needs to know which photographs show a point, expected a COLMAP model")
     model, tracks = read
@@ -100,7 +104,7 @@ def _check_frame(scene: Scene, known: Mapping[str, KnownDepth], model: Path) -> 
 
 
 def _mapped(scene: Scene, use: DepthUse) -> dict[str, KnownDepth]:
-    """Depth maps of the photographs. Relative maps get the scale and offset that fit the points."""
+    """Return the depth maps of the photographs. Relative maps get the scale and offset that fit COLMAP's points."""
     told = {view.name: view.depth_file for view in scene.views if view.depth_file}
     files = {**_beside(scene.views, told, strict=not scene.missing), **told}
     if not files:
@@ -130,8 +134,8 @@ def _check_shape(path: Path, width: int, height: int, lens: Lens) -> None:
 def _fitted(scene: Scene, known: dict[str, KnownDepth]) -> dict[str, KnownDepth]:
     """Fit relative maps, which have larger values for nearer points, to the points of their photographs.
 
-    Scale and offset come from medians. Maps with few points, or with a scale far from the others, are left out;
-    `with_depths` warns of them.
+    The offset comes from medians, the scale from mean absolute deviations. Maps with few points, or with a scale far
+    from the others, are left out, and `with_depths` warns of them.
     """
     points, fits = _tracked(scene, "--depth-maps relative"), {}
     for view in scene.train_views:
@@ -162,17 +166,18 @@ def _path(known: KnownDepth) -> Path:
 
 
 def _middle(values: Float64) -> tuple[float, float]:
-    """Median, and mean absolute deviation from it."""
+    """Return the median of the values, and their mean absolute deviation from it."""
     median = float(np.median(values))
     return median, float(np.abs(values - median).mean())
 
 
 def _beside(views: Sequence[View], told: Mapping[str, Path], *, strict: bool) -> dict[str, Path]:
-    """Depth map for each view's name, from a folder next to the photographs' folder or inside it.
+    """Find each view's depth map in a folder next to the photographs' folder or inside it. The keys are view names.
 
     A map is named like its photograph, with or without the photograph's extension, or with _depth or .depth after the
     stem.
-    told: maps that the data set names, which are skipped.
+
+    told: by view name, maps that the data set names; they are skipped.
     strict: raise InputError for a map that fits no photograph.
     Raises InputError for two maps of one photograph.
     """
@@ -206,10 +211,11 @@ def _tracks_of(scene: Scene) -> tuple[Path, colmap.Tracks] | None:
 
 
 def length_unit_of(scene: Scene) -> float:
-    """Length unit in world units: the extent, but at most `DEPTH_TO_UNIT` times the median depth.
+    """Return the scene's length unit, in world units: the extent, but at most `DEPTH_TO_UNIT` times the median depth.
 
-    The depth is the median over the training photographs of the median depth of the points that they show. These are
-    the points of a COLMAP model's tracks. Without tracks, each cell of a picture shows its nearest point.
+    Each training photograph has a median depth of the points that it shows; the median of these is used. A COLMAP
+    model's tracks tell which points a photograph shows. Without tracks, it shows the nearest point in each cell of
+    pixels.
     """
     medians = [float(np.median(depths)) for depths in _depths(scene) if len(depths)]
     unit = DEPTH_TO_UNIT * float(np.median(medians)) if medians else np.inf
@@ -217,7 +223,7 @@ def length_unit_of(scene: Scene) -> float:
 
 
 def _depths(scene: Scene) -> Iterator[Float64]:
-    """Depths (k,) of the points that each of the sampled photographs shows."""
+    """Yield, for each sampled training photograph, the depths (k,) of the points that it shows."""
     views = scene.train_views
     views = views[:: max(-(-len(views) // MAX_SAMPLED_VIEWS), 1)]
     tracked = _tracked_points(scene, views)
@@ -231,7 +237,10 @@ def _depths(scene: Scene) -> Iterator[Float64]:
 
 
 def _tracked_points(scene: Scene, views: Sequence[View]) -> dict[str, Float64]:
-    """Points (k, 3) of the tracks of each view, by its name; empty without tracks in the cameras' world frame."""
+    """Return the points (k, 3) that tracks observe in each view, by view name.
+
+    The result is empty without tracks, or if the points have another world frame than the cameras.
+    """
     if not len(scene.points) or (read := _tracks_of(scene)) is None:
         return {}
     _, tracks = read
@@ -243,7 +252,7 @@ def _tracked_points(scene: Scene, views: Sequence[View]) -> dict[str, Float64]:
 
 
 def _nearest(points: Float64, view: View, near: float) -> Float64:
-    """Depth of the nearest of the points (N, 3) in each occupied cell of the view's picture.
+    """Return the depth of the nearest point in each cell of the view's picture that has any of the points (N, 3).
 
     near: depth from which points count, if the camera has no near plane of its own.
     """

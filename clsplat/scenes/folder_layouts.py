@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detection of a data set's layout, and reading of its images, with their split and missing pictures."""
+"""Detection of a data set's layout (COLMAP, Blender, nerfstudio, photos), and reading of its images and their split."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ COLMAP_IMAGE_FOLDER = "images"
 OTHER_IMAGE_FOLDERS = ("input", "inputs", "image", "img", "imgs", "rgb", "color", "frames", "photos", "pictures")
 """Names of the picture folder in other programs' data sets, in order of precedence. 3DGS' convert.py reads input/."""
 MODEL_FOLDERS = ("sparse", "colmap", "distorted")
-"""Names of folders with a model but without pictures. Users may specify them instead of the scene's folder."""
+"""Names of folders that hold a COLMAP model without pictures. Users may give such a folder instead of the scene's."""
 HELD_OUT_LIST_FILE = "test.txt"
 """File with the names of the held-out pictures, one per line.
 
@@ -38,7 +38,7 @@ MAX_HELD_OUT_LIST_BYTES = 64 << 20
 
 
 def detect(path: Path) -> Kind:
-    """Layout of a scene's folder or transforms.json. Raises InputError that lists the known layouts if none fits."""
+    """Return the layout of a scene's folder or transforms.json. Raises InputError, with all layouts, if none fits."""
     path = Path(path)
     if path.is_file():
         if path.suffix.lower() != ".json":
@@ -49,7 +49,7 @@ def detect(path: Path) -> Kind:
     if (path / "transforms_train.json").is_file():
         return "blender"
     model = colmap.find_model(path)
-    # nerfstudio makes transforms.json from a model in colmap/, which has larger pictures: prefer transforms.json
+    # Prefer nerfstudio's transforms.json to the model in colmap/ that it was made from: the model has larger pictures.
     if model is not None and not (model.is_relative_to(path / "colmap") and (path / "transforms.json").is_file()):
         return "colmap"
     if (path / "transforms.json").is_file():
@@ -63,8 +63,11 @@ def detect(path: Path) -> Kind:
 
 
 def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tuple[DataSet, list[Path]]:
-    """Read a COLMAP model, and find folders with downscaled pictures that may be used instead of its pictures. Raises
-    InputError."""
+    """Read a COLMAP model and find its pictures. Returns the data set, and folders with downscaled copies of them.
+
+    chosen: another folder with the pictures, relative to `path`, or None.
+    Raises InputError.
+    """
     model_path = colmap.find_model(path)
     assert model_path is not None  # detect has found it
     model = colmap.read_model(model_path)
@@ -94,7 +97,11 @@ def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tupl
 
 
 def read_transforms(path: Path, kind: Kind, chosen: str | Path | None, missing: Missing, *, masks: bool) -> DataSet:
-    """Read the data set of one transforms.json, or of Blender's two files for training and test. Raises InputError."""
+    """Read the data set of one transforms.json, or of Blender's two files for training and test.
+
+    chosen: as for `read_colmap`.
+    Raises InputError.
+    """
     folder = path.parent if path.is_file() else path
     images = None if chosen is None else folder / chosen
     if images is not None and not images.is_dir():
@@ -114,11 +121,10 @@ def read_transforms(path: Path, kind: Kind, chosen: str | Path | None, missing: 
 
 
 def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, images: Sequence[PosedImage]) -> Path:
-    """Folder of a COLMAP model's pictures: images/, its downscaled copy, one with another known name, or the scene's
-    folder itself.
+    """Find the folder of a COLMAP model's pictures: images/, images_2 or the like, another known name, or the scene's.
 
-    If images/ has no pictures, folders with a listed picture come first. Warns if the folder is not images/. Raises
-    InputError if there is none.
+    If images/ has no pictures, a folder with a picture that the model lists is preferred. Warns if the folder is not
+    images/. Raises InputError if there is no such folder.
     """
     if chosen is not None:
         if not (folder := path / chosen).is_dir():
@@ -157,10 +163,10 @@ def _warn_of_unlisted(present: Iterable[Path], data: DataSet, listed_in: Path, f
 
 
 def _held_out(data: DataSet, path: Path) -> list[PosedImage]:
-    """Images with the split from a file of held-out names, if it exists.
+    """Return the images with the split from the file of held-out names `path`; unchanged if there is no such file.
 
-    Names are matched like those in a model (`photo_names.match`). Warns of names that match no picture. Raises
-    InputError if no training picture is left.
+    Names are matched like a model's (`photo_names.match`). Warns of names that match no picture. Raises InputError if
+    no training picture is left.
     """
     path = next((each for each in path.parent.iterdir() if each.name.lower() == path.name), path)
     if not is_file(path):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loading of scenes: pictures with their cameras at the working size, the split, checks, and points."""
+"""Loading of scenes (`load_scene`): pictures with cameras at the working size, held-out views, checks, and points."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from clsplat.scenes.start.point_cloud import with_cloud_beside, without_stray_po
 from clsplat.scenes.supervision.masks import after_sfm, for_sfm, masks_of
 
 DEFAULT_MAX_SIDE_PX = 1600
-"""Default maximum of the longest side in pixels."""
+"""Default maximum of a picture's longest side in pixels."""
 MAX_ASPECT_RATIO_CHANGE = 1.5
-"""Largest ratio of the aspect ratios of a picture and its camera. For 4:3 and 16:9 the ratio is 1.33.
+"""Largest factor by which the aspect ratios of a picture and its camera may differ; for 4:3 and 16:9 it is 1.33.
 
-A file with a larger ratio, or a rotated file, counts as another picture.
+A file whose ratio differs more, or that is rotated, counts as another picture.
 """
 SIDE_ROUNDING_PX = 2.5
-"""Maximum difference in pixels, at the camera's size, that rounding of the sides may cause."""
+"""Largest difference between a camera's side and its picture's, in pixels of the camera, that rounding may cause."""
 BLENDER_CUBE_HALF_SIDE = 1.3
 """Half the side of the cube for random points in the synthetic scenes. This is the 3DGS authors' value."""
 
@@ -59,7 +59,8 @@ def load_scene(
 
     path: a folder in a layout that `detect` knows, or a transforms.json.
     resolution: longest side of the views in pixels, never larger than the pictures. 0 keeps their size up to 1600.
-    test_every: every n-th view in the order of names is held out, 0 for none. A split in the data set takes precedence.
+    test_every: every n-th view, in the order of names, is held out; 0 for none. A split in the data set takes
+        precedence.
     test_most: maximum number of views that `test_every` holds out, spread evenly over them, 0 for no maximum.
     images: another folder with the pictures, relative to `path`, such as "images_4". By default, images_2, images_4 or
         images_8 of a COLMAP scene is used instead of larger pictures if its pictures have exactly the requested size.
@@ -106,7 +107,7 @@ def load_scene(
 
 @dataclass(frozen=True)
 class _SceneFiles:
-    """A data set, before its pictures' headers are read.
+    """A data set whose picture headers have not been read yet.
 
     source: the folder from which the data set was read. For photographs it is the result of structure from motion.
     smaller: folders of downscaled pictures that may be used instead of the data set's pictures.
@@ -142,7 +143,7 @@ def _read(
 
 
 def _views(files: _SceneFiles, path: Path, resolution: int, test_views: tuple[int, int], lenses: Lenses) -> list[View]:
-    """Views of the data set, sorted by name, with the split and the masks. Warns of copies and of uneven scaling.
+    """Return the data set's views, sorted by name, with split and masks. Warns of copies and of uneven scaling.
 
     test_views: test_every and test_most.
     """
@@ -162,7 +163,7 @@ def _views(files: _SceneFiles, path: Path, resolution: int, test_views: tuple[in
 
 
 def _held_out(names: Sequence[str], every: int, most: int) -> Sequence[str]:
-    """Names to hold out: every `every`-th of the sorted names, none if `every` is 0.
+    """Return the names to hold out: every `every`-th of the sorted names, none if `every` is 0.
 
     most: maximum number of names, which are then spread evenly; 0 for no maximum.
     """
@@ -173,7 +174,7 @@ def _held_out(names: Sequence[str], every: int, most: int) -> Sequence[str]:
 
 
 def _scene(files: _SceneFiles, path: Path, kind: Kind, views: list[View]) -> Scene:
-    """Scene of the views, with points, and with bounds for random points. Warns of outliers and of a lack of points."""
+    """Return the scene of the views, with points and bounds for random points. Warns of outliers and missing points."""
     data = files.data
     cube = np.full(3, BLENDER_CUBE_HALF_SIDE)
     name = path.resolve().name if path.is_dir() else path.resolve().parent.name
@@ -190,23 +191,23 @@ def _scene(files: _SceneFiles, path: Path, kind: Kind, views: list[View]) -> Sce
 
 
 def without_strays(scene: Scene) -> Scene:
-    """Copy of a scene without outlier points. Warns of outlier points and outlier cameras."""
+    """Return a copy of a scene without outlier points. Warns of outlier points and outlier cameras."""
     if scene.stray_cameras:
         warn(
-            f"{scene.name}: {len(scene.stray_cameras):,} camera(s) stand over {OUTLIER_DISTANCE_RATIO:g} times as far "
-            f"off as the others ({examples(sorted(scene.stray_cameras))}) and do not affect the scene's size; if their "
-            "poses are wrong, correct them or leave these photographs out"
+            f"{scene.name}: {len(scene.stray_cameras):,} camera(s) are over {OUTLIER_DISTANCE_RATIO:g} times as far "
+            f"away as the others ({examples(sorted(scene.stray_cameras))}) and do not affect the scene's size; if "
+            "their poses are wrong, correct them or leave these photographs out"
         )
     kept = without_stray_points(scene.points, scene, scene.name)
     return scene if kept.all() else replace(scene, points=scene.points[kept], point_colors=scene.point_colors[kept])
 
 
 def camera_bounds(cameras: list[Camera], box: tuple[Float64, Float64] | None = None) -> tuple[Float64, Float64]:
-    """Cube (low, high) for random points, around the point that the cameras face, large enough to hold the cameras.
+    """Return the corners (low, high) of a cube for random points, around the point that the cameras face.
 
-    The centre is the point nearest to all optical axes. If these are parallel, a weak pull towards a point ahead of the
-    cameras determines it. If the cameras face away from the centre (outward from one place), the cube is three times as
-    large. The cube is clipped to `box` if they overlap.
+    The cube's centre is the point nearest to all optical axes. If the axes are parallel, a weak pull towards a point
+    ahead of the cameras determines the centre. The cube holds all cameras. It is three times as large if the cameras
+    face away from its centre (outward from one place). It is clipped to `box` if they overlap.
     """
     centres = np.stack([camera.position for camera in cameras])
     axes = np.stack([camera.rotation[2] for camera in cameras])
@@ -229,7 +230,7 @@ def camera_bounds(cameras: list[Camera], box: tuple[Float64, Float64] | None = N
 
 
 def _warn_of_copies(views: list[View]) -> None:
-    """Warn of held-out pictures that are also training pictures: their scores do not measure other viewpoints."""
+    """Warn of held-out pictures that are also training pictures, whose scores do not measure other viewpoints."""
     by_size: dict[int, list[View]] = {}
     for view in views:
         by_size.setdefault(view.path.stat().st_size, []).append(view)
@@ -247,7 +248,7 @@ def _warn_of_copies(views: list[View]) -> None:
 
 
 def _view(image: PosedImage, split: Split, resolution: int, smaller: Sequence[Path], lenses: Lenses) -> View:
-    """View of an image at the working size. Reads and checks the picture's header."""
+    """Return the view of an image at the working size. Reads and checks the picture's header."""
     lens, upright = _fit(image.path, image.lens)
     camera = lens.camera(image.rotation, image.translation, lenses)
     longest = max(camera.width, camera.height)
@@ -266,9 +267,9 @@ def _view(image: PosedImage, split: Split, resolution: int, smaller: Sequence[Pa
 
 
 def _warn_of_uneven(images: Sequence[PosedImage], views: Sequence[View]) -> None:
-    """Warn of pictures that were resized by different factors in width and height.
+    """Warn of pictures whose width and height differ from their camera's by different factors.
 
-    Both factors are applied to the camera, as in gsplat. However, such a picture may also belong to another camera.
+    The camera is scaled by both factors, as in gsplat. However, such a picture may also belong to another camera.
     """
     uneven = []
     for image, view in zip(images, views, strict=True):
@@ -285,18 +286,18 @@ def _warn_of_uneven(images: Sequence[PosedImage], views: Sequence[View]) -> None
 
 
 def _stands_in(path: Path, width: int, height: int, lens: Lens) -> bool:
-    """True if a downscaled picture has the requested size. Its shorter side may differ by 1, as tools round it up or
-    down."""
+    """Return True if a downscaled picture has the requested size, up to rounding of the shorter side by 1 pixel."""
     size = image_size(path, orient=False)
     near = abs(size[0] - width) <= 1 and abs(size[1] - height) <= 1
     return near and max(size) == max(width, height) and max(size) < max(lens.width, lens.height)
 
 
 def _fit(path: Path, lens: Lens) -> tuple[Lens, bool]:
-    """Lens at the file's size, and True if the picture must be rotated upright. Raises InputError that names the path.
+    """Return the lens at the file's size, and True if the picture must be rotated by its EXIF orientation.
 
     COLMAP, instant-ngp and nerfstudio use the pixels as stored. If only the rotated picture has the camera's aspect
-    ratio, the cameras are from a tool that rotates pictures, so it is rotated here too.
+    ratio, the cameras are from a tool that rotates pictures, so that the picture is rotated here too. Raises InputError
+    if neither has a similar aspect ratio.
     """
     stored = image_size(path, orient=False)
     if stored == (lens.width, lens.height):

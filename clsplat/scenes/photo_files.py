@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Search for the files of listed pictures. They may have other names, be in other folders, or be missing."""
+"""Search for the files of a data set's pictures, which may have other names, be in other folders, or be missing."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DOWNSCALED_FOLDER_FACTORS = (2, 4, 8)
 FALLBACK_FOLDER_FACTORS = range(2, 65)
 """Factors of the folders of downscaled pictures that are used if there are no other pictures."""
 MAX_MISSING_FRACTION = 0.1
-"""Maximum fraction of the pictures that may be missing by default: users delete some, or do not copy all.
+"""Maximum fraction of the pictures that may be missing by default, as users delete some or do not copy all.
 
 If more pictures are missing, the folder may be the wrong one.
 """
@@ -41,8 +41,8 @@ def find_pictures(
     missing: how many pictures may be left out: "error" none, "skip" any number but not all, "few" up to
         MAX_MISSING_FRACTION.
     present: the pictures in `folder`, if known.
-    Warns of other names and of pictures that are left out. Raises InputError that names the missing pictures and those
-    found instead.
+    Warns of other names and of pictures that are left out. Raises InputError that names the missing pictures and
+    similar names.
     """
     files = [path if path is not None and is_file(path) else None for path in exact]
     lost = [index for index, path in enumerate(files) if path is None]
@@ -81,9 +81,12 @@ def find_pictures(
 
 
 def called(listed: str, exact: Path | None, file: Path | None, folder: Path) -> str:
-    """Name of a picture in its scene: the listed name, with the file's extension if it has none.
+    """Return the name of a picture in its scene: the listed name, with the file's extension if the name has none.
 
     If the listed name and the file's path have different numbers of folders, it is the file's path below `folder`.
+
+    exact: the file with the listed name.
+    file: the file that was found, None for a missing picture.
     """
     plain = listed if listed.isprintable() else slashed(legible(listed))
     if file is None or file == exact:
@@ -95,7 +98,11 @@ def called(listed: str, exact: Path | None, file: Path | None, folder: Path) -> 
 
 
 def by_name(folder: Path, present: Collection[Path], used: Sequence[Path]) -> dict[str, Path]:
-    """Pictures by their path relative to `folder`. Leaves out companions, such as masks, and downscaled copies."""
+    """Return the pictures by their paths relative to `folder`, without masks, depth maps and downscaled copies.
+
+    present: the pictures in `folder`.
+    used: pictures that the data set uses, whose masks and depth maps are recognised by name.
+    """
     aside = companions(present, used, folder)
     copies = {path for path in {path.parent for path in present} if is_smaller_copy(path)}
     kept = (path for path in present if path not in aside and not copies.intersection(path.parents))
@@ -103,18 +110,18 @@ def by_name(folder: Path, present: Collection[Path], used: Sequence[Path]) -> di
 
 
 def is_smaller_copy(folder: Path) -> bool:
-    """True for a folder such as images_2 if images/ next to it has pictures."""
+    """Return True for a folder such as images_2 if images/ next to it has pictures."""
     base, _, factor = folder.name.rpartition("_")
     return factor in map(str, FALLBACK_FOLDER_FACTORS) and bool(base) and has_pictures(folder.with_name(base))
 
 
 def has_pictures(folder: Path) -> bool:
-    """True if a folder exists and has pictures in it or below it."""
-    return os.path.isdir(folder) and bool(find_images(folder))  # noqa: PTH112  # Path raises for names too long
+    """Return True if a folder exists and has pictures in it or below it."""
+    return os.path.isdir(folder) and bool(find_images(folder))  # noqa: PTH112  # Path.is_dir raises for a long name
 
 
 def or_smaller(folder: Path) -> Path:
-    """The folder itself, or its largest downscaled copy (such as images_2) if only copies have pictures."""
+    """Return the folder itself, or its largest downscaled copy (such as images_2) if only copies have pictures."""
     if has_pictures(folder):
         return folder
     copies = (folder.with_name(f"{folder.name}_{factor}") for factor in FALLBACK_FOLDER_FACTORS)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Matching of the picture names that other programs list to files.
+"""Matching of picture names in data sets to files with similar names.
 
 A listed name and a file's name may differ in slashes, Unicode form (macOS decomposes accents), or encoding (COLMAP on
 Windows writes the system's code page). They may also differ in case (RealityScan), in the extension (Metashape lists
@@ -36,22 +36,25 @@ SOURCE_EXTENSIONS = (
     ".rw2",
     ".orf",
 )
-"""Extensions of photographs before conversion."""
+"""Extensions of photographs that users convert before training. A data set may list photographs with the old extension.
+"""
 NAME_ENCODINGS = ("utf-8", "gb18030", "cp932", "cp949", "big5", "cp1252", "cp1250", "cp1251", "cp1253", "cp1254",
                   "cp1255", "cp1256", "cp437", "cp850", "cp866", "mac_roman", "latin-1")  # fmt: skip
 """Encodings of names, in the order in which they are tried."""
 DRIVE_PREFIX = re.compile(r"\A[A-Za-z]:(?=/)")
+"""A drive at the beginning of a path, such as "C:"."""
 FOLDER_STEP_LABEL = "folder"
-"""Prefix of the labels of the steps that ignore folders."""
+"""Prefix of the labels of the matching steps that ignore folders."""
 Key = Callable[[str], str]
+"""Function that reduces a name to a key. Names with equal keys match."""
 
 
 @dataclass(frozen=True)
 class Found:
     """Result of `match`.
 
-    names: present name for each listed name.
-    how: for each step that found names, the difference that it ignores and a first example.
+    names: the matching present name for each listed name.
+    how: for each matching step that found names, a text with the ignored difference and a first example.
     """
 
     names: dict[str, str]
@@ -59,14 +62,15 @@ class Found:
 
 
 def match(listed: Sequence[str], present: Iterable[str], settled: Iterable[str] = ()) -> Found:
-    """Match listed names to present names, both with folders, if the match is unambiguous.
+    """Match listed names to names of present files, both with folders, where the match is unambiguous.
 
-    Matching has several steps, each for the names that remain and looser than the step before. In a step, a listed name
-    matches a present one if each is the only match of the other.
+    Matching has several steps. Each handles the names that remain, and ignores larger differences than the step before.
+    In a step, a listed name matches a present one if each is the only match of the other.
 
-    A change of folder applies to all pictures of a listed folder or to none. If one of these pictures is found in that
-    folder, or a name of `settled` is in it, no picture of the folder is searched elsewhere. Surrogates in names
-    (`os.fsdecode`) stand for bytes of an unknown encoding.
+    Pictures of a listed folder are searched in other folders only if none of them is found in the listed folder, and no
+    name of `settled` is in it. Surrogates in names (`os.fsdecode`) stand for bytes of an unknown encoding.
+
+    settled: listed names whose files are known already.
     """
     there = dict.fromkeys(present)
     found = {name: name for name in listed if name in there}
@@ -99,7 +103,7 @@ def match(listed: Sequence[str], present: Iterable[str], settled: Iterable[str] 
 
 
 def nearest(name: str, present: Iterable[str]) -> str:
-    """Present names that most resemble a listed one, for an error message; "" if none does."""
+    """Return the present names that most resemble a listed one, for an error message; "" if none does."""
     by_base: dict[str, str] = {}
     for other in present:
         by_base.setdefault(PurePosixPath(other).name.casefold(), other)
@@ -108,23 +112,23 @@ def nearest(name: str, present: Iterable[str]) -> str:
 
 
 def slashed(name: str) -> str:
-    """Name with forward slashes, in Unicode form NFC, without a drive and without "." parts."""
+    """Return a name with forward slashes, in Unicode form NFC, without a drive and without "." parts."""
     text = DRIVE_PREFIX.sub("", unicodedata.normalize("NFC", name).replace("\\", "/"))
     return "/".join(part for part in text.split("/") if part not in ("", "."))
 
 
 def legible(name: str) -> str:
-    """Name as printable text. Bytes of an unknown encoding are decoded with the first encoding that gives such text."""
+    """Return a name as printable text. If its encoding is unknown, the first encoding that gives such text is used."""
     return next((text for text in _decoded(name) if text.isprintable()), ascii(name))
 
 
 def is_legible(name: str) -> bool:
-    """True if a name is printable, in UTF-8 or an encoding of NAME_ENCODINGS."""
+    """Return True if a name is printable, in UTF-8 or an encoding of NAME_ENCODINGS."""
     return any(text.isprintable() for text in _decoded(name))
 
 
 def _is_raw(name: str) -> bool:
-    """True if a name has bytes of an unknown encoding."""
+    """Return True if a name has bytes of an unknown encoding."""
     return not name.isascii() and any("\udc80" <= char <= "\udcff" for char in name)
 
 
@@ -142,9 +146,9 @@ def _decoded(name: str) -> Iterator[str]:
 
 
 def _steps(names: Iterable[str]) -> Iterator[tuple[str, Key]]:
-    """Steps of `match`: a label for the ignored difference, and the function that makes a name's key.
+    """Yield the steps of `match`: a label for the ignored difference, and the function that reduces names to keys.
 
-    Names with equal keys match. An empty key matches none.
+    Names with equal keys match. An empty key matches no name.
     """
     yield "slashes or Unicode form", slashed
     for encoding in NAME_ENCODINGS[1:]:
@@ -152,7 +156,7 @@ def _steps(names: Iterable[str]) -> Iterator[tuple[str, Key]]:
     yield "case", _lower
     yield "extension", _without_extension
     deepest = max((slashed(name).count("/") for name in names), default=0)
-    for count in range(deepest, 0, -1):  # longer endings come first
+    for count in range(deepest, 0, -1):  # endings of a path with more folders come first
         yield FOLDER_STEP_LABEL, partial(_ending, count, _lower)
         yield f"{FOLDER_STEP_LABEL} and extension", partial(_ending, count, _without_extension)
 
@@ -180,5 +184,5 @@ def _without_extension(name: str) -> str:
 
 
 def _ending(count: int, key: Key, name: str) -> str:
-    """Last `count` parts of a path, or all of them if it has fewer."""
+    """Return the last `count` parts of a path's key, or all of them if it has fewer."""
     return "/".join(key(name).split("/")[-count:])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading of point clouds (PLY, LAS and LAZ), and names of the clouds that programs store with a scene."""
+"""Reading of point clouds (PLY, LAS and LAZ), and search for the clouds that other programs store with a scene."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ UNCOLOURED_GREY = 0.5
 """Grey value of points from a file without colours."""
 LAS_EXTENSIONS = (".las", ".laz")
 START_CLOUD_NAMES = ("points3d.ply", "sparse_pc.ply", "init.ply", "point_cloud.ply", "pointcloud.ply", "points.ply")
-"""Names of clouds from which programs start training by default, in lower case, in order of precedence.
+"""Names of clouds from which other programs start training by default, in lower case, in order of precedence.
 
-The programs are those of the 3DGS authors, nerfstudio, Brush and others.
+The programs are the 3DGS authors' code, nerfstudio, Brush and others.
 """
 
 
@@ -50,15 +50,17 @@ class Cloud:
 
 
 def clouds_beside(folders: Iterable[Path]) -> list[Path]:
-    """Files in these folders that have the name of a start cloud, in the order of START_CLOUD_NAMES, then by folder."""
+    """Return the files with a name of START_CLOUD_NAMES in these folders, in the order of names, then of folders."""
     found = [path for folder in dict.fromkeys(folders) if folder.is_dir() for path in sorted(folder.iterdir())]
     named = [path for path in found if path.name.lower() in START_CLOUD_NAMES and is_file(path)]
     return sorted(named, key=lambda path: START_CLOUD_NAMES.index(path.name.lower()))
 
 
 def read_cloud(path: Path) -> Cloud:
-    """Read a PLY (ascii or binary, points or Gaussians), LAS or LAZ. Raises InputError for other files and for files
-    without points."""
+    """Read a point cloud from a PLY (ascii or binary, points or Gaussians), LAS or LAZ.
+
+    Raises InputError for other files and for files without points.
+    """
     if path.suffix.lower() in LAS_EXTENSIONS:
         cloud = _read_las(path)
     else:
@@ -77,18 +79,21 @@ def read_cloud(path: Path) -> Cloud:
 
 
 def of_one_colour(colors: Float32) -> bool:
-    """True if there are several points, all with the same colour (N, 3), as after reading a file without colours."""
+    """Return True if several points all have the same colour, as after reading a file without colours.
+
+    colors: (N, 3), of the points.
+    """
     return len(colors) > 1 and bool((colors == colors[0]).all())
 
 
 def point_colours(levels: NDArray[Any]) -> Float32:
-    """Convert stored colours (N, 3) to [0, 1]. The white level follows from their values (`full_scale`)."""
+    """Convert stored colours (N, 3) to [0, 1]. Their range of values tells the white level (`full_scale`)."""
     colors: Float32 = np.clip(np.asarray(levels, np.float32) / np.float32(full_scale(levels)), 0, 1)
     return colors
 
 
 def count_points(path: Path) -> int:
-    """Number of points according to a PLY's header. Raises InputError."""
+    """Return the number of points that a PLY's header gives. Raises InputError for other files."""
     with open_input(path, "a PLY of points") as file:
         return ply_file.read_header(file, path).vertex.count
 
@@ -103,7 +108,7 @@ def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
         header = ply_file.read_header(file, path)
         vertex = header.elements[0] if header.elements else None
         if vertex is None or vertex.name != "vertex" or vertex.has_list:
-            raise InputError(f"{path}: does not begin with vertices without list properties, expected a point cloud")
+            raise InputError(f"{path}: its first element is not 'vertex' with numbers only, expected a point cloud")
         kinds = dict(vertex.properties)
         if missing := [name for name in "xyz" if name not in kinds]:
             raise InputError(f"{path}: PLY has no property {missing[0]!r}, expected x, y and z")

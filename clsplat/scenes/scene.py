@@ -39,8 +39,8 @@ FAR_ORIGIN_RATIO = 64.0
 At this distance float32 resolves 64 * 2^-24 of the scene's size, or 1 % of a pixel if the scene is 2600 pixels wide.
 """
 MIN_POINTS_IN_FAR_VIEW, MIN_POINT_SPREAD_IN_FAR_VIEW = 10, 0.08
-"""A distant camera is no outlier if its picture shows at least this many points, and their standard deviation is at
-least this fraction of the width or height.
+"""A distant camera is no outlier if its picture shows at least this many points, and the standard deviation of their
+pixels is at least this fraction of the width or height.
 
 Such a picture shows the scene from further away, or another reconstructed part of it. Points all over the picture have
 a standard deviation of 0.29. The picture of an outlier shows no points, or has every point in one pixel.
@@ -48,7 +48,7 @@ a standard deviation of 0.29. The picture of an outlier shows no points, or has 
 MIN_FAR_GROUP_NEIGHBOURS = 2
 """In a scene without points, a distant camera is no outlier if at least this many other cameras are near it."""
 MAX_SAMPLED_PHOTOGRAPHS = 200
-"""Maximum number of photographs that findings are based on, in scenes whose photographs are decoded later."""
+"""Maximum number of photographs that findings (`scenes.analysis`) are based on, if training decodes them later."""
 SAME_PLACE_TOLERANCE = 1e-12
 """Cameras are in one place if none is farther from their middle than this fraction of their largest coordinate."""
 
@@ -62,12 +62,12 @@ class View:
     path: the photograph's file.
     split: "train" or "test".
     lens: the lens that took the file, at the file's size.
-    upright: True if the camera belongs to the picture rotated by its EXIF orientation, not as stored.
-    mask: mask of the pixels that count, None if all count.
+    upright: True if the camera belongs to the picture rotated by its EXIF orientation, False if to the stored picture.
+    mask: mask of the pixels that count in training, None if all count.
     depth_file: the depth map that the data set names, if any.
     depth: known depths for training.
-    stamps: size in bytes and modification time in nanoseconds of each of `files` when the scene was loaded; () if they
-        were not noted.
+    stamps: size in bytes and modification time in nanoseconds of each of `files` when the scene was loaded; () if
+        unknown.
     """
 
     name: str
@@ -87,7 +87,7 @@ class View:
         return (self.path,) if self.mask is None or self.mask.path is None else (self.path, self.mask.path)
 
     def stamped(self) -> View:
-        """The view with its files' sizes and modification times, as they are now. Raises OSError."""
+        """Return the view with its files' current sizes and modification times. Raises OSError for a missing file."""
         return replace(self, stamps=tuple(_stamp(path) for path in self.files))
 
     def check_unchanged(self) -> None:
@@ -97,15 +97,15 @@ class View:
                 now = _stamp(path)
             except OSError as error:
                 raise InputError(
-                    f"{path}: could be read when the scene was loaded, but not now: {reason_of(error)}"
+                    f"{path}: could be read when the scene was loaded, but not now: {reason_of(error)}; put it back"
                 ) from None
             if now != stamp:
-                raise InputError(f"{path}: has been changed or replaced since the scene was loaded")
+                raise InputError(f"{path}: has been changed or replaced since the scene was loaded; load it again")
 
     def load(self, width: int | None = None, height: int | None = None) -> Float32:
         """Read the undistorted pixels at the camera's size: float32 (H, W, 3), or (H, W, 4) with straight alpha.
 
-        width, height: size to use instead.
+        width, height: size in pixels to use instead of the camera's.
         Reads the file in every call. Pixels that a mask leaves out are black or transparent. Raises InputError if the
         file does not decode or its size has changed.
         """
@@ -113,17 +113,17 @@ class View:
         return image if image.shape[2] < 5 else np.ascontiguousarray(image[:, :, : 3 + _has_alpha(image)])
 
     def load_masked(self, width: int | None = None, height: int | None = None) -> Float32:
-        """Read like `load`. If pixels are left out, there is a fifth channel: 1 for pixels that count, else 0.
+        """Read like `load`. If a mask leaves pixels out, there is a fifth channel: 1 for pixels that count, else 0.
 
         A pixel counts if at least half of its area counts. Its colour is the mean over the part that counts.
         """
         return self.load_sizes([(width or self.camera.width, height or self.camera.height)])[0]
 
     def load_sizes(self, sizes: Sequence[tuple[int, int]], *, reduce: bool = False) -> list[Float32]:
-        """Read like `load_masked` at several sizes, (width, height), and decode the file once.
+        """Read like `load_masked` at several sizes, (width, height), decoding the file only once.
 
-        reduce: make each size from the picture at the camera's size, which is quicker than from the file. The result
-        differs by rounding. Pictures with masked pixels are always made from the file.
+        reduce: resample each size from the picture at the camera's size, which is quicker than from the file's and
+        differs by rounding. Pictures with masked pixels are always resampled from the file's size.
         """
         image, counts = self._read(), None
         if self.mask is not None:
@@ -136,7 +136,7 @@ class View:
         return [self._fitted(image, width, height) for width, height in sizes]
 
     def _masked(self, image: Float32, counts: Float32, width: int, height: int) -> Float32:
-        """Picture of five channels, from a picture (H, W, 3 or 4) and its mask (H, W, 1)."""
+        """Resample a picture (H, W, 3 or 4) and its mask (H, W, 1) to a picture (height, width, 5)."""
         parts = [np.where(counts > 0, image[:, :, :3], np.float32(0)), counts]
         if image.shape[2] == 4:  # alpha is averaged over the part that counts, like a colour
             there = np.where(counts > 0, image[:, :, 3:], np.float32(0))
@@ -155,7 +155,7 @@ class View:
         return undistort(image, self.lens, self.camera.resized(width, height))
 
     def check(self) -> Thumbnail:
-        """Thumbnail of the picture. Raises InputError if `load` would."""
+        """Decode the picture and return its thumbnail. Raises InputError if `load` would."""
         image = self._read()
         if self.mask is not None:
             self.mask.applied(image, orient=self.upright)
@@ -165,7 +165,10 @@ class View:
         image = read_image(self.path, orient=self.upright)
         if image.shape[:2] != (self.lens.height, self.lens.width):
             actual = f"{image.shape[1]}x{image.shape[0]}"
-            raise InputError(f"{self.path}: now has {actual} pixels, expected {self.lens.width}x{self.lens.height}")
+            raise InputError(
+                f"{self.path}: now has {actual} pixels, expected {self.lens.width}x{self.lens.height} as when the "
+                "scene was loaded; load it again"
+            )
         return image
 
 
@@ -179,13 +182,13 @@ class Scene:
     point_colors: (N, 3) float32 in [0, 1].
     bounds: corners (low, high) of the box for random initial points, each (3,) float64, in world units.
     warnings: messages for the user, one line each.
-    start: choice of the initial points (`scenes.start`).
+    start: settings by which the initial points were chosen (`scenes.start.point_cloud`).
     colourless: (N,), True for points that get their colours from photographs; None if no point does.
     source: the folder from which the scene was read.
-    depth_use: choice of known depths (`scenes.depth_sources`).
+    depth_use: settings by which known depths were added (`scenes.depth_sources`).
     clouds: point files next to the scene that are not used.
     missing: names of listed pictures that do not exist.
-    unit: the length unit, if it is not the extent (`scenes.depth_sources`).
+    unit: the length unit in world units (`scenes.depth_sources`); None for the extent.
     """
 
     name: str
@@ -213,7 +216,7 @@ class Scene:
         return [view for view in self.views if view.split == "test"]
 
     def require_training_views(self) -> list[View]:
-        """Training views. Raises InputError if there are none."""
+        """Return the training views. Raises InputError if there are none."""
         if not self.train_views:
             count = len(self.views)
             raise InputError(f"{self.name}: all {count} views are held out; use --test-every 0 to hold out none")
@@ -227,17 +230,17 @@ class Scene:
 
     @cached_property
     def sampled_views(self) -> list[View]:
-        """Views that findings are based on: all, or an even sample of the training views if they are decoded later."""
+        """Views that findings (`scenes.analysis`) are based on: all, or an even sample of many training views."""
         if self.decoded_first:
             return self.views
         count = min(MAX_SAMPLED_PHOTOGRAPHS, len(self.train_views))
         return [self.train_views[index * len(self.train_views) // count] for index in range(count)]
 
     def check_pictures(self) -> None:
-        """Decode every picture once, so that a truncated one is reported before training. Sets `digests` and
-        `thumbnails`. If pictures are decoded later (`decoded_first`), it only sets `digests`.
+        """Decode every picture once, so that a truncated one is reported before training.
 
-        Raises InputError for the first picture in the order of names that does not decode.
+        Sets `digests` and `thumbnails`. In scenes whose pictures are decoded during training (`decoded_first`), sets
+        only `digests`. Raises InputError for the first picture, in the order of names, that does not decode.
         """
         if not self.decoded_first:
             self.__dict__["digests"] = self._of_each(_digest, self.views)
@@ -248,13 +251,12 @@ class Scene:
 
     @cached_property
     def thumbnails(self) -> dict[str, Thumbnail]:
-        """Thumbnail of each sampled view's picture. The keys are the views' names. Raises InputError like
-        `check_pictures`."""
+        """Thumbnail of each sampled view's picture, by view name. Raises InputError like `check_pictures`."""
         return self._of_each(View.check, self.sampled_views)
 
     @cached_property
     def digests(self) -> dict[str, str | None]:
-        """Digest of each view's file, mask and known depths. The keys are the views' names."""
+        """Digest of each view's file, mask and known depths, by view name."""
         return self._of_each(_digest, self.views)
 
     def _of_each(self, work: Callable[[View], T], views: Sequence[View]) -> dict[str, T]:
@@ -312,7 +314,7 @@ class Scene:
 
     @cached_property
     def extent(self) -> float:
-        """The authors' cameras_extent in world units.
+        """The scene's size in world units, as cameras_extent in the 3DGS authors' code.
 
         It is 1.1 times the distance of the farthest training camera from the cameras' mean, without outliers. If all
         cameras are in one place, it is the median distance of the points from there, or 1 without points.
@@ -334,18 +336,18 @@ class Scene:
 
     @property
     def near(self) -> float:
-        """Near plane, in world units, of a model of this scene (docs/decisions/0019)."""
+        """Near plane, in world units, of a model that is trained on this scene (docs/decisions/0019)."""
         return min(DEFAULT_NEAR_PLANE, self.length_unit / MIN_SIZE_IN_NEAR_PLANES)
 
 
 def spread(items: Sequence[T], most: int) -> list[T]:
-    """At most `most` of the items, evenly spaced from the first to the last."""
+    """Return at most `most` of the items, evenly spaced from the first to the last."""
     picked = min(len(items), most)
     return [items[index * (len(items) - 1) // max(picked - 1, 1)] for index in range(picked)]
 
 
 def _shows_much(view: View, points: Float64, views: Sequence[View]) -> bool:
-    """True if a distant camera is part of the capture, for example in another room.
+    """Return True if a distant camera is part of the capture, for example in another room, and no outlier.
 
     The picture must show points over a fair part of its area. Without points, at least MIN_FAR_GROUP_NEIGHBOURS other
     cameras must be nearer to the camera than the median distance of all cameras from their middle.
@@ -368,7 +370,7 @@ def _stamp(path: Path) -> FileStamp:
 
 
 def _has_alpha(image: Float32) -> bool:
-    """True if a masked picture is transparent in a pixel that counts."""
+    """Return True if a masked picture (H, W, 5) is transparent in a pixel that counts."""
     return bool((image[:, :, 3] < image[:, :, 4]).any())
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sidecar files of photographs, such as masks and depth maps, in a folder next to the photographs' folder."""
+"""Search for sidecar files of photographs, such as masks and depth maps, in a folder next to the photographs'."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from typing import Protocol
 from clsplat.errors import InputError, examples
 
 _INNER_EXTENSION = re.compile(r"\.(?:jpe?g|png|tiff?|webp|bmp|exr|heic|dng)(?=[._-]|\Z)")
-"""Photograph extension inside the name of a sidecar file."""
+"""Photograph's extension inside the name of a sidecar file, as in IMAGE.jpg.png."""
 
 _TRAILING_NUMBER = re.compile(r"(.*?)([0-9]{1,18})\Z", re.DOTALL)
+"""A name that ends in a number: the text before it, and the number."""
 
 
 class Named(Protocol):
@@ -22,18 +23,18 @@ class Named(Protocol):
 
     @property
     def name(self) -> str:
-        """Name, with sub-folders."""
+        """Name of the photograph, with sub-folders."""
 
     @property
     def path(self) -> Path:
-        """Path of the file."""
+        """Path of the photograph's file."""
 
 
 def bases_of(images: Sequence[Named]) -> list[Path]:
-    """Folders that contain all photographs. Sidecar folders are searched inside these folders and next to them.
+    """Return folders that contain all photographs. Sidecar folders are searched inside them and next to them.
 
-    The last folder of the list is the one that the photographs' names are relative to. If all names begin with the
-    same sub-folder, as is usual in transforms.json, the list begins with this sub-folder.
+    The photographs' names are relative to the last folder of the list. If all names begin with the same sub-folder, as
+    is usual in transforms.json, the list begins with this sub-folder.
     """
     top = images[0].path
     for _ in PurePosixPath(images[0].name).parts:
@@ -44,12 +45,12 @@ def bases_of(images: Sequence[Named]) -> list[Path]:
 
 
 def beside(base: Path, names: Sequence[str]) -> Path | None:
-    """Folder in `base` or next to `base` with one of these names, in upper or lower case; None if there is none."""
+    """Return the folder in `base` or next to it that has one of these names, in any case, or None."""
     return next((at for parent in (base, base.parent) if (at := inside(parent, names)) is not None), None)
 
 
 def inside(parent: Path, names: Sequence[str]) -> Path | None:
-    """Folder in `parent` with one of these lower-case names, in any case, or None. Earlier names are preferred."""
+    """Return the folder in `parent` with one of these lower-case names, in any case, or None. Earlier names win."""
     for name in names:
         if (at := parent / name).is_dir():
             return at
@@ -71,10 +72,11 @@ def owned(
     strict: bool = True,
     numbered: bool = False,
 ) -> dict[str, Path]:
-    """Match the files of a folder to photographs.
+    """Match the sidecar files of a folder to photographs. Returns the file of each photograph, by its name.
 
-    known: photograph for each name that its sidecar file may have, without the file's extension.
-    what: word for a sidecar file, for messages.
+    paths: the sidecar files in `folder`.
+    known: by name that a sidecar file may have, without extension, the name of its photograph.
+    what: the kind of sidecar file, such as "mask", for messages.
     example: name of a photograph, for messages.
     without: files to skip.
     strict: raise InputError for a file that fits no photograph; otherwise it is skipped.
@@ -97,7 +99,7 @@ def owned(
         for owner, files in by_owner.items():
             first, *more = [*([found[owner]] if owner in found else []), *files]
             if more and (strict or step is str):
-                second = f"{more[0]}: is a second {what} of {owner}, beside {first.name}"
+                second = f"{more[0]}: is a second {what} of {owner}, besides {first.name}"
                 raise InputError(f"{second}; remove one of them")
             if not more:
                 found[owner] = first
@@ -117,9 +119,9 @@ def owned(
 
 
 def _series(names: Iterable[str]) -> dict[int, str]:
-    """Names by the number at their end, without extensions.
+    """Return names by the number at their end, before the extension.
 
-    Empty unless there are at least two names, and they differ only in this number.
+    The result is empty unless there are at least two names that differ only in this number.
     """
     texts, numbers = set(), {}
     names = sorted(names)
@@ -142,11 +144,11 @@ _NAME_KEYS: tuple[Callable[[str], str], ...] = (
     lambda name: _INNER_EXTENSION.sub("", _loose(name)),
     lambda name: _INNER_EXTENSION.sub("", _loose(name)).rpartition("/")[2],
 )
-"""Functions that reduce names to keys for the successive steps of matching, each ignoring more of the name."""
+"""Functions that reduce a name to a key, for successive steps of matching. Each ignores more of the name."""
 
 
 def _unambiguous(known: Mapping[str, str], step: Callable[[str], str]) -> dict[str, str]:
-    """Photograph for each key that `step` makes of the names in `known`, without keys that fit several photographs."""
+    """Return the photograph for each key that `step` makes of the names in `known`; only for unambiguous keys."""
     if step is str:
         return dict(known)
     owners: dict[str, set[str]] = {}

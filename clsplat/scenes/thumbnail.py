@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thumbnails of photographs. Findings about the scene are based on them (`clsplat.scenes.analysis`)."""
+"""Thumbnails and sharpness of photographs, from which `clsplat.scenes.analysis` derives findings about a scene."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float32
 
 THUMBNAIL_SIDE_PX = 96
-"""Maximum longer side in pixels. It suffices, because findings concern large parts of a picture."""
+"""Maximum longer side of a thumbnail in pixels. It suffices, as findings concern large parts of a picture."""
 SHARPNESS_SIDE_PX = 800
 """Longer side in pixels at which sharpness is measured. Blur that is invisible at this size is invisible in training
 too."""
 SHARPNESS_SCALE_RATIO = 4
 """Ratio of the two scales whose gradients are compared to measure sharpness."""
 REC601_LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+"""Weights of red, green and blue in Rec. 601 luma."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,14 +36,14 @@ class Thumbnail:
 
 
 def thumbnail_of(image: Float32) -> Thumbnail:
-    """Thumbnail of a picture (H, W, 3 or 4)."""
+    """Compute the thumbnail of a picture (H, W, 3 or 4)."""
     middle = reduced(image[:, :, :3], SHARPNESS_SIDE_PX)
     transparent = float((image[:, :, 3] < 0.5).mean()) if image.shape[2] == 4 else 0.0
     return Thumbnail(reduced(middle, THUMBNAIL_SIDE_PX), transparent, sharpness_of(middle @ REC601_LUMA))
 
 
 def reduced(image: Float32, side: int) -> Float32:
-    """Downscale by an integer factor, by averaging squares of pixels. The longer side gets at most `side` pixels."""
+    """Downscale an image by an integer factor, averaging squares, to a longer side of at most `side` pixels."""
     factor = -(-max(image.shape[:2]) // side)
     if factor == 1:
         return image
@@ -56,11 +57,10 @@ def reduced(image: Float32, side: int) -> Float32:
 
 
 def sharpness_of(grey: NDArray[np.float32]) -> float:
-    """Mean gradient of a grey picture (H, W), divided by the mean gradient of a copy SHARPNESS_SCALE_RATIO times
-    smaller.
+    """Return the sharpness of a grey picture (H, W): its mean gradient, relative to that of a smaller copy.
 
-    It is 1 / SHARPNESS_SCALE_RATIO for a smooth picture and larger for a sharper picture, nearly independent of content
-    and brightness. It is 1 for a featureless picture.
+    The copy is SHARPNESS_SCALE_RATIO times smaller. Sharpness is 1 / SHARPNESS_SCALE_RATIO for a smooth picture and
+    larger for a sharper one, nearly independent of content and brightness. It is 1 for a featureless picture.
     """
     coarse = reduced(grey[:, :, None], max(max(grey.shape) // SHARPNESS_SCALE_RATIO, 1))[:, :, 0]
     if min(coarse.shape) < 2:

@@ -240,5 +240,5 @@ def _parsed(path: Path) -> dict[str, Any] | list[Any]:
         raise InputError(f"{path}: is not JSON: {error}; expected a file of cameras") from None
     if not isinstance(document, dict | list):
         keys = f"'frames', 'camera_path' or '{CAMERAS_VERSION_KEY}'"
-        raise InputError(f"{path}: holds no JSON object, expected one with {keys}, or a list of cameras")
+        raise InputError(f"{path}: is not a JSON object, expected one with {keys}, or a list of cameras")
     return document

@@ -230,15 +230,15 @@ def test_calls_that_make_no_sense(folder: Path, tmp_path: Path, capsys: Capture)
     write_flat(tmp_path / "nan.exr", {"Z": np.full((HEIGHT, WIDTH), np.nan)})
     held = f"--holdout {folder}/z.####.exr"
     cases = [
-        (f"--holdout {folder}/none.####.exr", "none.0001.exr: no such holdout, expected a depth or deep EXR"),
-        (f"{held} --width 20", f"z.0001.exr: holds a frame of {WIDTH}x{HEIGHT}, expected 20x"),
-        (f"{held} --holdout.channel depth.Z", "has the channels Z, expected depth.Z; name its depths with"),
+        (f"--holdout {folder}/none.####.exr", "none.0001.exr: no such holdout file, expected a depth or deep EXR"),
+        (f"{held} --width 20", f"z.0001.exr: has a display window of {WIDTH}x{HEIGHT} pixels, expected 20x"),
+        (f"{held} --holdout.channel depth.Z", "has the channels Z, expected depth.Z; give the channel of its depths"),
         ("--holdout.channel Z", "--holdout.channel Z: is for holdouts, expected --holdout with it"),
         (f"{held} --deep", "--deep and --holdout exclude each other: a deep picture is held out where"),
         ("--holdout.depths ray", "--holdout.depths ray: is for holdouts, expected --holdout with it"),
         (f"--holdout {folder}/z.$X.exr --frames 1", "z.$X.exr: no such holdout"),
         (f"--holdout {folder}/z.{{shot}}.exr", "{shot} is not known, expected {name}"),
-        (f"--holdout {tmp_path}/nan.exr", "values of Z are not a number, expected depths and alpha of surfaces"),
+        (f"--holdout {tmp_path}/nan.exr", "values of Z are NaN, expected depths and alpha of surfaces"),
     ]
     for flags, message in cases:
         assert message in fails(capsys, render, folder, tmp_path / "new", flags), flags

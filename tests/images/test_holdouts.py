@@ -74,18 +74,24 @@ def test_taken_and_scaled() -> None:
 def test_what_is_wrong(tmp_path: Path) -> None:
     nan, negative = (np.where(DEPTH == 3, value, DEPTH) for value in (np.nan, -3.0))
     cases = [
-        (tmp_path / "none.exr", "none.exr: no such holdout, expected a depth or deep EXR for each frame"),
-        (write_flat(tmp_path / "s.exr", {"Z": np.ones((4, 4))}), "s.exr: holds a frame of 4x4, expected 3x2"),
-        (write_flat(tmp_path / "c.exr", {"Y": DEPTH}), "c.exr: has the channels Y, expected Z; name its depths with"),
+        (tmp_path / "none.exr", "none.exr: no such holdout file, expected a depth or deep EXR for each"),
+        (
+            write_flat(tmp_path / "s.exr", {"Z": np.ones((4, 4))}),
+            "s.exr: has a display window of 4x4 pixels, expected 3x2",
+        ),
+        (
+            write_flat(tmp_path / "c.exr", {"Y": DEPTH}),
+            "c.exr: has the channels Y, expected Z; give the channel of its depths",
+        ),
         (write_samples(tmp_path / "a.exr", SIZE, [[[1.0]]] * 6, ("Z",)), "a.exr: is a deep EXR without A, expected"),
-        (write_flat(tmp_path / "z.tif", {"Z": DEPTH}), "z.tif: is no EXR, expected a depth or deep EXR"),
+        (write_flat(tmp_path / "z.tif", {"Z": DEPTH}), "z.tif: is not an EXR file, expected a depth or deep EXR"),
     ]
     for path, message in cases:
         refuses(f"^{tmp_path}/{message}", check_holdout, path, SIZE)
     decoded = [
-        (write_flat(tmp_path / "n.exr", {"Z": nan}), "n.exr: 1 values of Z are not a number, expected depths"),
+        (write_flat(tmp_path / "n.exr", {"Z": nan}), "n.exr: 1 values of Z are NaN, expected depths"),
         (write_flat(tmp_path / "g.exr", {"Z": negative}), "g.exr: 1 values of Z are negative, expected depths along"),
-        (write_flat(tmp_path / "f.exr", {"Z": DEPTH, "A": nan}), "f.exr: 1 values of A are not a number, expected"),
+        (write_flat(tmp_path / "f.exr", {"Z": DEPTH, "A": nan}), "f.exr: 1 values of A are NaN, expected"),
     ]
     for path, message in decoded:
         check_holdout(path, SIZE)

@@ -199,7 +199,7 @@ def test_unknown_camera_models_are_refused_by_name(tmp_path: Path) -> None:
         ("1 1 0 0 0 0 0 0 1 ../..\n\n", "expected a path inside"),
         ("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 0 0 0 1 a.png\n\n", "a.png occurs twice"),
         ("1 0 0 0 0 0 0 0 1 a.png\n\n", "expected a unit quaternion"),
-        ("1 1 0 0 0 nan 0 0 1 a.png\n\n", "expected a unit quaternion, finite numbers"),
+        ("1 1 0 0 0 nan 0 0 1 a.png\n\n", "expected a unit quaternion and a finite translation"),
         ("# nothing\n", "holds no images"),
     ],
 )

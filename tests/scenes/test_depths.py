@@ -210,7 +210,7 @@ def test_what_is_refused(folder: Path) -> None:
     refuses(r"1 depth map\(s\) fit no photograph \(99\.png\)", with_depths, scene, MAPS)
     (maps / "99.png").unlink()
     (maps / "00_depth.png").write_bytes((maps / "00.png").read_bytes())
-    refuses(r"is a second depth map of 00\.png, beside 00\.png", with_depths, scene, MAPS)
+    refuses(r"is a second depth map of 00\.png, besides 00\.png", with_depths, scene, MAPS)
     (maps / "00_depth.png").unlink()
     write_pixels(maps / "03.png", np.ones((HEIGHT, WIDTH // 2, 1), np.uint16))
     refuses(r"03\.png: the depth map has 24x40 pixels, expected the aspect ratio", with_depths, scene, MAPS)

@@ -50,7 +50,7 @@ def test_what_a_gaussian_starts_as() -> None:
 
 def test_bad_points() -> None:
     refuses("no points", from_points, np.zeros((0, 3)), np.zeros((0, 3)))
-    refuses("point 1 is not finite", from_points, [[0, 0, 0], [0, np.nan, 0]], np.zeros((2, 3)))
+    refuses("point 1 has the position", from_points, [[0, 0, 0], [0, np.nan, 0]], np.zeros((2, 3)))
     refuses("expected", from_points, np.zeros((4, 3)), np.zeros((3, 3)), error=ValueError)
 
 

@@ -59,10 +59,10 @@ def test_sizes_are_those_of_the_other_cameras(rows: dict[int, float], model: str
     assert scene.near == plain.near
     np.testing.assert_array_equal(scene.origin, plain.origin)
     np.testing.assert_allclose(scene.bounds, plain.bounds, rtol=1e-12)  # sums of as many, in another order
-    (warning,) = [text for text in scene.warnings if "far off" in text]
-    assert f"{len(rows)} camera(s) stand over 5 times as far off as the others" in warning
+    (warning,) = [text for text in scene.warnings if "times as far away" in text]
+    assert f"{len(rows)} camera(s) are over 5 times as far away as the others" in warning
     assert NAMES[min(rows)] in warning
-    assert not [text for text in plain.warnings if "far off" in text]
+    assert not [text for text in plain.warnings if "times as far away" in text]
 
 
 def test_a_far_scene_has_its_own_origin(tmp_path: Path) -> None:
@@ -88,7 +88,7 @@ def test_captures_have_none(rows: dict[int, float], tmp_path: Path) -> None:
     assert not scene.stray_cameras
     centres = np.stack([view.camera.position for view in scene.train_views])
     assert scene.extent == 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-    assert not [text for text in scene.warnings if "far off" in text]
+    assert not [text for text in scene.warnings if "times as far away" in text]
 
 
 def test_a_tripod_and_a_walk_have_none() -> None:
@@ -156,7 +156,7 @@ def test_stray_points_are_left_out(count: int, distance: float, tmp_path: Path) 
         np.testing.assert_allclose(scene.points, plain.points, rtol=1e-6)
         np.testing.assert_array_equal(scene.point_colors, plain.point_colors)
         (warning,) = scene.warnings
-        assert f"{count} of 400 points lie over 5 times as far off as the others, such as " in warning
+        assert f"{count} of 400 points lie over 5 times as far away as the others, such as " in warning
         assert warning.endswith("; they are left out")
     assert plain.warnings == []
 
@@ -173,7 +173,7 @@ def test_those_of_a_cloud_do_not_make_its_voxels_large(tmp_path: Path) -> None:
     xyz[0] = [1e9, 0, 0]
     write_cloud(tmp_path / "cloud.ply", xyz, rgb)
     scene = load_scene(write_colmap(tmp_path))
-    with pytest.warns(UserWarning, match="1 of 2,000 points lie over 5 times as far off"):
+    with pytest.warns(UserWarning, match="1 of 2,000 points lie over 5 times as far away"):
         chosen = with_points(scene, StartPoints(str(tmp_path / "cloud.ply"), "replace", 500))
     assert 300 < len(chosen.points) <= 500
 

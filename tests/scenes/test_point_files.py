@@ -170,7 +170,7 @@ def test_a_cloud_beside_a_scene_without_points_is_taken(kind: str, name: str, tm
     scene = load_scene(tmp_path)
     np.testing.assert_array_equal(scene.points, XYZ.astype(np.float32))
     np.testing.assert_allclose(scene.point_colors, RGB / 255, atol=1e-6)
-    assert f"{path}: its 60 points are used, as the scene names no points" in scene.warnings
+    assert f"{path}: its 60 points are used, as the scene itself has no points" in scene.warnings
     assert not [text for text in sanity_checks.of_scene(scene, "black") if "not used" in text]
 
 

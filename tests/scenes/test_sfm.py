@@ -108,7 +108,7 @@ def test_every_pose_is_recovered(scene, pictures):
     stages = list(dict.fromkeys(text for text, _ in heard))
     assert stages == ["reading photos", "finding features", "matching photos", "placing cameras", "undistorting photos"]
     placed = [fraction.text for text, fraction in heard if text == "placing cameras"]
-    assert (placed[0], placed[-1]) == (f"0 of {COUNT} cameras stand", f"{COUNT} of {COUNT} cameras stand")
+    assert (placed[0], placed[-1]) == (f"0 of {COUNT} cameras placed", f"{COUNT} of {COUNT} cameras placed")
     assert len(placed) > 3  # they are counted as they come
     assert leftovers(output.parent) == ["scene"]
 
@@ -232,7 +232,7 @@ def test_bad_folders(tmp_path, photos):
     refuses(r"missing: no such folder", sfm.reconstruct, tmp_path / "missing", tmp_path / "out")
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty/a.webp").write_bytes(b"")
-    with pytest.raises(InputError, match=r"empty: no photos found, only 1 of an unsupported kind such as a\.webp"):
+    with pytest.raises(InputError, match=r"empty: no photos found, only 1 in unsupported formats such as a\.webp"):
         sfm.reconstruct(tmp_path / "empty", tmp_path / "out")
     (tmp_path / "few").mkdir()
     shutil.copy(photos / "view_00.jpg", tmp_path / "few")

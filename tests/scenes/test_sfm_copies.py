@@ -178,7 +178,7 @@ def test_the_same_bytes_under_another_name(copy: str, pictures: list[Picture], t
     shutil.copy(tmp_path / "in" / "0.jpg", tmp_path / "in" / copy)
     found, (message,) = used(tmp_path / "in")
     assert found == names("")
-    told = f"1 photograph is a copy of another and left out ({copy} is 0.jpg, same bytes); to use copies, give"
+    told = f"1 photograph is a copy of another and left out ({copy} is 0.jpg, same bytes); to use the copies instead"
     assert told in message
 
 

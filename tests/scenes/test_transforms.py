@@ -121,7 +121,7 @@ def test_habits_of_file_path(tmp_path: Path, listed: str, name: str) -> None:
         ({"fl_x": None, "camera_angle_x": 30.0}, {}, "'camera_angle_x' is 30, expected an angle between 0 and pi"),
         ({"k1": 0.1, "k4": 0.1}, {}, "'k4' is 0.1 in a perspective camera"),
         ({"camera_model": "KALEIDOSCOPE"}, {}, "unknown 'camera_model' 'KALEIDOSCOPE', expected one of"),
-        ({"aabb_scale": 4, "scale": "x"}, {}, "'scale' or 'offset'"),
+        ({"aabb_scale": 4, "scale": "x"}, {}, "'scale' is 'x', 'offset' is None"),
         ({}, {"file_path": None}, "frame 1: has no 'file_path'"),
         ({}, {"file_path": 7}, "frame 1: 'file_path' is 7, expected text"),
         ({}, {"transform_matrix": None}, "frame 1: has no 'transform_matrix'"),
@@ -143,7 +143,7 @@ def test_keys_that_are_missing_or_wrong_are_named(
 
 def test_not_json(tmp_path: Path) -> None:
     path = tmp_path / "transforms.json"
-    for text, found in (("{", "is not JSON"), ("[1]", "holds no JSON object"), ("\xff", "is not text in UTF-8")):
+    for text, found in (("{", "is not JSON"), ("[1]", "is not a JSON object"), ("\xff", "is not text in UTF-8")):
         path.write_bytes(text.encode("latin-1"))
         refuses(found, read_transforms, path)
     refuses("no such file", read_transforms, tmp_path / "none.json")

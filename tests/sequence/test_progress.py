@@ -217,16 +217,16 @@ def test_counts_are_told_as_such_and_the_last_always(now: list[float], capsys: p
     progress = StageProgress()
     for second, done in ((0.0, 0), (3.0, 7), (10.5, 12), (12.0, 23)):
         now[0] = second
-        progress("placing cameras", CountedFraction(done, 25, "cameras stand"))
+        progress("placing cameras", CountedFraction(done, 25, "cameras placed"))
     progress("undistorting photos", None)
-    progress("placing cameras", CountedFraction(2, 2, "cameras stand"))
+    progress("placing cameras", CountedFraction(2, 2, "cameras placed"))
     progress("done", None)
     assert capsys.readouterr().err.splitlines() == [
-        "placing cameras: 0 of 25 cameras stand",
-        "placing cameras: 12 of 25 cameras stand",
-        "placing cameras: 23 of 25 cameras stand",
+        "placing cameras: 0 of 25 cameras placed",
+        "placing cameras: 12 of 25 cameras placed",
+        "placing cameras: 23 of 25 cameras placed",
         "undistorting photos",
-        "placing cameras: 2 of 2 cameras stand",
+        "placing cameras: 2 of 2 cameras placed",
         "done",
     ]
 

@@ -266,7 +266,7 @@ def test_each_eye_has_a_holdout(shot: list[str], tmp_path: Path, capsys: Capture
         assert f"{folder}/z.right.exr: no such holdout" in fails(capsys, render, shot, folder / names, flags)
         write_flat(folder / "z.right.exr", {"Z": whole[:, 1:]})
         assert render(shot, folder / names, flags) == 2
-        assert "z.right.exr: holds a frame of 95x64, expected 96x64" in error_line(capsys)
+        assert "z.right.exr: has a display window of 95x64 pixels, expected 96x64" in error_line(capsys)
         write_flat(folder / "z.right.exr", {"Z": np.inf * whole})
         assert not list(folder.glob("*01.exr"))
         assert render(shot, folder / names, flags) == 0

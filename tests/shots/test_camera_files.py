@@ -278,7 +278,7 @@ def test_own_files_that_cannot_be(changes: dict[str, Any], message: str, tmp_pat
     ("name", "content", "message"),
     [
         ("a.json", "{", "is not JSON"),
-        ("a.json", "1", "holds no JSON object, expected one with 'frames', 'camera_path' or 'clsplat_cameras'"),
+        ("a.json", "1", "is not a JSON object, expected one with 'frames', 'camera_path' or 'clsplat_cameras'"),
         ("a.json", "{}", "has neither 'clsplat_cameras' (a clsplat camera file) nor 'camera_path'"),
         ("a.json", '{"frames": []}', "has no 'frames'"),
         ("a.abc", "", "has the extension '.abc', expected a COLMAP model's folder, a transforms.json"),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of a photograph in which the masked parts are tinted."""
+"""Overlay of masks on photographs: pictures in which the masked parts are tinted."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from clsplat.arrays import Float32
 from clsplat.scenes.scene import View
 
 IGNORED_OVERLAY_RGB, TRANSPARENT_OVERLAY_RGB = (0.85, 0.1, 0.1), (0.1, 0.35, 1.0)
-"""RGB colours of ignored and of transparent pixels in the overlay."""
+"""Overlay colours of pixels that masks ignore (red), and of pixels that masks make transparent (blue)."""
 MASK_OVERLAY_OPACITY = 0.6
-"""Opacity of the overlay colour on a pixel that is fully left out."""
+"""Opacity of the overlay colour on a pixel that is fully masked."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Masked:
         return float(np.maximum(self.ignored, self.clear).mean())
 
     def drawn(self) -> Float32:
-        """Photograph (H, W, 3) with the left-out parts tinted."""
+        """Return the photograph (H, W, 3) with the left-out parts tinted."""
         picture = self.photograph
         for part, colour in ((self.clear, TRANSPARENT_OVERLAY_RGB), (self.ignored, IGNORED_OVERLAY_RGB)):
             picture = picture + MASK_OVERLAY_OPACITY * part * (np.array(colour, np.float32) - np.clip(picture, 0, 1))

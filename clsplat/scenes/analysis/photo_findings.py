@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Findings about a scene before training: problems of its photographs, and settings that mitigate them.
+"""Findings about a scene before training: blur, varying exposure, masks, sky and other problems of its photographs.
 
-They are based on thumbnails, cameras and points, and need no device.
+Findings are based on thumbnails, cameras and points, and need no OpenCL device.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ EXPOSURE_SPREAD_STOPS = 0.2
 With locked exposure, occlusion and highlights cause up to 0.1. From about 0.2, learnt gains improve a model.
 """
 DISTANCE_SPREAD_RATIO = 4.0
-"""Ratio of the 90th to the 10th percentile of distance / focal length that counts as a wide range.
+"""Ratio of the 90th to the 10th percentile of distance / focal length from which distances count as varying widely.
 
 At 4, a Gaussian one pixel wide in one photograph is a quarter of a pixel, or four pixels, wide in another.
 """
@@ -59,25 +59,26 @@ WIDE_FISHEYE_DEGREES = 100.0
 FEW_TRAINING_VIEWS = 16
 """Number of training photographs below which they hardly constrain the depth of a scene.
 
-In publications, training on 12 photographs is 8 dB below training on 100 photographs, and training on 24 about 3 dB.
+According to publications, training on 12 photographs gives a PSNR 8 dB below training on 100, and on 24 about 3 dB.
 """
 SPARSE_TRAINING_VIEWS = 30
 """Number of training photographs below which unlimited growth overfits (docs/quality.md)."""
 MAX_GAUSSIANS_PER_POINT, MIN_PIXELS_PER_GAUSSIAN = 12, 64
 """Maximum number of Gaussians per point, and minimum number of pixels per Gaussian, for scenes with few photographs.
 
-A Gaussian has up to 59 parameters. A pixel has three values, and most of these resemble its neighbours'. The results
+A Gaussian has up to 59 parameters. A pixel has three values, most of which resemble its neighbours' values. The results
 are best with 64 to 85 pixels per Gaussian for 25 photographs of bonsai, and with 7 Gaussians per point for the 50
 photographs of fox (docs/quality.md, Few photographs and Growth).
 """
 SUPPORTED_GAUSSIANS_PER_POINT = 1.5
-"""Number of Gaussians per point that few photographs support even if they are small. Neighbouring pixels of a small
+"""Number of Gaussians per point that few photographs always support, even small ones, as neighbouring pixels of a small
 photograph differ more."""
 FEW_STEPS_PER_VIEW = 60
 """Steps per training photograph below which high learning rates give better models
 (docs/decisions/0031-high-rates.md)."""
 SHORT_TRAINING_STEPS = range(1000, 10_001)
-"""Numbers of training steps for which high learning rates are recommended. Trainings of 2000 to 7000 were measured."""
+"""Numbers of training steps for which high learning rates are recommended, after measurements with 2000 to 7000 steps.
+"""
 RECOMMENDED_PASSES = 30
 """Number of passes through the training photographs below which a longer schedule is recommended. The paper's 30,000
 steps are 30 passes through 1000 photographs."""
@@ -90,7 +91,7 @@ BLUR_OUTLIER_SIGMAS = 3.5
 """The log sharpness of a blurred photograph must also lie this many standard deviations below the median. The standard
 deviation is estimated from quartiles."""
 DUPLICATE_RMS = 1.5 / 255
-"""Maximum RMS difference of two thumbnails that count as the same picture. JPEG rounding causes half of it."""
+"""Maximum RMS difference of two thumbnails that count as the same picture. JPEG compression causes half of it."""
 FEATURELESS_THUMBNAIL_STD = 8 / 255
 """Standard deviation of a thumbnail up to which it is featureless and never counts as a duplicate."""
 MIN_SKY_PIXEL_FRACTION, MIN_SKY_VIEW_FRACTION = 0.06, 0.3
@@ -100,17 +101,18 @@ MAX_SKY_POINT_DENSITY_RATIO = 0.1
 MAX_SKY_PIXEL_STEP, MIN_SKY_LUMA = 0.025, 0.45
 """Maximum luma difference of neighbouring thumbnail pixels in a sky, and minimum luma of a sky."""
 MIN_SKY_BLUE_EXCESS = 0.02
-"""Minimum of blue minus red in a blue sky. For a wall in lamplight it is below 0. The luma of a white sky must exceed
-MAX_EXPOSURE_COLOUR instead."""
+"""Minimum of blue minus red in a blue sky; for a wall in lamplight it is below 0. A sky that is not blue must have a
+luma over MAX_EXPOSURE_COLOUR."""
 
 
 @dataclass(frozen=True)
 class Finding:
     """A finding about the photographs.
 
-    kind: the check that made the finding.
+    kind: kind of the problem.
     text: a clause for the report.
-    options: alternative settings that mitigate the problem, best first, if they depend on the photographs.
+    options: alternative settings that mitigate the problem, best first. Only if they depend on the photographs; others
+        are in `recommendations.SETTINGS_BY_FINDING`.
     """
 
     kind: Kind
@@ -144,12 +146,12 @@ def findings(scene: Scene, use: MaskUse = NO_MASKS, iterations: int = 0) -> list
 
 
 def _sampled_training_views(scene: Scene) -> list[View]:
-    """Training views that have thumbnails."""
+    """Return the training views that have thumbnails."""
     return [view for view in scene.sampled_views if view.split == "train"]
 
 
 def _counted(scene: Scene, count: int) -> str:
-    """A number of photographs as text; if only a sample was inspected, with the sample's size."""
+    """Return a number of photographs as text, with the size of the sample if only a sample was inspected."""
     return f"{count:,}" if scene.decoded_first else f"{count:,} of {len(scene.sampled_views):,} sampled"
 
 
@@ -243,7 +245,7 @@ def _few(scene: Scene) -> Finding | None:
     count = len(scene.train_views)
     if count >= FEW_TRAINING_VIEWS:
         return None
-    return Finding("few views", f"there are only {count} training photographs, so that other views will show fog")
+    return Finding("few views", f"there are only {count} training photographs, so that other views will show floaters")
 
 
 def _some(scene: Scene, iterations: int) -> Finding | None:
@@ -289,7 +291,7 @@ def _sky(visible: VisiblePoints) -> Finding | None:
 
 
 def _sky_part(visible: VisiblePoints, view: View) -> float:
-    """Fraction of a view that is sky.
+    """Return the fraction of a view that is sky.
 
     Sky is a bright, smooth, blue or white region at the upper border, above the horizon, with hardly any points.
     """
@@ -307,7 +309,7 @@ def _sky_part(visible: VisiblePoints, view: View) -> float:
         & (steps < MAX_SKY_PIXEL_STEP)
         & ((blue > MIN_SKY_BLUE_EXCESS) | (light > MAX_EXPOSURE_COLOUR))
     )
-    reached = np.logical_and.accumulate(likely, axis=0)  # counts from the upper border down
+    reached = np.logical_and.accumulate(likely, axis=0)  # sky in a column ends at the first pixel that is unlikely
     part = float(reached.mean())
     if part < MIN_SKY_PIXEL_FRACTION or not likely[0].mean() > 0.5:
         return 0.0
@@ -319,7 +321,7 @@ def _sky_part(visible: VisiblePoints, view: View) -> float:
 
 
 def _elevation(view: View, part: NDArray[np.bool_], up: Float64) -> float:
-    """Sine of the elevation of the mean pixel of `part`, a mask (h, w) of the view."""
+    """Return the sine of the elevation above the horizon of the mean pixel of `part`, a mask (h, w) of the view."""
     rows, columns = np.nonzero(part)
     camera = view.camera.resized(part.shape[1], part.shape[0])
     x, y = (columns.mean() + 0.5 - camera.cx) / camera.fx, (rows.mean() + 0.5 - camera.cy) / camera.fy

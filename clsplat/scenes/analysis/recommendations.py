@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recommended training settings for the findings about a scene."""
+"""Recommended training settings (--auto) for the findings about a scene."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from clsplat.errors import InputError
 from clsplat.scenes.analysis.photo_findings import Finding, Kind
 
 SCHEDULE_SETTING = "schedule"
-"""Key of a schedule in the settings of an answer. A schedule is a bundle of settings."""
+"""Key, among recommended settings, of the name of a schedule: a bundle of learning rates and steps."""
 SETTINGS_BY_FINDING: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
     "exposure": ({"appearance": "exposure"},),
     "scales": ({"antialiased": True},),
@@ -38,7 +38,8 @@ SETTINGS_BY_FINDING: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
 """Alternative settings for each kind of finding, best first. The first one compatible with the other settings is used.
 """
 PASSES_SETTING = "passes"
-"""Key of the number of passes in the settings of an answer. It scales the schedule (`config.presets.by_passes`)."""
+"""Key, among recommended settings, of the number of passes through the photographs, which scales the schedule
+(`config.presets.by_passes`)."""
 SCHEDULED_SETTINGS = ("sh_degree_every", "optimiser", "density.stop", "density.noise_rate")
 """Settings that a schedule changes, except for the number of steps."""
 ADVICE_BY_FINDING: Mapping[Kind, str] = {
@@ -47,15 +48,15 @@ ADVICE_BY_FINDING: Mapping[Kind, str] = {
     "blur": "leave them out if other photographs show the same",
     "duplicates": "remove the copies",
 }
-"""Advice for findings for which SETTINGS_BY_FINDING has no settings."""
+"""Advice, by kind of finding, where SETTINGS_BY_FINDING has no settings."""
 
 
 @dataclass(frozen=True)
 class Answer:
     """A finding and the settings recommended for it.
 
-    settings: empty if there are none for the finding, or if none is compatible with the other settings.
-    given: name of a setting that the user has specified, which takes precedence; "" for none.
+    settings: the recommended settings; empty if there are none, or none that is compatible with the other settings.
+    given: name of a setting that the user has set otherwise, so that nothing is recommended; "" for none.
     """
 
     finding: Finding
@@ -80,7 +81,7 @@ class Answer:
 
 
 def flags(settings: Mapping[str, Any]) -> str:
-    """Settings as command-line flags."""
+    """Return settings as command-line flags."""
     words = []
     for name, value in settings.items():
         text = ",".join(map(str, value)) if isinstance(value, tuple) else value
@@ -91,7 +92,7 @@ def flags(settings: Mapping[str, Any]) -> str:
 def answered(
     found: Sequence[Finding], config: TrainConfig, given: Collection[str] = (), photographs: int = 0
 ) -> tuple[list[Answer], TrainConfig]:
-    """Choose settings for each finding. Returns the answers, and the configuration with all their settings.
+    """Choose settings for each finding. Returns an answer for each, and the configuration with all these settings.
 
     given: names of settings that must not change.
     photographs: number of training photographs, for settings that count passes through them.
@@ -114,12 +115,12 @@ def answered(
 
 
 def _options(finding: Finding) -> Sequence[Mapping[str, Any]]:
-    """Alternative settings for a finding, best first; empty if there are none."""
+    """Return alternative settings for a finding, best first; empty if there are none."""
     return finding.options or SETTINGS_BY_FINDING.get(finding.kind, ())
 
 
 def _touched(option: Mapping[str, Any], given: Collection[str]) -> str:
-    """First setting of `given`, in the order of names, that `option` or its schedule would change; "" for none."""
+    """Return the first setting of `given`, by name, that `option` or its schedule would change; "" for none."""
     names = {*option, *((*SCHEDULED_SETTINGS, "density.start") if SCHEDULE_SETTING in option else ())}
     names |= {"iterations"} if PASSES_SETTING in option else set()
     return min((name for name in given if name in names or name.partition(".")[0] in names), default="")
@@ -128,10 +129,11 @@ def _touched(option: Mapping[str, Any], given: Collection[str]) -> str:
 def with_settings(
     config: TrainConfig, settings: Mapping[str, Any], given: Collection[str] = (), photographs: int = 0
 ) -> TrainConfig:
-    """Apply the settings of an answer to a configuration.
+    """Apply recommended settings to a configuration.
 
     given, photographs: as for `answered`.
-    Raises InputError if they are incompatible, or if a schedule would override settings that differ from the paper's.
+    Raises InputError if the settings are incompatible, or if a schedule would override settings that differ from the
+    paper's.
     """
     changes = dict(settings)
     config = replace(config, iterations=changes.pop("iterations", config.iterations))
@@ -139,7 +141,8 @@ def with_settings(
         paper, values = scheduled("paper", config.iterations), attrgetter(*SCHEDULED_SETTINGS)
         if values(config) != values(paper):
             raise InputError(
-                f"--schedule {name}: would override settings that are not the paper's, expected one or the other"
+                f"--schedule {name}: would override settings that are not the paper's, expected either the schedule or "
+                "these settings"
             )
         changes = dict(zip(SCHEDULED_SETTINGS, values(scheduled(name, config.iterations)), strict=True)) | changes
     if (passes := changes.pop(PASSES_SETTING, None)) is not None:
@@ -151,9 +154,9 @@ def with_settings(
 
 
 def paragraph(answers: Sequence[Answer], looked: int, *, auto: bool, sampled: int | None = None) -> str:
-    """Report of the findings and the settings for them.
+    """Return the report of the findings and the settings for them, in one line.
 
-    looked: number of photographs.
+    looked: number of photographs in the scene.
     auto: True if the settings are applied.
     sampled: number of photographs that were inspected, if not all.
     """

@@ -29,7 +29,7 @@ MAX_CHECKED_VIEWS = 8
 CHECK_DOWNSCALE = 4
 """Factor by which checked pictures are downscaled."""
 MANY_START_POINTS = 1_000_000
-"""Number of start points above which further points hardly improve a model.
+"""Number of initial points above which further points hardly improve a model.
 
 Published models of rooms and gardens grow to 1 to 6 million Gaussians from 50,000 to 200,000 points.
 """
@@ -45,7 +45,7 @@ colour."""
 
 
 def of_scene(scene: Scene, background: Background) -> list[str]:
-    """Warnings about the scene's points, cameras and photographs, and about the background colour."""
+    """Return warnings about the scene's points, cameras and photographs, and about the background colour."""
     lenses = absurd([(view.name, view.lens) for view in scene.views])
     checked = spread(scene.train_views, MAX_CHECKED_VIEWS)
     pictures = [_pixels(view) for view in checked]
@@ -65,7 +65,7 @@ def of_scene(scene: Scene, background: Background) -> list[str]:
 def of_pictures(
     draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: Sequence[View], kind: str = "training"
 ) -> str:
-    """Warning about a model's pictures of these views; "" if there is nothing to report.
+    """Return a warning about a model's renders of these views: invisible or of one colour; "" if they are neither.
 
     draw: function that renders the image (H, W, 3) and alpha (H, W) of a camera.
     kind: name of the kind of views, for the message.
@@ -94,7 +94,7 @@ def _pixels(view: View) -> NDArray[np.float32]:
 
 
 def _is_flat(image: NDArray[Any]) -> bool:
-    """True if the pixels differ by less than one 8-bit step in each channel."""
+    """Return True if the pixels differ by less than one 8-bit step in each channel."""
     return bool(np.ptp(image.reshape(-1, image.shape[2]), axis=0).max() < 1 / 255)
 
 
@@ -119,7 +119,7 @@ def _other_clouds(scene: Scene) -> str:
 
 
 def _count(path: Path) -> int:
-    """Number of points according to a cloud's header; 0 if the file cannot be read."""
+    """Return the number of points that a cloud's header gives; 0 if the file cannot be read."""
     try:
         return count_points(path)
     except InputError:
@@ -179,7 +179,7 @@ def _background(pictures: Sequence[NDArray[np.float32]], background: Background)
     edges = []
     for pixels in pictures:
         if pixels.shape[2] == 4 and pixels[:, :, 3].min() < 1:
-            return ""  # training composites it over the background
+            return ""  # training composites a transparent photograph over the background
         edges.append(np.concatenate([pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]])[:, :3])
     border = np.concatenate(edges)
     for name, part in (("white", (border >= WHITE_LEVEL).all(axis=1)), ("black", (border <= BLACK_LEVEL).all(axis=1))):

@@ -29,9 +29,9 @@ COLOUR_NOISE_FLOOR = 1 / 255
 A higher limit would exclude the darkest points of a dark photograph, which would then seem brighter.
 """
 EXPOSURE_IRLS_ITERATIONS, MIN_EXPOSURE_RESIDUAL_STOPS = 10, 0.02
-"""Iterations of reweighted least squares, and the residual in stops below which all points have the same weight."""
+"""Iterations of reweighted least squares for exposures, and residual in stops below which weights no longer grow."""
 EXPOSURE_RIDGE = 1e-9
-"""Ridge term of the normal equations, as a fraction of their diagonal."""
+"""Ridge term of the normal equations for exposures, as a fraction of their diagonal."""
 
 
 class VisiblePoints:
@@ -92,10 +92,10 @@ class VisiblePoints:
         """log2 exposure (3,) of each photograph relative to the others. The keys are the views' names.
 
         Each point is assumed to have the same colour in all photographs, so that differences are due to exposure. The
-        fit minimises absolute differences by iteratively reweighted least squares. It does not use the point colours
-        stored in the scene. Photographs with fewer than MIN_POINTS_PER_VIEW shared points are left out.
+        fit minimises absolute differences by iteratively reweighted least squares. The scene's own point colours are
+        not used. Photographs with fewer than MIN_POINTS_PER_VIEW shared points are left out.
         """
-        if len(self.points) < MIN_POINTS_PER_VIEW:  # so that no thumbnail is loaded
+        if len(self.points) < MIN_POINTS_PER_VIEW:  # return before thumbnails are loaded
             return {}
         seen = {name: self._logs(name) for name in self.places}
         counts = np.bincount(np.concatenate([np.empty(0, np.int64), *(which for which, _ in seen.values())]))
@@ -111,7 +111,7 @@ class VisiblePoints:
         return dict(zip(shared, relative_exposures(points, views, colors), strict=True))
 
     def _logs(self, name: str) -> tuple[NDArray[np.int64], Float64]:
-        """Points (n,) that are neither too dark nor clipped in a view, and log2 of their colours there, (n, 3)."""
+        """Return the points (n,) that are neither too dark nor clipped in a view, and log2 of their colours (n, 3)."""
         which, rows, columns, _ = self.places[name]
         pixels = self.scene.thumbnails[name].pixels
         seen, most = (
@@ -138,7 +138,7 @@ def relative_exposures(points: NDArray[np.int64], views: NDArray[np.int64], logs
         shown[points, views] = weights
         whole = shown.sum(axis=1)
         means = _sums(points, weights, logs) / whole[:, None]
-        # normal equations with the points' colours eliminated; the ridge term makes each group's weighted mean 0
+        # Normal equations, with the points' colours eliminated. The ridge term makes each group's weighted mean 0.
         matrix = np.diag(shown.sum(axis=0) * (1 + EXPOSURE_RIDGE)) - shown.T @ (shown / whole[:, None])
         found = np.linalg.solve(matrix, _sums(views, weights, logs - means[points]))
         colors = means - shown @ found / whole[:, None]
@@ -147,5 +147,5 @@ def relative_exposures(points: NDArray[np.int64], views: NDArray[np.int64], logs
 
 
 def _sums(places: NDArray[np.int64], weights: Float64, values: Float64) -> Float64:
-    """Sum of weighted values (M, 3) for each place, (places, 3)."""
+    """Return sums (K, 3) of weighted values (M, 3), one for each of the K indices in `places` (M,)."""
     return np.stack([np.bincount(places, weights * column) for column in values.T], axis=1)

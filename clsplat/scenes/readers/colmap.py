@@ -2,8 +2,8 @@
 """Reading of COLMAP models: cameras, images and points3D, binary or text (https://colmap.github.io/format.html).
 
 `pycolmap.Reconstruction` is not used, because version 4.2.1 does not handle damaged files. It fails without naming the
-file, allocates all memory, or accepts a truncated cameras.bin and goes on with uninitialised data. This reader accounts
-for every byte.
+file, allocates all memory, or accepts a truncated cameras.bin and goes on with uninitialised data. This reader rejects
+files with missing or additional bytes.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ OBSERVATION_BYTES = 24  # x, y, id of the point
 TRACK_BYTES = 8  # id of the image, index of the observation in it
 MAX_NAME_BYTES = 4096
 MAX_LINE_CHARACTERS = 1 << 26
-"""Maximum characters of a text line. The observations of a picture and the track of a point are one line each."""
+"""Maximum length of a text line. The observations of a picture and the track of a point are one line each."""
 EDITED_AFTER_SECONDS = 60.0
 """A text file that is newer than its binary file by more seconds than this counts as edited.
 
@@ -64,10 +64,10 @@ COLMAP_FILE_KIND = "a file of a COLMAP model"
 
 
 def find_model(folder: Path) -> Path | None:
-    """Folder of the model that belongs to `folder`, or None.
+    """Find the folder of the COLMAP model that belongs to `folder`, or None.
 
     The folder itself, sparse/ and colmap/sparse/ are searched, and in each, numbered sub-folders such as sparse/0 come
-    first. Of several numbered models, the one with the most images is used: COLMAP's first model may be a fragment.
+    first. Of several numbered models, the one with the most images is used, as COLMAP's first model may be a fragment.
     """
     for candidate in (folder, folder / "sparse", folder / "colmap" / "sparse"):
         numbered = [path for path in candidate.glob("[0-9]*") if _is_model(path)]
@@ -81,7 +81,7 @@ def find_model(folder: Path) -> Path | None:
 
 
 def read_model(folder: Path) -> DataSet:
-    """Read the model in `folder`: each of the three files as .bin if it exists, else as .txt.
+    """Read the COLMAP model in `folder`: cameras, images and points3D, each from .bin if it exists, else from .txt.
 
     Without points3D there are no points. Raises InputError that names the file if a file is missing, truncated, longer
     than its contents, damaged, or has an unknown camera model. Warns of text files with fewer records than their
@@ -97,7 +97,7 @@ def _read_posed_images(folder: Path) -> list[PosedImage]:
 
 
 def read_cameras(folder: Path, lenses: Lenses = "undistort") -> dict[str, Camera]:
-    """Cameras of a model, sorted by image name. The keys are the image names. Points and pictures are not read.
+    """Read the cameras of a model, keyed and sorted by image name. Points and pictures are not read.
 
     folder: the folder of the model or of the scene, as for `find_model`.
     lenses: treatment of distorted cameras, as for training (`Lens.camera`). By default they become full-size pinhole
@@ -108,7 +108,7 @@ def read_cameras(folder: Path, lenses: Lenses = "undistort") -> dict[str, Camera
 
 
 def read_images(folder: Path) -> list[PosedImage]:
-    """Images of a model, sorted by name. Raises InputError and warns like `read_model`.
+    """Read the images of a model, sorted by name. Raises InputError and warns like `read_model`.
 
     folder: as for `read_cameras`.
     """
@@ -132,7 +132,7 @@ class Tracks:
     by_image: dict[str, NDArray[np.int64]]
 
     def shown_in(self, names: Sequence[str]) -> dict[str, NDArray[np.int64]]:
-        """Indices (k,) of the points of each photograph, by its name; without photographs that have none.
+        """Return the indices (k,) of the points of each photograph that has any, by the photograph's name.
 
         names: the photographs' names, which may differ from the images' names as in `photo_names.match`.
         """
@@ -141,8 +141,10 @@ class Tracks:
 
 
 def read_tracks(folder: Path) -> Tracks:
-    """Read the tracks of the model in `folder`, without observations in unknown images. Raises InputError like
-    `read_model`."""
+    """Read the tracks of the model in `folder`, without observations in images that it lacks.
+
+    Raises InputError like `read_model`.
+    """
     path = _require(folder, "images")
     rows = _binary_images(path) if path.suffix == ".bin" else _text_images(path)
     names = {key: _named(path, name) for key, name, *_ in rows}
@@ -163,16 +165,17 @@ def read_tracks(folder: Path) -> Tracks:
 
 
 def safe_name(name: str) -> bool:
-    """True if a name from a file is legible and stays inside the folder that it is relative to."""
+    """Return True if a name from a file is legible and stays inside the folder that it is relative to."""
     path, windows = PurePosixPath(name), PureWindowsPath(name)
     inside = not path.is_absolute() and not windows.anchor and ".." not in windows.parts
     return bool(path.parts) and inside and is_legible(name)
 
 
 def _named(path: Path, name: str) -> str:
-    """Name of a picture, without a drive, root or "..". Such a picture is later found by the end of its path.
+    """Return the name of a picture without a drive, root or "..".
 
-    Raises InputError if the remaining name is not a path inside the images' folder.
+    `photo_names.match` finds a picture whose name was changed here by the end of its path. Raises InputError if the
+    remaining name is not a path inside the images' folder.
     """
     inner = name if safe_name(name) else "/".join(part for part in slashed(name).split("/") if part != "..")
     if not safe_name(inner):
@@ -209,14 +212,18 @@ class _Binary:
     def name(self) -> str:
         raw = b"".join(islice(iter(lambda: self.file.read(1), b"\0"), min(MAX_NAME_BYTES, self.left)))
         if len(raw) == min(MAX_NAME_BYTES, self.left):
-            raise corrupt(self.path, f"{self.doing} has a name without an end")
+            raise corrupt(self.path, f"{self.doing} has a name without a zero byte at its end")
         self.left -= len(raw) + 1
-        # not always UTF-8: COLMAP on Windows writes names in the system's code page, see `photo_names`
+        # Names are not always UTF-8: COLMAP on Windows writes them in the system's code page, see `photo_names`.
         return raw.decode("utf-8", "surrogateescape")
 
 
 def _records(path: Path, what: str, least: int) -> Iterator[_Binary]:
-    """Yield a reader at the beginning of each record that the file announces. Records have at least `least` bytes."""
+    """Yield a reader at the beginning of each record that the file's header announces.
+
+    what: the kind of record, for messages.
+    least: minimum number of bytes of a record.
+    """
     with open_input(path, COLMAP_FILE_KIND) as opened:
         file = _Binary(path, opened)
         (number,) = map(int, file.read(COLMAP_COUNT))
@@ -231,7 +238,7 @@ def _records(path: Path, what: str, least: int) -> Iterator[_Binary]:
 
 
 def corrupt(path: Path, trouble: str) -> InputError:
-    """Error for invalid contents of a model's file."""
+    """Return the error for invalid contents of a model's file."""
     return InputError(f"{path}: truncated or corrupt: {trouble}; copy the file again or export the model again")
 
 
@@ -244,11 +251,11 @@ def _file(folder: Path, stem: str) -> Path | None:
         path = folder / (stem + extension)
         if is_file(path):
             return path
-    if not os.path.isdir(folder):  # noqa: PTH112  # Path raises for names too long
+    if not os.path.isdir(folder):  # noqa: PTH112  # Path.is_dir raises for a long name
         return None
     lower = {
         f"{stem}{extension}".lower() for extension in (".bin", ".txt")
-    }  # hierarchical-3d-gaussians writes points3d
+    }  # hierarchical-3d-gaussians writes points3d in lower case
     return next((path for path in sorted(folder.iterdir()) if path.name.lower() in lower and is_file(path)), None)
 
 
@@ -260,7 +267,7 @@ def _require(folder: Path, stem: str) -> Path:
 
 
 def _claimed_images(folder: Path) -> int:
-    """Number of images that a model announces; -1 if it has no images file."""
+    """Return the number of images in a model, by images.bin's header or images.txt's lines; -1 without such a file."""
     path = _file(folder, "images")
     if path is None:
         return -1
@@ -271,7 +278,7 @@ def _claimed_images(folder: Path) -> int:
 
 
 def _warn_of_newer_text(folder: Path) -> None:
-    """Warn of edited text files that are not read, as binary files take precedence."""
+    """Warn of edited text files, which are not read because binary files take precedence."""
     edited = []
     for stem in COLMAP_FILE_STEMS:
         binary, text = folder / f"{stem}.bin", folder / f"{stem}.txt"
@@ -283,8 +290,7 @@ def _warn_of_newer_text(folder: Path) -> None:
 
 
 def _check_count(path: Path, count: int) -> None:
-    """Warn of a text file with fewer records than announced. Truncation at the end of a line is not detected
-    elsewhere."""
+    """Warn of a text file with fewer records than announced. No other check detects truncation at the end of a line."""
     if path.suffix != ".txt":
         return
     announced = 0
@@ -343,7 +349,9 @@ def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[PosedImage]:
         quaternion, translation = np.array(pose[:4], np.float64), np.array(pose[4:], np.float64)
         norm = math.hypot(*pose[:4])
         if not (0.5 < norm < 2 and (np.abs(translation) < MAX_COORDINATE).all()):
-            raise corrupt(path, f"image {name} has the pose {list(pose)}, expected a unit quaternion, finite numbers")
+            raise corrupt(
+                path, f"image {name} has the pose {list(pose)}, expected a unit quaternion and a finite translation"
+            )
         images[name] = PosedImage(name, lenses[camera], rotation_from_quaternion(quaternion / norm), translation)
     if not images:
         raise InputError(f"{path}: holds no images, expected at least one")
@@ -362,9 +370,9 @@ def _binary_images(path: Path) -> Iterator[tuple[int, str, int, tuple[float, ...
 
 
 def _image_lines(path: Path) -> Iterator[tuple[int, str, str]]:
-    """Line number, text and expected fields of the first line of each image.
+    """Yield line number, text and expected fields of the first line of each image.
 
-    The second line, with the observations, may be empty. Some tools omit it.
+    An image's second line, with its observations, may be empty, and some tools omit it.
     """
     after_pose = False
     for number, line in _lines(path, keep_empty=True):
@@ -380,8 +388,7 @@ def _image_lines(path: Path) -> Iterator[tuple[int, str, str]]:
 
 
 def _are_observations(line: str) -> bool:
-    """True if the number of words is a multiple of three and the last word is a number. An image's first line ends with
-    a name."""
+    """Return True for a line of observations: a multiple of three words, of which the last is a number and no name."""
     words = line.split()
     try:
         float(words[-1])
@@ -431,20 +438,20 @@ def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
 def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
     for number, line in _lines(path):
         with _parsing(path, number, POINT_LINE_FIELDS):
-            _, x, y, z, red, green, blue, *others = _with_colours(line)  # some tools leave error and track out
+            _, x, y, z, red, green, blue, *others = _with_colours(line)  # some tools omit error and track
             if len(others) == 2 and len(others[1].split()) % 2:
                 raise ValueError("a track consists of pairs")
             yield float(x), float(y), float(z), float(red), float(green), float(blue)
 
 
 def _with_colours(line: str) -> list[str]:
-    """Fields of a point's line, with the track as one field. Grey is added if there is only a position."""
+    """Split a point's line into its fields, with the track as one field. Grey is added if there is only a position."""
     words = line.split(maxsplit=8)
     return [*words, "128", "128", "128"] if len(words) == 4 else words
 
 
 def _binary_tracks(path: Path) -> Iterator[tuple[tuple[float, ...], float, tuple[int, ...]]]:
-    """Position, error and image ids of each point."""
+    """Yield position, error and image ids of each point."""
     layout = struct.Struct("<Q3d3BdQ")
     for file in _records(path, "point", layout.size):
         _, *values, error, length = file.read(layout)
@@ -462,9 +469,9 @@ def _text_tracks(path: Path) -> Iterator[tuple[tuple[float, ...], float, tuple[i
 
 
 def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str]]:
-    """Line numbers and lines, without comments."""
+    """Yield numbers and text of a file's lines, without comments."""
     with open_input(path, COLMAP_FILE_KIND) as opened:
-        wide = opened.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)  # PowerShell redirects to UTF-16
+        wide = opened.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)  # PowerShell writes text in UTF-16
         opened.seek(0)
         encoding, errors = ("utf-16", "strict") if wide else ("utf-8-sig", "surrogateescape")
         file, number = io.TextIOWrapper(opened, encoding=encoding, errors=errors), 0
@@ -472,7 +479,7 @@ def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str]]
             while line := file.readline(MAX_LINE_CHARACTERS):
                 number += 1
                 if len(line) == MAX_LINE_CHARACTERS:
-                    raise corrupt(path, f"line {number} has no end")
+                    raise corrupt(path, f"line {number} has over {MAX_LINE_CHARACTERS:,} characters")
                 text = line.strip()
                 if not text.startswith("#") and (text or keep_empty):
                     yield number, text

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing of COLMAP models as text: https://colmap.github.io/format.html."""
+"""Writing of COLMAP models as text (https://colmap.github.io/format.html)."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ from clsplat.scenes.dataset import Lens
 
 
 def write_model(folder: Path, images: Sequence[tuple[str, Lens, Camera]], points: Float64, colors: Float32) -> None:
-    """Create the folder and write cameras.txt, images.txt and points3D.txt into it.
+    """Create the folder and write cameras.txt, images.txt and points3D.txt into it, without observations.
 
     images: (name, lens, camera) of each image. The lens has the intrinsics, and the camera the pose.
-    points: (N, 3), world coordinates.
+    points: (N, 3), world coordinates. Their tracks are empty and errors 0.
     colors: (N, 3) in [0, 1].
-    There are no observations: tracks are empty, and errors are 0.
     """
     folder.mkdir(parents=True, exist_ok=True)
     numbers: dict[Lens, int] = {}

@@ -40,6 +40,7 @@ from clsplat.scenes.photo_names import DRIVE_PREFIX, match
 from clsplat.scenes.point_files import clouds_beside, read_point_cloud
 
 COLMAP_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
+"""Rotation from OpenGL's camera axes to COLMAP's."""
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5
 """Default scale and offset of instant-ngp, whose positions are scale * p + offset for positions p of the file."""
 LAST_ROW_TOLERANCE = 1e-6
@@ -92,13 +93,13 @@ def read_transforms(
 
 
 def _clouds_below(folder: Path) -> list[str]:
-    """Names of the PLY files in a folder and in its direct sub-folders."""
+    """Return the paths of the PLY files in a folder and its direct sub-folders, relative to the folder."""
     files = [file for pattern in ("*", "*/*") for file in folder.glob(pattern) if file.suffix.lower() == ".ply"]
     return sorted(file.relative_to(folder).as_posix() for file in files)
 
 
 def _pictures(path: Path, readers: list[Keys], images: Path | None, missing: Missing) -> list[Path | None]:
-    """Picture of each frame; None for pictures that are left out.
+    """Find the picture of each frame; None for pictures that are left out.
 
     Warns and raises InputError like `find_pictures`. Also raises InputError for a name that leads out of the folder and
     matches no picture in the folder.
@@ -122,32 +123,40 @@ def _pictures(path: Path, readers: list[Keys], images: Path | None, missing: Mis
 
 
 def _smaller_folders(lost: list[Path], folder: Path) -> dict[Path, Path]:
-    """For each folder of missing pictures that has no pictures, its downscaled copy next to it, if that has some."""
+    """Find downscaled copies of picture folders, such as images_2, by the folder that they replace.
+
+    The folders are those above missing pictures that hold no pictures themselves.
+
+    lost: missing pictures.
+    folder: folder of the transforms.json.
+    """
     names = {parent for file in lost for parent in file.parents if folder in parent.parents}
     found = {name: or_smaller(name) for name in sorted(names)}
     return {name: copy for name, copy in found.items() if copy != name}
 
 
 def _moved(file: Path | None, copies: Mapping[Path, Path]) -> Path | None:
-    """The file's counterpart in a downscaled copy, of the outermost of its folders that `copies` names; else the
-    file."""
+    """Return the file's path in the downscaled copy of its outermost folder that has one; else the file itself.
+
+    copies: downscaled copies by the folder that they replace.
+    """
     usual = next((parent for parent in reversed(file.parents) if parent in copies), None) if file is not None else None
     return file if file is None or usual is None else copies[usual] / file.relative_to(usual)
 
 
 def read_poses(path: Path, size: tuple[int, int] | None = None, lenses: Lenses = "undistort") -> dict[str, Camera]:
-    """Cameras of a transforms.json in the order of the file, as from `cameras_of`. The keys are the image names.
+    """Read the cameras of a transforms.json, in the order of the file, as from `cameras_of`. The keys are image names.
 
     Pictures need not exist if the file has `w` and `h`. Otherwise a missing picture is assumed to have `size`, (width,
-    height). Raises InputError like `read_transforms`. Warns of contradictions and of implausible lenses.
+    height). Raises InputError like `read_transforms`. Warns of contradictory keys and of implausible lenses.
     """
     return cameras_of(read_images(path, size), lenses)
 
 
 def read_images(path: Path, size: tuple[int, int] | None = None) -> list[PosedImage]:
-    """Images of a transforms.json, in the order of the file. Pictures need not exist, as for `read_poses`."""
+    """Read the images of a transforms.json, in the order of the file. Pictures need not exist, as for `read_poses`."""
     readers = _readers(path, load_document(path))
-    with warnings.catch_warnings():  # hide warnings of missing pictures, which are not needed
+    with warnings.catch_warnings():  # hide warnings of missing pictures: only their names are needed
         warnings.simplefilter("ignore")
         try:
             files = _pictures(path, readers, None, "skip")
@@ -157,7 +166,7 @@ def read_images(path: Path, size: tuple[int, int] | None = None) -> list[PosedIm
 
 
 def _within(keys: Keys) -> Path:
-    """Path of a picture that may not exist: as listed, or without ".." and drive if it leads out of the folder."""
+    """Return the path of a picture that may not exist: as listed, without ".." and drive if it leaves the folder."""
     listed = keys.text("file_path")
     if not listed.isprintable():
         _inside(keys.path.parent, listed, keys.where)
@@ -173,11 +182,12 @@ def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:
 def _images(
     path: Path, frames: list[tuple[Keys, Path]], missing: Sequence[str] = (), *, size: tuple[int, int] | None = None
 ) -> list[PosedImage]:
-    """Images of frames, with their files.
+    """Return the images of frames.
 
+    frames: values and picture file of each frame.
     missing: names of missing pictures, which the file's split may list.
     size: as for `read_poses`.
-    Warns of contradictions.
+    Warns of contradictory keys.
     """
     images: dict[str, PosedImage] = {}
     in_parts = []
@@ -186,7 +196,7 @@ def _images(
         exact = _find_file(keys)
         name = called(listed, None, file, path.parent)
         if exact == file or not file.is_relative_to(path.parent):
-            name = listed + file.name[len(PurePosixPath(listed).name) :]  # adds the file's extension
+            name = listed + file.name[len(PurePosixPath(listed).name) :]  # add the file's extension
         lens, parts = _lens(keys, file, size)
         in_parts += [name] if parts else []
         rotation, translation, _ = opengl_pose(keys.frame.get("transform_matrix"), keys.where, "'transform_matrix'")
@@ -202,7 +212,7 @@ def _images(
 
 
 def _split(path: Path, readers: list[Keys], images: list[PosedImage], missing: Sequence[str]) -> list[PosedImage]:
-    """Images with nerfstudio's own split, if the file has one."""
+    """Return the images with the split by nerfstudio's keys, such as `train_filenames`; unchanged without such keys."""
     names = [*(image.name for image in images), *missing]
     known = dict(zip(names, names, strict=True))
     known |= {_plain(keys.text("file_path")): image.name for keys, image in zip(readers, images, strict=True)}
@@ -234,7 +244,7 @@ def _warn_of_contradictions(path: Path, readers: list[Keys], images: list[PosedI
         contradictions = []
         for keys, image in zip(readers, images, strict=True):
             used, other = keys.number(focal), keys.get(angle)
-            # compare only if both are the frame's own or both the file's, which is for frames without their own
+            # Compare only values from one place: both from the frame, or both from the file's top level.
             alike = (keys.frame.get(focal) is None) == (keys.frame.get(angle) is None)
             if used and alike and isinstance(other, int | float) and 0 < other < math.pi:
                 size = image.lens.width if axis == "x" else image.lens.height
@@ -269,14 +279,13 @@ def read_blender(folder: Path, *, images: Path | None = None, missing: Missing =
 
 
 def _plain(listed: str) -> str:
-    """Name from a file_path: with forward slashes, and without a leading "./", "../" or "C:/"."""
+    """Return the name in a file_path, with forward slashes and without a leading "./", "../" or "C:/"."""
     text = DRIVE_PREFIX.sub("", posixpath.normpath(listed.replace("\\", "/")))
     return "/".join(part for part in text.split("/") if part not in ("", ".", ".."))
 
 
 def _find_file(keys: Keys) -> Path:
-    """Path of a frame's picture, with the extension added if the file omits it. If no picture exists, the listed
-    path."""
+    """Return the path of a frame's picture, with the extension that the file may omit; the listed path if missing."""
     path = Path(os.path.normpath(keys.path.parent / keys.text("file_path").replace("\\", "/")))
     if is_file(path) or not path.name:
         return path
@@ -288,7 +297,7 @@ def _find_file(keys: Keys) -> Path:
 
 
 def _file_of(keys: Keys, key: str) -> Path | None:
-    """Sidecar file of a frame's picture, if the frame names one."""
+    """Return the mask or depth map of a frame's picture, if the frame names one under `key`."""
     listed = keys.frame.get(key)
     if not isinstance(listed, str) or not listed:
         return None
@@ -297,8 +306,8 @@ def _file_of(keys: Keys, key: str) -> Path | None:
 
 
 def is_inside(folder: Path, listed: str) -> bool:
-    """True if a listed file name stays below the folder of the file that lists it."""
-    root = folder.absolute()  # not resolve: a link in the scene's folder may lead anywhere
+    """Return True if a listed file name stays below the folder of the file that lists it."""
+    root = folder.absolute()  # Links are not resolved: a link in the scene's folder may lead anywhere.
     path = Path(os.path.normpath(root / listed.replace("\\", "/")))
     return listed.isprintable() and path.is_relative_to(os.path.normpath(root))
 
@@ -307,13 +316,16 @@ def _inside(folder: Path, listed: str, where: str) -> None:
     """Raise InputError if a listed file name leads out of the folder of the file that lists it."""
     if not is_inside(folder, listed):
         raise InputError(
-            f"{where}: {short(listed)} is no path inside the scene's folder {folder}; move the file into that folder, "
-            "or put a link there"
+            f"{where}: {short(listed)} is not a path inside the scene's folder {folder}; move the file into that "
+            "folder, or put a link there"
         )
 
 
 def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> tuple[Lens, bool]:
-    """Lens of a frame, and True if it was given in fractions of the picture's size."""
+    """Return the lens of a frame, and True if it was given in fractions of the picture's size.
+
+    size: as for `read_poses`.
+    """
     width, height = keys.number("w"), keys.number("h")
     if width is None or height is None:
         if not file.is_file():
@@ -355,8 +367,7 @@ def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> tuple[Lens, b
 
 
 def _full_size(keys: Keys, file: Path) -> tuple[int, int]:
-    """Size of a frame's picture. For a picture in a downscaled copy of the listed folder, the size before
-    downscaling."""
+    """Return the size of a frame's picture; for a picture in images_2 or the like, the size before downscaling."""
     width, height = image_size(file, orient=False)
     listed = PurePosixPath(_plain(keys.text("file_path"))).parts
     for part in file.parts:
@@ -377,7 +388,7 @@ def _focal(keys: Keys, focal: str, angle: str, size: float) -> float | None:
 
 
 def _distortion(keys: Keys) -> tuple[str, list[float]]:
-    """COLMAP's name of the camera model, and its distortion coefficients."""
+    """Return COLMAP's name of a frame's camera model, and the distortion coefficients."""
     model = keys.get("camera_model") or ""
     k1, k2, k3, k4, k5, k6, p1, p2 = (
         keys.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -388,7 +399,7 @@ def _distortion(keys: Keys) -> tuple[str, list[float]]:
             raise InputError(
                 f"{keys.where}: has 'k5' or 'k6' for a fisheye, expected k1 to k4 only; undistort the pictures first"
             )
-        if p1 or p2:  # the model with tangential terms; if they are 0, it equals OPENCV_FISHEYE
+        if p1 or p2:  # THIN_PRISM_FISHEYE has tangential terms; without them it equals OPENCV_FISHEYE
             return "THIN_PRISM_FISHEYE", [k1, k2, p1, p2, k3, k4, 0.0, 0.0]
         return "OPENCV_FISHEYE", [k1, k2, k3, k4]
     if named is None:
@@ -397,7 +408,7 @@ def _distortion(keys: Keys) -> tuple[str, list[float]]:
     if not any((k1, k2, k3, k4, k5, k6, p1, p2)):
         return "PINHOLE", []
     if k4 and model != "FULL_OPENCV":
-        # k4 is ambiguous: the coefficient of r^8 in nerfstudio, a coefficient of the denominator in OpenCV
+        # k4 is ambiguous: in nerfstudio the coefficient of r^8, in OpenCV a coefficient of the denominator.
         raise InputError(
             f"{keys.where}: 'k4' is {k4} in a perspective camera, expected 0; undistort the pictures first"
         )
@@ -409,9 +420,9 @@ def _distortion(keys: Keys) -> tuple[str, list[float]]:
 def opengl_pose(given: object, where: str, what: str) -> tuple[Float64, Float64, float]:
     """Convert a `world_from_cam` matrix (4, 4) or (3, 4) in OpenGL's axes.
 
-    where, what: place and name of the matrix, for messages.
-    Returns the rotation (3, 3) and translation (3,) of `cam_from_world`, and the scale of the matrix, which is removed
-    from both. Raises InputError for a matrix that is not a pose.
+    where, what: the file with the frame in it, and the matrix's key, for messages.
+    Returns the rotation (3, 3) and translation (3,) of `cam_from_world`, without scale, and the scale of the matrix.
+    Raises InputError for a matrix that is not a pose.
     """
     if given is None:
         raise InputError(f"{where}: has no {what} (the 4 x 4 pose); {EXPORT_AGAIN_ADVICE}")
@@ -448,7 +459,9 @@ def _ngp_box(keys: Keys) -> tuple[Float64, Float64] | None:
         shift = np.broadcast_to(np.array(NGP_OFFSET if offset is None else offset, np.float64), 3)
         factor = float(NGP_SCALE if scale is None else scale)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{keys.where}: 'scale' or 'offset' is invalid, expected one number and three") from None
+        raise InputError(
+            f"{keys.where}: 'scale' is {short(scale)}, 'offset' is {short(offset)}, expected a number and three numbers"
+        ) from None
     if not (1 / MAX_COORDINATE < factor < MAX_COORDINATE and (np.abs(shift) < MAX_COORDINATE).all()):
         raise InputError(f"{keys.where}: 'scale' is {factor}, 'offset' is {shift.tolist()}, expected a scale above 0")
     return (0.5 - side / 2 - shift) / factor, (0.5 + side / 2 - shift) / factor

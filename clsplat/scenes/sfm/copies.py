@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Copies of photographs in a folder: downscaled, undistorted, with another file type or name. One copy is used."""
+"""Detection of duplicate photographs in a folder: downscaled, undistorted, or with another file type or name."""
 
 from __future__ import annotations
 
@@ -34,44 +34,48 @@ Programs with such folders are the 3DGS authors' convert.py, Polycam, OpenSfM (u
 (dense/0/images) and others.
 """
 PLAIN_FOLDER_STAGE, UNDISTORTED_FOLDER_STAGE = 1, 2
-"""Indices in UNDISTORTION_FOLDERS of photographs in other folders, and of undistorted photographs."""
+"""Indices in UNDISTORTION_FOLDERS of photographs in folders with other names, and of undistorted photographs."""
 LOSSLESS_EXTENSIONS = (".png", ".tif", ".tiff", ".bmp")
+"""Extensions of lossless photographs, which are preferred to their lossy copies."""
 COPY_THUMBNAIL_SIZE_PX = (96, 72)
 """Width and height of the thumbnails that are compared."""
 MAX_COMPARED_PIXELS_PER_PIXEL, MIN_COMPARED_WIDTH_PX = 0.5, 24
 """Maximum width of compared thumbnails as a fraction of the narrower picture's width, and minimum width in pixels.
 
-In small pictures, resizing changes the pixels visibly.
+The maximum is needed because resizing visibly changes the pixels of small pictures.
 """
 MAX_COPY_RMS_LEVELS, MAX_COPY_RMS_PER_GRADIENT = 1.0, 0.2
 """Largest RMS difference of two thumbnails of one photograph: in 255ths, or as a multiple of the RMS difference of
-neighbouring pixels.
+neighbouring pixels. The larger limit counts.
 
-A shift of 0.2 thumbnail pixels, 1/480 of the picture's width, reaches the second. JPEG and resizing filters cause less
-in pictures of at least 240 pixels.
+A shift of 0.2 thumbnail pixels, 1/480 of the picture's width, reaches the second limit. JPEG and resizing filters cause
+less in pictures of at least 240 pixels.
 """
 MIN_FOLDER_CORRELATION, CORRELATION_SIDE_PX = 0.9, 24
 """Minimum correlation of the pictures in two related folders, and longer side to which the pictures are reduced for it.
 
-The median of FOLDER_PAIR_SAMPLES pairs is compared. Photographs correlate with their undistorted copies at 0.9995 (fox,
-k1 0.058, k2 -0.081). Six other scenes reach 0.93 or more, with k1 from 0.1 to -0.35 at a focal length of 0.8 of the
-width, cropped to valid pixels. In these scenes, successive photographs correlate at 0.16 to 0.87, and more distant ones
-at 0.45 or less. Successive frames of an almost still video correlate more than a picture and its undistorted copy if
-the distortion is strong. Folders of such frames are mistaken for copies.
+The median of FOLDER_PAIR_SAMPLES pairs counts. In the scene fox (k1 0.058, k2 -0.081), photographs correlate with their
+undistorted copies at 0.9995. In six other scenes, with k1 from 0.1 to -0.35, they do at 0.93 or more. Successive
+photographs of these scenes correlate at 0.16 to 0.87, and photographs farther apart at 0.45 or less.
+
+Frames of an almost still video correlate more than pictures and their copies after strong undistortion. So two folders
+of such frames are mistaken for copies.
 """
 FOLDER_PAIR_SAMPLES = 5
 """Number of pairs of pictures that are decoded to compare two folders."""
 MAX_COPY_ASPECT_RATIO_CHANGE = 1.3
-"""Ratio of two aspect ratios from which the pictures are different. Cropping by undistortion changes it by less."""
+"""Ratio of two aspect ratios from which the pictures are different. Cropping by undistortion changes them by less."""
 FEATURELESS_STD_LEVELS = 8.0
-"""Standard deviation in 255ths below which a picture is featureless and resembles no other."""
+"""Standard deviation in 255ths below which a picture is featureless, and never counts as a copy."""
 ASPECT_RATIO_TOLERANCE = 0.02
 """Relative tolerance between the aspect ratios of one photograph's copies, whose sides are rounded."""
 COMPARED_MIDDLE_BYTES = 4096
 """Number of bytes from the middle of a file that are compared before the whole file."""
 
 _NUMBERED_FOLDER = re.compile(r"(.+?)[_-](\d{1,2})\Z")
+"""Name of a folder of downscaled pictures, such as images_4."""
 Thumb = NDArray[np.uint8]
+"""Grey thumbnail (72, 96) from `thumb_of`."""
 P = TypeVar("P", "_Place", "_Staged")
 
 
@@ -80,7 +84,7 @@ class Decoded(Protocol):
 
     @property
     def name(self) -> str:
-        """Path below the folder."""
+        """Path below the folder of photographs."""
 
     @property
     def width(self) -> int:
@@ -92,7 +96,7 @@ class Decoded(Protocol):
 
     @property
     def lens(self) -> tuple[str, ...]:
-        """Make, model and focal length from EXIF; empty strings for missing ones."""
+        """Make, model and focal length from EXIF; empty strings for missing values."""
 
     @property
     def transparent(self) -> bool:
@@ -105,10 +109,10 @@ class Decoded(Protocol):
 
 @dataclass(frozen=True)
 class Copy:
-    """A photograph that is a copy of another.
+    """A photograph that is left out as a copy of another.
 
     kept: name of the photograph that is used instead.
-    why: how this one differs from it, or the evidence for a copy, such as "smaller" or "same bytes".
+    why: how the copy differs from the used photograph, or how it was recognised, such as "smaller" or "same bytes".
     """
 
     kept: str
@@ -116,13 +120,13 @@ class Copy:
 
 
 def found_by_name(folder: Path, names: Sequence[str]) -> dict[str, Copy]:
-    """Find copies before all photographs are decoded.
+    """Find copies by names and bytes, before all photographs are decoded. Returns the copies by name.
 
     Copies are files with the same bytes, and pictures with the same names in related folders. A sample of these
     pictures is decoded to confirm that they look alike.
 
-    Related folders are folders such as images and images_2, with half the size, and those in UNDISTORTION_FOLDERS, next
-    to each other or nested. The folder with the most pixels is used; among equals, the earliest in
+    Related folders are next to each other or nested. They have names such as images and images_2, with pictures of half
+    the size, or names in UNDISTORTION_FOLDERS. The folder with the most pixels is used; among equals, the earliest in
     UNDISTORTION_FOLDERS.
     """
     copies = _of_same_bytes(folder, names)
@@ -146,11 +150,11 @@ def found_by_name(folder: Path, names: Sequence[str]) -> dict[str, Copy]:
 
 
 def found_by_picture(photos: Sequence[Decoded]) -> dict[str, Copy]:
-    """Find copies among decoded photographs: the same picture with the same name in a sibling folder, or with another
-    file type.
+    """Find copies among decoded photographs by their thumbnails and names. Returns the copies by name.
 
-    The photograph with the most pixels is used. Among equals, one with transparency is preferred, then one with a lens
-    in EXIF, then a lossless file.
+    Copies have the same picture and the same name, in a sibling folder or with another file type. The photograph with
+    the most pixels is used. Among equals, one with transparency is preferred, then one with a lens in EXIF, then a
+    lossless file.
     """
     by_name = {photo.name: photo for photo in photos}
 
@@ -169,12 +173,12 @@ def found_by_picture(photos: Sequence[Decoded]) -> dict[str, Copy]:
 
 
 def to_compare(names: Sequence[str]) -> set[str]:
-    """Photographs whose thumbnails `found_by_picture` compares."""
+    """Return the names of photographs whose thumbnails `found_by_picture` compares."""
     return {place.name for group in _alike(names) for place in group}
 
 
 def thumb_of(pixels: NDArray[Any], alpha: int) -> Thumb:
-    """Grey thumbnail (72, 96) of a picture (H, W, C) of any aspect ratio.
+    """Return the grey thumbnail (72, 96) of a picture (H, W, C) of any aspect ratio.
 
     pixels: unsigned integers, or floats from 0 to 1.
     alpha: index of the alpha channel, -1 for none.
@@ -188,7 +192,7 @@ def thumb_of(pixels: NDArray[Any], alpha: int) -> Thumb:
 
 
 def resolved(copies: dict[str, Copy]) -> dict[str, Copy]:
-    """Copies, each with the photograph that is used in the end. `Copy.kept` in the input may itself be a copy."""
+    """Return copies with the photographs that are used in the end. In the input, `Copy.kept` may itself be a copy."""
 
     def last(name: str) -> str:
         while name in copies:
@@ -199,7 +203,7 @@ def resolved(copies: dict[str, Copy]) -> dict[str, Copy]:
 
 
 def listed(copies: dict[str, Copy]) -> str:
-    """Copies as text for a message: the first ones in the order of names."""
+    """Return copies as text for a message: the first of them in the order of names."""
     return examples(f"{name} is {copy.kept}, {copy.why}" for name, copy in sorted(copies.items()))
 
 
@@ -207,7 +211,7 @@ def listed(copies: dict[str, Copy]) -> str:
 class _Place:
     """A photograph that may have copies.
 
-    folder: the folder in its path that may have another name in the paths of its copies, "" for none.
+    folder: the folder in the photograph's path that may have another name in the paths of copies, "" for none.
     """
 
     name: str
@@ -216,11 +220,11 @@ class _Place:
 
 @dataclass(frozen=True)
 class _Staged:
-    """A photograph, classified by the names of its folders.
+    """A photograph, classified by the names of its folders: UNDISTORTION_FOLDERS, or names such as images_2.
 
-    head: path up to the last classified folder, "" for none.
-    stage: largest index in UNDISTORTION_FOLDERS of the classified folders.
-    factor: factor by which the photograph is downscaled.
+    head: path up to the last folder with such a name, "" for none.
+    stage: largest index in UNDISTORTION_FOLDERS of the folders.
+    factor: factor by which the photograph is downscaled, by the folder's name.
     """
 
     name: str
@@ -230,14 +234,14 @@ class _Staged:
 
     @property
     def kind(self) -> tuple[int, int]:
-        """Stage and factor."""
+        """Stage of undistortion and factor of downscaling, which differ between a photograph and its copies."""
         return self.stage, self.factor
 
 
 class _Pictures:
     """Sizes and thumbnails of the pictures in a folder, read on demand.
 
-    groups: groups of photographs with the same name.
+    groups: groups of photographs with the same name in related folders.
     """
 
     def __init__(self, folder: Path, groups: Sequence[Sequence[_Staged]]) -> None:
@@ -256,7 +260,7 @@ class _Pictures:
                     self._pairs[frozenset((one.head, two.head))].append((one.name, two.name))
 
     def size(self, name: str) -> tuple[int, int]:
-        """Width and height; (0, 0) for a picture that does not decode. `photos.stage_photos` raises the error."""
+        """Return width and height of a picture; (0, 0) if it does not decode, which `photos.stage_photos` reports."""
         if name not in self._sizes:
             try:
                 self._sizes[name] = image_size(self._folder / name)
@@ -265,7 +269,7 @@ class _Pictures:
         return self._sizes[name]
 
     def pixels(self, head: str) -> int:
-        """Number of pixels of the median picture in the folder `head`."""
+        """Return the number of pixels of the median picture in the folder `head`."""
         if head not in self._pixels:
             self._pixels[head] = sorted(math.prod(self.size(name)) for name in self._names[head])[
                 len(self._names[head]) // 2
@@ -273,7 +277,7 @@ class _Pictures:
         return self._pixels[head]
 
     def are_alike(self, one: str, two: str) -> bool:
-        """True if the pictures of two folders are the same, apart from undistortion."""
+        """Return True if the pictures of two folders are the same, apart from undistortion."""
         key = frozenset((one, two))
         if key not in self._alike:
             pairs = self._pairs[key]
@@ -283,7 +287,7 @@ class _Pictures:
         return self._alike[key]
 
     def _likeness(self, one: str, two: str) -> float | None:
-        """Correlation of two pictures, None if one is featureless or does not decode."""
+        """Return the correlation of two pictures, None if one is featureless or does not decode."""
         (width, height), (across, down) = self.size(one), self.size(two)
         thumbs = [thumb for thumb in (self._thumb(one), self._thumb(two)) if thumb is not None]
         if len(thumbs) < 2 or min(width, height, across, down) < 1:
@@ -306,10 +310,10 @@ class _Pictures:
 
 
 def _staged(names: Iterable[str]) -> list[list[_Staged]]:
-    """Groups of photographs with the same stem in the same folders. Classified folders are ignored.
+    """Group photographs with the same stem in the same folders, ignoring folders that `_Staged` classifies.
 
-    Each group has at least two kinds. Folders above a folder of undistorted pictures are also ignored, as another
-    program may have made them.
+    Each group has at least two kinds (`_Staged.kind`). Folders above a folder of undistorted pictures are also ignored,
+    as another program may have made them.
     """
     groups: dict[tuple[Hashable, ...], list[_Staged]] = defaultdict(list)
     for name in names:
@@ -333,13 +337,13 @@ def _staged(names: Iterable[str]) -> list[list[_Staged]]:
 
 
 def _plain_stem(name: str) -> str:
-    """Stem of a picture in lower case, without a second extension: OpenSfM undistorts IMG.JPG to IMG.JPG.jpg."""
+    """Return a picture's stem in lower case, without a second extension: OpenSfM undistorts IMG.JPG to IMG.JPG.jpg."""
     stem = PurePosixPath(PurePosixPath(name).stem.casefold())
     return stem.stem if stem.suffix in IMAGE_SUFFIXES else stem.name
 
 
 def _alike(names: Iterable[str]) -> list[list[_Place]]:
-    """Groups of photographs that may be copies according to their names.
+    """Group photographs that may be copies according to their names.
 
     The photographs of a group have the same stem. They are in one folder, in sibling folders, or in a folder and its
     sub-folder, or in sub-folders of these with the same names.
@@ -358,10 +362,11 @@ def _alike(names: Iterable[str]) -> list[list[_Place]]:
 def _found(
     groups: Iterable[list[P]], rank: Callable[[P], tuple[Hashable, ...]], why: Callable[[P, P], str]
 ) -> dict[str, Copy]:
-    """Find the copies in each group. A photograph is a copy if it matches an earlier one, in the order of `rank`.
+    """Find the copies in each group: photographs that match an earlier one in the order of `rank`.
 
     The earlier photograph may itself be a copy.
-    why: function of the earlier and the later photograph. Returns the evidence for a copy; "" if they differ.
+
+    why: function of the earlier and the later photograph that returns the text for `Copy.why`; "" if they differ.
     """
     copies: dict[str, Copy] = {}
     for group in groups:
@@ -375,8 +380,10 @@ def _found(
 
 
 def _of_same_bytes(folder: Path, names: Sequence[str]) -> dict[str, Copy]:
-    """Files with the same bytes as another file. The file in the earliest of UNDISTORTION_FOLDERS is used; if there are
-    several, the one with the shortest name."""
+    """Find files with the same bytes as another file.
+
+    The file in the earliest of UNDISTORTION_FOLDERS is used; if there are several, the one with the shortest name.
+    """
     alike: dict[tuple[object, ...], list[str]] = {}
     keys: tuple[Callable[[Path], object], ...] = (lambda path: path.stat().st_size, _middle, short_digest)
     groups = [[name for name in names if is_file(folder / name)]]
@@ -401,7 +408,7 @@ def _middle(path: Path) -> bytes:
 
 
 def _stage(folder: str) -> int:
-    """Index in UNDISTORTION_FOLDERS of a folder's name; len(UNDISTORTION_FOLDERS) for any other name."""
+    """Return the index in UNDISTORTION_FOLDERS of a folder's name; len(UNDISTORTION_FOLDERS) for other names."""
     return next(
         (stage for stage, known in enumerate(UNDISTORTION_FOLDERS) if folder.casefold() in known),
         len(UNDISTORTION_FOLDERS),
@@ -409,13 +416,17 @@ def _stage(folder: str) -> int:
 
 
 def _numbered(folder: str) -> tuple[str, int]:
-    """Split images_4 into images and 4. The factor is 1 if the name has none."""
+    """Split a folder's name such as images_4 into "images" and the factor 4. The factor is 1 in a name without one."""
     match = _NUMBERED_FOLDER.match(folder)
     return (match[1], int(match[2])) if match else (folder, 1)
 
 
 def _is_downscaled(factor: int, by: int, whole: tuple[int, int], size: tuple[int, int]) -> bool:
-    """True if two pictures' sizes agree with the factors in the names of their folders."""
+    """Return True if two pictures' sizes agree with the factors in the names of their folders.
+
+    factor, by: factors of the larger and of the smaller picture.
+    whole, size: width and height of the larger and of the smaller picture.
+    """
     return factor < by and all(abs(side * by / factor - long) <= by for side, long in zip(size, whole, strict=True))
 
 

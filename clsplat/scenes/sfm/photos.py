@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding of photographs for structure from motion. They are decoded once, rotated upright, and grouped by camera."""
+"""Photographs for structure from motion: search in a folder, decoding, upright copies, and grouping by camera."""
 
 from __future__ import annotations
 
@@ -28,19 +28,20 @@ from clsplat.scenes.sfm.copies import Thumb, thumb_of, to_compare
 SFM_PHOTO_EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 """Extensions that pycolmap's wheel reads and writes. The wheel's OpenImageIO has no WebP, JPEG 2000 or HEIF."""
 SFM_IMAGE_FORMATS = frozenset({"jpeg", "png", "tiff", "bmp"})
-"""OpenImageIO's names of these formats. They identify a file by its contents, whatever its extension is."""
+"""OpenImageIO's names of the formats that pycolmap's wheel reads. They tell a file's contents despite its extension."""
 UNREADABLE_PHOTO_EXTENSIONS = frozenset(
     {".webp", ".heic", ".heif", ".avif", ".jp2", ".gif", ".exr", ".dng", ".cr2", ".nef", ".arw"}
 )
+"""Extensions of photographs that pycolmap's wheel does not read. A warning asks for conversion."""
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photograph as staged for pycolmap.
+    """A photograph that was decoded and put into the folder that pycolmap reads.
 
     name: path below the folder, with forward slashes.
     width, height: size in pixels of the upright photograph.
-    lens: make, model and focal length from EXIF, empty strings for missing ones.
+    lens: make, model and focal length from EXIF, empty strings for missing values.
     transparent: True if the alpha channel makes any pixel transparent.
     thumb: thumbnail from `copies.thumb_of`, for photographs that may be copies.
     """
@@ -54,7 +55,7 @@ class Photo:
 
 
 def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path], dict[str, list[Path]]]:
-    """Photographs below a folder, sorted by name, and for each reason the files that are left out.
+    """Find the photographs below a folder, sorted by name; and the files that are left out, by reason.
 
     Hidden files and folders are skipped, as is `excluded` (the output, if it is inside). Raises InputError for a folder
     that does not exist, cannot be read, or has no photographs.
@@ -73,7 +74,7 @@ def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path],
             if name.startswith("."):
                 continue
             if extension in SFM_PHOTO_EXTENSIONS and not name.isprintable():
-                raise InputError(f"{here / name}: has a name that a scene cannot list; rename it")
+                raise InputError(f"{here / name}: its name has unprintable characters; rename it")
             if extension in SFM_PHOTO_EXTENSIONS and (here / name).is_symlink() and not (here / name).exists():
                 broken.append(here / name)
             elif extension in SFM_PHOTO_EXTENSIONS:
@@ -82,7 +83,7 @@ def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path],
                 others.append(here / name)
     if not photos:
         kinds = " ".join(sorted(SFM_PHOTO_EXTENSIONS))
-        unusable = f", only {len(others)} of an unsupported kind such as {others[0].name}" if others else ""
+        unusable = f", only {len(others)} in unsupported formats such as {others[0].name}" if others else ""
         unusable += f", only {len(broken)} broken link(s) such as {broken[0].name}" if broken else ""
         raise InputError(f"{folder}: no photos found{unusable}; expected files ending in {kinds}")
     key = partial(photo_name, folder)
@@ -97,13 +98,12 @@ def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path],
 
 
 def photo_name(folder: Path, path: Path) -> str:
-    """Name of a photograph in the scene: its path below the folder, with forward slashes."""
+    """Return the name of a photograph in the scene: its path below the folder, with forward slashes."""
     return path.relative_to(folder).as_posix()
 
 
 def fingerprint(folder: Path, photos: Sequence[Path], settings: str) -> str:
-    """Digest that changes when a photograph is added, removed or rewritten, or a setting changes. It reads no
-    pixels."""
+    """Return a digest of settings and of the photographs' names, sizes and modification times. Reads no pixels."""
     digest = hashlib.sha256(settings.encode())
     for path in photos:
         status = path.stat()
@@ -114,12 +114,11 @@ def fingerprint(folder: Path, photos: Sequence[Path], settings: str) -> str:
 def stage_photos(
     folder: Path, photos: Sequence[Path], target: Path, report: Callable[[float], None], threads: int
 ) -> list[Photo]:
-    """Put every photograph under `target`, upright and with its name. Returns their descriptions.
+    """Put every photograph under `target`, upright and under its name, and decode it once. Returns descriptions.
 
-    pycolmap ignores the EXIF orientation and cannot read some formats. Rotated photographs, and files with contents in
-    such a format, are rewritten. Other files are linked, or copied if the file system cannot link. Every photograph is
-    decoded once, as pycolmap would silently skip a broken one. Raises InputError that names the first photograph that
-    does not decode.
+    pycolmap ignores the EXIF orientation and cannot read some formats. So rotated photographs, and files whose contents
+    have such a format, are rewritten. Other files are linked, or copied if the file system cannot link. pycolmap would
+    silently skip broken photographs. Raises InputError that names the first photograph that does not decode.
     """
     staged: list[Photo] = []
     compared = to_compare([photo_name(folder, path) for path in photos])
@@ -137,12 +136,12 @@ def stage_photos(
 
 def _stage(folder: Path, target: Path, compared: Collection[str], path: Path) -> Photo:
     if not is_file(path):
-        raise InputError(f"{path}: cannot be decoded as an image: is no regular file")
+        raise InputError(f"{path}: cannot be decoded as an image: is not a regular file")
     source = open_image(path)
     try:
         spec, kind = source.spec(), source.format_name()
         pixels = source.read_image(spec.format)
-        # a truncated JPEG still gives pixels, with grey at the end; only the error text tells that it is truncated
+        # A truncated JPEG still gives pixels, with grey at the end. Only the error text tells that it is truncated.
         trouble = error_of(source)
     finally:
         source.close()
@@ -173,7 +172,7 @@ def _stage(folder: Path, target: Path, compared: Collection[str], path: Path) ->
 
 
 def _is_transparent(pixels: NDArray[Any], alpha_channel: int) -> bool:
-    """True if a picture (H, W, C) is not opaque everywhere. alpha_channel: its index, -1 for none."""
+    """Return True if a picture (H, W, C) is not opaque everywhere. alpha_channel: index of alpha, -1 for none."""
     if alpha_channel < 0:
         return False
     opaque = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
@@ -181,15 +180,17 @@ def _is_transparent(pixels: NDArray[Any], alpha_channel: int) -> bool:
 
 
 def has_alpha(path: Path) -> bool:
-    """True if an image file has an alpha channel. Reads only its header."""
+    """Return True if an image file has an alpha channel. Reads only the file's header."""
     with opened(path) as source:
         return source is not None and alpha_of(source.spec()) >= 0
 
 
 def _write_upright(path: Path, copy: Path, spec: Any) -> None:
-    """Write a photograph upright, in the format of its extension.
+    """Write an upright copy of a photograph, in the format of the copy's extension.
 
     EXIF is kept for the focal length, but its orientation is set to upright.
+
+    spec: OpenImageIO's specification of the photograph.
     """
     upright = oiio.ImageBufAlgo.reorient(oiio.ImageBuf(native_name(path)))
     upright.specmod().attribute("Orientation", 1)
@@ -208,7 +209,7 @@ def _last_line(text: str) -> str:
 
 
 def camera_groups(photos: Sequence[Photo], shared_camera: bool | str) -> list[list[str]]:
-    """Groups of the photographs' names, one group per camera, with names in order. A group shares its intrinsics.
+    """Group the photographs' names by camera. The photographs of a group share their intrinsics.
 
     shared_camera: True groups all photographs of the same size. "auto" also requires the same make, model and focal
         length in EXIF. False gives each photograph its own camera.

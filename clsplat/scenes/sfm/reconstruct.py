@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Structure from motion with pycolmap on the CPU: makes a COLMAP scene with pinhole cameras from photographs."""
+"""Structure from motion with pycolmap on the CPU (`reconstruct`): a COLMAP scene with pinhole cameras from photos."""
 
 from __future__ import annotations
 
@@ -39,11 +39,14 @@ MAX_EXHAUSTIVE_PHOTOS = 100
 The number of pairs grows with the square of the number of photographs, and a CPU matches about 50 pairs per second.
 """
 MIN_SFM_PHOTOS = 3
+"""Minimum number of photographs of a reconstruction."""
 SFM_CAMERA_MODELS = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL",
                  "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")  # fmt: skip
+"""Choices of `SfmSettings.camera_model`."""
 
-PLACED_CAMERAS_UNIT = "cameras stand"
-# each stage has a text for the user, and a table of the database that gets a row for each photograph or pair
+PLACED_CAMERAS_UNIT = "cameras placed"
+"""Unit of the progress of placing cameras, as in "12 of 25 cameras placed"."""
+# Each stage has a text for the user, and a table of the database that gets a row for each photograph or pair.
 _PROGRESS_BY_STAGE = {
     "features": ("finding features", "keypoints"),
     "matches": ("matching photos", "two_view_geometries"),
@@ -82,7 +85,7 @@ class SfmSettings:
             raise InputError(f"camera model {self.camera_model!r}: expected one of {', '.join(SFM_CAMERA_MODELS)}")
 
     def __str__(self) -> str:
-        """The values in one line, for the fingerprint of a result."""
+        """Return the values in one line, for the fingerprint of a result."""
         lens = f"{self.camera_model} {self.shared_camera}"
         return f"{self.matching} {lens} {self.max_image_size} {self.max_features} {self.seed}"
 
@@ -100,16 +103,16 @@ def reconstruct(
     masks: MaskUse | None = None,
     progress: Progress | None = None,
 ) -> Path:
-    """Recover the cameras of the photographs under `images`, and write a COLMAP scene to `output`, which is returned.
+    """Recover the cameras of the photographs under `images`, and write a COLMAP scene to `output`. Returns `output`.
 
     The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points) and `sfm.json`. The
     folder is created when all files are complete. An existing result for the same photographs and settings is reused.
 
     threads: all cores if None.
     overwrite: replace a result of other photographs.
-    masks: use of masks and alpha. No features are found in masked pixels. The output gets the masks too, as
-        `masks/IMAGE.jpg.png`, white for pixels that count.
-    progress: function that is called with a text and a fraction or None in every stage.
+    masks: use of masks and alpha. No features are found in masked pixels. The masks are written to the output too, as
+        `masks/IMAGE.jpg.png`, with white for pixels that count.
+    progress: function that is called in every stage, with a text and a fraction or None.
 
     Of several copies of a photograph, one is used (`clsplat.scenes.sfm.copies`).
 
@@ -135,7 +138,7 @@ def reconstruct(
 
     workers = threads or os.cpu_count() or 1
     output.parent.mkdir(parents=True, exist_ok=True)
-    # it is in the output's parent folder, so that the last step is a rename within one file system
+    # Work in the output's parent folder, so that the last step is a rename within one file system.
     work = Path(tempfile.mkdtemp(prefix=f".{output.name}-sfm-", dir=output.parent))
     try:
         photos = _staged_photos(images, paths, copies, work / "photos", report, workers)
@@ -152,7 +155,10 @@ def reconstruct(
 
 
 def _described(masks: MaskUse | None, shapes: dict[str, Path]) -> str:
-    """Text about the masks for the fingerprint: their use, and size and time of each file."""
+    """Return the masks as text for the fingerprint: their use, and size and modification time of each mask file.
+
+    shapes: mask files by photograph.
+    """
     if masks is None:
         return ""
     stats = [(name, path.stat()) for name, path in sorted(shapes.items())]
@@ -164,7 +170,7 @@ def _staged_photos(
 ) -> list[sfm_photos.Photo]:
     """Put the photographs under `target`. Returns the photographs that are not copies, and warns of copies.
 
-    copies: the copies found so far, from names. The keys are their names.
+    copies: by name, the copies that were found by their names.
     Raises InputError if too few photographs remain.
     """
     photos = sfm_photos.stage_photos(
@@ -174,7 +180,7 @@ def _staged_photos(
     photos = [photo for photo in photos if photo.name not in copies]
     if copies:
         count = "1 photograph is a copy of another" if len(copies) == 1 else f"{len(copies):,} photographs are copies"
-        again = f"{count} and left out ({sfm_copies.listed(copies)}); to use copies, give only their folder"
+        again = f"{count} and left out ({sfm_copies.listed(copies)}); to use the copies instead, give only their folder"
         warn(f"{images}: {again}")
     _require_enough(images, len(photos))
     return photos
@@ -183,7 +189,10 @@ def _staged_photos(
 def _staged_masks(
     photos: list[sfm_photos.Photo], shapes: dict[str, Path], masks: MaskUse | None, work: Path
 ) -> list[str]:
-    """Write the masks of the photographs under `work`. Returns the names of the photographs that have one."""
+    """Write the masks of the photographs under `work`. Returns the names of the photographs with a mask.
+
+    shapes: mask files by photograph. A photograph's alpha may be a mask too.
+    """
     if masks is None:
         return []
     masked = []
@@ -200,7 +209,7 @@ def _staged_masks(
 def sfm_task(
     settings: SfmSettings, photos: list[sfm_photos.Photo], masked: list[str], work: Path, threads: int
 ) -> dict[str, Any]:
-    """Task of the worker, as JSON. See `clsplat.scenes.sfm.worker.Worker`."""
+    """Return the task for the worker process (`clsplat.scenes.sfm.worker.Worker`), as values for JSON."""
     many = len(photos) > MAX_EXHAUSTIVE_PHOTOS
     return {
         "masks": masked,
@@ -227,7 +236,7 @@ def _write_record(folder: Path, fingerprint: str, photos: list[sfm_photos.Photo]
 def _warn_of_losses(
     images: Path, photos: list[sfm_photos.Photo], registered: list[str], result: Path, masks: MaskUse | None
 ) -> None:
-    """Warn of photographs without a pose, and of those that lost their alpha.
+    """Warn of photographs without a pose, and of transparent photographs that lost their alpha.
 
     registered: names of the photographs with a pose.
     result: folder of the undistorted photographs.
@@ -254,8 +263,10 @@ def _require_enough(images: Path, count: int) -> None:
 
 
 def _masks(images: Path, paths: list[Path], use: MaskUse | None) -> dict[str, Path]:
-    """Mask for each photograph's name. Raises InputError if masks are requested but missing, or if a mask fits no
-    photograph."""
+    """Find the masks of the photographs, by the photographs' names.
+
+    Raises InputError if masks are requested but missing, or if a mask fits no photograph.
+    """
     if use is None or use.masks == "none":
         return {}
     photos = [_FoundPhoto(sfm_photos.photo_name(images, path), path) for path in paths]
@@ -269,17 +280,19 @@ def _masks(images: Path, paths: list[Path], use: MaskUse | None) -> dict[str, Pa
 
 
 def _without_their_alpha(photos: list[sfm_photos.Photo], registered: list[str], result: Path) -> list[str]:
-    """Names of photographs with transparency that have no alpha after undistortion.
+    """Return the names of transparent photographs that have no alpha after undistortion.
 
-    pycolmap keeps alpha only if the lens model has no distortion: it then copies the file.
+    pycolmap keeps alpha only if the lens model has no distortion, because it then copies the file.
     """
     transparent = {photo.name for photo in photos if photo.transparent}
     return [name for name in registered if name in transparent and not sfm_photos.has_alpha(result / name)]
 
 
 def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: bool) -> bool:
-    """True if the output is a complete result of the same photographs and settings. Raises InputError for another
-    output that must not be replaced."""
+    """Return True if the output is a complete result of the same photographs and settings.
+
+    Raises InputError for any other output that must not be replaced.
+    """
     if not output.exists():
         return False
     if not output.is_dir():
@@ -311,14 +324,14 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
 
 
 def _sizes(result: Path) -> dict[str, int]:
-    """Size in bytes of each file of a result. The keys are paths relative to the result."""
+    """Return the size in bytes of each file of a result. The keys are paths relative to the result."""
     folders = (result / "images", result / "sparse", result / "masks")
     paths = (path for folder in folders for path in folder.rglob("*"))
     return {path.relative_to(result).as_posix(): path.stat().st_size for path in sorted(paths) if is_file(path)}
 
 
 def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str, Any]:
-    """Run `clsplat.scenes.sfm.worker` to its end. Returns its answer, {"result"} or {"failure"}.
+    """Run `clsplat.scenes.sfm.worker` to its end. Returns the worker's answer, {"result"} or {"failure"}.
 
     Raises ClsplatError if the worker ends without an answer.
     """
@@ -357,14 +370,14 @@ def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str,
 
 
 def _follow(lines: IO[str], database: Path, report: Progress) -> dict[str, Any]:
-    """Report the worker's stages until its answer, which is returned; {} if the worker ends without an answer."""
+    """Report the worker's progress until it answers. Returns the answer, {} if the worker ends without one."""
     inbox: queue.Queue[str | None] = queue.Queue()
 
     def read() -> None:
         try:
             for line in lines:
                 inbox.put(line)
-        except ValueError:  # closed because the caller was interrupted
+        except ValueError:  # the stream is closed, because the caller was interrupted
             pass
         inbox.put(None)
 
@@ -393,7 +406,7 @@ def _follow(lines: IO[str], database: Path, report: Progress) -> dict[str, Any]:
 
 
 def _rows(database: Path, table: str) -> int:
-    """Number of rows in a table that the worker fills; 0 while it cannot be read."""
+    """Return the number of rows in a table that the worker fills; 0 while the table cannot be read."""
     try:
         name = f"{database.resolve().as_uri()}?mode=ro"
         with contextlib.closing(sqlite3.connect(name, uri=True, timeout=0.1)) as connection:
@@ -411,5 +424,5 @@ def _no_model(images: Path, count: int, evidence: dict[str, int]) -> str:
 
 
 def _listed(names: list[str]) -> str:
-    """Text such as 3 photo(s) (a.jpg, b.jpg, c.jpg), shortened if there are many."""
+    """Return text such as "3 photo(s) (a.jpg, b.jpg, c.jpg)", shortened if there are many names."""
     return f"{len(names):,} photo(s) ({examples(names)})"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Worker process for pycolmap, started by `clsplat.scenes.sfm.reconstruct` as `python -m clsplat.scenes.sfm.worker`.
+"""Worker process that runs structure from motion with pycolmap, started by `clsplat.scenes.sfm.reconstruct`.
 
 A separate process is needed for three reasons. pycolmap's long calls ignore Ctrl-C, its log goes to the standard error
 of the process, and a crash in native code must not end the caller.
@@ -26,21 +26,23 @@ from typing import Any, TextIO
 import pycolmap
 
 MAX_SINGLE_THREAD_PHOTOS = 80
-"""Number of photographs up to which mapping runs on one thread. Its result is then reproducible, at little cost."""
+"""Number of photographs up to which mapping runs on one thread, so that its result is reproducible, at little cost."""
 MIN_OPENCV_PHOTOS = 20
 """Minimum number of photographs of one camera for fitting the eight parameters of OPENCV.
 
 On a phone's distorted photographs OPENCV has a reprojection error of 0.477 px, and SIMPLE_RADIAL one of 0.493 px.
 """
 SEQUENTIAL_OVERLAP = 12
-"""Number of neighbours on each side that sequential matching pairs with a photograph, besides those at distance 2^n."""
+"""Number of photographs before and after a photograph that sequential matching pairs with it. It also pairs photographs
+that are 2^n apart."""
 
 
 class Worker:
-    """One reconstruction. `run` calls the methods for its stages in order.
+    """One reconstruction from photographs. `run` calls the methods for its stages in order.
 
     task: see `sfm.reconstruct.sfm_task`. "photos" and "work" are folders. Each of "groups" lists the names of the
         photographs of one camera.
+    channel: stream for the answers to the parent.
     """
 
     def __init__(self, task: dict[str, Any], channel: TextIO) -> None:
@@ -59,12 +61,12 @@ class Worker:
         self.match()
         models = self.map(relaxed=False)
         if max((model.num_reg_images() for model in models.values()), default=0) < 0.6 * self.count:
-            # The baseline may be weak, or features few: try again with a smaller angle of the initial pair.
+            # The cameras may be close together, or features few: try again with a smaller angle of the initial pair.
             models |= self.map(relaxed=True)
         if not models:
             self.say(failure=self.evidence())
             return
-        best = max(models, key=lambda path: models[path].num_reg_images())  # mapping does not sort its models by size
+        best = max(models, key=lambda path: models[path].num_reg_images())  # models are not sorted by size
         self.undistort(best)
         model = models[best]
         registered = sorted(model.images[image_id].name for image_id in model.reg_image_ids())
@@ -109,7 +111,7 @@ class Worker:
             )
 
     def match(self) -> None:
-        """Match all pairs, or neighbours in the order of names, and verify the matches by epipolar geometry."""
+        """Match features of all pairs, or of neighbours in the order of names, and verify them by epipolar geometry."""
         options = pycolmap.FeatureMatchingOptions()
         options.use_gpu = False
         options.num_threads = self.task["threads"]
@@ -131,7 +133,10 @@ class Worker:
         )
 
     def map(self, *, relaxed: bool) -> dict[Path, pycolmap.Reconstruction]:
-        """Recover camera poses and points by incremental mapping. Returns all models. The keys are their folders."""
+        """Recover camera poses and points by incremental mapping. Returns all models, by their folders.
+
+        relaxed: accept smaller angles and fewer matches.
+        """
         self.say(stage="cameras again" if relaxed else "cameras", total=self.count)
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = 1 if self.count <= MAX_SINGLE_THREAD_PHOTOS else self.task["threads"]
@@ -183,7 +188,7 @@ class Worker:
         self.undistort_masks(model, result / "masks")
 
     def undistort_masks(self, model: Path, result: Path) -> None:
-        """Resample the masks of the registered photographs like the photographs. The mask of NAME is NAME.png."""
+        """Undistort the masks of the registered photographs like the photographs. The mask of NAME is NAME.png."""
         placed = pycolmap.Reconstruction(model)
         named = {placed.images[image].name: placed.images[image] for image in placed.reg_image_ids()}
         for name in set(self.task["masks"]) & named.keys():
@@ -195,7 +200,7 @@ class Worker:
             flat.write(path)
 
     def evidence(self) -> dict[str, Any]:
-        """Counts of features and matches, for the message about a failed reconstruction."""
+        """Return counts of features and matches, for the message about a failed reconstruction."""
         with sqlite3.connect(self.database) as connection:
             features = [row[0] for row in connection.execute("SELECT rows FROM keypoints")]
             matches = [row[0] for row in connection.execute("SELECT rows FROM two_view_geometries")]
@@ -208,7 +213,7 @@ class Worker:
 
 
 def as_pinhole(folder: Path) -> None:
-    """Rewrite SIMPLE_PINHOLE cameras as PINHOLE, the model of all others. Undistortion keeps SIMPLE_PINHOLE."""
+    """Rewrite a model's SIMPLE_PINHOLE cameras, which undistortion keeps, as PINHOLE like all other cameras."""
     model = pycolmap.Reconstruction(folder)
     simple = [camera for camera in model.cameras.values() if camera.model_name == "SIMPLE_PINHOLE"]
     for camera in simple:
@@ -220,7 +225,7 @@ def as_pinhole(folder: Path) -> None:
 
 
 def renumber_by_name(database: Path) -> None:
-    """Number images, frames, cameras and rigs in the order of the images' names.
+    """Renumber the database's images, frames, cameras and rigs in the order of the images' names.
 
     Several threads process photographs and number them as they finish, in varying order. The numbers decide the order
     of all later work, and thus the last bits of the result.
@@ -248,7 +253,7 @@ def renumber_by_name(database: Path) -> None:
             ("rigs", "rig_id", rigs),
             ("frames", "rig_id", rigs),
         ):
-            # renumbered in two steps, via unused numbers, as the values of these columns must be unique
+            # Renumber in two steps, by way of unused numbers, as the values of these columns must be unique.
             far = 1 << 30
             connection.executemany(
                 f"UPDATE {table} SET {column} = ? WHERE {column} = ?",  # noqa: S608 - names from the list above
@@ -259,7 +264,7 @@ def renumber_by_name(database: Path) -> None:
 
 
 def _ranks(numbers: Sequence[int]) -> dict[int, int]:
-    """Rank of each number, from 1, in the order of first occurrence."""
+    """Return the rank of each number, from 1, in the order of first occurrence."""
     return {number: place for place, number in enumerate(dict.fromkeys(numbers), start=1)}
 
 
@@ -269,8 +274,8 @@ def _end_with_parent(stream: TextIO) -> None:
 
 
 def main() -> None:
-    """Read the task, run it, and send the answer."""
-    # native code prints to standard output, which must not mix with the answers
+    """Read the task from standard input, run it, and send the answer to standard output."""
+    # Native code prints to standard output, too. Send its output to standard error, so that it is not mixed in.
     channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     task = json.loads(sys.stdin.readline())
@@ -278,7 +283,7 @@ def main() -> None:
     pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value
     Worker(task, channel).run()
     channel.flush()
-    # Skip the teardown of native threads. The answer is sent, and the parent removes the folder.
+    # Skip the teardown of native threads: the answer is sent, and the parent process removes the folder.
     os._exit(0)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Initial Gaussians: one per point, isotropic, with a size according to the distance to the point's neighbours."""
+"""Initial Gaussians of a training: one per point, isotropic, as large as the distance to neighbouring points."""
 
 from __future__ import annotations
 
@@ -18,23 +18,27 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
 
 INITIAL_OPACITY = 0.1
+"""Opacity of every initial Gaussian."""
 MIN_SQUARED_DISTANCE = 1e-7
-"""Lower bound of the mean squared distance, in world units squared. It gives coincident points a size.
+"""Lower bound of a point's mean squared distance to its neighbours, in world units squared. It gives coincident points
+a size.
 
 This is the 3DGS authors' bound, for scenes whose length unit is within ORDINARY_UNITS. In other scenes it is scaled by
-the squared ratio of the unit to the nearer end of that range.
+the squared ratio of the length unit to the nearer end of that range.
 """
 ORDINARY_UNITS = (1.0, 100.0)
+"""Least and largest length unit, in world units, for which MIN_SQUARED_DISTANCE is not scaled."""
 MIN_START_COLOUR = 1 / 512
 """Smallest initial value of a colour channel: half a step of an 8-bit image.
 
 A channel that starts at 0 is at the colour clamp, where it has no gradient. Rounding may then keep it at 0.
 """
 SCALE_NEIGHBOURS = 3
+"""Number of nearest points whose distances give a Gaussian its size."""
 
 
 def from_scene(scene: Scene, random_count: int, rng: np.random.Generator) -> Gaussians:
-    """Gaussians of SH degree 0 at the scene's points, or at `random_count` random points if the scene has no points."""
+    """Create Gaussians of SH degree 0 at the scene's points, or at `random_count` random points if it has no points."""
     points: NDArray[Any] = scene.points
     colors: NDArray[Any] = scene.point_colors
     if len(points) == 0:
@@ -50,7 +54,7 @@ def from_points(
     length_unit: float = 1.0,
     near: float = DEFAULT_NEAR_PLANE,
 ) -> Gaussians:
-    """One Gaussian per point.
+    """Create one Gaussian per point.
 
     points: (N, 3), in world units.
     colors: (N, 3) in [0, 1].
@@ -59,7 +63,7 @@ def from_points(
     near: the model's near plane.
 
     The standard deviation is the root of the mean squared distance to the three nearest other points, or to all if
-    there are fewer. A lone point gets the lower bound. The opacity is 0.1, the quaternion 1 0 0 0.
+    there are fewer. It has a lower bound (`squared_floor`). The opacity is 0.1, the quaternion 1 0 0 0.
     Raises InputError for no points or points that are not finite, ValueError for wrong shapes.
     """
     xyz = np.asarray(points, np.float64)
@@ -70,7 +74,8 @@ def from_points(
     if count == 0:
         raise InputError("no points to start from, expected at least one")
     if not np.isfinite(xyz).all():
-        raise InputError(f"point {int(np.argmin(np.isfinite(xyz).all(axis=1)))} is not finite")
+        row = int(np.argmin(np.isfinite(xyz).all(axis=1)))
+        raise InputError(f"point {row} has the position {xyz[row].tolist()}, expected finite coordinates")
 
     origin = np.zeros(3) if origin is None else origin
     log_scales = 0.5 * np.log(np.maximum(mean_squared_distance(xyz), squared_floor(length_unit)))
@@ -89,13 +94,13 @@ def from_points(
 
 
 def squared_floor(length_unit: float) -> float:
-    """Lower bound, in world units squared, of the mean squared distance of a scene's points."""
+    """Return the lower bound, in world units squared, of points' mean squared distances in a scene."""
     low, high = ORDINARY_UNITS
     return MIN_SQUARED_DISTANCE * (length_unit / min(max(length_unit, low), high)) ** 2
 
 
 def mean_squared_distance(points: Float64) -> Float64:
-    """Mean squared distance (N,) of points (N, 3) to their three nearest neighbours; 0 for a lone point.
+    """Return the mean squared distance (N,) of points (N, 3) to their three nearest neighbours; 0 for a single point.
 
     Coincident points are neighbours at distance 0, as in the authors' code.
     """
@@ -105,15 +110,16 @@ def mean_squared_distance(points: Float64) -> Float64:
     if neighbours == 0:
         return np.zeros(len(points))
     distances, _ = cKDTree(points).query(points, k=neighbours + 1)
-    # Distances are sorted, so the first one is 0: that of the point itself or of a coincident point.
+    # Distances are sorted, so the first is 0, the distance of the point to itself or to a coincident point.
     return np.asarray(np.mean(np.square(distances[:, 1:]), axis=1))
 
 
 def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Generator) -> tuple[Float64, Float64]:
-    """Uniformly random points in a box, and their colours, for a scene without points.
+    """Return uniformly random points (count, 3) in a box, and their colours (count, 3), for a scene without points.
+
+    The colours are grey with a little noise, as in the 3DGS authors' code.
 
     low, high: (3,), corners of the box in world units.
-    Returns points (count, 3) and colours (count, 3). As in the authors' code, these are grey with a little noise.
     """
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     points = low + rng.random((count, 3)) * (high - low)

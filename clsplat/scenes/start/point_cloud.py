@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points from which training starts: clouds, the sky's points, and the colours of both.
+"""Points from which training starts: point clouds (--points), points on the sky (--sky), and the colours of both.
 
 Clouds are checked against the cameras and thinned to one point per voxel. Sky points lie on a sphere around the scene,
 where photographs show the sky. Points without colours take the median colour of the photographs that show them.
@@ -31,41 +31,46 @@ MAX_CHECKED_CLOUD_POINTS = 20_000
 MIN_CLOUD_POINTS_IN_VIEW = 0.05
 """Minimum fraction of a cloud's points that the training photographs show."""
 MAX_CLOUD_DEPTH_RATIO = 30.0
-"""Largest factor by which the distances of the cloud and of the scene's points from the cameras that see them may
-differ."""
+"""Largest factor between the cloud's and the scene's points in their median distance from the cameras that see them."""
 MAX_CLOUD_DISTANCE_EXTENTS = 1000.0
 """Maximum distance of a cloud from the cameras, in scene extents. It applies if the scene has no points."""
 VOXEL_SIZE_TOLERANCE = 0.02
-"""Relative amount by which the voxel size may exceed the smallest sufficient size."""
+"""Relative amount by which the voxel size of a thinned cloud may exceed the smallest sufficient size."""
 MAX_VOXELS_PER_SIDE = 1 << 20
 """Maximum number of voxels along the longest side of the box, so that three indices fit in 64 bits."""
 SKY_IMAGE_SIDE_PX = 400
-"""Longer side in pixels to which larger photographs are reduced. A sky point covers several pixels of the full size."""
+"""Longer side in pixels to which larger photographs are reduced to find the sky. A sky point covers several pixels of
+the full size."""
 SKY_RADIUS_QUANTILE = 0.95
-"""Quantile of the distances of the scene's points that counts as the farthest distance."""
+"""Quantile of the distances of the scene's points that counts as the farthest distance, and scales the sky sphere."""
 SKY_OVERSAMPLING = 4
 """Number of candidate directions on the half sphere, per requested point."""
 SKYLINE_COLUMNS = 24
-"""Number of column strips of a photograph. In each, the sky is above all points."""
+"""Number of column strips of a photograph. In each strip, the sky is above all points."""
 MIN_SKY_VOTE_FRACTION = 0.5
 """A direction is sky if at least this fraction of the photographs that show it have sky there."""
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5.0))
+"""Angle in radians between successive points of a spiral that covers a sphere evenly."""
 COLOUR_VIEWS_PER_POINT = 15
 """Number of nearest photographs that give a point its colour.
 
-In distant photographs the colour of a point is mixed with its surroundings. With fewer photographs than this number, a
-photograph with something else in front of the point would have too much weight.
+In photographs farther away, the colour of a point is mixed with its surroundings. With fewer photographs, one with
+something else in front of the point would have too much weight.
 """
 OCCLUSION_DEPTH_RATIO = 1.05
 """Ratio of a point's depth to that of the nearest point in its cell, above which the point counts as occluded."""
 HIDDEN_POINT_RANK = 1e30
-"""An occluded point's rank is this times its relative depth. It thus exceeds the rank of any visible point."""
+"""Factor of the ranks of occluded points, by which they exceed the ranks of all visible points.
+
+The photographs with the lowest ranks give a point its colour. Where the point is visible, its rank is depth / focal
+length. Where it is occluded, its rank is this factor times its depth relative to the nearest point.
+"""
 UNSEEN_GREY = UNCOLOURED_GREY
 """Grey value of points that no photograph shows."""
 
 
 def with_points(scene: Scene, start: StartPoints) -> Scene:
-    """Copy of the scene with the points from which training starts; `scene` itself if it already has them.
+    """Return a copy of the scene with the points from which training starts; `scene` itself if it already has them.
 
     Raises InputError for a file that cannot be read, and for a cloud that is not where the cameras look.
     """
@@ -99,9 +104,10 @@ def with_points(scene: Scene, start: StartPoints) -> Scene:
 
 
 def with_cloud_beside(scene: Scene) -> Scene:
-    """Copy of a scene without points, with the points of a cloud from its folder if one lies where its cameras look.
+    """Give a scene without points the points of a cloud in its folder. Returns a copy of the scene.
 
-    The first such cloud is used. Warns of the cloud that is used, and of clouds that cannot be read or lie elsewhere.
+    The first cloud that lies where the scene's cameras look is used. Warns of this cloud, and of clouds that cannot be
+    read or lie elsewhere.
     """
     for index, path in enumerate(scene.clouds):
         try:
@@ -110,16 +116,16 @@ def with_cloud_beside(scene: Scene) -> Scene:
         except InputError as error:
             warn(f"{error}; it is not used")
             continue
-        warn(f"{path}: its {len(cloud.points):,} points are used, as the scene names no points")
+        warn(f"{path}: its {len(cloud.points):,} points are used, as the scene itself has no points")
         colors = np.full(cloud.points.shape, UNSEEN_GREY, np.float32) if cloud.colors is None else cloud.colors
         return replace(scene, points=cloud.points, point_colors=colors, clouds=scene.clouds[index + 1 :])
     return replace(scene, clouds=()) if scene.clouds else scene
 
 
 def without_stray_points(points: Float64, scene: Scene, where: object) -> NDArray[np.bool_]:
-    """Mark the points (N, 3) that are not outliers, as compared with all points and the scene's cameras. Returns (N,).
+    """Return a mask (N,) of the points (N, 3) that are no outliers, compared with all points and the scene's cameras.
 
-    where: origin of the points, for the warning about outliers.
+    where: the file or scene that the points are from, for the warning about outliers.
     """
     middle, spread, _ = scene.spread
     kept = ~strays(points, MAX_OUTLIER_POINT_FRACTION, spread, middle)
@@ -127,15 +133,17 @@ def without_stray_points(points: Float64, scene: Scene, where: object) -> NDArra
         far = points[~kept]
         first = " ".join(f"{value:.4g}" for value in far[0])
         warn(
-            f"{where}: {len(far):,} of {len(points):,} points lie over {OUTLIER_DISTANCE_RATIO:g} times as far off "
+            f"{where}: {len(far):,} of {len(points):,} points lie over {OUTLIER_DISTANCE_RATIO:g} times as far away "
             f"as the others, such as the point {first}; they are left out"
         )
     return kept
 
 
 def check_place(points: Float64, scene: Scene, path: Path) -> None:
-    """Raise InputError for a cloud (N, 3) that the training photographs do not show, or that is much nearer to the
-    cameras or farther away than the scene's points."""
+    """Raise InputError for a cloud (N, 3) outside the training photographs, or far nearer or farther than the scene's.
+
+    The distances of the cloud and of the scene's points are compared, from the cameras that see them.
+    """
     sample = _spread(points)
     seen, depths = _seen(sample, scene)
     advice = "expected points with the axes, scale and origin of the scene's cameras"
@@ -160,8 +168,7 @@ def _spread(points: Float64) -> Float64:
 
 
 def _seen(points: Float64, scene: Scene) -> tuple[int, float]:
-    """The number of points that at least one training photograph shows, and their median distance from the cameras that
-    see them."""
+    """Return how many points training photographs show, and their median distance from the cameras that see them."""
     anywhere = np.zeros(len(points), np.bool_)
     distances: list[Float64] = []
     for view in scene.train_views:
@@ -177,14 +184,14 @@ def _centres(scene: Scene) -> Float64:
 
 
 def _where(points: Float64) -> str:
-    """Text such as "about 1 2 3 within 4"."""
+    """Return the median position of points and their median distance from it, as text: "about 1 2 3 within 4"."""
     middle = np.median(points, axis=0)
     place = " ".join(f"{value:.4g}" for value in middle)
     return f"about {place} within {np.median(np.linalg.norm(points - middle, axis=1)):.3g}"
 
 
 def thinned(cloud: Cloud, limit: int) -> Cloud:
-    """Reduce a cloud to at most `limit` points: for each occupied voxel, the mean position and colour.
+    """Reduce a cloud to at most `limit` points: the mean position and colour of each occupied voxel.
 
     The voxel size is the smallest sufficient one, within VOXEL_SIZE_TOLERANCE. A cloud within the limit is unchanged.
     """
@@ -210,23 +217,24 @@ def thinned(cloud: Cloud, limit: int) -> Cloud:
 
 
 def _cells(points: Float64, low: Float64, voxel: float) -> NDArray[np.int64]:
-    """Index (N,) of each point's voxel among the occupied voxels."""
+    """Return the index (N,) of each point's voxel among the occupied voxels."""
     at = np.floor((points - low) / voxel).astype(np.int64)
     _, cells = np.unique((at[:, 0] << 42) | (at[:, 1] << 21) | at[:, 2], return_inverse=True)
     return np.asarray(cells.reshape(-1), np.int64)
 
 
 def _means(values: NDArray[Any], cells: NDArray[np.int64]) -> Float64:
-    """Mean per voxel, (voxels, 3), of values (N, 3). They are summed in the order of the file."""
+    """Return the mean per voxel, (voxels, 3), of values (N, 3), summed in their order."""
     counts = np.bincount(cells)
     return np.stack([np.bincount(cells, values[:, axis]) / counts for axis in range(3)], axis=1)
 
 
 def sky_points(scene: Scene, count: int) -> tuple[Float64, Float32]:
-    """At most `count` points (N, 3) on the sky sphere in the world, and their mean colours (N, 3) in the photographs.
+    """Return at most `count` points (N, 3) on a sphere around the scene, where it shows sky, and their colours (N, 3).
 
     A direction above the horizon is sky if, in most photographs that show it, no scene point lies above it in its
-    column strip.
+    column strip. Colours are means over the photographs.
+
     Raises InputError if there is no such direction, no common up direction, or no points in the scene.
     """
     if len(scene.points) == 0:
@@ -268,7 +276,7 @@ def sky_points(scene: Scene, count: int) -> tuple[Float64, Float32]:
 
 
 def half_sphere(count: int, up: Float64) -> Float64:
-    """Directions (count, 3), evenly spaced over the half sphere around `up` on a golden-angle spiral."""
+    """Return directions (count, 3), evenly spaced over the half sphere around `up`, on a golden-angle spiral."""
     height = (np.arange(count) + 0.5) / count
     level, angle = np.sqrt(1 - height**2), _GOLDEN_ANGLE * np.arange(count)
     aside = np.eye(3)[int(np.argmin(np.abs(up)))]
@@ -279,10 +287,10 @@ def half_sphere(count: int, up: Float64) -> Float64:
 
 
 def _skyline(points: Float64, camera: Camera, view: View) -> NDArray[np.int64]:
-    """Row above which a picture shows no scene points, for each column.
+    """Return, for each column of a picture, the row above which it shows no scene points.
 
-    It is the same for all columns of a strip, and takes the neighbouring strips into account. It is 0 for strips
-    without points, which may be too plain to have any.
+    The row is the same for all columns of a strip, and neighbouring strips count too. It is 0 for strips without
+    points, as they may show something too plain to have points instead of the sky.
     """
     rows, columns, _ = pixels_of(points, camera, view.lens)
     part = np.minimum(columns * SKYLINE_COLUMNS // camera.width, SKYLINE_COLUMNS - 1)
@@ -295,17 +303,18 @@ def _skyline(points: Float64, camera: Camera, view: View) -> NDArray[np.int64]:
 
 
 def is_colourless(scene: Scene) -> bool:
-    """True if points lack colours: some are marked as colourless (from --points), or all have the same colour, as from
-    another cloud without colours."""
+    """Return True if points lack colours: if some are marked as colourless, or all have the same colour."""
     return scene.colourless is not None or of_one_colour(scene.point_colors)
 
 
 def photographed(scene: Scene, background: ArrayLike) -> Float32:
-    """Colours (N, 3) float32 in [0, 1] of the scene's points. Points with colours of their own keep them.
+    """Return colours (N, 3) float32 in [0, 1] of the scene's points. Points with colours of their own keep them.
 
     A colour is the median per channel over the nearest COLOUR_VIEWS_PER_POINT training photographs that show the point,
     at the training size. Masked and occluded points do not count as shown. A point that is occluded in all photographs
     uses the photographs in which it is least occluded.
+
+    background: colour (3,) behind transparent photographs.
     """
     count = len(scene.points)
     ranks, colors = (
@@ -332,8 +341,7 @@ def photographed(scene: Scene, background: ArrayLike) -> Float32:
 
 
 def _medians(colors: Float32) -> Float32:
-    """Medians per channel, (N, 3), of the finite colours in (N, K, 3); UNSEEN_GREY if there are none. Sorts `colors` in
-    place."""
+    """Return medians per channel (N, 3) of the finite colours in (N, K, 3), UNSEEN_GREY without any. Sorts in place."""
     counts = np.isfinite(colors).all(axis=2).sum(axis=1)[:, None, None]
     colors.sort(axis=1)
     middles = np.concatenate([np.maximum(counts - 1, 0) // 2, counts // 2], axis=1)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Masks and known depths of a scene's photographs."""
+"""Supervision of a training in addition to colours: masks and known depths of photographs."""

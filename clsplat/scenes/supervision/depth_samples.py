@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Known depths of one view: their pixels and inverse depths."""
+"""Known depths of one view, from points or a depth map: their pixels and inverse depths, for the depth loss."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ NO_DEPTH_VALUE = 65535
 
 @dataclass(frozen=True, eq=False)
 class KnownDepth:
-    """Known depths of a view: points or a depth map.
+    """Known depths of a view, from points or from a depth map.
 
-    points: (K, 3) float64, world coordinates.
-    weights: (K,), 0 to 1.
-    path: the depth map, if any.
+    points: (K, 3) float64, world coordinates; not used with a depth map.
+    weights: (K,), weights of the points in the depth loss, 0 to 1.
+    path: file of the depth map, if any.
     unit: world units per value of a metric map, whose inverse depth is 1 / (value * unit).
-    fit: scale and offset of a relative map, whose inverse depth is scale * value + offset.
+    fit: scale and offset of a relative map, whose inverse depth is scale * value + offset; None for a metric map.
     whole: True if the map has integer values.
     """
 
@@ -41,10 +41,11 @@ class KnownDepth:
     whole: bool = False
 
     def at(self, camera: Camera, lens: Lens) -> tuple[NDArray[np.int64], Float32, Float32]:
-        """Pixels with known depth in a picture of the camera's size.
+        """Return the pixels with known depth in a picture of the camera's size.
 
-        lens: lens of the depth map, and of the camera if that is not a pinhole camera.
-        Returns ascending pixel indices (k,), inverse depths in 1 / world units, and weights.
+        The results are ascending pixel indices, inverse depths in 1 / world units, and weights, each (k,).
+
+        lens: lens of the depth map, and of the camera unless it is a pinhole camera.
         """
         if self.path is not None:
             nearness = self._from_map(camera, lens)
@@ -53,7 +54,7 @@ class KnownDepth:
         rows, columns, inside = pixels_of(self.points, camera, lens)
         index, near = rows * camera.width + columns, 1 / camera.depths_of(self.points[inside])
         weights = self.weights[inside]
-        order = np.lexsort((-near, index))  # the nearest of several points in a pixel comes first
+        order = np.lexsort((-near, index))  # of several points in a pixel, the nearest comes first
         index, first = np.unique(index[order], return_index=True)
         kept = order[first]
         return index, near[kept].astype(np.float32), weights[kept].astype(np.float32)
@@ -67,7 +68,7 @@ class KnownDepth:
             return np.where(np.isfinite(values), self.fit[0] * values + self.fit[1], 0.0)
 
     def measured(self, values: NDArray[Any]) -> NDArray[np.bool_]:
-        """True where a metric map has a depth."""
+        """Return a mask of the values of a metric map that are depths, not marks of unknown depth."""
         known: NDArray[np.bool_] = (values > 0) & np.isfinite(values) & ~(self.whole & (values == NO_DEPTH_VALUE))
         return known
 
@@ -81,9 +82,9 @@ class KnownDepth:
 
 
 def sampled(values: Float32, camera: Camera, lens: Lens) -> Float64:
-    """Nearest values of a map (h, w) at the pixels of a camera (H, W); NaN for pixels outside the map.
+    """Sample a depth map (h, w) at the pixels of a camera (H, W), without interpolation; NaN outside the map.
 
-    lens: the lens of the map, which may have any size.
+    lens: lens of the depth map, at any size.
     """
     height, width = values.shape
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)

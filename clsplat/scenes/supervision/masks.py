@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Masks of photographs: finding their files by name, and applying them to pixels."""
+"""Masks of photographs: search for their files by name, reading, and application to pixels."""
 
 from __future__ import annotations
 
@@ -25,26 +25,25 @@ OTHER_MASK_FOLDERS = (
 )
 """More names of mask folders. They are searched if masks are requested and MASK_FOLDERS has none."""
 DYNAMIC_FOLDER_PREFIX = "dynamic"
-"""Prefix of the name of a folder whose white pixels may be moving objects."""
+"""Prefix of the names of mask folders in which white may mark moving objects instead of pixels that count."""
 MASK_THRESHOLD = 0.5
 """Minimum mask value of a pixel that counts. In a resized mask, also the minimum fraction of a pixel's area that must
 count."""
 COMPARED_MASKS = 12
-"""Approximate number of masks of a folder that are searched for values of at least a half and for void labels. At most
-twice as many are read."""
+"""Approximate number of a folder's masks that are read to interpret an ambiguous one; at most twice as many are."""
 VOID_LABEL = 255
 """Label of undefined pixels, as at the object borders in VOC and Cityscapes."""
 MAX_LABEL = 40
 """Largest label except VOID_LABEL. Soft masks have larger values."""
 MAX_LABEL_NOISE_RATIO = 0.01
-"""A mask is black and white with noise if its area labelled 1 is under this fraction of its area labelled 255."""
+"""A mask is black and white with noise, not labels, if labels from 1 cover less than this fraction of white's area."""
 
 
 @dataclass(frozen=True)
 class Mask:
-    """Masking of a photograph.
+    """The mask of a photograph: a file, the photograph's alpha, or both.
 
-    use: meaning of the mask, and of the photograph's alpha.
+    use: what masked pixels mean, in the file and in alpha: ignored or transparent.
     path: the mask file, if there is one.
     """
 
@@ -53,14 +52,16 @@ class Mask:
 
     @property
     def ignores(self) -> bool:
-        """True if pixels may have to be left out."""
+        """True if pixels of the photograph may be ignored in training."""
         return self.use.alpha == "ignore" or (self.path is not None and self.use.masks == "ignore")
 
     def applied(self, image: Float32, *, orient: bool) -> tuple[Float32, Float32 | None]:
-        """Apply the masks to a photograph (H, W, 3 or 4).
+        """Apply the mask to a photograph (H, W, 3 or 4).
 
         Returns the photograph, and an array (H, W, 1) with 1 for pixels that count and 0 for others, or None if all
-        pixels count. Raises InputError for a mask of another size, or one that does not decode.
+        pixels count. Raises InputError for a mask that has another size or does not decode.
+
+        orient: rotate the mask by its EXIF orientation.
         """
         kept, counts = image[:, :, 3:] if image.shape[2] == 4 else None, None
         if kept is not None and self.use.alpha == "ignore":
@@ -80,10 +81,13 @@ class Mask:
 def read_mask(path: Path, *, orient: bool, invert: bool) -> Float32:
     """Read a mask (H, W, 1): 1 for pixels that count, else 0.
 
-    Grey values of at least a half count. If the grey is constant, alpha is used instead. Among labels (0 and 1, perhaps
-    255 for void), 1 counts, and void never does. Raises InputError if the file does not decode, and for ambiguous
-    labels. Also raises it if all values are below a half, and either there are only two or the folder's other masks are
-    dark too.
+    Pixels count if their grey value is at least a half; if the grey is constant, alpha is used instead. In a mask of
+    labels (0 and 1, perhaps 255 for void), 1 counts, and void never does. Raises InputError if the file does not
+    decode, and for ambiguous labels. Also raises it if all values are below a half, and either the mask has only two
+    values or the folder's other masks are dark too.
+
+    orient: rotate the mask by its EXIF orientation.
+    invert: exchange pixels that count and others.
     """
     image = read_image(path, orient=orient)
     pixels = image[:, :, :3]
@@ -100,12 +104,12 @@ def read_mask(path: Path, *, orient: bool, invert: bool) -> Float32:
 
 
 def _from_labels(path: Path, values: Float32, pixels: Float32) -> Float32:
-    """Interpret a mask whose values are all below a half. In a mask of labels, label 1 becomes 1.0 and void -1.
+    """Interpret a mask whose values are all below a half. In a mask of labels, label 1 becomes 1.0, and void -1.
 
-    A soft mask is returned unchanged if another mask in its folder reaches a half.
+    A soft mask is returned unchanged if another mask in its folder has values of at least a half.
 
     pixels: the colours whose means are `values`.
-    Raises InputError for other labels, and for a soft mask if no other mask reaches a half.
+    Raises InputError for other labels, and for a soft mask in a folder without such values.
     """
     most, exact = stored_range(path)
     levels = np.unique(np.rint(values * most)).astype(int).tolist()
@@ -124,7 +128,7 @@ def _from_labels(path: Path, values: Float32, pixels: Float32) -> Float32:
 
 
 def _stored(pixels: Float32, most: int) -> str:
-    """Pixel values (H, W, 1 or 3) as stored in the file, for a message."""
+    """Return pixel values (H, W, 1 or 3) as text for a message, scaled as stored in the file: 0 to `most`."""
     levels = np.unique(np.rint(pixels.reshape(-1, pixels.shape[2]) * most).astype(int), axis=0)
     if (levels == levels[:, :1]).all():
         grey = levels[:, 0].tolist()
@@ -161,13 +165,15 @@ def _without_void(path: Path, values: Float32) -> Float32:
 
 
 def _labels(levels: Float32, void: int) -> Float32:
-    """Labels, with -1 in place of void."""
+    """Return a mask's labels with -1 in place of `void`."""
     return np.where(levels == void, np.float32(-1), levels).astype(np.float32)
 
 
 def _areas(values: Float32, most: int) -> tuple[int, int] | None:
-    """Number of pixels with labels of at least 1, and of white pixels. None if the mask has other values than labels,
-    black and white."""
+    """Return the number of pixels with labels from 1 to MAX_LABEL, and of white pixels, which may be void.
+
+    Returns None if the mask has other values than such labels, black and white.
+    """
     levels = values * most
     dark = levels < most * MASK_THRESHOLD
     whole = np.abs(levels - np.rint(levels)).max() < 0.25  # integers up to rounding: values are means of channels
@@ -180,7 +186,7 @@ def _areas(values: Float32, most: int) -> tuple[int, int] | None:
 
 
 def _like(path: Path) -> list[Path]:
-    """Sample of the masks in the folder of a mask. Photographs in the same folder are excluded by their names."""
+    """Return a sample of the masks in the folder of a mask. Photographs there are recognised by their names."""
     named = "mask" in path.stem.lower()
     others = [other for other in find_images(path.parent, deep=False) if ("mask" in other.stem.lower()) == named]
     return others[:: max(len(others) // COMPARED_MASKS, 1)]
@@ -195,12 +201,12 @@ def find_masks(
 ) -> dict[str, Path]:
     """Find the masks in a folder. The keys are the names of their photographs.
 
-    names: all photographs, relative to their folder.
-    without, strict: as for `owned`.
-
     A mask is named IMAGE.jpg.png (COLMAP), IMAGE.png, IMAGE_mask.png or IMAGE.jpg.mask.png (RealityScan), in the same
     sub-folder. mask_0007.png may also belong to image_0007.png (`owned`). Raises InputError for a mask that fits no
-    photograph, and for two masks of one.
+    photograph, and for two masks of one photograph.
+
+    names: names of all photographs, relative to their folder.
+    without, strict: as for `owned`.
     """
     names = sorted(names)
     example = next(iter(names), "IMAGE.jpg")
@@ -210,9 +216,9 @@ def find_masks(
 
 
 def _known(names: Iterable[str], *, plain: bool = True) -> dict[str, str]:
-    """Photograph for each name that its mask may have, without the extension.
+    """Return the photograph for each name that its mask may have, without the extension.
 
-    plain: also accept the photograph's own name.
+    plain: also accept the photograph's own name for its mask.
     """
     known: dict[str, str] = {}
     for name in names:
@@ -226,7 +232,7 @@ def _known(names: Iterable[str], *, plain: bool = True) -> dict[str, str]:
 
 
 def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path, *, strict: bool = True) -> dict[str, Mask]:
-    """Mask for each name of a scene's photographs; empty if masks are not used and alpha is blended.
+    """Find the masks of a scene's photographs, by the photographs' names; none if masks and alpha are not used.
 
     where: the scene, for messages.
     strict: False if photographs are missing, as their masks may still exist.
@@ -275,7 +281,7 @@ def masks_beside(
     """Find masks in a folder next to the photographs' folder or inside it, else next to each photograph.
 
     The keys are the names of the photographs.
-    told: mask for each photograph for which the data set names one. In nerfstudio's scenes, one mask may serve all.
+    told: masks that the data set names, by photograph. In nerfstudio's scenes, one mask may serve all photographs.
     strict: as for `find_masks`.
     others: more names of folders, searched if the usual ones have no masks.
     Raises InputError like `find_masks`.
@@ -302,7 +308,7 @@ def masks_beside(
 def _beside_each(
     images: Sequence[Named], told: Mapping[str, Path], folders: Sequence[str], *, strict: bool
 ) -> dict[str, Path]:
-    """Masks in a folder inside each photograph's own folder, or in the photograph's folder itself.
+    """Find masks in a folder inside each photograph's own folder, or in the photograph's folder itself.
 
     In the photograph's folder, only files with "mask" or two extensions in their names are masks.
     """
@@ -330,7 +336,7 @@ def _says_mask(name: str) -> bool:
 def stage_mask(
     path: Path | None, target: Path, size: tuple[int, int], *, invert: bool, photo: Path | None = None
 ) -> None:
-    """Write a black and white mask for a photograph.
+    """Write a black and white mask for a photograph to `target`, with white for pixels that count.
 
     path: the mask file, None for all white.
     size: the photograph's width and height.
@@ -349,7 +355,7 @@ def stage_mask(
 
 
 def for_sfm(use: MaskUse) -> MaskUse | None:
-    """Use of masks for `clsplat.scenes.sfm.reconstruct`, which finds no features in masked pixels; None for no masks.
+    """Return the use of masks in structure from motion, which finds no features in masked pixels; None for no masks.
 
     Raises InputError if masks and alpha have different meanings, as the reconstruction has one mask for both.
     """
@@ -366,7 +372,7 @@ def for_sfm(use: MaskUse) -> MaskUse | None:
 
 
 def after_sfm(use: MaskUse, folder: Path) -> MaskUse:
-    """Use of the masks that `clsplat.scenes.sfm.reconstruct` wrote: white pixels count, and alpha is included."""
+    """Return the use of the masks that structure from motion wrote, in which white counts and alpha is included."""
     if not (folder / MASK_FOLDERS[0]).is_dir():
         return replace(use, masks="none", invert=False)
     meaning: MaskMeaning = "none" if use.alpha == "blend" else use.alpha
