@@ -1,5 +1,6 @@
-// Arguments that harmonics.cl and its gradient share: the directions in which colours are evaluated, and the mask of
-// the rows to evaluate. With DEGREE_4 also the SH band of degree 4, which models do not have; sh.h has the lower bands.
+// Arguments that harmonics.cl and harmonics_grad.cl share: the directions in which colours are evaluated, and the mask
+// of the rows to evaluate. With DEGREE_4 this file adds the SH band of degree 4, which models do not have; sh.h has the
+// lower bands.
 #ifdef DEGREE_4
 #define MOST_COEFFICIENTS 25
 #else
@@ -22,7 +23,8 @@
 #define HIDDEN(i) 0
 #endif
 
-// v: the unit direction; scale: 1 / the length of the given direction. Both are 0 for a direction of length 0.
+// A normalised direction. v: the unit direction; scale: 1 / the length of the given direction. Both are 0 for a
+// direction of length 0.
 typedef struct {
   floatL v[3], scale;
 } Direction;
