@@ -154,8 +154,8 @@ GROUP __kernel void count_tiles(const uint n, const int tiles_x, const int tiles
 // which each list begins; sums: their exclusive scan; ranges (tiles, 2); order (tiles): the tiles sorted by floor(log2)
 // of their lists' lengths, longest first, because these take longest to sort.
 //
-// readback gets what compact_visible in duplicate.cl writes, except that the keys are 0, and the length of the longest
-// list. A pass with more than `capacity` pairs stops, as described at compact_visible, and then has empty lists.
+// readback gets the entries that compact_visible in duplicate.cl writes, with keys of 0, and in addition the length of
+// the longest list. Under the conditions of compact_visible, a pass stops, and then it has empty lists.
 GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint capacity, __global uint *counts,
                                  __global uint *sums, __global uint *ranges, __global uint *order,
                                  __global uint *readback) {
@@ -286,7 +286,8 @@ GROUP __kernel void sort_lists(const uint fit, __global const uint *order, __glo
                                __local Pair *near) {
   const uint tile = order[get_group_id(0)], begin = ranges[2 * tile], count = ranges[2 * tile + 1] - begin;
   __global Pair *list = pairs + begin;
-  // One loop serves the parts and the larger blocks: PoCL compiles two loops with barriers inside to wrong code.
+  // One loop handles the parts and the larger blocks, because PoCL compiles two loops with barriers inside to wrong
+  // code.
   for (uint stage = fit / 2; stage == fit / 2 || stage < count; stage *= 2) {
     for (uint step = stage; step >= fit; step /= 2) order_step_far(list, count, step, step == stage);
     for (uint first = 0; first < count; first += fit) {

@@ -101,7 +101,7 @@ static inline int add_gaussian(Pixels *p, floatL power, int i, int zero, float c
   return !ANYL(p->t > 0.0f);
 #else
   p->t = goes_on ? after : -fabs(before);
-  p->stop = goes_on ? p->stop : min(p->stop, i); // pairs are in order: keeps the first
+  p->stop = goes_on ? p->stop : min(p->stop, i); // pairs come in order, so min keeps the first
   return 0;
 #endif
 }
@@ -178,7 +178,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   }
   RECORD(for (; i < end; ++i) cells_from_sorted[i] = 0;)
 #else
-#if OWNED == 1 // a short loop without branches
+#if OWNED == 1 // the loop over pairs is short and has no branches
 #define OF_PAIRS _Pragma("unroll 4")
 #else
 #define OF_PAIRS ROLLED
@@ -192,7 +192,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   __local uint marks[WARPS * BATCH / 4] __attribute__((aligned(16))), lists[WARPS * LIST];
   __local int open_in[BLOCKS]; // number of open pixels in each block
   __local uint *list = lists + WARP * LIST;
-  const int zero = min(pixels[0].stop + 1, 0); // see exp2_by
+  const int zero = min(pixels[0].stop + 1, 0); // always 0, but unknown to the compiler: see exp2_by
   for (int block = ITEM; block < BLOCKS; block += ITEMS) open_in[block] = 0;
   BARRIER_LOCAL();
   // Indices for the next batch, loaded early: loads of its splats need not wait for them.

@@ -391,7 +391,7 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
     }
   }
 #else
-  const int zero = min(pixels.stop[0] + 1, 0); // see exp2_by
+  const int zero = min(pixels.stop[0] + 1, 0); // always 0, but unknown to the compiler: see exp2_by
   __local Staged staged[BATCH];
   __local uint marks[BLOCK_ROWS * BATCH / 4] __attribute__((aligned(16)));
   __local uchar lists[BLOCK_ROWS * LIST];

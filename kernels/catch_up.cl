@@ -26,9 +26,10 @@
 #define AS_INTA as_int4
 #endif
 
-#define BLOCK 16              // number of steps between two checks for parameters that no longer change
-#define LEAST_BETA2 0.9f      // least beta2 for which (193) holds throughout a block of steps
-#define STILL 3.725290298e-9f // 2^-28: an eighth of the least half ulp, relative to the parameter
+#define BLOCK 16         // number of steps between two checks for parameters that no longer change
+#define LEAST_BETA2 0.9f // least beta2 for which (193) holds throughout a block of steps
+// A movement below this fraction of a parameter changes no bit of it: 2^-28, an eighth of the least half ulp.
+#define STILL 3.725290298e-9f
 
 // The missed steps of one array of a chunk. rates, roots: the array's columns of the table, from the first missed step
 // on; highest: the largest rate, or INFINITY if (193) does not apply.

@@ -46,7 +46,7 @@ GROUP __kernel void deep(const int first_tile, const int tiles_x, const int heig
   RAY_TABLES
   floatL t[OWNED], unit[OWNED], level[OWNED], open[OWNED][TRIED];
   intL stop[OWNED], counts[OWNED][TRIED];
-  Lanes values[OWNED][DEEP_SIZE]; // sums of the current slice; DEEP_ALPHA holds its transmittance
+  Lanes values[OWNED][DEEP_SIZE]; // sums of the current slice; DEEP_ALPHA holds the slice's transmittance
   IntLanes slices[OWNED];
   int last = begin;
   ALL_CELLS(cell) {

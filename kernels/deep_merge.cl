@@ -1,5 +1,5 @@
-// Merges several deep pictures of the same size, each with a weight: the samples of a shutter or lens, or the source
-// pixels of a warp. At every depth the transmittance is the weighted mean of the pictures' transmittances.
+// Merges several deep pictures of the same size with weights. The pictures are the samples of a shutter or lens, or the
+// source pixels of a warp. At every depth the transmittance is the weighted mean of the pictures' transmittances.
 //
 // Owner: A work-item owns a pixel.
 // Launch: One work-item for each pixel.

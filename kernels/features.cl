@@ -11,7 +11,7 @@
 // Equations: docs/channels.md, (61) to (64), (74) and (75).
 #include "shared/math.h"
 #if defined(FEATURE_MOTION) || defined(FEATURE_BACKWARD)
-#define NEEDS_MOTION // (64), of shared/camera/
+#define NEEDS_MOTION // motion_of in shared/camera/, (64)
 #endif
 #include "shared/lanes.h"
 #include "shared/elementary.h"

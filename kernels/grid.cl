@@ -16,7 +16,7 @@
 #define GRID_COLUMNS 16
 #define GRID_ROWS 16
 #define GRID_LEVELS 8
-#define MAP 12 // coefficients of a colour transform: three rows of four
+#define MAP 12 // number of coefficients of a colour transform, three rows of four
 #define GRID_FLOATS (GRID_LEVELS * GRID_ROWS * GRID_COLUMNS * MAP)
 #define LEVEL_FLOATS (GRID_ROWS * GRID_COLUMNS * MAP)
 
@@ -162,7 +162,7 @@ __kernel void move_grid(const int photograph, const float rate, const float root
   grids[at] -= rate * m / fma1(sqrt(v), root, epsilon);
 }
 
-// Shifts the grids of all photographs in place, so that their mean is the identity.
+// Shifts the grids of all photographs in place, so that their mean over the photographs is the identity.
 __kernel void centre_grids(const int photographs, __global const uint *readback, __global float *grids) {
   const int item = get_global_id(0);
   if (item >= GRID_FLOATS || readback[READBACK_STOPPED]) return;

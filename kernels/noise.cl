@@ -57,7 +57,7 @@ __kernel void add_noise(const uint n, const uint first_row, const uint key0, con
     const float along = fma1(axes[k][0], e0, fma1(axes[k][1], e1, axes[k][2] * e2)) * s * s * by;
     for (int j = 0; j < 3; ++j) moved[j] = fma1(axes[k][j], along, moved[j]);
   }
-  // As in Adam, a mean that is not finite is not stored.
+  // A mean that would be NaN, infinite or too large keeps its old value, as in Adam.
   if (!(moved[0] * moved[0] < limit2 && moved[1] * moved[1] < limit2 && moved[2] * moved[2] < limit2)) return;
   for (int j = 0; j < 3; ++j) mean[j] = moved[j];
 }

@@ -1,5 +1,5 @@
-// The gradients with respect to a camera's pose and lens. That of the pose is computed from the gradients with respect
-// to the model. That of the lens is a sum over Gaussians.
+// The gradients with respect to a camera's pose and lens. The pose's gradient is computed from the gradients with
+// respect to the model. The lens's gradient is a sum over Gaussians.
 //
 // Owner: A work-item owns POSE_ROWS consecutive Gaussians (pose_rows, lens_rows), then POSE_ROWS consecutive sums
 //   (pose_sums). Built with one lane; LANES and ITEMS do not change its bits.

@@ -148,7 +148,7 @@ static inline void step_rows(const uint n, const uint first_row, const uint widt
 #else
 #define TAKEN(k, g) (intL)(-1)
 #endif
-  ulong left = 0; // bits of vectors that have a refused element or go past the last row
+  ulong left = 0; // a bit for each vector that has a refused element or goes past the last row
   for (uint k = 0; k < width; ++k) {
     const floatL g = *(const floatL *)(gradients + k * LANES);
     if ((k + 1) * LANES > count || !step_vector(begin + k * LANES, g, TAKEN(k, g), s, model)) left |= (ulong)1 << k;
@@ -313,7 +313,7 @@ __kernel void project_step(
     const uint width = step.width, count = rows * width, whole = aligned ? count : 0;
     const size_t begin = (size_t)width * first_row, at = begin + own;
     Stepped model = {step.model.parameters + at, step.model.first + at, step.model.second + at};
-    uint left = 0; // bits of vectors that have a refused element or go past the last row
+    uint left = 0; // a bit for each vector that has a refused element or goes past the last row
     ROLLED for (uint k = own, bit = 1; k < count; k += stride, bit += bit) {
       const floatA g = *(__local const floatA *)(step.gradients + k);
       const intA taken =

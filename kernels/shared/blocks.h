@@ -91,7 +91,7 @@ static inline uint blocks_of(const float *splat, int tile_x, int tile_y) {
   for (int row = 0; row < BLOCK_ROWS; ++row) {
     float d0 = (float)(row * BLOCK_H) + (0.5f - TILE_SLACK) - my;
     float d1 = d0 + ((float)BLOCK_H - 1.0f + 2.0f * TILE_SLACK);
-#ifdef NO_ROW_SKIP // RasterizerConfig.row_skip
+#ifdef NO_ROW_SKIP // RasterizerConfig.row_skip is off
     d0 = -half_h;
     d1 = half_h;
 #endif
@@ -101,7 +101,7 @@ static inline uint blocks_of(const float *splat, int tile_x, int tile_y) {
     const float left = mx - block_edge(-d1, -d0, tangent, half_w, l12, l22, inverse_l11, budget);
     for (int column = 0; column < BLOCK_COLUMNS; ++column) {
       const float first = (float)(column * BLOCK_W) + (0.5f - TILE_SLACK);
-#ifdef NO_COLUMN_SKIP // RasterizerConfig.column_skip
+#ifdef NO_COLUMN_SKIP // RasterizerConfig.column_skip is off
       const int reached = d0 <= d1;
 #else
       const int reached = d0 <= d1 && right >= first && left <= first + ((float)BLOCK_W - 1.0f + 2.0f * TILE_SLACK);

@@ -18,14 +18,14 @@
 
 #ifdef NEEDS_TANGENTS
 typedef struct {
-  float e1[3], e2[3]; // right and down on the tangent plane
+  float e1[3], e2[3]; // unit vectors to the right and down on the tangent plane
   float k[4];         // d(point on the tangent plane) / d(pixel), the footprint of a pixel, row by row
 } Tangent;
 #endif
 #ifdef NEEDS_BOXES
 typedef struct {
   float low_x, high_x, low_y, high_y; // in pixels, not clamped
-  int whole_rows;                     // the box goes all the way round the panorama
+  int whole_rows;                     // 1 if the box goes all the way round the panorama
 } Box;
 #endif
 #ifdef RAYS
@@ -36,7 +36,7 @@ typedef struct {
 #include "shared/camera/orthographic.h"
 #elif defined(EQUIRECTANGULAR)
 #include "shared/camera/equirectangular.h"
-#elif defined(FISHEYE_RAYS) // BENT_FISHEYE adds its coefficients
+#elif defined(FISHEYE_RAYS) // with BENT_FISHEYE the radius is a polynomial of the angle
 #include "shared/camera/fisheye.h"
 #elif defined(PERSPECTIVE_RAYS)
 #include "shared/camera/perspective_rays.h"

@@ -128,10 +128,10 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
   const float l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22], inverse = splat[SPLAT_INVERSE_L11];
   const float budget = EXTENT(splat[SPLAT_LOG2O]) + 0.01f;
   int8 bits = reached_columns(my, mx, l12, l22, inverse, budget);
-#ifdef NO_COLUMN_SKIP // RasterizerConfig.column_skip
+#ifdef NO_COLUMN_SKIP // RasterizerConfig.column_skip is off
   bits = bits != 0 ? (int8)(15) : (int8)(0);
 #endif
-#ifdef NO_ROW_SKIP // RasterizerConfig.row_skip
+#ifdef NO_ROW_SKIP // RasterizerConfig.row_skip is off
   bits = (int8)((int)join_rows(bits));
 #endif
 #if LANES == 8

@@ -5,8 +5,9 @@
 // fraction divided by the thickness. Each pixel's surfaces are sorted by the depth of their fronts. Equations:
 // docs/pictures.md, (75).
 #ifdef HOLDOUT
-// State of a cell while depth increases. through: the transmittance of the surfaces passed so far; next: the depth of
-// the next surface's front; at, end: the indices of the next surface and of the end of the pixel's surfaces.
+// State of a cell while depth increases. through: the transmittance of the surfaces passed as a whole; at: the index of
+// the pixel's first surface that is not; next: the depth of the front of that surface; end: the end of the pixel's
+// surfaces.
 typedef struct {
   Lanes through, next;
   uint at[LANES], end[LANES];

@@ -24,7 +24,7 @@
 #if COLUMNS + 2 * REACH != PARTS || COLUMNS % RUN != 0 || ROWS * RUNS > PARTS
 #error "LOSS_PARTS must be the columns of a block and its margins, and at least its runs"
 #endif
-#define INLINE inline __attribute__((always_inline)) // PoCL computes wrong results if it does not inline
+#define INLINE inline __attribute__((always_inline)) // PoCL computes wrong results if these are not inlined
 #define FOR_PARTS(part, count) for (int part = get_local_id(0) % ITEMS; part < (count); part += ITEMS)
 
 // The middle pixel of the cell that contains pixel (x, y), clamped to the image.

@@ -309,7 +309,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     FOR_HIGHER(k, SH_USED(coefficients)) {
       weight[k].lane[lane] = fma1(d_colour.x, f[0], fma1(d_colour.y, f[1], d_colour.z * f[2]));
       f += 3;
-#ifndef NO_SH_REST // OptimiserConfig.sh_rest_every
+#ifndef NO_SH_REST // set in steps that do not update sh_rest (OptimiserConfig.sh_rest_every)
       const float along = basis[k].lane[lane];
       d_f[0] = along * d_colour.x;
       d_f[1] = along * d_colour.y;

@@ -1,4 +1,4 @@
-// Conventions of splats and slots, in addition to layouts.h.
+// Units of splats and slots, and the number of floats per slot. Their columns are in layouts.h.
 
 // A splat's L11, L12 and L22 are the whitening W (docs/gradients.md, (44)) times WHITEN = sqrt(log2(e) / 2). Moments in
 // slots use WHITEN W too.

@@ -31,7 +31,8 @@ static inline int project_ray(size_t i, __global const float *means, __global co
   if (!is_shown(p->f, camera)) return 0;
   tangent_of(p->f, camera, &p->t);
 
-  // (11), (12): M = e A S / distance, with two more columns for the low-pass; the determinant is from the minors.
+  // (11), (12): M = e A S / distance, with two more columns for the low-pass. The determinant is the sum of the squared
+  // minors.
   const Tangent t = p->t;
   __global const float *raw = quaternions + 4 * i;
   float norm2 = 0.0f, r[9];
@@ -82,7 +83,7 @@ static inline float depth_of_axis(const RayProjection *p, int k) {
   return fma1(p->f[0], p->a[k], fma1(p->f[1], p->a[3 + k], p->f[2] * p->a[6 + k]));
 }
 
-// The minor of the unscaled M that omits axis k.
+// The minor of M that omits the Gaussian's axis k, without the factors of the scales.
 static inline float minor_of_axis(const RayProjection *p, __constant float *camera, int k) {
   const float inverse = 1.0f / p->distance;
   return camera[CAMERA_HAND] * depth_of_axis(p, k) * (inverse * inverse);

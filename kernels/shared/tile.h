@@ -88,8 +88,7 @@ static inline Ellipse ellipse_of(__global const float *splat, int tiles_x, int t
   e.my = splat[SPLAT_PIXEL_Y] + splat[SPLAT_SUB_Y];
   e.half_w = splat[SPLAT_HALF_W];
   e.half_h = splat[SPLAT_HALF_H];
-#ifdef SQUARE_TILE_TEST // RasterizerConfig.tile_test: a square around the ellipse, which rounding must not make smaller
-                        // than the box
+#ifdef SQUARE_TILE_TEST // RasterizerConfig.tile_test: a square, which rounding must not make smaller than the box
   const float radius = longest_half_axis(splat);
   e.half_w = radius > e.half_w ? radius : e.half_w;
   e.half_h = radius > e.half_h ? radius : e.half_h;

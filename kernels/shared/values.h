@@ -16,7 +16,7 @@
 #define FOR_VALUES(k) UNROLL for (int k = 0; k < VALUES; ++k)
 
 // The cells that may have a pixel to which the i-th pair is added.
-#ifdef RECORD_CELLS // blend has recorded them
+#ifdef RECORD_CELLS // blend.cl has recorded the cells
 #define CELLS_OF_PAIR(i, splat) cells_from_sorted[i]
 #else
 #define CELLS_OF_PAIR(i, splat) reach_of(splat, tile_x, tile_y)
