@@ -82,7 +82,8 @@ GROUP __kernel void limit_blend_grad(const int rounds, __global const float *spl
   sums[get_global_id(0)] = sum;
 }
 
-// Copies from (n) -> to (n), COPIED elements (at least 16 bytes) per work-item; n is a multiple of COPIED.
+// Copies the array `from` (n) to the array `to` (n), COPIED elements (at least 16 bytes) per work-item. n is a multiple
+// of COPIED.
 #if LANES > 4
 #define COPIED LANES
 typedef floatL copied;

@@ -37,7 +37,7 @@ class Inputs(SimpleNamespace):
         return self.image.shape[1], self.image.shape[0]
 
     def wide(self, *names: str) -> list[NDArray[np.float64]]:
-        """The arrays with these names, in float64."""
+        """Convert the inputs with these names to float64."""
         return [getattr(self, name).astype(np.float64) for name in names]
 
 
@@ -77,7 +77,7 @@ class Expected:
 
 
 def exactly(values: Array) -> Expected:
-    """The twin's values of a result that must be equal to them."""
+    """Expect a result to be equal to the twin's values."""
     return Expected(values, 0.0, exact=True)
 
 
@@ -125,7 +125,7 @@ class Case:
         return {name: Deviation(each.error_of(got[name]), each.bound) for name, each in self.twin(given, got).items()}
 
     def outcome(self, bench: CaseBench) -> StageOutcome:
-        """The outcome of this case as a stage of the self-test."""
+        """Run this case as a stage of the self-test, on the bench's frozen scene."""
         assert self.frozen is not None
         return joined([self._outcome(bench, given) for given in self.frozen(bench)])
 

@@ -53,7 +53,7 @@ class MadeUpSlots:
         return found
 
     def on_image(self, bench: CaseBench) -> reference_project.ProjectedGradients:
-        """Gradients with respect to the scene's Gaussians as the twin projects them."""
+        """Gradients with respect to the scene's projected Gaussians, in the form of the float64 reference."""
         l11, l12, l22 = (WHITENING_FACTOR * bench.splats().whitening).T
         *_, uu, uv, vv = self.sums[:, SLOT_MOMENTS].T
         entries = [l11 * l11 * uu, l11 * (l12 * uu + l22 * uv), l12 * l12 * uu + 2 * l12 * l22 * uv + l22 * l22 * vv]

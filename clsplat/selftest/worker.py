@@ -47,7 +47,7 @@ DEFAULT_DEFINES: dict[str, dict[str, object]] = {
     "values": {"VALUES": 3},
     "values_grad": {"VALUES": 3, "GEOMETRY": True},
 }
-"""Defines that these kernel files need to be built, by the file's name without ending."""
+"""Preprocessor defines without which a kernel file cannot be built, by the file's name without ".cl"."""
 
 
 @cache
@@ -86,7 +86,7 @@ def run(
         for bench in benches:
             try:
                 outcomes.append(OUTCOMES_BY_STAGE[name](bench))
-            except DriverError:  # The caller may try another shape.
+            except DriverError:  # The caller may try another kernel shape.
                 raise
             except Exception as error:  # noqa: BLE001  # drivers, and sizes from a wrong kernel, raise anything
                 text = " ".join(str(error).split())[:300]

@@ -20,8 +20,9 @@ static inline float quotient(float t, float x) {
   return fma1(fma1(-near, x, t), inverse, near);
 }
 
-// Removes a pair from a pixel, and returns the pair's g and weight. *t: transmittance; *behind: D . B; difference: D .
-// c - *behind; uncapped: the pair's alpha before the cap. If `uncapped` is 0, nothing changes.
+// Removes a pair from a pixel, and returns the pair's g and weight. *t: transmittance; *behind: D . B, the pixel's
+// gradient D times the light B behind the pair; difference: D . c - *behind, with the pair's colour c; uncapped: the
+// pair's alpha before the cap. If `uncapped` is 0, nothing changes.
 static inline Share take_out_of(float *t, float *behind, float uncapped, float difference) {
   const float alpha = uncapped < ALPHA_MAX ? uncapped : ALPHA_MAX;
   const float before = quotient(*t, 1.0f - alpha), weight = alpha * before;

@@ -185,9 +185,9 @@ static inline void mark(__local uint *marks, int j, uint blocks, int sets, int o
       (blocks >> set * own & FIRST_BLOCKS(own)) != 0;
 }
 
-// An entry of a list: the pair's number in its batch, with the bit DENSE if `spare` is negative. That means that the
-// pair reaches more than half of the set's blocks. It is then quicker to process all of the item's cells without a
-// branch.
+// An entry of a list: the pair's number in its batch, with the bit DENSE if the pair reaches more than half of the
+// set's blocks. It is then quicker to process all of the item's cells without a branch. spare: SPARSE minus the number
+// of reached blocks, negative for DENSE.
 #define DENSE 0x80000000u
 #define ENTRY_OF(j, spare) ((uint)(j) | ((uint)(spare) & DENSE))
 #define PAIR_OF(entry) ((int)((entry) & ~DENSE))

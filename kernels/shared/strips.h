@@ -23,7 +23,7 @@
 #define SUBGROUPED
 #endif
 #include "shared/item_sums.h"
-// A sub-group has items of two teams, which then process their lists in step.
+// True if a sub-group has items of two teams. The two teams then run the same number of iterations.
 #define ACROSS_TEAMS (SUBGROUP > BLOCK_ITEMS)
 #define ABREAST (ITEMS < SLOT_STRIDE ? ITEMS : SLOT_STRIDE) // number of items that write a slot together
 
@@ -79,7 +79,7 @@ static inline void finish_row(float v, float *sums) {
   }
 
 #if TEAM_WARPS > 1
-// Stores in local memory what another lane needs to add the pixel to its sums.
+// Stores a pixel's values in local memory, for the lane that adds them up in join_blocks.
 #define LEAVE_PIXEL(cell, block_rows)                                                                                  \
   {                                                                                                                    \
     ALPHA_IN(cell)                                                                                                     \

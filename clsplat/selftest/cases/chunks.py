@@ -103,7 +103,7 @@ MOMENTS = ("first", "second")
 CURRENT = ("current_totals", "current_largest")
 """Statistics of contributions that each view changes."""
 BEGIN = 0.5
-"""Value of these statistics before the view."""
+"""Value of the statistics in CURRENT before the view."""
 STEP = 7
 """Number of the step of Adam, from 1."""
 AREA = 2.0
@@ -254,7 +254,7 @@ def _twin_of_adam(given: Inputs, got: Arrays, listed: NDArray[np.bool_]) -> dict
     # "sparse" updates the elements with a gradient, "late" the rows of `visible`.
     rows = "sparse" if given.sparse else "late"
     step = Inputs(arrays=arrays, rows=rows, step=STEP, visible=listed, rates=ADAM_RATES)
-    got["gradients"] = np.zeros(0)  # project_step has no array of gradients to set to zero
+    got["gradients"] = np.zeros(0)  # project_step keeps no gradients in memory
     return dict(ADAM_CASE.twin(step, got))
 
 
@@ -277,14 +277,14 @@ def _random_missed(rng: Generator, count: int) -> Inputs:
     last: the last step that each chunk to catch up has taken, by the chunk's number.
     first_step: number of the table's first step, at most that of the first step that any chunk missed.
     rates: learning rates by the step's number and by parameter group.
-    every: the SH bands from degree 1 on are updated in every so many steps.
+    every: number of steps between updates of the SH bands from degree 1 on.
     """
     span, before = int(rng.choice([1, 7, 40, 300])), int(rng.choice([0, 1, 100, 30_000]))
     chunks = -(-count // CHUNK_ROWS)
     last = {chunk: before + int(rng.integers(span)) for chunk in range(chunks) if chunk == 0 or rng.random() < 0.7}
     made: dict[str, Arrays] = {name: {} for name in STATE}
     for group, shape in group_shapes(count, int(rng.choice([1, 4, 9, 16]))).items():
-        size = 10 ** rng.uniform(-9, 6, shape)  # gradients far above Adam's epsilon
+        size = 10 ** rng.uniform(-9, 6, shape)  # far above Adam's epsilon
         made["parameters"][group] = rng.standard_normal(shape).astype(np.float32)
         made["first"][group] = (rng.standard_normal(shape) * size * (rng.random(shape) < 0.9)).astype(np.float32)
         made["second"][group] = (rng.uniform(0.1, 1.0, shape) * size**2).astype(np.float32)
@@ -340,8 +340,9 @@ def _twin_of_catch_up(given: Inputs, got: Arrays) -> dict[str, Expected]:
         # As long as a parameter moves, each step rounds it by 6e-8 of its size: up to 150 steps. The betas in float32
         # are off by 3e-8, which is 1e-6 of a movement over some 30 steps.
         "parameters": Expected(parameters, 1e-5, moves, listed),
-        "first": Expected(first, 3e-5, np.abs(first), listed),  # 300 steps, in each a rounding and beta1 off by 2.6e-8
-        "second": Expected(second, 3e-5, second, listed),  # as `first`, with beta2
+        # In each of up to 300 steps a moment is rounded, and beta1 or beta2 is off by up to 2.6e-8.
+        "first": Expected(first, 3e-5, np.abs(first), listed),
+        "second": Expected(second, 3e-5, second, listed),
     }
     for name in STATE:
         got[f"{name} of other chunks"] = got[name][~listed]

@@ -19,7 +19,7 @@ from clsplat.selftest.scenes import evenly
 from clsplat.stages.grid import GRID_SHAPE, Grids, apply_grid, centre_grids, grid_gradient, step_grid
 
 GRID_PHOTOGRAPH = 1
-"""Index of the photograph whose grid is used, of two."""
+"""Index of the photograph whose grid is tested; there are two photographs."""
 MIN_LEVEL_DISTANCE = 1e-4
 """Least distance of a luminance from a level at which rounding does not change which two levels are interpolated."""
 

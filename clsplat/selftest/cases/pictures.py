@@ -65,8 +65,8 @@ DEEP_SLICE_PARTS = {"colour": slice(0, 3), "alpha": slice(3, 4), "depth": slice(
 """Columns of a slice, by the names of the quantities that are compared."""
 
 MAX_GAUSSIANS_FOR_REFERENCE = 500
-"""Largest scene, in Gaussians, whose picture along rays is compared. The reference evaluates each Gaussian at every
-pixel, which takes a second for this number."""
+"""Largest number of Gaussians in a scene whose picture along rays is compared. The reference evaluates each Gaussian at
+every pixel, which takes a second for this number."""
 
 
 def _after(camera: Camera) -> Camera:
@@ -139,7 +139,8 @@ def random_deep_pictures(
     1."""
     count, bins = count or int(rng.choice([1, 2, 3, DEEP_PICTURES])), bins or int(rng.choice([1, 4, 7, 40]))
     shape = (count, bins, size[1], size[0])
-    alpha = (rng.uniform(0.02, 0.95, shape) * min(1, 8 / bins)).astype(np.float32)  # low, so that some light passes all
+    # Alpha is so low that some light passes all slices.
+    alpha = (rng.uniform(0.02, 0.95, shape) * min(1, 8 / bins)).astype(np.float32)
     depth = np.cumsum(rng.uniform(0.01, 1, shape), axis=1).astype(np.float32)
     depth[:, :, ::3] = np.round(depth[:, :, ::3]) + np.arange(bins, dtype=np.float32)[:, None, None]  # equal depths
     colours = rng.uniform(-0.2, 1.5, (*shape, 3)).astype(np.float32) * alpha[..., None]
@@ -177,8 +178,7 @@ def _twin_of_deep_merge(given: Inputs, _: Arrays) -> dict[str, Expected]:
     pictures, weights = given.wide("pictures", "weights")
     twin = reference_deep_merge.deep_merge(pictures, weights)
     sure = np.broadcast_to(twin.margin > MIN_MERGED_MARGIN, twin.slices.shape[:3])
-    # A slice's colour is a sum of up to 16 x bins products, times a transmittance of as many factors. Depths are
-    # copied.
+    # Colours are sums of up to 16 x bins products, times a transmittance of as many factors. Depths are copied.
     bounds = {"colour": 1e-5, "alpha": 1e-5, "depth": 0.0}
     return {name: Expected(twin.slices[..., at], bounds[name], 1.0, sure) for name, at in DEEP_SLICE_PARTS.items()}
 

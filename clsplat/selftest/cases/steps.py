@@ -145,7 +145,7 @@ def _random_missed(rng: Generator, count: int) -> Inputs:
 
     first_step: the last step that all rows have taken.
     rates: learning rates of each step after `first_step`, by parameter group.
-    every: the SH bands from degree 1 on are updated in every so many steps.
+    every: number of steps between updates of the SH bands from degree 1 on.
     """
     span, every = int(rng.choice([1, 7, 40, MOST_MISSED])), int(rng.choice([1, 2]))
     first_step = int(rng.choice([0, 1, 100, 30_000]))
@@ -153,7 +153,7 @@ def _random_missed(rng: Generator, count: int) -> Inputs:
     last[0] = first_step
     made: dict[str, Arrays] = {name: {} for name in ("parameters", "first", "second")}
     for group, shape in group_shapes(count, int(rng.choice([1, 16]))).items():
-        size = 10 ** rng.uniform(-9, 6, shape)  # gradients far above Adam's epsilon
+        size = 10 ** rng.uniform(-9, 6, shape)  # far above Adam's epsilon
         made["parameters"][group] = rng.standard_normal(shape).astype(np.float32)
         made["first"][group] = (rng.standard_normal(shape) * size * (rng.random(shape) < 0.9)).astype(np.float32)
         made["second"][group] = (rng.uniform(0.1, 1.0, shape) * size**2).astype(np.float32)
@@ -188,7 +188,7 @@ def _launch_settle(device: Device, _: Workspace, given: Inputs) -> Read:
     }
 
 
-def _twin_of_settle(given: Inputs, got: Arrays) -> dict[str, Expected]:  # noqa: ARG001  # as every twin
+def _twin_of_settle(given: Inputs, got: Arrays) -> dict[str, Expected]:  # noqa: ARG001  # all twins have these arguments
     taken = np.ones_like(given.visible) if given.all_rows else given.visible
     made: dict[str, list[Array]] = {name: [] for name in ("parameters", "first", "second", "moves")}
     for group, rates in given.rates.items():
