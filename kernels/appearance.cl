@@ -25,9 +25,9 @@ __kernel void column_sums(const int stride, const int tiles_y, __global const fl
   columns[(size_t)stride * c + x] = sum;
 }
 
-// Takes a step of Adam on the entries of all photographs. Only those of `photograph` have a gradient; the others' is 0.
-// columns, logs, start, begins, others, weights -> moved: the new logs before centring; first and second change in
-// place. The learning rate of mixes is `slow` times `rate`.
+// Takes a step of Adam on the entries of all photographs. Only the entries of `photograph` have a gradient; that of all
+// other entries is 0. columns, logs, start, begins, others, weights -> moved: the new logs before centring; first and
+// second change in place. The learning rate of mixes is `slow` times `rate`.
 __kernel void move_gains(const int count, const int entries, const int photograph, const int stride, const int at,
                          const float rate, const float slow, const float root, const float beta1, const float beta2,
                          const float epsilon, __global const uint *readback, __global const float *columns,

@@ -6,10 +6,10 @@
 //   items; for each entry of `chunks`, PIECES groups for each float of a row.
 // Buffers: chunks (entries): numbers of chunks, or NO_CHUNK; last (entries): the last step that each of them took with
 //   its gradients; caught (chunks of the model): the step up to which each has been caught up; table (steps,
-//   TABLE_NUMBERS): for each step from number `first_step` on, Step's root for all groups but sh_rest, then for sh_rest
-//   (0 in a step that does not update it), and the rates of the six parameter groups; parameters and both moments of
-//   the model's model_rows rows, updated up to step `step`; readback (READBACK_SIZE) counts refusals. The other scalars
-//   are fields of Step. After a stopped pass (duplicate.cl) nothing changes.
+//   TABLE_NUMBERS): numbers of each step from `first_step` on: Step's root for all groups but sh_rest, Step's root for
+//   sh_rest (0 if the step does not update sh_rest), and the rates of the six parameter groups; parameters and both
+//   moments of the model's model_rows rows, updated up to step `step`; readback (READBACK_SIZE) counts refusals. The
+//   other scalars are fields of Step. After a stopped pass (duplicate.cl) nothing changes.
 // Equations: docs/gradients.md, (42), and (193) for the steps that only the moments take.
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -10,7 +10,7 @@
 //   items: blocks across x blocks down x channels. Blocks are numbered in this order.
 // Buffers: image, target (3, rows, stride): colour, padded to whole tiles with zeros; with PHOTOGRAPH the target is
 //   (height, width, 3), bytes or floats; partials: with ITEMS == 1 (groups, LOSS_RING, 3, field), otherwise (3
-//   channels, strips of COLUMNS columns, height, 3 derivatives, COLUMNS), so that address differences in a column are
+//   channels, strips of COLUMNS columns, height, 3 derivatives, COLUMNS), so that addresses within a column differ by
 //   constants; gradient (3, rows, stride), 0 right of the image; sums (3, ...) of SSIM, of |image - target| and of its
 //   square: one sum per block, or with ITEMS == 1 per row of a block.
 // Equations: docs/gradients.md, (17) to (21) in the forms (78) and (79); with several items (188) and (189).

@@ -55,8 +55,8 @@
 // could not, because -0 + 0 is 0.
 #define BEGIN_SUMS(sums) FOR_FIELDS(field) sums[field] = -0.0f;
 
-// Computes those fields of a lane's sums that are v times other fields, instead of adding them pixel by pixel. With
-// RAYS the fields stay as add_gradients added them, because each pixel has its own v.
+// Computes those fields of a lane's sums that equal v times other fields, so that they are not added pixel by pixel.
+// With RAYS the fields stay as add_gradients added them, because each pixel has its own v.
 static inline void finish_row(float v, float *sums) {
 #ifndef RAYS
   sums[SLOT_GV] = v * sums[SLOT_G];
