@@ -1,19 +1,22 @@
 // Adam on one parameter group, from gradients in memory. Usually Adam is fused into project_grad.cl. These kernels are
 // for steps that need the gradients in memory, for example to add up the views of a batch.
 //
-// Adam sets the gradients to zero, because project_grad writes only the rows of visible Gaussians.
+// These kernels also set the gradients to zero for the next step, because project_grad writes only the rows of visible
+// Gaussians.
 //
 // Owner: A work-item owns ABREAST consecutive elements (adam), ABREAST rows (adam_visible) or an element (add_view).
-// Launch: One work-item for each of these, in groups of 64; work-items past the end do nothing.
-// Buffers: The group's parameters in its own units, their gradients, the moments `first` and `second`; `readback`
-//   (READBACK_SIZE) counts elements that are not updated. The scalars are those of Step. Shapes are above each kernel.
+// Launch: One work-item for each ABREAST elements, ABREAST rows or element, in groups of 64; work-items past the end do
+//   nothing.
+// Buffers: A parameter group in its own units, its gradients, its moments `first` and `second`; `readback`
+//   (READBACK_SIZE) counts the elements whose update is refused. The scalars are fields of Step (shared/adam.h). Shapes
+//   are above each kernel.
 // Equations: docs/gradients.md, (42).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/adam.h"
 
-// Updates the group as a flat array, ABREAST elements per work-item. parameters, gradients, first, second (n). With
-// SPARSE (OptimiserConfig.sparse) elements whose gradient is zero do not change.
+// Updates a parameter group as a flat array, ABREAST elements per work-item. parameters, gradients, first, second (n).
+// With SPARSE (OptimiserConfig.sparse) elements whose gradient is zero do not change.
 __kernel void adam(const ulong n, const float rate, const float root, const float beta1, const float beta2,
                    const float epsilon, const float limit2, __global uint *readback, __global float *parameters,
                    __global float *gradients, __global float *first, __global float *second) {
@@ -43,8 +46,9 @@ __kernel void adam(const ulong n, const float rate, const float root, const floa
 }
 
 #ifdef WIDTH
-// Updates only the rows of visible Gaussians (OptimiserConfig.late), ABREAST rows per work-item. The gradients of the
-// others are zero. tile_counts (n): 0 if not visible; parameters, gradients, first, second (n, WIDTH).
+// Updates only the rows of visible Gaussians (OptimiserConfig.late), ABREAST rows per work-item. The gradients of
+// invisible Gaussians are zero. tile_counts (n): 0 for an invisible Gaussian; parameters, gradients, first, second (n,
+// WIDTH).
 __kernel void adam_visible(const uint n, const float rate, const float root, const float beta1, const float beta2,
                            const float epsilon, const float limit2, __global uint *readback,
                            __global const uint *tile_counts, __global float *parameters, __global float *gradients,
@@ -79,8 +83,9 @@ __kernel void adam_visible(const uint n, const float rate, const float root, con
   }
 }
 
-// Adds a view's gradients to the sums over earlier views, one element per work-item. Gradients of Gaussians that are
-// not visible in the view are not read. tile_counts (n / WIDTH): 0 if not visible; gradients, sums (n).
+// Adds a view's gradients to the sums over earlier views of the batch, one element per work-item. It does not read the
+// gradients of Gaussians that are invisible in the view. tile_counts (n / WIDTH): 0 for an invisible Gaussian;
+// gradients, sums (n).
 __kernel void add_view(const ulong n, __global const uint *tile_counts, __global const float *gradients,
                        __global float *sums) {
   const size_t i = get_global_id(0);

@@ -1,8 +1,8 @@
-// The alpha loss: weight times the mean |A - alpha| over the pixels that count, for the render's A = 1 - T; and its
-// gradient with respect to T.
+// The alpha loss and its gradient with respect to the render's transmittance T. The loss is a weight times the mean of
+// |A - alpha| over the pixels that count, where A = 1 - T is the render's alpha and `alpha` is the photograph's.
 //
 // Owner: A work-item owns a column of TILE rows.
-// Launch: A grid of stride x rows / TILE.
+// Launch: A grid of stride x rows / TILE work-items.
 // Buffers: stops (rows, stride), negative where a pixel does not count; transmittance, alpha (rows, stride); scale: the
 //   weight divided by the number of pixels that count -> gradient (rows, stride) with respect to the transmittance, 0
 //   in pixels that do not count; sums (rows / TILE, stride) of |A - alpha|. alpha and gradient are the fourth planes of

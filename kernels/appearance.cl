@@ -1,13 +1,14 @@
-// Appearance of photographs: the update by Adam of their gains and colour mixes, or of the vignettes of lenses, from
-// column sums of the gradient (shared/develop.h).
+// Updates the appearance of photographs by Adam: the gains and colour mixes of photographs, or the vignettes of lenses.
+// The gradients come from the partial sums of shared/develop.h.
 //
 // Owner: A work-item owns a column of the partial sums (column_sums), or one entry of one photograph or lens
-//   (move_gains, centre_gains). Sums are added in the same order on every device. Built with one lane.
-// Launch: A grid of stride x sums; a work-item for each of the `count` entries.
+//   (move_gains, centre_gains). Every device adds the sums in the same order. Built with one lane.
+// Launch: A grid of stride x sums work-items (column_sums); one work-item for each of the `count` entries (move_gains,
+//   centre_gains).
 // Buffers: logs, start, first, second, moved, gains (photographs, entries): the first three entries are base-2 logs of
-//   gains, the rest are colour mixes (ppisp.cl). begins (photographs + 1), others, weights: rows of a sparse matrix.
-//   partials (sums, tiles_y, stride); columns (sums, stride), where the photograph's entries begin at row `at`. Shapes
-//   are above each kernel.
+//   gains, the rest are colour mixes (ppisp.cl). begins (photographs + 1), others, weights: a sparse matrix in CSR
+//   form, which pulls gains towards `start`. partials (sums, tiles_y, stride); columns (sums, stride), where the
+//   photograph's entries begin at row `at`. Shapes are above each kernel.
 // Equations: docs/gradients.md, "Appearance".
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -15,7 +16,7 @@
 #define MOST_LOG 16.0f
 #define MOST_MIX 0.2f // limit of a mix: the matrix of six mixes is invertible up to it
 
-// partials -> columns.
+// Adds the partial sums over the rows of tiles: partials -> columns.
 __kernel void column_sums(const int stride, const int tiles_y, __global const float *partials,
                           __global float *columns) {
   const int x = get_global_id(0), c = get_global_id(1);
@@ -24,9 +25,9 @@ __kernel void column_sums(const int stride, const int tiles_y, __global const fl
   columns[(size_t)stride * c + x] = sum;
 }
 
-// columns of one photograph, logs, start, begins, others, weights -> moved; first and second in place. The entries of
-// all photographs are updated; the other photographs' gradients are 0. The learning rate of mixes is `slow` times
-// `rate`.
+// Takes a step of Adam on the entries of all photographs. Only the entries of `photograph` have a gradient; that of all
+// other entries is 0. columns, logs, start, begins, others, weights -> moved: the new logs before centring; first and
+// second change in place. The learning rate of mixes is `slow` times `rate`.
 __kernel void move_gains(const int count, const int entries, const int photograph, const int stride, const int at,
                          const float rate, const float slow, const float root, const float beta1, const float beta2,
                          const float epsilon, __global const uint *readback, __global const float *columns,
@@ -41,7 +42,8 @@ __kernel void move_gains(const int count, const int entries, const int photograp
   if (c < 3) g *= LN2;
   const int begin = begins[photograph], end = begins[photograph + 1];
   if (i / entries == photograph && end > begin) {
-    float told = 0.0f, apart = 0.0f, pull = 0.0f; // the mean offset of the pulled photographs is subtracted
+    // `apart` sums the offsets from `start` of the `told` pulled photographs.
+    float told = 0.0f, apart = 0.0f, pull = 0.0f;
     for (int k = 0; entries * k < count; ++k)
       if (begins[k + 1] > begins[k]) told += 1.0f, apart = added(apart, logs[entries * k + c] - start[entries * k + c]);
     for (int k = begin; k < end; ++k) {
@@ -56,7 +58,8 @@ __kernel void move_gains(const int count, const int entries, const int photograp
   moved[i] = logs[i] - (c < 3 ? rate : slow * rate) * m / fma1(sqrt(v), root, epsilon);
 }
 
-// moved -> logs, each entry with mean 0 over the photographs if `centred`; gains: 2^logs.
+// Centres and limits the entries: moved -> logs, where with `centred` each entry has mean 0 over the photographs;
+// gains: 2^logs.
 __kernel void centre_gains(const int count, const int entries, const int centred, __global const uint *readback,
                            __global const float *moved, __global float *logs, __global float *gains) {
   const int i = get_global_id(0), c = i % entries;

@@ -1,11 +1,12 @@
-// Tile lists by append, for groups of several items. Every Gaussian is appended to the lists of its tiles, in any
-// order. A group then sorts a tile's list by (depth, slot). Slots follow the order of the Gaussians, so this total
-// order is that of duplicate.cl and ranges.cl: depth, then index.
+// Builds the tile lists by appending, for groups of several items. Every Gaussian is appended to the lists of its
+// tiles, in any order. A group then sorts a tile's list by (depth, slot). Slots follow the order of the Gaussians. So
+// the lists have the same order as those of duplicate.cl and ranges.cl: by depth, then by the Gaussian's index.
 //
-// Owner: In count_tiles and append_pairs a work-item owns a Gaussian, and its group shares those with wide boxes. In
-//   list_offsets a group owns all tiles, and another the sums of count_tiles' groups. In sort_lists a group owns a
-//   tile.
-// Launch: One work-item for each Gaussian, in groups of ITEMS; two groups; one group for each tile.
+// Owner: In count_tiles and append_pairs a work-item owns a Gaussian; the items of a group share a Gaussian whose box
+//   of tiles is large. In list_offsets one group owns all tiles, and a second group owns the sums of count_tiles'
+//   groups. In sort_lists a group owns a tile.
+// Launch: count_tiles and append_pairs: one work-item for each Gaussian, in groups of ITEMS; list_offsets: two groups;
+//   sort_lists: one group for each tile.
 // Buffers: splats (n, SPLAT_SIZE) in pixels, depth in world units; tile_counts (n) -> slots (n): each Gaussian's first
 //   slot; ranges (tiles, 2): a list's begin and end; gaussian_from_sorted, slot_from_sorted (pairs): the lists. The
 //   other shapes are above each kernel.
@@ -22,12 +23,12 @@
 // Number of items that share a row of tiles of a wide box.
 #define SIDE (ITEMS < 8 ? ITEMS : 8)
 
-// A pair: its slot, then its depth's bits. The lists are in the order of depth, then slot.
+// A pair of a tile and a Gaussian: .x is its slot, .y the bits of its depth. Lists are sorted by depth, then by slot.
 typedef uint2 Pair;
-// Fills the unused end of a list in local memory. It sorts after every pair.
+// Filler for the unused end of a list in local memory; it sorts after every pair.
 #define NO_PAIR ((Pair)(0xffffffff))
 
-// Swaps two pairs if the first comes after the second. One comparison of 64 bits and four selections.
+// Swaps two pairs if the first sorts after the second, by one comparison of 64 bits and four selections.
 static inline void order_two(Pair *one, Pair *other) {
   const Pair a = *one, b = *other;
   const int after = ((ulong)a.y << 32 | a.x) > ((ulong)b.y << 32 | b.x);
@@ -35,14 +36,17 @@ static inline void order_two(Pair *one, Pair *other) {
   *other = (Pair)(after ? a.x : b.x, after ? a.y : b.y);
 }
 
-// Where local memory keeps the pair with this number: within 16, so that neighbouring items use different banks of it,
-// whatever the step. PLACE(a ^ b) is PLACE(a) ^ PLACE(b).
+// The index in local memory of a list's pair `number`. It permutes each 16 numbers, so that neighbouring items use
+// different banks of local memory at every step of the network. PLACE(a ^ b) is PLACE(a) ^ PLACE(b).
 #define PLACE(number) ((number) ^ ((number) >> 4 & 3) ^ ((number) >> 2 & 12))
 
-// Two steps of the network over pairs (count) in local memory: pairs `step` apart, or in a mirrored step at equal
-// distances from the ends of a block of 2 step, then pairs step / 2 apart. An item does both for four pairs in
-// registers, which may go past `count`, up to the next power of two. If step is 1, the first is an additional
-// one: it repeats a step that has been done, or comes before all others, when any exchange is allowed.
+// Takes two steps of the sorting network over `pairs` (count) in local memory. The first step compares pairs that are
+// `step` apart. If `mirrored`, it compares pairs at equal distances from the two ends of a block of 2 step pairs. The
+// second step compares pairs that are step / 2 apart. An item does both steps for four pairs in registers; these may
+// lie past `count`, up to the next power of two.
+//
+// If `step` is 1, the function still takes two steps, and the first is redundant. It repeats an earlier step, or comes
+// before all others, when any exchange is allowed.
 static inline void order_steps(__local Pair *pairs, uint count, uint step, int mirrored) {
   const uint apart = max(step / 2, 1u), within = apart - 1;
   const uint near = PLACE(apart), far = PLACE(mirrored ? 3 * apart - 1 : 2 * apart), turned = mirrored ? near : 0;
@@ -62,8 +66,8 @@ static inline void order_steps(__local Pair *pairs, uint count, uint step, int m
   BARRIER_LOCAL();
 }
 
-// One step over pairs (count) in global memory. All comparisons leave the lesser pair first, so that places past the
-// end of a list need no pairs: none would move.
+// Takes one step of the network over `list` (count) in global memory. All comparisons leave the lesser pair first. So a
+// list needs no filler past its end: the filler would never move.
 static inline void order_step_far(__global Pair *list, uint count, uint step, int mirrored) {
   for (uint k = get_local_id(0); 2 * k - (k & (step - 1)) + 1 < count; k += ITEMS) {
     const uint a = 2 * k - (k & (step - 1));
@@ -78,8 +82,8 @@ static inline void order_step_far(__global Pair *list, uint count, uint step, in
   BARRIER_GLOBAL();
 }
 
-// Copies pairs (count) to local memory, and fills it up to `whole`. An item reads only pairs that it writes in
-// store_pairs, as the barriers between do not order global memory.
+// Copies `list` (count) to `pairs` in local memory, and fills `pairs` with NO_PAIR up to `whole`. An item reads only
+// the elements that it also writes in store_pairs, because the barriers in between do not order global memory.
 static inline void fetch_pairs(__global const Pair *list, uint count, uint whole, __local Pair *pairs) {
   for (uint k = get_local_id(0); k < whole; k += AHEAD * ITEMS) {
     Pair ahead[AHEAD];
@@ -92,16 +96,17 @@ static inline void fetch_pairs(__global const Pair *list, uint count, uint whole
   BARRIER_LOCAL();
 }
 
-// Writes pairs (count) back from local memory.
+// Writes `pairs` (count) in local memory back to `list` in global memory.
 static inline void store_pairs(__global Pair *list, uint count, __local const Pair *pairs) {
   for (uint k = get_local_id(0); k < count; k += ITEMS) list[k] = pairs[PLACE(k)];
   BARRIER_GLOBAL();
   BARRIER_LOCAL();
 }
 
-// tile_counts, shown (n) -> counts (tiles + 1), zero before: the length of each tile's list, then the number of visible
-// Gaussians; slots (n): the number of pairs of the group's earlier Gaussians; sums (groups): of all its pairs. Integer
-// sums do not depend on the order of the atomics.
+// Counts the pairs of each tile and of each group of Gaussians. tile_counts, shown (n) -> counts (tiles + 1), zeroed
+// before: the length of each tile's list, then the number of visible Gaussians; slots (n): the number of pairs of
+// earlier Gaussians in the same group; sums (groups): the number of all pairs of a group. Integer sums do not depend on
+// the order of the atomics.
 GROUP __kernel void count_tiles(const uint n, const int tiles_x, const int tiles_y, __global const uint *shown,
                                 __global const uint *tile_counts, __global const float *splats, __global uint *counts,
                                 __global uint *slots, __global uint *sums) {
@@ -145,10 +150,12 @@ GROUP __kernel void count_tiles(const uint n, const int tiles_x, const int tiles
   }
 }
 
-// counts (tiles + 1), sums (groups) of count_tiles -> counts: where each list begins; sums: their exclusive scan;
-// ranges (tiles, 2); order (tiles): the tiles with the longest lists first, to a power of two, as these take longest;
-// readback: as from compact_visible in duplicate.cl, but for the keys, which are 0, and with the longest list's length.
-// A pass that stops as there, BY_CAPACITY, has empty lists.
+// Computes where each tile's list begins. counts (tiles + 1), sums (groups) of count_tiles -> counts: the index at
+// which each list begins; sums: their exclusive scan; ranges (tiles, 2); order (tiles): the tiles sorted by floor(log2)
+// of their lists' lengths, longest first, because these take longest to sort.
+//
+// readback gets the entries that compact_visible in duplicate.cl writes, with keys of 0, and in addition the length of
+// the longest list. Under the conditions of compact_visible, a pass stops, and then it has empty lists.
 GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint capacity, __global uint *counts,
                                  __global uint *sums, __global uint *ranges, __global uint *order,
                                  __global uint *readback) {
@@ -206,16 +213,17 @@ GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint
   for (uint k = begin; k < end_of_tiles; ++k) order[atomic_inc(places + clz(ranges[2 * k + 1] - ranges[2 * k]))] = k;
 }
 
-// Appends a pair to a tile's list.
+// Appends a pair of the Gaussian's `depth` to the list of `tile`.
 #define APPEND(tile, slot, gaussian)                                                                                   \
   {                                                                                                                    \
     pairs[atomic_inc(cursors + (tile))] = (Pair)(slot, depth);                                                         \
     gaussian_from_slot[slot] = gaussian;                                                                               \
   }
 
-// sums (groups) and cursors (tiles): `counts` of list_offsets; slots (n) of count_tiles -> slots (n): each Gaussian's
-// first slot; pairs (pairs): depth and slot, by tile in any order; gaussian_from_slot (pairs). In a pass that has
-// stopped, tile_counts (n) become zero, so that it adds nothing to statistics.
+// Appends every Gaussian to the lists of its tiles. sums (groups) and cursors (tiles), which are the `sums` and
+// `counts` of list_offsets; slots (n) of count_tiles -> slots (n): each Gaussian's first slot; pairs (pairs): slot and
+// depth, grouped by tile, in any order within a tile; gaussian_from_slot (pairs). In a stopped pass, tile_counts (n)
+// become zero, so that the pass adds nothing to statistics.
 GROUP __kernel void append_pairs(const uint n, const int tiles_x, const int tiles_y, __global const float *splats,
                                  __global const uint *sums, __global const uint *readback, __global uint *cursors,
                                  __global uint *tile_counts, __global uint *slots, __global Pair *pairs,
@@ -269,16 +277,17 @@ GROUP __kernel void append_pairs(const uint n, const int tiles_x, const int tile
   }
 }
 
-// order and ranges, which list_offsets writes; pairs and gaussian_from_slot (pairs), which append_pairs writes ->
-// gaussian_from_sorted, slot_from_sorted (pairs). fit, a power of two from 16 on: the number of pairs that `near`, in
-// local memory, holds. A longer list is sorted in parts, then merged in ever larger blocks, in `pairs`.
+// Sorts each tile's list. order and ranges of list_offsets; pairs and gaussian_from_slot (pairs) of append_pairs ->
+// gaussian_from_sorted, slot_from_sorted (pairs). `near` in local memory holds `fit` pairs, a power of two from 16 on.
+// A longer list is sorted in parts of `fit` pairs; then the parts are merged in ever larger blocks, in `pairs`.
 GROUP __kernel void sort_lists(const uint fit, __global const uint *order, __global const uint *ranges,
                                __global const uint *gaussian_from_slot, __global Pair *pairs,
                                __global uint *gaussian_from_sorted, __global uint *slot_from_sorted,
                                __local Pair *near) {
   const uint tile = order[get_group_id(0)], begin = ranges[2 * tile], count = ranges[2 * tile + 1] - begin;
   __global Pair *list = pairs + begin;
-  // PoCL makes wrong code of two loops, one for the parts and one for the blocks, that both have barriers inside.
+  // One loop handles the parts and the larger blocks, because PoCL compiles two loops with barriers inside to wrong
+  // code.
   for (uint stage = fit / 2; stage == fit / 2 || stage < count; stage *= 2) {
     for (uint step = stage; step >= fit; step /= 2) order_step_far(list, count, step, step == stage);
     for (uint first = 0; first < count; first += fit) {

@@ -1,5 +1,5 @@
-// The arithmetic that the other kernels rely on, for `clsplat selftest`: division, square root, fused multiply-add and
-// denormals.
+// Division, square root, fused multiply-add and denormals as the device computes them, for `clsplat selftest`: the
+// other kernels rely on their rounding.
 //
 // Owner: A work-item owns LANES consecutive elements.
 // Launch: One work-item for each LANES elements, in groups of 64; work-items past the end do nothing.

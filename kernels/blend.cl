@@ -1,16 +1,18 @@
-// Front-to-back blending until a pixel's alpha saturates: the image from each tile's list of Gaussians.
+// Front-to-back alpha blending of each tile's list of Gaussians into an image, until a pixel's transmittance is used
+// up.
 //
-// Owner: A group owns a tile. On a CPU (ITEMS == 1) a work-item loops over the tile's Gaussians, and over the cells of
-//   open pixels that each ellipse reaches. On a GPU (LANES == 1) each work-item has its own pixels. The group fetches
-//   Gaussians in batches, as in Kerbl et al., and each warp loops over those that reach its blocks. Both give the same
-//   bits.
+// Owner: A group owns a tile. On a CPU (ITEMS == 1) a work-item loops over the tile's Gaussians; for each it loops over
+//   the cells of open pixels that the ellipse reaches. On a GPU (LANES == 1) each work-item owns pixels. The group
+//   fetches Gaussians in batches, as in Kerbl et al., and each warp loops over the Gaussians that reach its blocks. CPU
+//   and GPU give the same bits.
 // Launch: One group of ITEMS work-items for each tile of a band or of the whole image, in row-major order from
 //   first_tile on.
 // Buffers: ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE) in pixels, background (3), with RAYS
-//   camera -> image (3, height, width): colour; transmittance (height, width): final value, 0 to 1; stops (height,
-//   width): the sorted index of the first pair that is not added to the pixel, -1 in padding; with NEARNESS nearness
-//   (height, width): the sum of weight / depth, 0 in padding; with RECORD_CELLS cells_from_sorted (pairs): bits of the
-//   cells to which the Gaussian contributes, for the backward pass. Planes are padded with black to whole tiles.
+//   camera -> image (3, height, width): colour; transmittance (height, width): after all Gaussians, 0 to 1; stops
+//   (height, width): the sorted index of the first pair that is not added to the pixel, -1 in padding; with NEARNESS
+//   nearness (height, width): the sum of weight / depth, 0 in padding; with RECORD_CELLS cells_from_sorted (pairs):
+//   bits of the cells to which the Gaussian contributes, for the backward pass. Planes are padded with black to whole
+//   tiles.
 // Equations: docs/gradients.md, (14) to (16), (45) and (120); with RAYS docs/cameras.md, (14); Kerbl et al. 2023,
 //   section 6 and algorithm 2.
 #include "shared/widened.h"
@@ -22,7 +24,7 @@
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
 
-#ifdef NO_EARLY_STOP // RasterizerConfig.early_stop: continue past opaque pixels, with the same result
+#ifdef NO_EARLY_STOP // RasterizerConfig.early_stop is off: continue past opaque pixels, with the same result
 #define GOES_ON(open) 1
 #else
 #define GOES_ON(open) ((open) != 0)
@@ -32,8 +34,9 @@
 #else
 #define RECORD(statements)
 #endif
-// Nonzero if a vector of pixels should be blended. With CELLS_BY_ELLIPSE most vectors without an effect are skipped
-// before, and a test of the mask would cost more than it saves.
+// Nonzero if a vector of pixels should be blended. `mask`: the lanes that the Gaussian reaches. With CELLS_BY_ELLIPSE,
+// reach_of already skips most vectors that the Gaussian does not reach, and a test of the mask would cost more than it
+// saves.
 #if defined(RECORD_CELLS) && VECTORS > 1 // a cell of two vectors stays open while one of them is open
 #define CONTRIBUTES(mask) RECORDED((mask) & MASKL(pixels[cell].t > 0.0f))
 #elif defined(RECORD_CELLS)
@@ -49,9 +52,10 @@
 #define COUNT(statements)
 #endif
 
-// `t` is the transmittance of open pixels. In a finished pixel, t is such that weights are 0 without a test of their
-// own. On a CPU t is 0, and `kept`, rarely written, has the final transmittance. On a GPU, to save instructions, t is
-// minus the final transmittance, which fails the test against TRANSMITTANCE_MIN.
+// Colour sums and transmittance of a cell's pixels. While a pixel is open, `t` is its transmittance. In a finished
+// pixel, `t` makes all further weights 0 without an extra test. On a CPU `t` is then 0, and `kept`, which is rarely
+// written, holds the final transmittance. On a GPU `t` is then minus the final transmittance, to save instructions: it
+// fails the test against TRANSMITTANCE_MIN.
 typedef struct {
   floatL t;
 #if ITEMS == 1
@@ -71,8 +75,8 @@ typedef struct {
 #define T_AT_END(p) fabs((p).t)
 #endif
 
-// Adds the tile's i-th pair to a cell. On a CPU, returns true if that finishes the cell's last open pixel. zero: see
-// exp2_by.
+// Adds the tile's i-th pair to a cell. On a CPU, returns true if the pair finishes the cell's last open pixel. power:
+// log2 of the uncapped alpha; zero: an operand of exp2_by (lanes.h).
 static inline int add_gaussian(Pixels *p, floatL power, int i, int zero, float c_red, float c_green,
                                float c_blue NEAR_PARAMETER) {
   const floatL before = p->t;
@@ -97,7 +101,7 @@ static inline int add_gaussian(Pixels *p, floatL power, int i, int zero, float c
   return !ANYL(p->t > 0.0f);
 #else
   p->t = goes_on ? after : -fabs(before);
-  p->stop = goes_on ? p->stop : min(p->stop, i); // pairs are in order: keeps the first
+  p->stop = goes_on ? p->stop : min(p->stop, i); // pairs come in order, so min keeps the first
   return 0;
 #endif
 }
@@ -144,7 +148,9 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
 
 #if ITEMS == 1
   int i = begin;
-  Reach reach, second; // loaded in twos before their use, so that no load waits for the previous cells
+  // Two Gaussians' reaches are loaded together before their use, so that no load waits for the blending of earlier
+  // cells.
+  Reach reach, second;
   for (; i < end && GOES_ON(open); ++i) {
     const int turn = (i - begin) & 1;
     if (!turn) {
@@ -172,7 +178,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   }
   RECORD(for (; i < end; ++i) cells_from_sorted[i] = 0;)
 #else
-#if OWNED == 1 // a short loop without branches
+#if OWNED == 1 // the loop over pairs is short and has no branches
 #define OF_PAIRS _Pragma("unroll 4")
 #else
 #define OF_PAIRS ROLLED
@@ -184,16 +190,18 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   gaussian_of[fetch] = gaussian_from_sorted[min((batch) + ITEM + fetch * ITEMS, end - 1)];
   __local Staged staged[BATCH];
   __local uint marks[WARPS * BATCH / 4] __attribute__((aligned(16))), lists[WARPS * LIST];
-  __local int open_in[BLOCKS]; // number of open pixels of each block
+  __local int open_in[BLOCKS]; // number of open pixels in each block
   __local uint *list = lists + WARP * LIST;
-  const int zero = min(pixels[0].stop + 1, 0); // see exp2_by
+  const int zero = min(pixels[0].stop + 1, 0); // always 0, but unknown to the compiler: see exp2_by
   for (int block = ITEM; block < BLOCKS; block += ITEMS) open_in[block] = 0;
   BARRIER_LOCAL();
-  uint gaussian_of[FETCHES]; // of the next batch: its splats do not wait for them
+  // Indices for the next batch, loaded early: loads of its splats need not wait for them.
+  uint gaussian_of[FETCHES];
   if (begin < end) {
     FOR_FETCHES(fetch) { FETCH_INDEX(fetch, begin) }
   }
-  for (int batch = begin; batch < end; batch += BATCH) { // count open pixels, fetch, list; then walk without barriers
+  // For each batch: count open pixels, fetch splats, list the pairs of each warp, then blend without barriers.
+  for (int batch = begin; batch < end; batch += BATCH) {
     ALL_CELLS(cell) if (GOES_ON(pixels[cell].t > 0.0f)) atomic_inc(open_in + OWN_BLOCK(cell));
     BARRIER_LOCAL();
 
@@ -216,7 +224,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     uint next = list[0];
     OF_PAIRS for (int k = 1; k <= count; ++k) {
       const uint entry = next;
-      next = list[k]; // loaded before its use
+      next = list[k]; // loaded one iteration before its use
       const Staged s = staged[PAIR_OF(entry)];
       const int i = KEPT(batch + PAIR_OF(entry), (int)s.kept);
       SPLAT_STAGED(s)

@@ -1,18 +1,20 @@
-// The gradient of blending, back to front: partial sums for each pair of a tile and a Gaussian.
+// The gradient of alpha blending, back to front: for each pair of a tile and a Gaussian, partial sums over the tile's
+// pixels.
 //
-// Owner: A group owns a tile and writes one slot for each of its pairs. No two groups share a slot, so there are no
-//   atomics on global memory.
+// Owner: A group owns a tile and writes one slot for each of its pairs. No two groups share a slot, so global memory
+//   needs no atomics.
 // Launch: As in blend.cl, one group of ITEMS work-items for each tile from first_tile on. An item owns pixels; with
 //   BY_GAUSSIAN it owns one Gaussian after another.
-// Buffers: blend's inputs, its transmittance and stops; image_gradient (3, height, width): the loss's gradient with
-//   respect to colour; with ALPHA_GRADIENT a fourth plane, with respect to the final transmittance; with NEARNESS a
-//   last plane, with respect to nearness; slot_from_sorted (pairs) -> slots (pairs, SLOT_STRIDE), all written: sums
-//   over the tile's pixels, in the whitened units of (49).
+// Buffers: blend.cl's inputs, and its outputs transmittance and stops; image_gradient (3, height, width): the loss's
+//   gradient with respect to colour; with ALPHA_GRADIENT a fourth plane, with respect to the final transmittance; with
+//   NEARNESS a last plane, with respect to nearness; slot_from_sorted (pairs) -> slots (pairs, SLOT_STRIDE): sums over
+//   the tile's pixels, in the whitened units of (49); every slot is written.
 // Equations: docs/gradients.md, (14), (22) to (26), (48), (49), (55) and (122); with RAYS docs/cameras.md, (21).
 //
-// Each pixel goes from its last Gaussian to its first. Transmittance is recovered by division. `behind` is the light
-// behind the current Gaussian, background included, dotted with the pixel's gradient (shared/behind.h). The sums over
-// pixels are moments of g = alpha * dL/dalpha in (u, v); with CONTRIBUTIONS also the sum of the weights (55).
+// Each pixel visits its Gaussians from the last to the first, and recovers the transmittance by division. `behind` is
+// the light behind the current Gaussian, background included, dotted with the pixel's gradient (shared/behind.h). The
+// sums over pixels are moments of g = alpha * dL/dalpha in the whitened coordinates (u, v), and with CONTRIBUTIONS the
+// sum of the blending weights (55).
 #include "shared/widened.h"
 #include "shared/math.h"
 #include "shared/splat.h"
@@ -27,12 +29,12 @@
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
 
-#ifdef CONTRIBUTIONS // contributions need every cell, also cells without a gradient
+#ifdef CONTRIBUTIONS // contributions are summed over all cells, also over cells without a gradient
 #define LIVE(cells, live) (cells)
 #else
 #define LIVE(cells, live) ((cells) & (live))
 #endif
-#ifdef RECORD_CELLS // recorded by blend: in each visited cell, a pixel takes the Gaussian
+#ifdef RECORD_CELLS // blend.cl recorded the cells in which some pixel takes the Gaussian, and only these are visited
 #define CONTRIBUTES(mask) 1
 #define REACHED_AT_FIRST recorded
 #define ADD_REACHED(mask, cell)
@@ -42,7 +44,8 @@
 #define ADD_REACHED(mask, cell) reached |= RECORDED(mask) << FIRST_RECORDED(cell);
 #endif
 
-// State of the cells' pixels during the walk to the front, and the image's gradient there.
+// A work-item's pixels, by cell. t, behind: the transmittance and the light behind the current pair; near: the gradient
+// with respect to nearness; stop: the pixel's entry of `stops`; red, green, blue: the image's gradient.
 typedef struct {
   floatL t[OWNED], behind[OWNED], red[OWNED], green[OWNED], blue[OWNED];
   intL stop[OWNED];
@@ -51,14 +54,15 @@ typedef struct {
 #endif
 } Pixels;
 
-// g and the blending weight of a pair in a cell's pixels.
+// A pair's g = alpha * dL/dalpha and its blending weight in a cell's pixels.
 typedef struct {
   floatL g, weight;
 } Share;
 
 #include "shared/behind.h"
 
-// Removes a pair from a cell's pixels. `uncapped` is its alpha before the cap, 0 in lanes that did not take it.
+// Removes a pair from a cell's pixels, and returns its g and weight there. `uncapped` is the pair's alpha before the
+// cap, 0 in lanes whose pixel did not take the pair.
 static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red, float c_green,
                              float c_blue NEAR_PARAMETER) {
 #if ITEMS == 1
@@ -91,8 +95,9 @@ static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red,
 }
 
 #ifdef RAYS
-// The slot's fields for the mean hold the gradient on the mean's tangent plane. This gradient is not linear in (u, v),
-// because the plane turns with the mean: (21) of docs/cameras.md.
+// Adds a pixel to a slot's sums along rays. With RAYS, SLOT_GU and SLOT_GV hold the gradient with respect to the mean
+// on its tangent plane. This gradient is not linear in (u, v), because the plane turns with the mean: (21) of
+// docs/cameras.md.
 static inline void add_ray_moments(floatL g, floatL u, floatL v, float l11, float l12, float l22, floatL *sums) {
   const floatL q = fmaL(u, u, v * v);
   const floatL y = v / l22, x = fmaL((floatL)(-l12), y, u) / l11;
@@ -105,7 +110,8 @@ static inline void add_ray_moments(floatL g, floatL u, floatL v, float l11, floa
 }
 #endif
 
-// Adds the gradients of one vector of pixels (at `place`) to a pair's sums (SLOT_STRIDE).
+// Adds the gradients of one vector of pixels to a pair's sums (SLOT_STRIDE). place: the vector's index in an array of
+// cells.
 #define IN_PLACE(cells, place) (((const floatS *)(cells))[place])
 static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floatS g, floatS weight, floatS u, floatS v,
                                  float l11, float l12, float l22) {
@@ -129,7 +135,8 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
 #endif
 }
 
-// The gradient with respect to a pixel's final transmittance. background: its part through the background's colour.
+// The gradient with respect to a pixel's final transmittance. background: the part that comes through the background's
+// colour; by_t: the part from the alpha plane of the image's gradient.
 #ifdef ALPHA_GRADIENT
 #define AT_END(background) ((background) + by_t)
 #define NEAR_PLANE 4
@@ -142,7 +149,8 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
 #include "shared/strips.h"
 #endif
 
-// ALPHA_IN: alpha of the tile's i-th pair in a cell's pixels.
+// ALPHA_IN defines u, v, the log2 of the alpha (`power`) and the lanes that took the tile's i-th pair (`taken`), in a
+// cell's pixels.
 #ifdef RAYS
 #define WHITENING_HERE                                                                                                 \
   float whitening[3];                                                                                                  \
@@ -154,7 +162,7 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
   floatL u, v;                                                                                                         \
   const floatL power = offset_of_ray(ray_x[cell], ray_y[cell], ray_z[cell], splat, &u, &v);                            \
   const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < pixels.stop[cell]);                            \
-  u = AS_FLOATL(AS_INTL(u) & taken); /* undefined for rays that point away from the mean */                            \
+  u = AS_FLOATL(AS_INTL(u) & taken); /* u and v are undefined for rays that point away from the mean */                \
   v = AS_FLOATL(AS_INTL(v) & taken);
 #else
 #define WHITENING_HERE
@@ -168,8 +176,8 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
   const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < pixels.stop[cell]);
 #endif
 
-// Processes a pair in the cells that it reaches. A work-item with many cells runs three short loops instead of one:
-// short dependency chains and few registers keep more cells in flight (docs/performance.md).
+// Processes a pair in the cells that it reaches. A work-item with many cells runs three short loops instead of one,
+// because short dependency chains and few registers keep more cells in flight (docs/performance.md).
 #if LANES >= 8 && !defined(RAYS)
 #define TAKE_PAIR(reach)                                                                                               \
   floatL alpha_of[CELLS], u_of[CELLS], g_of[CELLS], weight_of[CELLS];                                                  \
@@ -237,7 +245,7 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
     const int stop = stops[pixel];
     float t = 0.0f;
     Fixed f = {0.0f, 0.0f, 0.0f, as_float(stop)};
-    if (stop >= 0) { // in padding no gradient is written
+    if (stop >= 0) { // in padding the gradient is uninitialised
       t = transmittance[pixel];
       f.x = image_gradient[pixel];
       f.y = image_gradient[plane + pixel];
@@ -257,11 +265,11 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
   PIXEL_TABLES
   RAY_TABLES
   Pixels pixels;
-  uint live = 0; // recorded cells with a pixel that has a gradient
+  uint live = 0; // recorded cells in which some pixel has a gradient
   ALL_CELLS(cell) {
     const size_t pixel = CELL_IN_PLANE(cell);
     const intL stop = LOAD_CELL(int, stops + pixel, stride);
-    const intL inside = MASKL(stop >= 0); // in padding no gradient is written, and 0 * NaN is not 0
+    const intL inside = MASKL(stop >= 0); // in padding the gradient is uninitialised, and 0 * NaN is not 0
     const floatL t = LOAD_CELL(float, transmittance + pixel, stride);
     const floatL red = AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + pixel, stride) & inside);
     const floatL green =
@@ -296,7 +304,9 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
 #endif
   RAISE_TO_GROUP_MAX(last)
 
-  for (int first = last; first < end; first += ITEMS) { // no early exit: Intel's runtime reads memory for absent items
+  // Every pair from `last` on contributes to no pixel, and its slot becomes 0. There is no early exit, because Intel's
+  // runtime reads memory for idle items too.
+  for (int first = last; first < end; first += ITEMS) {
     const int i = first + (int)get_local_id(0);
     __global float *slot = slots + (size_t)SLOT_STRIDE * slot_from_sorted[min(i, end - 1)];
     if (i < end)
@@ -343,11 +353,12 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
 #endif
   }
 #elif defined(BY_GAUSSIAN)
-  __local Staged staged[ITEMS]; // each entry is used by the item that stages it
+  __local Staged staged[ITEMS]; // each item uses only the entry that it stages itself
   float sums[SLOT_STRIDE];
   for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] = 0.0f;
   Walker walker = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, begin - 1, 0, 0};
-  for (int turn = last; turn > (last > begin ? begin - ITEMS : begin); turn -= ITEMS) { // the last turn adds no pairs
+  // In the last iteration, the items only finish the pairs that they have begun.
+  for (int turn = last; turn > (last > begin ? begin - ITEMS : begin); turn -= ITEMS) {
     const int next = max(turn - 1 - ITEM, begin);
     stage(staged + ITEM, gaussian_from_sorted[next], next, slot_from_sorted[next], ALL_BLOCKS, splats, tile_x, tile_y);
     for (int round = 0; round < ITEMS; ++round) {
@@ -380,14 +391,14 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
     }
   }
 #else
-  const int zero = min(pixels.stop[0] + 1, 0); // see exp2_by
+  const int zero = min(pixels.stop[0] + 1, 0); // always 0, but unknown to the compiler: see exp2_by
   __local Staged staged[BATCH];
   __local uint marks[BLOCK_ROWS * BATCH / 4] __attribute__((aligned(16)));
   __local uchar lists[BLOCK_ROWS * LIST];
-  __local int counts[BLOCK_ROWS]; // number of a strip's pairs
-  __local int lasts[BLOCKS];      // the largest stop of each block
+  __local int counts[BLOCK_ROWS]; // number of pairs listed for each strip
+  __local int lasts[BLOCKS];      // the largest entry of `stops` in each block
   __local float rows[TEAMS * TOGETHER * PAIR_ROWS * ROW] __attribute__((aligned(16)));
-  __local float totals[BLOCK_ROWS * SLOT_STRIDE * TOTALS]; // by strip, field and pair
+  __local float totals[BLOCK_ROWS * SLOT_STRIDE * TOTALS]; // sums of each strip, by field and pair
 #if TEAM_WARPS > 1
   Pixels strip_pixels[BLOCK_COLUMNS];
   load_strip(image_gradient, stops, stride * (tile_y + TEAM * BLOCK_H + LANE / BLOCK_W) + tile_x + LANE % BLOCK_W,
@@ -397,12 +408,13 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
   BARRIER_LOCAL();
   ALL_CELLS(cell) atomic_max(lasts + OWN_BLOCK(cell), pixels.stop[cell]);
   BARRIER_LOCAL();
-  uint gaussian_of[FETCHES], slot_of[FETCHES]; // of the next batch: its splats do not wait for them
+  // Indices for the next batch, loaded early: loads of its splats need not wait for them.
+  uint gaussian_of[FETCHES], slot_of[FETCHES];
   if (last > begin) {
     FOR_FETCHES(fetch) { FETCH_INDICES(fetch, last) }
   }
   for (int batch = last; batch > begin; batch -= BATCH) {
-    const int count = min(BATCH, batch - begin); // number of pairs before `batch`, from the last one on
+    const int count = min(BATCH, batch - begin); // number of pairs in this batch, which ends before index `batch`
     FOR_FETCHES(fetch) {
       const int j = ITEM + fetch * ITEMS;
       if (j < BATCH) {
@@ -422,13 +434,13 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
 #define ENTRY(j) (uchar)(j)
         LIST_MARKED(listed, marks + strip * BATCH / 4, list, ENTRY)
         if (LANE == 0) counts[strip] = listed;
-        if (LANE < 2) list[listed + LANE] = 0; // loaded, and not used
+        if (LANE < 2) list[listed + LANE] = 0; // read ahead, but not used
       }
       BARRIER_LOCAL();
-      int j = list[0], next = list[1]; // a pair, and the one after it, are loaded before their use
+      int j = list[0], next = list[1]; // the current and the next pair, loaded before their use
       Staged s = staged[j];
       const int own = counts[strip], most = max(counts[k], counts[(TEAMS - 1) * OWN_STRIPS + k]);
-      for (int first = 0; first < most; first += TOGETHER) { // in step with the other team
+      for (int first = 0; first < most; first += TOGETHER) { // both teams run the same number of iterations
         const int stop_at = min(first + TOGETHER, ACROSS_TEAMS ? most : own);
         __local float *pair_rows = rows + TEAM * (TOGETHER * PAIR_ROWS * ROW);
         for (int turn = first; turn < stop_at; ++turn, pair_rows += PAIR_ROWS * ROW) {
@@ -440,7 +452,8 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
 #if TEAM_WARPS == 1
           float sums[SLOT_STRIDE];
           BEGIN_SUMS(sums)
-          if (IS_WHOLE(reach)) { // alpha is 0 in pixels that do not take the pair, as in the first cell below
+          // `taken` is not tested here, nor in cell 0 below: alpha is 0 in pixels that do not take the pair.
+          if (IS_WHOLE(reach)) {
             FOR_STRIP(c) ADD_PIXEL(k * BLOCK_COLUMNS + c, 1);
           } else {
             FOR_STRIP(c) if (reach >> c & 1) ADD_PIXEL(k * BLOCK_COLUMNS + c, c == 0 || taken);

@@ -1,10 +1,11 @@
-// Bounds of a model's chunks: the box of a chunk's means, and its largest scale.
+// Bounds of a model's chunks: the axis-aligned box of each chunk's means, and its largest log scale.
 //
-// Owner: A group owns a chunk. Each item takes every ITEMS-th row; the first BOUNDS items then combine what all found.
+// Owner: A group owns a chunk. Each item reads every ITEMS-th row of it; the first BOUNDS items then combine the
+//   results of all items.
 // Launch: Groups of ITEMS items, one for each entry of `chunks`.
-// Buffers: `chunks`: numbers of chunks; means, log_scales (model_rows, 3) -> bounds (entries, BOUNDS): least and
-//   greatest coordinates of the means, and the greatest log scale. NaN counts as no value, because no view shows a
-//   Gaussian that has one. A chunk without values has an empty box, from INFINITY to -INFINITY.
+// Buffers: `chunks` (entries): numbers of chunks; means, log_scales (model_rows, 3) -> bounds (entries, BOUNDS): least
+//   and greatest coordinates of the means, and the greatest log scale. NaN is ignored, because a Gaussian with NaN is
+//   never drawn. A chunk without any other value has an empty box, from INFINITY to -INFINITY.
 // Equations: none.
 #include "shared/math.h"
 

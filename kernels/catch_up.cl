@@ -1,15 +1,15 @@
-// Catches up chunks of a model that earlier steps did not show: their missed steps of Adam, in which all gradients are
-// zero. The bits are those of steps over all rows.
+// Catches up chunks of a model that no view of the last steps showed: it takes the steps of Adam that they missed, in
+// which all gradients are zero. The result has the same bits as if each step had updated all rows.
 //
-// Owner: A group owns ROWS rows of a chunk if LANES > 1; otherwise, ITEMS vectors of a chunk's array at a time.
-// Launch: LANES > 1: groups of one item, CHUNK_ROWS / ROWS for each entry of `chunks`. Otherwise groups of ITEMS items,
-//   PIECES for each float of a row, for each entry of `chunks`.
-// Buffers: chunks (entries), last (entries): numbers of chunks, or NO_CHUNK, and the last step that each has taken with
-//   its gradients; caught (chunks of the model): the last step up to which each has been caught up; table (steps,
-//   TABLE_NUMBERS): for each step from number `first_step` on the two roots of Step and the rates of the six parameter
-//   groups, root 0 where a step leaves `sh_rest` alone; parameters and both moments of the model's model_rows rows,
-//   updated up to step `step`; readback (READBACK_SIZE) counts refusals. Other scalars are those of Step. After a
-//   stopped pass (duplicate.cl) nothing changes.
+// Owner: If LANES > 1, a group owns ROWS rows of a chunk. Otherwise a group owns ITEMS vectors of one array of a chunk.
+// Launch: If LANES > 1, groups of one item, CHUNK_ROWS / ROWS for each entry of `chunks`. Otherwise groups of ITEMS
+//   items; for each entry of `chunks`, PIECES groups for each float of a row.
+// Buffers: chunks (entries): numbers of chunks, or NO_CHUNK; last (entries): the last step that each of them took with
+//   its gradients; caught (chunks of the model): the step up to which each has been caught up; table (steps,
+//   TABLE_NUMBERS): numbers of each step from `first_step` on: Step's root for all groups but sh_rest, Step's root for
+//   sh_rest (0 if the step does not update sh_rest), and the rates of the six parameter groups; parameters and both
+//   moments of the model's model_rows rows, updated up to step `step`; readback (READBACK_SIZE) counts refusals. The
+//   other scalars are fields of Step. After a stopped pass (duplicate.cl) nothing changes.
 // Equations: docs/gradients.md, (42), and (193) for the steps that only the moments take.
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -26,12 +26,13 @@
 #define AS_INTA as_int4
 #endif
 
-#define BLOCK 16              // number of steps between two checks
-#define LEAST_BETA2 0.9f      // (193) holds for a block from this beta2 on
-#define STILL 3.725290298e-9f // 2^-28: an eighth of the least half ulp, relative to the parameter
+#define BLOCK 16         // number of steps between two checks for parameters that no longer change
+#define LEAST_BETA2 0.9f // least beta2 for which (193) holds throughout a block of steps
+// A movement below this fraction of a parameter changes no bit of it: 2^-28, an eighth of the least half ulp.
+#define STILL 3.725290298e-9f
 
-// The missed steps of an array. rates, roots: its columns of the table, from the first missed step on; highest: at
-// least the largest rate.
+// The missed steps of one array of a chunk. rates, roots: the array's columns of the table, from the first missed step
+// on; highest: the largest rate, or INFINITY if (193) does not apply.
 typedef struct {
   __global const float *rates, *roots;
   uint steps;
@@ -45,7 +46,7 @@ static inline Missed missed_steps(__global const float *rates, __global const fl
   return missed;
 }
 
-// Takes the missed steps from number `from` on of element i.
+// Takes the missed steps of element i, from the missed step with index `from` on.
 RARE void catch_up_element(size_t i, uint from, Missed missed, Stepped model) {
   Step s = missed.constants;
   for (uint k = from; k < missed.steps; ++k) {
@@ -55,7 +56,7 @@ RARE void catch_up_element(size_t i, uint from, Missed missed, Stepped model) {
   }
 }
 
-// Takes the missed steps of ABREAST elements from i on, as step_vector would.
+// Takes the missed steps of ABREAST elements from i on, with the bits of step_vector.
 __attribute__((always_inline)) static inline void catch_up_vector(size_t i, Missed missed, Stepped model) {
   const Step s = missed.constants;
   const floatA beta1 = s.beta1, beta2 = s.beta2, none = 0.0f;
@@ -76,7 +77,7 @@ __attribute__((always_inline)) static inline void catch_up_vector(size_t i, Miss
         for (uint k = begin; k < end; ++k)
           if (missed.roots[TABLE_NUMBERS * k] != 0.0f) v = fmaA(beta2, v, none);
       } else {
-        break; // nothing changes any more
+        break; // neither the moments nor the parameter change any more
       }
       continue;
     }
@@ -90,7 +91,7 @@ __attribute__((always_inline)) static inline void catch_up_vector(size_t i, Miss
       p = p - movement(rate, root, s.epsilon, m, v);
       taken &= fmaA(p, p, v) < s.limit2;
     }
-    if (ANYA(~taken)) { // one is refused in this block
+    if (ANYA(~taken)) { // a step of some element is refused in this block
       STOREA(p_before, model.parameters + i);
       STOREA(m_before, model.first + i);
       STOREA(v_before, model.second + i);
@@ -125,19 +126,20 @@ __kernel void catch_up(__global const uint *chunks, const uint model_rows, __glo
 #if LANES > 1
   const uint pieces = CHUNK_ROWS / ROWS;
 #else
-#define PIECES (CHUNK_ROWS / ABREAST / ITEMS) // of a column of a chunk
+#define PIECES (CHUNK_ROWS / ABREAST / ITEMS) // number of groups for one column of a chunk
   const uint pieces = PIECES * (14 + sh_width);
 #endif
   const uint place = get_group_id(0) / pieces, piece = get_group_id(0) % pieces;
   const size_t chunk_row = (size_t)CHUNK_ROWS * chunks[place];
-  // Intel's compiler moves a load of all items before the return, so it must not be of a chunk that is not there.
+  // Intel's compiler moves this load before the return below, so the load must be valid for NO_CHUNK too.
   const uint taken = max(last[place], caught[chunk_row < model_rows ? chunks[place] : 0]);
   if (chunk_row >= model_rows || readback[READBACK_STOPPED]) return;
-  if (taken >= step || taken + 1 < first_step) return; // the latter in a trial, where all arrays are zero
+  // The second condition holds only in a trial of the kernel, where all arrays are zero.
+  if (taken >= step || taken + 1 < first_step) return;
   const uint rows = min((size_t)CHUNK_ROWS, model_rows - chunk_row), steps = step - taken;
   __global const float *from = table + (size_t)TABLE_NUMBERS * (taken + 1 - first_step);
 #if LANES > 1
-  // One array of the model after another, so that runs are long enough for the processor's prefetcher.
+  // One array of the model after another, so that accesses run long enough for the processor's prefetcher.
   const uint first = ROWS * piece;
   if (first >= rows) return;
   const uint end = min(first + ROWS, rows);
@@ -177,8 +179,8 @@ __kernel void catch_up(__global const uint *chunks, const uint model_rows, __glo
 #endif
 }
 
-// caught (chunks of the model): `step` for each of the `entries` chunks, after they are caught up, so that a step that
-// is repeated does not catch them up again. After a stopped pass nothing changes.
+// Notes that the chunks are caught up: caught (chunks of the model) becomes `step` for each of the `entries` chunks. So
+// a step that is repeated does not catch them up again. After a stopped pass nothing changes.
 __kernel void note_caught_up(const uint entries, const uint model_rows, __global const uint *chunks, const uint step,
                              __global const uint *readback, __global uint *caught) {
   const uint place = get_global_id(0);

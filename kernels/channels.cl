@@ -1,14 +1,15 @@
-// Auxiliary channels: features blended with the image's weights; the depth of the first Gaussian, the depth of half
-// opacity, the number of Gaussians, and the index of the Gaussian with the largest weight.
+// Auxiliary channels of a frame: features blended with the image's weights; first depth (of the first Gaussian), median
+// depth (where the transmittance falls to 0.5), the number of Gaussians, and the index of the Gaussian with the largest
+// weight.
 //
-// Owner: A group owns a tile, as in blend.cl; transmittance has the same bits as there.
+// Owner: A group owns a tile, as in blend.cl; the transmittance has the same bits as in blend.cl.
 // Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
 // Buffers: blend's ranges, gaussian_from_sorted, splats and stops; features (n, FEATURES) of features.cl; with RAYS
 //   camera -> planes (PLANES, height, width): weighted means of the features, in their units (the three planes from
 //   FEATURE_NORMAL on are normalised); then median depth and first depth, in world units. whole (2, height, width): the
 //   number of Gaussians, and the index of the Gaussian with the largest weight (the first of equals), or -1. All other
 //   values are 0 in padding and in pixels without Gaussians. With HOLDOUT, weights are multiplied by the fraction of
-//   light that passes the surfaces of held.h; Gaussians that are fully hidden do not count.
+//   light that passes the surfaces of shared/held.h; Gaussians that are fully hidden do not count.
 // Equations: docs/channels.md, (60) to (67); with HOLDOUT docs/pictures.md, (75); with RAYS docs/cameras.md, (14).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -39,7 +40,7 @@ GROUP __kernel void channels(const int first_tile, const int tiles_x, const int 
   intL stop[OWNED], count[OWNED], heaviest[OWNED];
   int last = begin;
 #ifdef HOLDOUT
-  floatL cut[OWNED]; // fraction of light that the surfaces absorb
+  floatL cut[OWNED]; // fraction of the pixel's light that the surfaces have absorbed so far
   Held held[OWNED];
   ALL_CELLS(cell) {
     cut[cell] = (floatL)(0.0f);

@@ -1,7 +1,7 @@
-// A deep picture: each pixel in at most `bins` slices by depth. The slices are chosen such that the error of the
-// transmittance, at the depth where it is largest, is as small as possible.
+// A deep picture: divides each pixel into at most `bins` slices by depth. The slices minimise the largest error of the
+// transmittance over all depths.
 //
-// Owner: A group owns a tile, as in blend.cl; transmittance has the same bits as there.
+// Owner: A group owns a tile, as in blend.cl; the transmittance has the same bits as in blend.cl.
 // Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
 // Buffers: share: 1 / (DEEP_LEVELS * bins); blend's ranges, gaussian_from_sorted, splats, transmittance and stops; with
 //   RAYS camera -> planes (bins, DEEP_SIZE, height, width): premultiplied colour, alpha, and the slice's depth in world
@@ -16,7 +16,7 @@
 #include "shared/prefetch.h"
 #include "shared/slices.h"
 
-// In the lanes of `which`, writes the current slice and begins an empty one.
+// Writes the current slice and begins an empty one, in the lanes of `which`.
 static inline void write_slices(Lanes *values, IntLanes *slices, intL which, __global float *planes, size_t plane,
                                 size_t stride) {
   IntLanes written;
@@ -46,7 +46,7 @@ GROUP __kernel void deep(const int first_tile, const int tiles_x, const int heig
   RAY_TABLES
   floatL t[OWNED], unit[OWNED], level[OWNED], open[OWNED][TRIED];
   intL stop[OWNED], counts[OWNED][TRIED];
-  Lanes values[OWNED][DEEP_SIZE]; // sums of the current slice; DEEP_ALPHA holds its transmittance
+  Lanes values[OWNED][DEEP_SIZE]; // sums of the current slice; DEEP_ALPHA holds the slice's transmittance
   IntLanes slices[OWNED];
   int last = begin;
   ALL_CELLS(cell) {
@@ -88,7 +88,8 @@ GROUP __kernel void deep(const int first_tile, const int tiles_x, const int heig
           if (walk < WALKS - 1) {
             for (int k = 0; k < TRIED; ++k) {
               const floatL slack = unit[cell] * (level[cell] + (float)(step * (k + 1)));
-              counts[cell][k] -= begins_slice(open[cell] + k, before, after, slack, taken, taken); // -1 if begun
+              // Adds 1 where a slice begins, because true is -1.
+              counts[cell][k] -= begins_slice(open[cell] + k, before, after, slack, taken, taken);
             }
           } else {
             Lanes *slice = values[cell];

@@ -1,17 +1,18 @@
-// Merges several deep pictures of the same size with weights: the samples of a shutter or lens, or the source pixels of
-// a warp. At every depth the transmittance is the weighted mean of the pictures' transmittances.
+// Merges several deep pictures of the same size with weights. The pictures are the samples of a shutter or lens, or the
+// source pixels of a warp. At every depth the transmittance is the weighted mean of the pictures' transmittances.
 //
 // Owner: A work-item owns a pixel.
 // Launch: One work-item for each pixel.
-// Buffers: share: 1 / (DEEP_LEVELS bins); lists (pictures, bins, DEEP_SIZE, pixels): as deep.cl's planes; weights
-//   (pictures, pixels), whose sum is 1 -> sources (pictures * bins, pixels): the picture of each slice, front to back;
-//   left (pictures * bins, pixels): the transmittance behind the slice; planes (bins, DEEP_SIZE, pixels): as deep.cl's.
+// Buffers: share: 1 / (DEEP_LEVELS * bins); lists (pictures, bins, DEEP_SIZE, pixels), laid out like the planes of
+//   deep.cl; weights (pictures, pixels), whose sum over the pictures is 1 -> sources (pictures * bins, pixels): the
+//   picture of each slice, front to back; left (pictures * bins, pixels): the transmittance behind each of these
+//   slices; planes (bins, DEEP_SIZE, pixels), laid out like the planes of deep.cl.
 // Equations: docs/pictures.md, (73), (74) and (187).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/slices.h"
 
-// Writes the slice that reduces the light from `first` to `after`, and clears its colour.
+// Writes the slice that reduces the light from `first` to `after`, and sets `colour` to zero for the next slice.
 static inline void write_slice(__global float *to, size_t plane, float *colour, float first, float after, float depth) {
   for (int channel = 0; channel < 3; ++channel) {
     to[plane * (DEEP_RED + channel)] = colour[channel] / first;
@@ -46,12 +47,12 @@ __kernel void deep_merge(const int pixels, const int pictures, const int bins, c
     int p = 0;
     for (int other = 1; other < pictures; ++other) p = depth[other] < depth[p] ? other : p;
     if (depth[p] == INFINITY) break;
-    if (depth[p] > last) // slices of equal depth count as one: they get the same transmittance
+    if (depth[p] > last) // slices of equal depth count as one: `left` has the same transmittance for all of them
       for (; told < events; ++told) left[plane * told + pixel] = after;
     last = depth[p];
     __global const float *at = lists + picture * p + slice * next[p];
     t[p] = fma1(-t[p], at[plane * DEEP_ALPHA], t[p]);
-    after = 0.0f; // summed again each time: a running sum would lose small remainders
+    after = 0.0f; // summed anew for each slice: a running sum would lose small remainders
     for (int each = 0; each < pictures; ++each) after += t[each];
     sources[plane * events + pixel] = (uchar)p;
     const bool more = ++next[p] < bins && at[slice + plane * DEEP_ALPHA] > 0.0f;

@@ -1,12 +1,12 @@
-// The depth loss: factor times the sum of weight |N - aim| over the pixels, for the render's nearness N; and its
-// gradient with respect to N.
+// The depth loss and its gradient with respect to the render's nearness N = 1 / depth. The loss is a factor times the
+// sum of weight * |N - aim| over the pixels, where `aim` is the known nearness.
 //
 // Owner: A work-item owns a column of TILE rows.
-// Launch: A grid of stride x rows / TILE.
+// Launch: A grid of stride x rows / TILE work-items.
 // Buffers: stops (rows, stride), negative where a pixel does not count; nearness (rows, stride), in 1 / world units;
 //   aims (2, rows, stride): target nearness, and weight (0 where the target is unknown); factor: multiplies the
-//   gradient -> gradient: its plane `gradient_plane` (rows, stride), 0 where the target is unknown; sums (rows / TILE,
-//   stride) of weight |N - aim|.
+//   gradient -> gradient: plane number `gradient_plane` (rows, stride), 0 where the target is unknown; sums (rows /
+//   TILE, stride) of weight * |N - aim|.
 // Equations: docs/gradients.md, (121).
 #include "shared/math.h"
 

@@ -1,10 +1,10 @@
 // Emits one (tile, Gaussian) pair for each tile that the ellipse of a visible Gaussian reaches, in order of depth. A
 // stable sort by tile alone then leaves each tile's Gaussians front to back.
 //
-// Owner: A group owns a chunk of Gaussians in visible_sums and compact_visible. Elsewhere a work-item owns a Gaussian;
-//   in order_pairs, a pair.
-// Launch: One group of ITEMS work-items for each chunk; elsewhere one work-item for each Gaussian or pair, in groups of
-//   64.
+// Owner: In visible_sums and compact_visible a group owns a chunk of consecutive Gaussians. In order_pairs a work-item
+//   owns a pair, in the other kernels a Gaussian.
+// Launch: visible_sums and compact_visible: one group of ITEMS work-items for each chunk; the others: one work-item for
+//   each Gaussian or pair, in groups of 64.
 // Buffers: splats (n, SPLAT_SIZE) in pixels, depth in world units; tile_counts, slots (n): the number of pairs of each
 //   Gaussian, and the exclusive scan of these numbers. The other shapes are above each kernel.
 // Equations: docs/gradients.md, (47), through shared/tile.h, which project.cl uses to count.
@@ -14,7 +14,7 @@
 #include "shared/tile.h"
 #include "shared/prefetch.h"
 
-// tile_span, restricted to the tiles [first_tile, end_tile) in row-major order.
+// tile_span (shared/tile.h), restricted to the band of tiles [first_tile, end_tile) in row-major order.
 static inline void band_span(const Ellipse *e, int ty, int part, int tiles_x, int first_tile, int end_tile, int *x0,
                              int *x1) {
   tile_span(e, ty, part, tiles_x, x0, x1);
@@ -22,8 +22,8 @@ static inline void band_span(const Ellipse *e, int ty, int part, int tiles_x, in
   *x1 = max(*x0, min(*x1, end_tile - ty * tiles_x));
 }
 
-// shown, tile_counts (n) -> sums (2, groups): numbers of visible Gaussians and of pairs in each chunk, at most
-// 0xffffffff; the entries of readback before READBACK_STOPPED become zero. A group owns a chunk.
+// Counts the visible Gaussians and the pairs of each chunk. shown, tile_counts (n) -> sums (2, groups): the two numbers
+// of each chunk, at most 0xffffffff; the entries of readback before READBACK_STOPPED become zero. A group owns a chunk.
 GROUP __kernel void visible_sums(const uint n, const uint chunk, __global const uint *shown,
                                  __global const uint *tile_counts, __global uint *sums, __global uint *readback) {
   __local uint scratch[ITEMS];
@@ -41,14 +41,14 @@ GROUP __kernel void visible_sums(const uint n, const uint chunk, __global const 
   readback[READBACK_KEY_COMPLEMENT] = readback[READBACK_LARGEST_KEY] = readback[READBACK_LONGEST] = 0;
 }
 
-// shown, tile_counts (n), sums (2, groups) -> slots (n): scan of the tile counts; gaussian_from_visible, depth_keys
-// (visible). The first four entries of readback, zero before, become the numbers of visible Gaussians and of pairs, the
-// complement of the smallest key, and the largest key. The bits of positive floats sort like the floats. A group owns a
-// chunk.
+// Lists the visible Gaussians with their depths as sort keys. shown, tile_counts (n), sums (2, groups) -> slots (n):
+// exclusive scan of the tile counts; gaussian_from_visible, depth_keys (visible). The first four entries of readback,
+// zero before, become the numbers of visible Gaussians and of pairs, the complement of the smallest key, and the
+// largest key. A key is the bits of a depth: those of positive floats sort like the floats. A group owns a chunk.
 //
-// BY_CAPACITY: a pass stops if it has more than `capacity` pairs, or if Adam has refused an element in an earlier step.
-// All later passes stop too, until the host has reacted. A stopped pass has no visible Gaussians, and its step does not
-// change the model.
+// With BY_CAPACITY, a pass stops if it has more than `capacity` pairs, or if Adam has refused an element in an earlier
+// step. All later passes stop too, until the host has reacted. A stopped pass has no visible Gaussians, and its step
+// does not change the model.
 GROUP __kernel void compact_visible(const uint n, const uint chunk, __global const uint *shown,
                                     __global const uint *tile_counts, __global const float *splats,
                                     __global const uint *sums, __global uint *slots,
@@ -66,8 +66,8 @@ GROUP __kernel void compact_visible(const uint n, const uint chunk, __global con
   const uint begin = group * chunk, end = min(begin + chunk, n);
   uint visible = group_sum(sums, group, scratch);
   ulong pairs = group_sum(sums + groups, group, scratch);
-  // `least` is a minimum of keys and not a maximum of ~key: in groups of 2 to 8 items, Intel's CPU runtime computes
-  // ~key with a vector register that it never sets.
+  // `least` is a minimum of keys, not a maximum of ~key: in groups of 2 to 8 items, Intel's CPU runtime computes ~key
+  // with a vector register that it never sets.
   uint least = 0xffffffff, largest = 0;
   for (uint first = begin; first < end; first += ITEMS) {
     const uint i = first + get_local_id(0);
@@ -104,8 +104,9 @@ GROUP __kernel void compact_visible(const uint n, const uint chunk, __global con
   }
 }
 
-// order (visible): places in gaussian_from_visible by depth -> gaussian_from_rank, counts (visible). BY_CAPACITY: the
-// tile_counts (n) of a stopped pass become zero, so that it adds nothing to statistics.
+// Puts Gaussians and their tile counts in order of depth. order (visible): indices into gaussian_from_visible, sorted
+// by depth -> gaussian_from_rank, counts (visible). With BY_CAPACITY, the tile_counts (n) of a stopped pass become
+// zero, so that the pass adds nothing to statistics.
 __kernel void order_counts(ELEMENTS(visible), __global const uint *order, __global const uint *gaussian_from_visible,
                            __global uint *tile_counts, __global uint *gaussian_from_rank, __global uint *counts
 #ifdef BY_CAPACITY
@@ -124,8 +125,9 @@ __kernel void order_counts(ELEMENTS(visible), __global const uint *order, __glob
   counts[rank] = tile_counts[i];
 }
 
-// tile_counts (n): how many tiles of the whole image each Gaussian reaches -> counts (tiles), which the caller has set
-// to zero: the length of each tile's list. Integer sums do not depend on the order of the atomics.
+// Counts the Gaussians of each tile. tile_counts (n): the number of tiles of the whole image that each Gaussian reaches
+// -> counts (tiles), which the caller has set to zero: the length of each tile's list. Integer sums do not depend on
+// the order of the atomics.
 __kernel void count_by_tile(const uint n, const int tiles_x, const int tiles_y, __global const uint *tile_counts,
                             __global const float *splats, __global uint *counts) {
   const uint i = get_global_id(0);
@@ -140,7 +142,8 @@ __kernel void count_by_tile(const uint n, const int tiles_x, const int tiles_y, 
   }
 }
 
-// tile_counts (n): numbers of tiles on the whole image -> band_counts (n): of the tiles [first_tile, end_tile).
+// Counts each Gaussian's tiles in the band [first_tile, end_tile). tile_counts (n): the number of tiles in the whole
+// image -> band_counts (n): the number of tiles in the band.
 __kernel void band_counts(const uint n, const int tiles_x, const int tiles_y, const int first_tile, const int end_tile,
                           __global const uint *tile_counts, __global const float *splats, __global uint *band_counts) {
   const uint i = get_global_id(0);
@@ -160,10 +163,10 @@ __kernel void band_counts(const uint n, const int tiles_x, const int tiles_y, co
   band_counts[i] = count;
 }
 
-// offsets (visible): scan of the counts in order of rank; slots (n): scan of the counts in order of the Gaussians ->
-// tile_keys (pairs), pair_ids (pairs): slot and Gaussian. Pairs are in order of depth. Slots are consecutive within a
-// Gaussian and follow the order of the Gaussians, so that sums over slots stream through memory. Only the tiles
-// [first_tile, end_tile) get pairs; keys count from first_tile.
+// Writes the pairs in order of depth. offsets (visible): exclusive scan of the tile counts in order of rank; slots (n):
+// exclusive scan of the tile counts in order of the Gaussians -> tile_keys (pairs); pair_ids (pairs): slot and
+// Gaussian. A Gaussian's slots are consecutive, and slots follow the order of the Gaussians, so that sums over slots
+// stream through memory. Only the band of tiles [first_tile, end_tile) gets pairs; keys count from first_tile.
 __kernel void duplicate(ELEMENTS(visible), const int tiles_x, const int tiles_y, const int first_tile,
                         const int end_tile, __global const uint *gaussian_from_rank, __global const uint *offsets,
                         __global const uint *slots, __global const float *splats, __global uint *tile_keys,
@@ -190,8 +193,8 @@ __kernel void duplicate(ELEMENTS(visible), const int tiles_x, const int tiles_y,
   }
 }
 
-// gaussian_from_visible (visible), slots as above -> tile_keys, depth_keys, gaussian_from_slot (pairs): one pair per
-// slot, in the order of the Gaussians.
+// Writes the pairs in the order of the Gaussians, one per slot. gaussian_from_visible (visible), slots as in duplicate
+// -> tile_keys, depth_keys, gaussian_from_slot (pairs).
 __kernel void duplicate_slots(const uint visible, const int tiles_x, const int tiles_y, const int first_tile,
                               const int end_tile, __global const uint *gaussian_from_visible,
                               __global const uint *slots, __global const float *splats, __global uint *tile_keys,
@@ -217,9 +220,8 @@ __kernel void duplicate_slots(const uint visible, const int tiles_x, const int t
   }
 }
 
-// Brings the pairs from the order of slots into the order of depth. Reads slot_from_pair (pairs), in order of depth,
-// and tiles and gaussian_from_slot (pairs), in order of slots; writes tile_keys and pair_ids (pairs), in order of
-// depth.
+// Reorders the pairs from the order of slots to the order of depth. slot_from_pair (pairs), in order of depth; tiles,
+// gaussian_from_slot (pairs), in order of slots -> tile_keys, pair_ids (pairs), in order of depth.
 __kernel void order_pairs(const uint pairs, __global const uint *slot_from_pair, __global const uint *tiles,
                           __global const uint *gaussian_from_slot, __global uint *tile_keys, __global uint2 *pair_ids) {
   const uint pair = get_global_id(0);

@@ -13,11 +13,11 @@
 #include "shared/elementary.h"
 #include "shared/ewa.h"
 
-// Maximum half side of a Gaussian's box, in standard deviations.
+// Largest half side of a Gaussian's box of pixels, in standard deviations.
 #define EXTEND 3.33f
 #define LARGEST_RADIUS 1e9f
 
-// focal * ratio + centre, rounded once. rest, focal_low, centre_low: the low parts of the operands in two floats.
+// focal * ratio + centre, rounded once. rest, focal_low, centre_low: the low parts of ratio, focal and centre.
 static inline floatL place2(floatL ratio, floatL rest, float focal, float focal_low, float centre, float centre_low) {
   const Double c = {(floatL)(centre), fmaL((floatL)(focal), rest, (floatL)(centre_low))};
   return multiply_add2(focal, focal_low, ratio, c).high;

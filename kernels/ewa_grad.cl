@@ -1,14 +1,14 @@
-// The gradient of EWA projection: from gradients with respect to the projected values to gradients with respect to the
-// Gaussians and the camera.
+// The gradient of EWA projection: turns gradients with respect to the projected values into gradients with respect to
+// the Gaussians and the camera.
 //
 // Owner: A work-item owns LANES Gaussians.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
 // Buffers: ewa.cl's inputs except opacities; radii (n, 2); d_means2d (n, 2), d_depths (n), d_conics (n, 3), where b
 //   counts as one variable; with COMPENSATED d_compensations (n) -> d_means (n, 3); d_quaternions (n, 4) and d_scales
 //   (n, 3), or d_covariances (n, 6), where an off-diagonal entry holds the sum for its two places in the matrix. With
-//   ADDED they are added to the arrays. Culled rows are zero, or unchanged with ADDED. With BY_CAMERA by_camera
-//   (BY_CAMERA_SIZE, padded): each Gaussian's gradient with respect to the camera, zero from n on: to the view matrix
-//   row by row, its translation, fx, fy, cx and cy.
+//   ADDED the gradients are added to the arrays. Culled rows become zero, or stay unchanged with ADDED. With BY_CAMERA
+//   by_camera (BY_CAMERA_SIZE, padded): each Gaussian's gradient with respect to the camera, zero from n on, in this
+//   order: the view matrix's rotation row by row, its translation, fx, fy, cx and cy.
 // Equations: docs/gradients.md, (159) to (166), with (58) to (60).
 #include "shared/math.h"
 #define NEEDS_GRADIENT
@@ -139,7 +139,7 @@ __kernel void ewa_grad(const uint n, const uint padded, __constant float *camera
   }
   FOR_AXES(k) {
     const int l = (k + 1) % 3, m = (k + 2) % 3;
-    const floatL tu = fmaL(uu, wu[k], uv * wv[k]), tv = fmaL(uv, wu[k], vv * wv[k]); // without the scale
+    const floatL tu = fmaL(uu, wu[k], uv * wv[k]), tv = fmaL(uv, wu[k], vv * wv[k]); // not yet times the scale
     const floatL along = fmaL(wu[k], tu, wv[k] * tv), variance = p.s[k] * p.s[k];
     d_scale[k].all = p.s[k] * along;
     d_size = fmaL(variance, along, d_size);
@@ -248,7 +248,7 @@ __kernel void ewa_grad(const uint n, const uint padded, __constant float *camera
 #elif defined(PARALLEL_RAYS)
   d_fx = fmaL(p.x, d_u, d_fx);
   d_fy = fmaL(p.y, d_v2, d_fy);
-#else // the limit of the clamp is a position on the image, and moves with the principal point
+#else // the limit at which the Jacobian is clamped is a position on the image, which moves with the principal point
   d_fx = fmaL(p.x / p.z, d_u, fmaL(p.rx, beyond[0], d_fx));
   d_fy = fmaL(p.y / p.z, d_v2, fmaL(p.ry, beyond[1], d_fy));
   d_cx += beyond[0];

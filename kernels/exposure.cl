@@ -1,9 +1,9 @@
-// Exposure and white balance of photographs: removes a gain of each channel, and computes the gradient with respect to
-// it.
+// The colour model `exposure`: removes a photograph's gain in each channel, its exposure and white balance, from its
+// pixels, and computes the gradient with respect to the gains.
 //
-// Owner: As in shared/develop.h, which has the kernels.
-// Launch: As there.
-// Buffers: As there; the entries of a photograph are three gains, a lens has none.
+// Owner: As in shared/develop.h, which contains the kernels.
+// Launch: As in shared/develop.h.
+// Buffers: As in shared/develop.h; a photograph's entries are three gains; a lens has no entries.
 // Equations: docs/gradients.md, "Appearance".
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -1,12 +1,13 @@
-// Bilateral grids: applies a photograph's grid of colour transforms to the render, computes the gradients, and updates
+// Bilateral grids of colour transforms: applies a photograph's grid to the render, computes the gradients, and updates
 // the grid by Adam.
 //
 // Owner: A work-item owns a pixel (slice, slice_gradient); a channel, a grid column and an image line (line_sums); one
 //   coefficient of one photograph's grid (grid_sums, move_grid) or of all grids (centre_grids). Sums are added in the
 //   same order on every device. Built with one lane.
-// Launch: Grids of stride x rows, width x height and columns x height x 3; a work-item for each coefficient.
-// Buffers: Planes (3, rows, stride) of colour, or the loss's gradient with respect to it; grids, first, second
-//   (photographs, GRID_LEVELS, GRID_ROWS, GRID_COLUMNS, 3, 4); lines (height, GRID_COLUMNS, 3, 4, GRID_LEVELS);
+// Launch: Grids of work-items. slice: stride x rows; slice_gradient: width x height; line_sums: GRID_COLUMNS x height x
+//   3; the others: one work-item for each coefficient.
+// Buffers: image, seen, gradient (3, rows, stride): colour, or the loss's gradient with respect to it; grids, first,
+//   second (photographs, GRID_LEVELS, GRID_ROWS, GRID_COLUMNS, 3, 4); lines (height, GRID_COLUMNS, 3, 4, GRID_LEVELS);
 //   by_grid: the gradient with respect to one photograph's grid. Shapes are above each kernel.
 // Equations: docs/gradients.md, "Bilateral grids".
 #include "shared/math.h"
@@ -15,7 +16,7 @@
 #define GRID_COLUMNS 16
 #define GRID_ROWS 16
 #define GRID_LEVELS 8
-#define MAP 12 // coefficients of a colour transform: three rows of four
+#define MAP 12 // number of coefficients of a colour transform, three rows of four
 #define GRID_FLOATS (GRID_LEVELS * GRID_ROWS * GRID_COLUMNS * MAP)
 #define LEVEL_FLOATS (GRID_ROWS * GRID_COLUMNS * MAP)
 
@@ -23,13 +24,13 @@ static inline float luminance_of(const float r, const float g, const float b) {
   return fma1(0.299f, r, fma1(0.587f, g, 0.114f * b));
 }
 
-// The coordinate of a luminance along the levels; NaN gives the first level.
+// The coordinate of a luminance along the grid's levels, 0 to GRID_LEVELS - 1; NaN gives 0.
 static inline float level_of(const float luminance) {
   return luminance > 0.0f ? min(luminance, 1.0f) * (GRID_LEVELS - 1) : 0.0f;
 }
 
-// A pixel's colour transform, and its derivative with respect to the level: interpolated bilinearly in two levels, then
-// linearly between them.
+// Interpolates a pixel's colour transform: bilinearly within two levels, then linearly between them. (u, v, level): the
+// pixel's coordinates in the grid; map (MAP): the transform; risen (MAP): its derivative with respect to the level.
 static inline void pixel_map(const float u, const float v, const float level, __global const float *grid, float *map,
                              float *risen) {
   const int i = min((int)u, GRID_COLUMNS - 2), j = min((int)v, GRID_ROWS - 2), l = min((int)level, GRID_LEVELS - 2);
@@ -47,7 +48,7 @@ static inline void pixel_map(const float u, const float v, const float level, __
   }
 }
 
-// grids, image -> seen: the image after the colour transform of each pixel.
+// Applies each pixel's colour transform: grids, image -> seen.
 __kernel void slice(const int photograph, const int stride, const int plane, const float across, const float down,
                     __global const float *grids, __global const float *image, __global float *seen) {
   const int x = get_global_id(0), y = get_global_id(1);
@@ -61,7 +62,8 @@ __kernel void slice(const int photograph, const int stride, const int plane, con
         fma1(map[4 * c], r, fma1(map[4 * c + 1], g, fma1(map[4 * c + 2], b, map[4 * c + 3])));
 }
 
-// grids, image, gradient with respect to seen -> gradient with respect to image, in place.
+// Turns the gradient with respect to `seen` into the gradient with respect to `image`: grids, image -> gradient, in
+// place.
 __kernel void slice_gradient(const int photograph, const int stride, const int plane, const float across,
                              const float down, __global const float *grids, __global const float *image,
                              __global float *gradient) {
@@ -87,7 +89,8 @@ __kernel void slice_gradient(const int photograph, const int stride, const int p
   gradient[2 * (size_t)plane + at] = fma1(0.114f, by_luminance, by_blue);
 }
 
-// image, gradient with respect to seen -> lines: sums over the pixels of a line, with the weights of column and level.
+// Sums the gradient over the pixels of an image line, with the interpolation weights of grid column and level: image,
+// gradient with respect to `seen` -> lines.
 __kernel void line_sums(const int width, const int stride, const int plane, const float across,
                         __global const float *image, __global const float *gradient, __global float *lines) {
   const int i = get_global_id(0), y = get_global_id(1), c = get_global_id(2);
@@ -111,8 +114,8 @@ __kernel void line_sums(const int width, const int stride, const int plane, cons
   for (int k = 0; k < 4 * GRID_LEVELS; ++k) line[k] = sums[k];
 }
 
-// The sum of a coefficient's differences from its two neighbours along an axis, `step` floats away. It is half the
-// gradient of their squares.
+// The sum of a coefficient's differences from its two neighbours along an axis of the grid, which are `step` floats
+// away. This is half the gradient of the squared differences.
 static inline float pull(__global const float *value, const int place, const int count, const int step) {
   float sum = 0.0f;
   if (place > 0) sum += value[0] - value[-step];
@@ -120,8 +123,8 @@ static inline float pull(__global const float *value, const int place, const int
   return sum;
 }
 
-// lines, the photograph's grid -> by_grid: sums of the lines with the weights of grid rows, plus the gradient of the
-// smoothness penalty.
+// Computes the gradient with respect to a photograph's grid. lines, grids -> by_grid: sums of the lines, with the
+// interpolation weights of grid rows, plus the gradient of the smoothness penalty.
 __kernel void grid_sums(const int photograph, const int height, const float down, const float weight,
                         __global const float *grids, __global const float *lines, __global float *by_grid) {
   const int at = get_global_id(0);
@@ -145,7 +148,7 @@ __kernel void grid_sums(const int photograph, const int height, const float down
   by_grid[at] = fma1(above, pull(value, l, GRID_LEVELS, LEVEL_FLOATS), sum);
 }
 
-// Adam: by_grid -> the photograph's grid and its moments `first` and `second`, in place.
+// Takes a step of Adam: by_grid -> the photograph's grid and its moments `first` and `second`, in place.
 __kernel void move_grid(const int photograph, const float rate, const float root, const float beta1, const float beta2,
                         const float epsilon, __global const uint *readback, __global const float *by_grid,
                         __global float *grids, __global float *first, __global float *second) {
@@ -159,7 +162,7 @@ __kernel void move_grid(const int photograph, const float rate, const float root
   grids[at] -= rate * m / fma1(sqrt(v), root, epsilon);
 }
 
-// Shifts the grids of all photographs in place, so that their mean is the identity.
+// Shifts the grids of all photographs in place, so that their mean over the photographs is the identity.
 __kernel void centre_grids(const int photographs, __global const uint *readback, __global float *grids) {
   const int item = get_global_id(0);
   if (item >= GRID_FLOATS || readback[READBACK_STOPPED]) return;

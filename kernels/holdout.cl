@@ -1,10 +1,10 @@
-// Holdout: the image of blend.cl, without the light that surfaces of other elements absorb.
+// Holdout: blends the image of blend.cl again, without the light that surfaces of CG elements absorb.
 //
-// Owner: A group owns a tile, as in blend.cl; transmittance has the same bits as there.
+// Owner: A group owns a tile, as in blend.cl; the transmittance has the same bits as in blend.cl.
 // Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
-// Buffers: blend's ranges, gaussian_from_sorted, splats, background and stops; the surfaces of held.h; with RAYS camera
-//   -> blend's image (3, height, width) and transmittance (height, width), overwritten: colour, and 1 minus the visible
-//   alpha. The bits of pixels without a surface in front of a Gaussian do not change.
+// Buffers: blend's ranges, gaussian_from_sorted, splats, background and stops; the surfaces of shared/held.h; with RAYS
+//   camera -> image (3, height, width) and transmittance (height, width) of blend, overwritten by the colour and 1
+//   minus the visible alpha. Pixels without a surface in front of a Gaussian keep their bits.
 // Equations: docs/pictures.md, (75) to (77).
 #define HOLDOUT
 #include "shared/math.h"

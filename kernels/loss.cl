@@ -1,24 +1,25 @@
 // The loss (1 - weight) L1 + weight (1 - SSIM) and its gradient. SSIM has the usual 11 x 11 Gaussian window, sigma 1.5,
-// with zeros outside the image. The window is separable: vertical first, into local memory, then horizontal. A second
-// pair of passes, the adjoint of the first, convolves the three partial derivatives.
+// with zeros outside the image. The window is separable: it is applied vertically, into local memory, then
+// horizontally. A second pair of passes, the adjoint of the first pair, convolves SSIM's three partial derivatives.
 //
 // Owner: A group owns blocks of one channel. With ITEMS == 1 it processes a block from the top, ROWS rows at a time,
-//   and keeps the derivatives of LOSS_RING rows; rows shared with other blocks are recomputed. Otherwise a block is
-//   ROWS x COLUMNS pixels in PARTS parts, of which an item has one or several. A first launch writes the derivatives of
-//   the whole image, and a second reads them.
-// Launch: With ITEMS == 1 any number of groups, which share the blocks; otherwise a grid of groups of at most PARTS
-//   items, for the blocks across and down and the channels. Blocks are numbered in this order.
+//   and keeps the derivatives of LOSS_RING rows; it recomputes rows shared with other blocks. Otherwise a block is ROWS
+//   x COLUMNS pixels in PARTS parts, and an item has one or several parts. A first launch (loss_ssim) writes the
+//   derivatives of the whole image, and a second one (loss_grad) reads them.
+// Launch: With ITEMS == 1 any number of groups, which share the blocks. Otherwise a grid of groups of at most PARTS
+//   items: blocks across x blocks down x channels. Blocks are numbered in this order.
 // Buffers: image, target (3, rows, stride): colour, padded to whole tiles with zeros; with PHOTOGRAPH the target is
 //   (height, width, 3), bytes or floats; partials: with ITEMS == 1 (groups, LOSS_RING, 3, field), otherwise (3
-//   channels, strips of COLUMNS columns, height, 3 derivatives, COLUMNS), so that address differences in a column are
+//   channels, strips of COLUMNS columns, height, 3 derivatives, COLUMNS), so that addresses within a column differ by
 //   constants; gradient (3, rows, stride), 0 right of the image; sums (3, ...) of SSIM, of |image - target| and of its
-//   square: one per block, or per row of a block with ITEMS == 1.
+//   square: one sum per block, or with ITEMS == 1 per row of a block.
 // Equations: docs/gradients.md, (17) to (21) in the forms (78) and (79); with several items (188) and (189).
 //
-// In bright, flat pictures E[x^2] - E[x]^2 cancels. So a window sums differences from one of its own pixels
-// (docs/gradients.md, section 12). Variances are then sums of small squares, and the gradient is a sum of differences.
+// In bright, flat pictures the variance E[x^2] - E[x]^2 would lose its digits by cancellation. So a window sums
+// differences from one of its own pixels (docs/gradients.md, section 12). Variances are then sums of small squares, and
+// the gradient is a sum of differences.
 #if ITEMS == 1 && LANES == 8 && defined(FMA_BY_CONTRACTION)
-#undef LANES // Two vectors at a time, because a window's sum is a chain of dependent additions.
+#undef LANES // two vectors at a time, because a window's sum is a chain of dependent additions
 #define LANES 16
 #endif
 #include "shared/math.h"
@@ -37,12 +38,13 @@ __constant float window[TAPS] = {1.02838008e-3f, 7.59875814e-3f, 3.60007721e-2f,
 #define PIXEL_AT(block, x, y) ((uint)(block).stride * (uint)(y) + (uint)(x))
 
 #if ITEMS == 1
-// Number of columns that a window reaches beyond each side of a block, rounded up to whole vectors.
+// Number of columns by which windows reach beyond each side of a block, rounded up to whole vectors.
 #define MARGIN ((REACH + LANES - 1) / LANES * LANES)
 #define ROWS LOSS_ROWS
 #define RING_ROW(y) ((y) & (LOSS_RING - 1))
 
-// Local memory `near`: five fields of ROWS rows of a block with margins. A block has at most LOSS_COLUMNS columns.
+// Size of `near` in local memory: five fields, each with ROWS rows of a block and its margins. A block has at most
+// LOSS_COLUMNS columns.
 #define NEAR_MARGIN (2 * MARGIN)
 #define NEAR_WIDTH (LOSS_COLUMNS + 2 * NEAR_MARGIN)
 #define NEAR_FIELD (ROWS * NEAR_WIDTH)
@@ -54,8 +56,8 @@ __constant float window[TAPS] = {1.02838008e-3f, 7.59875814e-3f, 3.60007721e-2f,
 #define STORE_NEAR(x, p) (*(__local floatU *)(p) = (x))
 #endif
 
-// Columns x0 to x1 of a channel. partials: its derivatives from column x_partials on, with `pitch` floats between rows
-// and `field` floats between fields.
+// A block: columns x0 to x1 of a channel. partials: the block's derivatives from column x_partials on, with `pitch`
+// floats between rows and `field` floats between fields.
 typedef struct {
   __global const float *image, *target;
   __global float *partials;
@@ -65,8 +67,9 @@ typedef struct {
 } Block;
 #define PARTIALS_AT(block, x, y) ((block).pitch * (uint)RING_ROW(y) + (uint)((x) - (block).x_partials))
 
-// FOR_VECTORS and VECTOR loop over the vectors in `rows` rows, with `margin` columns on each side; they define x, row
-// and `near_at`. The inner loop is over rows, because vertical windows of neighbouring rows share pixels.
+// FOR_VECTORS loops over the vectors of `rows` rows of a block, with `margin` columns on each side, and defines x and
+// row. VECTOR defines near_at, the vector's address in `near`. The inner loop is over rows, because vertical windows of
+// neighbouring rows share pixels.
 #define FOR_VECTORS(block, margin, rows)                                                                               \
   for (int x = (block).x0 - (margin); x < (block).x1 + (margin); x += LANES)                                           \
     for (int row = 0; row < (rows); ++row)
@@ -78,8 +81,8 @@ static inline int2 taps_inside(const Block block, const int y) {
   return (int2)(max(0, REACH - y), min(TAPS, block.height + REACH - y));
 }
 
-// near = sums over vertical windows around row y and the rows below: means of image and target, their variances, and
-// the covariance; 0 outside the image.
+// Computes the vertical sums of SSIM: `near` gets the means of image and target, their variances, and the covariance,
+// over the vertical windows around row y and the ROWS - 1 rows below it; 0 outside the image.
 static inline void moments(const Block block, const int margin, const int y, __local float *near) {
   FOR_VECTORS(block, margin, ROWS) {
     VECTOR(block)
@@ -88,7 +91,7 @@ static inline void moments(const Block block, const int margin, const int y, __l
       continue;
     }
     const int2 taps = taps_inside(block, y + row);
-    float beyond = 0.0f; // weight of the taps outside the image, where pixels are 0
+    float beyond = 0.0f; // sum of the weights of taps outside the image, where pixels are 0
     for (int tap = 0; tap < taps.x; ++tap) beyond += window[tap];
     for (int tap = taps.y; tap < TAPS; ++tap) beyond += window[tap];
     const uint here = PIXEL_AT(block, x, y + row);
@@ -113,9 +116,9 @@ static inline void moments(const Block block, const int margin, const int y, __l
   }
 }
 
-// near -> partials: the derivatives of SSIM with respect to the image's mean (relative to the centre pixel), to its
-// variance (doubled), and to the covariance. All are 0 right of the image. Returns the item's sum of SSIM over the
-// block's own columns.
+// Computes SSIM and its derivatives by horizontal sums: near -> partials: the derivatives of SSIM with respect to the
+// image's mean (relative to the centre pixel), to its variance (doubled), and to the covariance, all 0 right of the
+// image. Returns the item's sum of SSIM over the block's own columns.
 static inline float derivatives(const Block block, const int margin, const int y, __local float *near) {
   floatL total = (floatL)(0.0f);
   FOR_VECTORS(block, margin, 1) {
@@ -123,7 +126,8 @@ static inline float derivatives(const Block block, const int margin, const int y
     if (OUTSIDE(block, x, y + row)) continue;
     const uint here = PIXEL_AT(block, x, y + row);
     const floatL p = LOADL(block.image + here), q = LOADL(block.target + here);
-    floatL off1 = (floatL)(0.0f), off2 = off1, var1 = off1, var2 = off1, covariance = off1; // off: means minus p and q
+    // off1, off2: the means minus p and q.
+    floatL off1 = (floatL)(0.0f), off2 = off1, var1 = off1, var2 = off1, covariance = off1;
     for (int tap = 0; tap < TAPS; ++tap) {
       __local const float *in = near_at + (tap - REACH);
       const floatL e1 = LOAD_NEAR(in) - p, e2 = LOAD_NEAR(in + NEAR_FIELD) - q;
@@ -158,8 +162,9 @@ static inline float derivatives(const Block block, const int margin, const int y
   return sumL(total);
 }
 
-// near = sums over vertical windows of the partials, then image and target; 0 outside the image. The first sum includes
-// the other two partials, times differences of pixels from the centre pixel.
+// Computes the vertical sums of SSIM's gradient: `near` gets the sums of the three partials over vertical windows, then
+// image and target; 0 outside the image. The first sum includes the other two partials, times differences of pixels
+// from the centre pixel.
 static inline void adjoint_moments(const Block block, const int margin, const int y, __local float *near) {
   FOR_VECTORS(block, margin, ROWS) {
     VECTOR(block)
@@ -191,8 +196,8 @@ static inline void adjoint_moments(const Block block, const int margin, const in
   }
 }
 
-// near -> gradient, a plane. Returns the item's sums of |image - target| and of its square. l1_scale and ssim_scale
-// are the loss weights divided by the number of pixels and channels.
+// Computes the loss's gradient by horizontal sums: near -> gradient, one plane. Returns the item's sums of |image -
+// target| and of its square. l1_scale, ssim_scale: the loss weights divided by the number of pixels times channels.
 static inline float2 differences(const Block block, const int y, const float l1_scale, const float ssim_scale,
                                  __local float *near, __global float *gradient) {
   floatL absolute = (floatL)(0.0f), squares = absolute;
@@ -221,8 +226,8 @@ static inline float2 differences(const Block block, const int y, const float l1_
   return (float2)(sumL(absolute), sumL(squares));
 }
 
-// image, target -> gradient, sums. A block has block_rows x columns pixels, and at most LOSS_COLUMNS columns. field: as
-// in Block, at least columns + 2 MARGIN.
+// Computes the loss and its gradient in one launch: image, target -> gradient, sums. A block has block_rows x columns
+// pixels, and at most LOSS_COLUMNS columns. field: as in Block, at least columns + 2 * MARGIN.
 GROUP __kernel void loss(const int width, const int height, const int stride, const int plane, const int columns,
                          const int block_rows, const int field, const float l1_scale, const float ssim_scale,
                          __global const float *image, __global const float *target, __global float *partials,
@@ -241,7 +246,7 @@ GROUP __kernel void loss(const int width, const int height, const int stride, co
     block.x0 = index % across * columns, block.x1 = min(block.x0 + columns, stride);
     block.x_partials = block.x0 - MARGIN;
     __global float *ssims = sums + (size_t)height * across * channel + index % across;
-    int next = y0 - REACH; // next row of derivatives; rows above the image get none
+    int next = y0 - REACH; // the next row whose derivatives are computed; rows above the image have none
     for (int y = y0; y < y1; y += ROWS) {
       for (; next < min(height, y + ROWS + REACH); next += ROWS) {
         moments(block, 2 * MARGIN, next, near);
@@ -263,7 +268,7 @@ GROUP __kernel void loss(const int width, const int height, const int stride, co
 #else
 #include "shared/loss_groups.h"
 
-// image, target -> partials, sums[0].
+// Computes SSIM and its derivatives: image, target -> partials, sums[0].
 GROUP __kernel void loss_ssim(const int width, const int height, const int stride, const int plane,
                               __global const float *image, __global const source_t *target, __global float *partials,
                               __global float *sums) {
@@ -276,7 +281,7 @@ GROUP __kernel void loss_ssim(const int width, const int height, const int strid
   if (get_local_id(0) == 0) sums[BLOCK_NUMBER] = parts[TOP];
 }
 
-// image, target, partials -> gradient, sums[1], sums[2].
+// Computes the loss's gradient from the derivatives of SSIM: image, target, partials -> gradient, sums[1], sums[2].
 GROUP __kernel void loss_grad(const int width, const int height, const int stride, const int plane,
                               const float l1_scale, const float ssim_scale, __global const float *image,
                               __global const source_t *target, __global float *partials, __global float *gradient,

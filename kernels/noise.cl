@@ -1,23 +1,24 @@
-// Noise on the means of nearly transparent Gaussians, in the shape of their ellipsoids. It moves invisible Gaussians,
-// which have no gradient.
+// The noise of MCMC: adds normally distributed noise to the means of nearly transparent Gaussians, in the shape of
+// their ellipsoids. It also moves Gaussians that no view shows and that have no gradient.
 //
 // Owner: A work-item owns a Gaussian. Built with one lane; LANES and ITEMS do not change its bits.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
-// Buffers: quaternions (n, 4), log_scales (n, 3), opacity_logits (n) -> means (n, 3), world units. first_row: the
-//   row of the first Gaussian in the model; key0, key1: the step's key; amount: in 1 / world units; dead: opacity at
-//   which half of the noise is added; highest: Gaussians with this logit or more do not move; readback (READBACK_SIZE).
-//   After a stopped pass (duplicate.cl) nothing changes.
+// Buffers: quaternions (n, 4), log_scales (n, 3), opacity_logits (n) -> means (n, 3), world units. first_row: the first
+//   Gaussian's row in the model; key0, key1: the step's random key; amount: in 1 / world units; dead: opacity at which
+//   half of the noise is added; highest: Gaussians with this logit or more do not move; readback (READBACK_SIZE). After
+//   a stopped pass (duplicate.cl) nothing changes.
 // Equations: docs/gradients.md, (92) and (93).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
 #include "shared/random.h"
 
-#define HALVES 8              // uniform 16-bit numbers that are summed
-#define WORDS (HALVES / 2)    // random words, each with two of the numbers
-#define SPREAD 1.86881232e-5f // 1 / the sum's standard deviation, sqrt(HALVES (2^32 - 1)/12)
+#define HALVES 8              // number of uniform 16-bit numbers that are summed
+#define WORDS (HALVES / 2)    // number of random 32-bit words, each with two of these numbers
+#define SPREAD 1.86881232e-5f // 1 / sqrt(HALVES * (2^32 - 1) / 12), the inverse of the sum's standard deviation
 
-// Normally distributed number `index` of a row: (93). The sum is an integer below 2^23, so there is a single rounding.
+// The normally distributed number `index` of a row, (93). The sum is an integer below 2^23, so the result is rounded
+// only once.
 static inline float normal(uint row_word, uint index) {
   int sum = -(HALVES * 65535) / 2;
   for (uint k = 0; k < WORDS; ++k) {
@@ -39,7 +40,7 @@ __kernel void add_noise(const uint n, const uint first_row, const uint key0, con
   const float e0 = normal(row_word, 0), e1 = normal(row_word, 1), e2 = normal(row_word, 2);
   const float by = amount * sigmoidL(100.0f * (dead - sigmoidL(logit)));
 
-  // For each axis of the ellipsoid: the axis times its variance times the component of eta along it.
+  // (92): adds, for each axis of the ellipsoid, the axis times its variance times the component of the noise along it.
   __global const float *q = quaternions + 4 * (size_t)i;
   __global const float *l = log_scales + 3 * (size_t)i;
   __global float *mean = means + 3 * (size_t)i;
@@ -56,7 +57,7 @@ __kernel void add_noise(const uint n, const uint first_row, const uint key0, con
     const float along = fma1(axes[k][0], e0, fma1(axes[k][1], e1, axes[k][2] * e2)) * s * s * by;
     for (int j = 0; j < 3; ++j) moved[j] = fma1(axes[k][j], along, moved[j]);
   }
-  // As in Adam, a mean that is not finite is not stored.
+  // A mean that would be NaN, infinite or too large keeps its old value, as in Adam.
   if (!(moved[0] * moved[0] < limit2 && moved[1] * moved[1] < limit2 && moved[2] * moved[2] < limit2)) return;
   for (int j = 0; j < 3; ++j) mean[j] = moved[j];
 }

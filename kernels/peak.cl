@@ -1,10 +1,11 @@
-// The device's peak rates for the operations of the pipeline. `clsplat bench` compares each stage with them.
+// Kernels that measure a device's peak rates: blending, its gradient, and copying. `clsplat bench` compares the stages
+// with these rates.
 //
-// Owner: A work-item owns OWNED cells of pixels, which are not stored; in limit_copy, COPIED elements.
+// Owner: A work-item owns OWNED cells of pixels, whose values are not stored; in limit_copy it owns COPIED elements.
 // Launch: As many groups of ITEMS work-items as keep the device busy; limit_copy: one work-item for each COPIED
 //   elements.
-// Buffers: splats (LIMIT_SPLATS, SPLAT_SIZE) in pixels -> sums (items), so that compilers do not remove the arithmetic.
-//   limit_copy: from (n) -> to (n).
+// Buffers: splats (LIMIT_SPLATS, SPLAT_SIZE) in pixels -> sums (items), which keep compilers from removing the
+//   arithmetic. limit_copy: from (n) -> to (n).
 // Equations: those of blend.cl and blend_grad.cl, without branches.
 #define SUMS_OF_LANES // the bits of the sums do not matter
 #include "shared/widened.h"
@@ -18,7 +19,7 @@
 #define LIMIT_SPLATS 64
 
 // The arithmetic of blending without branches. Every Gaussian reaches every pixel, sums stay in registers, and splats
-// stay in the nearest cache. Each item processes rounds * OWNED * LANES pairs.
+// stay in the nearest cache. Each item processes rounds * OWNED * LANES pairs of a Gaussian and a pixel.
 GROUP __kernel void limit_blend(const int rounds, __global const float *splats, __global float *sums) {
   float sum = 0.0f;
   for (int k = 0; k < OWNED; ++k) {
@@ -44,7 +45,8 @@ GROUP __kernel void limit_blend(const int rounds, __global const float *splats, 
   sums[get_global_id(0)] = sum;
 }
 
-// Like limit_blend, for the gradient of blending: alpha, transmittance by division, nine sums.
+// The arithmetic of the gradient of blending without branches, measured like limit_blend: alpha, transmittance by
+// division, nine sums.
 GROUP __kernel void limit_blend_grad(const int rounds, __global const float *splats, __global float *sums) {
   float sum = 0.0f;
   for (int k = 0; k < OWNED; ++k) {
@@ -80,7 +82,8 @@ GROUP __kernel void limit_blend_grad(const int rounds, __global const float *spl
   sums[get_global_id(0)] = sum;
 }
 
-// from (n) -> to (n): COPIED elements per work-item, at least 16 bytes; n is a multiple of COPIED.
+// Copies the array `from` (n) to the array `to` (n), COPIED elements (at least 16 bytes) per work-item. n is a multiple
+// of COPIED.
 #if LANES > 4
 #define COPIED LANES
 typedef floatL copied;

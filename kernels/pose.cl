@@ -1,14 +1,14 @@
-// The gradient with respect to a camera's pose, from the gradients with respect to the model; and the sum over
-// Gaussians of the gradient with respect to the camera's lens.
+// The gradients with respect to a camera's pose and lens. The pose's gradient is computed from the gradients with
+// respect to the model. The lens's gradient is a sum over Gaussians.
 //
 // Owner: A work-item owns POSE_ROWS consecutive Gaussians (pose_rows, lens_rows), then POSE_ROWS consecutive sums
 //   (pose_sums). Built with one lane; LANES and ITEMS do not change its bits.
 // Launch: One work-item for each POSE_ROWS Gaussians; then one for each POSE_ROWS sums of each of `width` columns,
 //   until one row is left.
-// Buffers: tile_counts (n), means (n, 3), quaternions (n, 4), sh_rest (n, coefficients - 1, 3). The gradients with
-//   respect to means, quaternions and sh_dc (n, 3), not read in rows without tiles -> sums (ceil(n / POSE_ROWS), 6),
-//   from row first_block on: with respect to rotation about the world's axes, then translation along them.
-//   by_lens (n, 4) of project_grad.cl -> sums (ceil(n / POSE_ROWS), 4).
+// Buffers: tile_counts (n), means (n, 3), quaternions (n, 4), sh_rest (n, coefficients - 1, 3); d_means, d_quaternions,
+//   d_sh_dc: the gradients in the same shapes, not read for Gaussians without tiles -> sums (ceil(n / POSE_ROWS), 6),
+//   from row first_block on: the gradient with respect to rotation about the world's axes, then to translation along
+//   them. by_lens (n, 4) of project_grad.cl -> sums (ceil(n / POSE_ROWS), 4).
 // Equations: docs/gradients.md, (140) to (142), (144).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -32,7 +32,8 @@ __kernel void pose_rows(const uint n, const uint first_block, const int coeffici
     shift[1] += gy;
     shift[2] += gz;
 
-    // (142): the gradient with respect to the view direction, which for parallel rays does not depend on the mean.
+    // (142): the gradient with respect to the view direction. For parallel rays this direction does not depend on the
+    // mean.
     const float distance = sqrt(fma1(x, x, fma1(y, y, z * z)));
     const float ux = SEEN_ALONG(x, distance, camera[CAMERA_R20]), uy = SEEN_ALONG(y, distance, camera[CAMERA_R21]),
                 uz = SEEN_ALONG(z, distance, camera[CAMERA_R22]);
@@ -69,7 +70,7 @@ __kernel void lens_rows(const uint n, const uint first_block, __global const uin
   for (int k = 0; k < 4; ++k) sums[4 * (first_block + block) + k] = own[k];
 }
 
-// parts (count, width) -> sums (ceil(count / POSE_ROWS), width).
+// Adds up blocks of POSE_ROWS rows: parts (count, width) -> sums (ceil(count / POSE_ROWS), width).
 __kernel void pose_sums(const uint count, const uint width, __global const float *parts, __global float *sums) {
   const uint item = get_global_id(0), block = item / width, first = block * POSE_ROWS;
   if (first >= count) return;

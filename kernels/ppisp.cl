@@ -1,10 +1,10 @@
-// The colour model ppisp: removes a photograph's gains and colour mixes and its lens's vignette from its pixels, and
-// computes the gradient with respect to these. It is for photographs by cameras that process colours differently.
+// The colour model `ppisp`: removes a photograph's gains, its colour mixes and its lens's vignette from its pixels, and
+// computes the gradient with respect to them. It is for photographs by cameras that process colours differently.
 //
-// Owner: As in shared/develop.h, which has the kernels.
-// Launch: As there.
-// Buffers: As there. The entries of a photograph are three gains, then six mixes: for each channel c from channels
-//   c + 1 and c + 2, modulo 3. Those of a lens are the coefficients of its vignette.
+// Owner: As in shared/develop.h, which contains the kernels.
+// Launch: As in shared/develop.h.
+// Buffers: As in shared/develop.h. A photograph's entries are three gains, then six mixes: for each channel c, the
+//   mixes from channels c + 1 and c + 2, modulo 3. A lens's entries are the coefficients of its vignette.
 // Equations: docs/gradients.md, "Colours and vignettes".
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -1,21 +1,21 @@
-// Kernels by which tests call single shared functions. probe_fma also runs when a device is opened.
+// Kernels through which tests call single functions of shared/. probe_fma also runs when a device is opened.
 //
 // Owner: A work-item owns an element; in probe_fma one work-item owns all.
 // Launch: One work-item for each element; for probe_fma, a single work-item.
-// Buffers: Above each kernel, without units.
+// Buffers: Described above each kernel, without units.
 // Equations: none.
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
 #include "shared/sh.h"
 
-// out[0..LANES), out[LANES..2 LANES): factor * factor + addend by fmaL and by fma1.
+// Computes factor * factor + addend: by fmaL in the first LANES elements of out, by fma1 in the next LANES.
 __kernel void probe_fma(__global float *out, const float factor, const float addend) {
   STOREL(fmaL((floatL)(factor), (floatL)(factor), (floatL)(addend)), out);
   for (int lane = 0; lane < LANES; ++lane) out[LANES + lane] = fma1(factor, factor, addend);
 }
 
-// x (n) -> out (4, n): expL, log2L, sigmoidL and exp2L, each from the first lane.
+// Computes elementary functions: x (n) -> out (4, n): expL, log2L, sigmoidL and exp2L, each from the first lane.
 __kernel void probe_elementary(__global const float *x, __global float *out, const uint n) {
   const uint i = get_global_id(0);
   Lanes values[4];
@@ -26,7 +26,7 @@ __kernel void probe_elementary(__global const float *x, __global float *out, con
   for (uint k = 0; k < 4; ++k) out[k * n + i] = values[k].lane[0];
 }
 
-// bits (n) of halves -> out (n, 4): the values as floats, in every lane.
+// Converts 16-bit floats: bits (n) -> out (n, 4): each value as a float in all four lanes.
 __kernel void probe_half(__global const ushort *bits, __global float *out) {
   const uint i = get_global_id(0);
   const float4 value = float_from_half((int4)(bits[i]));

@@ -1,9 +1,9 @@
-// Integer atomics in global and in local memory: shows whether a driver counts correctly, as append.cl needs it.
+// Tests integer atomics in global and in local memory: append.cl needs a driver that counts correctly.
 //
 // Owner: A work-item owns an element.
 // Launch: Any number of groups of ITEMS work-items.
-// Buffers: counters (PROBED), zero before -> counters; places (2, items of all groups): what each item got from its
-//   global counter and from its group's local counter. Successive items use the PROBED counters in turn.
+// Buffers: counters (PROBED), zeroed before -> counters; places (2, items of all groups): the values that each item got
+//   from a global counter and from a local counter of its group. Item i uses counter i % PROBED.
 // Equations: none.
 #include "shared/group.h"
 

@@ -1,8 +1,9 @@
-// Test of the exchange within sub-groups: a driver's shuffles must work as subgroup.h expects.
+// Tests the exchange within sub-groups: a driver's shuffles must work as shared/subgroup.h expects.
 //
 // Owner: A group of ITEMS work-items; each item has an element of every row.
 // Launch: One group.
-// Buffers: out (log2 SUBGROUP, ITEMS): row k: the number of the item from which item i received, across bit k.
+// Buffers: out (log2 SUBGROUP, ITEMS): row k holds, for each item i, the number of the item from which it received a
+//   value; the two numbers differ in bit k.
 // Equations: none.
 #include "shared/group.h"
 #include "shared/subgroup.h"

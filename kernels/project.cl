@@ -1,14 +1,15 @@
 // Projection for perspective and orthographic cameras: each Gaussian's ellipse, colour, depth and number of tiles.
 //
-// Owner: A work-item owns LANES Gaussians. The common part runs in vectors, the rest one visible Gaussian at a time.
+// Owner: A work-item owns LANES Gaussians. It projects in vectors, and computes tiles and colours one visible Gaussian
+//   at a time.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
 // Buffers: means (n, 3) in world units; quaternions (n, 4) w x y z; log_scales (n, 3); opacity_logits (n); sh_dc (n,
 //   3); sh_rest (n, coefficients - 1, 3) -> splats (n, SPLAT_SIZE) in pixels, depth in world units, written where
 //   visible; tile_counts (n): 0 where culled. With NO_FRUSTUM_CULL shown (n): 1 where a splat is written, including
 //   Gaussians without a tile. With SH_DEGREES sh_degrees (n): the highest SH degree that each Gaussian uses. With
-//   THINNED a Gaussian is left out if its random word is under `threshold`, and `factor` multiplies the others'
-//   opacities; model_row: the model's row of the first Gaussian; key0, key1: the step's key. With CHUNKS as in
-//   chunks.h.
+//   THINNED a Gaussian is left out if its random word is under `threshold`, and `factor` multiplies the opacities of
+//   the others; model_row: the first Gaussian's row in the model; key0, key1: the step's random key. CHUNKS: see
+//   shared/chunks.h.
 // Equations: docs/gradients.md, (1) to (13), (44) to (47) and (53) to (57); orthographic docs/cameras.md, (15) to (17);
 //   Kerbl et al. 2023, section 4.
 #include "shared/math.h"
@@ -45,7 +46,8 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
 #ifdef CHUNKS
   const uint first = get_global_id(0) * LANES;
   if (first >= n) return;
-  for (uint lane = 0; lane < LANES; ++lane) tile_counts[first + lane] = 0; // whole chunks, so whole vectors
+  // n is a whole number of chunks, so no vector reaches past n.
+  for (uint lane = 0; lane < LANES; ++lane) tile_counts[first + lane] = 0;
   const long ahead = rows_ahead(chunks, first);
   const uint end = end_of_rows(first, n, ahead, model_rows);
   MOVE_ROWS(ahead, )
@@ -109,7 +111,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
     for (uint k = 0; k < sizeof(fields) / sizeof(fields[0]); ++k) splat[fields[k]] = field[fields[k]].lane[lane];
     const Ellipse e = ellipse_of(splat, tiles_x, tiles_y);
     const uint count = tile_count(&e, tiles_x);
-#ifdef NO_FRUSTUM_CULL // RasterizerConfig.frustum_cull: shown even without a tile
+#ifdef NO_FRUSTUM_CULL // RasterizerConfig.frustum_cull is off: a Gaussian counts as visible even without a tile
     shown[i] = 1;
 #else
     if (count == 0) continue;

@@ -1,21 +1,21 @@
-// The gradient of projection: sums a Gaussian's slots in the order of its tiles, then applies the chain rule down to
-// its parameters. project_step also updates the parameters by Adam, so that no gradient is written to memory.
+// The gradient of projection: sums a Gaussian's slots in the order of its tiles, then applies the chain rule to reach
+// its parameters. project_step also updates the parameters by Adam, so that it writes no gradient to memory.
 //
-// Owner: A work-item owns LANES Gaussians, or one in add_slots; project_grad skips those that are not visible. A group
-//   of project_step owns ROWS Gaussians, and processes one array of the model after another.
+// Owner: A work-item owns LANES Gaussians, in add_slots one; project_grad skips invisible Gaussians. A group of
+//   project_step owns ROWS Gaussians, and processes one array of the model after another.
 // Launch: One work-item for each LANES Gaussians, in add_slots for each Gaussian, in groups of 64; work-items past the
 //   end do nothing. project_step: groups of one item; if LANES is 1, of ROWS items.
-// Buffers: slots (pairs, SLOT_STRIDE) of blend_grad.cl, or with ADDED_UP their sums (n, SLOT_STRIDE); tile_counts,
-//   first_slots (n): its prefix sums; parameters, splats and camera as in project.cl -> screen (n, 2): gradient with
-//   respect to the mean's image position, per pixel, plain or absolute. With CONTRIBUTIONS contributions (n): each
-//   Gaussian's blending weights, summed over all pixels. With LENS by_lens (n, 4): each Gaussian's gradient with
-//   respect to the logs of the focal lengths and, per pixel, to the principal point. project_grad: gradients in the
-//   parameters' shapes, in loss per unit; rows that are not visible do not change. project_step, with ADAM: parameters,
-//   moments `first` and `second`; `readback` (READBACK_SIZE); the scalars of Step, one per group where they differ.
-//   Rows that are not visible have a zero gradient. With SPARSE elements whose gradient is zero do not change, with
-//   VISIBLE rows that are not visible. After a stopped pass (duplicate.cl)
-//   nothing changes. PENALTIES adds the gradient of opacity_weight o + scale_weight (s_0 + s_1 + s_2). project_step has
-//   CHUNKS as in chunks.h.
+// Buffers: slots (pairs, SLOT_STRIDE) of blend_grad.cl, or with ADDED_UP their sums (n, SLOT_STRIDE); tile_counts (n),
+//   and first_slots (n), the prefix sums of tile_counts; parameters, splats and camera as in project.cl -> screen (n,
+//   2): the gradient, plain or absolute, with respect to the mean's image position, per pixel. With CONTRIBUTIONS
+//   contributions (n): each Gaussian's blending weights, summed over all pixels. With LENS by_lens (n, 4): each
+//   Gaussian's gradient with respect to the logs of the focal lengths and, per pixel, to the principal point.
+//   project_grad writes gradients in the parameters' shapes, but no rows of invisible Gaussians. project_step, with
+//   ADAM, updates parameters and moments `first` and `second`; `readback` (READBACK_SIZE); the scalars are those of
+//   Step, one per parameter group where they differ. Invisible Gaussians count with zero gradients, but do not change
+//   with VISIBLE. With SPARSE, elements with a zero gradient do not change. After a stopped pass (duplicate.cl) nothing
+//   changes. PENALTIES adds the gradient of opacity_weight o + scale_weight (s_0 + s_1 + s_2). CHUNKS of project_step:
+//   see shared/chunks.h.
 // Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91); (144) and
 //   (145). With RAYS docs/cameras.md, (22) to (29).
 #include "shared/math.h"
@@ -40,8 +40,8 @@
 #endif
 
 #ifndef ADAM
-// Adds the slots of a band to the sums. tile_counts, first_slots (n), slots (pairs) of the band -> sums (n,
-// SLOT_STRIDE). With all bands in order, the additions are the same as in project_grad.
+// Adds the slots of a band of tiles to each Gaussian's sums. tile_counts, first_slots (n), slots (pairs, SLOT_STRIDE)
+// of the band -> sums (n, SLOT_STRIDE). After all bands in order, the sums have the same bits as those in project_grad.
 __kernel void add_slots(const uint n, __global const uint *tile_counts, __global const uint *first_slots,
                         __global const float *slots, __global float *sums) {
   const uint i = get_global_id(0);
@@ -108,8 +108,9 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
 
 #define BLOCKS (ROWS / LANES)
 #define ROW_ALIGNED __attribute__((aligned(4 * ABREAST)))
-#define SH_FLOATS (3 * SH_HIGHER) // floats in a Gaussian's higher SH bands
-// The model's arrays: number, name, floats per row, gradients, and constants of the step.
+#define SH_FLOATS (3 * SH_HIGHER) // number of floats in a Gaussian's SH bands from degree 1 on
+// MODEL(EACH) calls EACH for each array of the model, with: number, name, floats per row, gradients, and Step's root
+// and limit2.
 #ifdef NO_SH_REST
 #define ARRAYS 5
 #define SH_REST(EACH)
@@ -126,7 +127,8 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   SH_REST(EACH)
 
 #if LANES > 1
-// Updates LANES rows by Adam, or fewer at the end of n. gradients (LANES, width): zero in rows that are not `shown`.
+// Updates LANES rows by Adam, or fewer at the end of the n rows. gradients (LANES, width): zero in rows that are not
+// `shown`.
 static inline void step_rows(const uint n, const uint first_row, const uint width, const int *shown,
                              const float *gradients, Step s, Stepped model) {
   const size_t begin = (size_t)first_row * width;
@@ -146,7 +148,7 @@ static inline void step_rows(const uint n, const uint first_row, const uint widt
 #else
 #define TAKEN(k, g) (intL)(-1)
 #endif
-  ulong left = 0; // bits of vectors that have a refused element or go past the last row
+  ulong left = 0; // a bit for each vector that has a refused element or goes past the last row
   for (uint k = 0; k < width; ++k) {
     const floatL g = *(const floatL *)(gradients + k * LANES);
     if ((k + 1) * LANES > count || !step_vector(begin + k * LANES, g, TAKEN(k, g), s, model)) left |= (ulong)1 << k;
@@ -164,8 +166,8 @@ static inline void step_rows(const uint n, const uint first_row, const uint widt
 }
 #else
 #define ROLLED _Pragma("unroll 1")
-// Arguments for a group's update of an array of the model. gradients (rows, width); scalars as in Step. They are in
-// local memory, because so many pointers do not fit into the scalar registers of AMD's GPUs.
+// Arguments for the update of one array of the model by a work-group. gradients (rows, width); the scalars are as in
+// Step. These structs are in local memory, because so many pointers do not fit into the scalar registers of AMD's GPUs.
 typedef struct {
   Stepped model;
   __local const float *gradients;
@@ -191,7 +193,7 @@ __kernel void project_step(
     __global float *first_sh_dc, __global float *first_sh_rest, __global float *second_means,
     __global float *second_quaternions, __global float *second_log_scales, __global float *second_opacity_logits,
     __global float *second_sh_dc, __global float *second_sh_rest CHUNK_PARAMETERS) {
-#ifdef CHUNKS // the end of the rows from `row` on, and the model's arrays at them
+#ifdef CHUNKS // defines `end`, where the rows from `row` on end, and moves the model's arrays to these rows
 #define MODEL_ROWS(row)                                                                                                \
   const long ahead = (row) < n ? rows_ahead(chunks, row) : 0;                                                          \
   const uint end = (row) < n ? end_of_rows(row, n, ahead, model_rows) : 0;                                             \
@@ -207,7 +209,7 @@ __kernel void project_step(
   Gradients d;
   const uint sh_width = 3 * (coefficients - 1);
 #if LANES > 1
-  // Updates one array of the model after another, so that runs are long enough for the processor's prefetcher.
+  // Updates one array of the model after another, so that accesses run long enough for the processor's prefetcher.
   const uint begin = get_global_id(0) * BLOCKS * LANES;
   if (begin >= n || readback[READBACK_STOPPED]) return;
   MODEL_ROWS(begin)
@@ -264,7 +266,7 @@ __kernel void project_step(
   MODEL_ROWS(first_row)
   const uint rows = first_row < end && !readback[READBACK_STOPPED] ? min((uint)get_local_size(0), end - first_row) : 0;
   const uint own = ABREAST * me, stride = ABREAST * get_local_size(0);
-  const int aligned = first_row % ABREAST == 0; // false only if a driver allows less than ABREAST items in a group
+  const int aligned = first_row % ABREAST == 0; // false only if a driver allows fewer than ABREAST items in a group
 #define GROUP_STEP(number, group, columns, by, root, limit2)                                                           \
   steps[number] = (GroupStep){{group, first_##group, second_##group}, by, columns, rate_##group, root, limit2};
   if (me == 0) {
@@ -274,12 +276,12 @@ __kernel void project_step(
 #if defined(SPARSE) || defined(VISIBLE)
   barrier(CLK_LOCAL_MEM_FENCE);
 #endif
-  // Adjacent items read adjacent SH coefficients. If each read its own row, every access would touch a cache line per
-  // item.
+  // Adjacent items read adjacent SH coefficients. If each item read its own row, every access would touch a cache line
+  // per item.
   __global const float *from = sh_rest + (size_t)sh_width * first_row;
   const uint floats = sh_width * rows, whole_floats = aligned ? floats / ABREAST * ABREAST : 0;
 #define WANTED(k) ((k) < whole_floats && (ROW_SHOWN(k, sh_width) | ROW_SHOWN((k) + ABREAST - 1, sh_width)))
-  for (uint k = own; k < whole_floats; k += 4 * stride) { // four loads, then their stores
+  for (uint k = own; k < whole_floats; k += 4 * stride) { // four loads start before the first store waits
     floatA ahead[4];
     UNROLL for (uint i = 0; i < 4; ++i) {
       if (WANTED(k + i * stride)) ahead[i] = LOADA(from + k + i * stride);
@@ -290,7 +292,7 @@ __kernel void project_step(
   }
   for (uint k = whole_floats + me; k < floats; k += stride / ABREAST) by_sh_rest[k] = from[k];
   barrier(CLK_LOCAL_MEM_FENCE);
-  __local float *own_sh_rest = by_sh_rest + sh_width * me; // gradients replace the coefficients
+  __local float *own_sh_rest = by_sh_rest + sh_width * me; // gradients_of replaces the coefficients by their gradients
   int any = 0, shown[1] = {0};
   if (me < rows)
     any = gradients_of(end, first_row + me, coefficients, camera, tile_counts, first_slots, slots, splats, means,
@@ -304,14 +306,14 @@ __kernel void project_step(
 #ifndef NO_SH_REST
   for (uint k = any ? 3 * (SH_USED(coefficients) - 1) : 0; k < sh_width; ++k) own_sh_rest[k] = 0.0f;
 #endif
-  barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);     // a row is read by an item and written by others
-  ROLLED for (int number = 0; number < ARRAYS; ++number) { // unrolled, the code would be six times as long
+  barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);     // some items read a row that other items write
+  ROLLED for (int number = 0; number < ARRAYS; ++number) { // not unrolled: the code would be six times as long
     const GroupStep step = steps[number];
     const Step s = {step.rate, step.root, beta1, beta2, epsilon, step.limit2, readback};
     const uint width = step.width, count = rows * width, whole = aligned ? count : 0;
     const size_t begin = (size_t)width * first_row, at = begin + own;
     Stepped model = {step.model.parameters + at, step.model.first + at, step.model.second + at};
-    uint left = 0; // bits of vectors that have a refused element or go past the last row
+    uint left = 0; // a bit for each vector that has a refused element or goes past the last row
     ROLLED for (uint k = own, bit = 1; k < count; k += stride, bit += bit) {
       const floatA g = *(__local const floatA *)(step.gradients + k);
       const intA taken =

@@ -1,10 +1,11 @@
 // Projection for the camera models along rays (RAYS). Each Gaussian becomes an ellipse on the plane that touches the
-// sphere of directions at its mean, where the distortion is smallest. So poles and seams need no special case.
+// sphere of directions at its mean, where the distortion is smallest. So the poles and the seam of a panorama need no
+// special case.
 //
 // Owner: A work-item owns a Gaussian. Built with one lane; LANES and ITEMS do not change its bits.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
-// Buffers: The inputs of project.cl; NO_FRUSTUM_CULL is not supported -> splats (n, RAY_SIZE), directions in the
-//   camera's axes and distance in world units; tile_counts (n). With CHUNKS as in chunks.h.
+// Buffers: The inputs of project.cl, without NO_FRUSTUM_CULL -> splats (n, RAY_SIZE), with directions in the camera's
+//   axes and distances in world units; tile_counts (n). CHUNKS: see shared/chunks.h.
 // Equations: docs/cameras.md, (8) to (14), (18), (19), (30), (32); colour docs/gradients.md, (12).
 #include "shared/math.h"
 #define NEEDS_TANGENTS
@@ -21,7 +22,8 @@
 #include "shared/random.h"
 #endif
 
-// Slack of a box in pixels, in addition to TILE_SLACK, for rounding of float32 angles in a picture 32768 pixels wide.
+// Slack in pixels by which a box is enlarged, in addition to TILE_SLACK: it covers the rounding of float32 angles in a
+// picture 32768 pixels wide.
 #define BOX_SLACK 0.1f
 // Stores the tiles of a box in the form that `ellipse_of` reads.
 static inline void store_box(const Box *t, int width, int height, int tiles_x, int tiles_y, __constant float *camera,
@@ -30,7 +32,7 @@ static inline void store_box(const Box *t, int width, int height, int tiles_x, i
   if (!t->whole_rows) {
     float low = t->low_x - BOX_SLACK, high = t->high_x + BOX_SLACK;
 #ifdef WRAPS
-    // Columns of a full turn begin at `begin`; the picture may be narrower.
+    // A full turn of the panorama is `turn` pixels wide and begins at column `begin`; the picture may be narrower.
     const float turn = 2.0f * HALF_TURN * camera[CAMERA_FX], begin = 0.5f * ((float)width - turn);
     const float shift = turn * floor((low - begin) / turn);
     low -= shift;
@@ -39,7 +41,7 @@ static inline void store_box(const Box *t, int width, int height, int tiles_x, i
     const int last = wraps ? end_cell(high - turn, (float)TILE, tiles_x) : 0;
     x0 = first_cell(low, (float)TILE, tiles_x);
     x1 = wraps ? tiles_x : max(x0, end_cell(high, (float)TILE, tiles_x));
-    if (last >= x0) { // the ends of a wrapped box meet: it has all columns
+    if (last >= x0) { // the two ends of a wrapped box meet, so the box has all columns
       x0 = wraps ? 0 : x0;
     } else if (last > 0) {
       x0 = x0 == tiles_x ? 0 : x0;

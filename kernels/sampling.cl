@@ -1,10 +1,11 @@
-// Lower limit of each Gaussian's scales: the smallest size that the training pictures resolve at its mean.
+// Limits the scales of Gaussians from below, to the smallest size that the training pictures resolve at a Gaussian's
+// mean.
 //
 // Owner: A work-item owns a Gaussian.
-// Launch: One work-item for each, in groups of 64; work-items past the end do nothing.
+// Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
 // Buffers: cameras (views, CAMERA_SIZE), each as in project.cl, all of one camera model; means (n, 3) -> least (n):
-//   natural log of the smallest standard deviation in world units; with `more`, the minimum of this and the value
-//   already stored. log_scales (n, 3): raised to `least` where smaller.
+//   natural log of the smallest standard deviation in world units; with `more`, the smaller of this and the value
+//   already stored. limit_scales: log_scales (n, 3) below `least` are raised to it.
 // Equations: docs/gradients.md, (88).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -13,15 +14,15 @@
 #define NEEDS_PIXEL_WIDTH
 #include "shared/camera.h"
 
-#define UNSEEN -1e30f          // log of size zero: no limit
-#define SAMPLING 0.4472135901f // in pixel widths, sqrt(0.2)
+#define UNSEEN -1e30f          // log scale of a Gaussian that no camera sees: no limit
+#define SAMPLING 0.4472135901f // smallest standard deviation in pixel widths, sqrt(0.2)
 
 #define ALONG(row)                                                                                                     \
   fma1(camera[CAMERA_R##row##0], x,                                                                                    \
        fma1(camera[CAMERA_R##row##1], y, fma1(camera[CAMERA_R##row##2], z, camera[CAMERA_T##row])))
 
-// The width of a pixel at the mean (x, y, z), in world units; 1e30 if the camera does not see the mean. Points up to
-// 0.15 of the picture's size beyond its edges, where the Jacobian is clamped, count as seen.
+// The width of a pixel at the mean (x, y, z), in world units; 1e30 if the camera does not see the mean. A mean counts
+// as seen up to 0.15 of the picture's size beyond its edges, where the Jacobian is clamped.
 static inline float width_at(float x, float y, float z, __global const float *camera) {
   return pixel_width(ALONG(0), ALONG(1), ALONG(2), camera);
 }

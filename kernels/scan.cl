@@ -1,15 +1,16 @@
-// Exclusive prefix sum of unsigned integers: the sum of each chunk, then the scan inside each chunk, whose group first
-// adds the sums of the earlier chunks. A single chunk needs scan_chunks alone.
+// Exclusive prefix sum (scan) of unsigned integers in two launches. scan_sums computes the sum of each chunk. In
+// scan_chunks each group adds up the sums of the earlier chunks, then scans its own chunk. A single chunk needs only
+// scan_chunks.
 //
 // Owner: A group owns one chunk.
 // Launch: One group of ITEMS work-items for each chunk.
-// Buffers: values (n), sums (groups), total (1), out (n): counts.
+// Buffers: values (n), sums (groups), total (1), out (n), all without units.
 // Equations: out[i] is the sum of values[0] to values[i - 1].
 #include "shared/math.h"
 #include "shared/group.h"
 #include "shared/count.h"
 
-// values (n) -> sums (groups)
+// Sums each chunk: values (n) -> sums (groups).
 GROUP __kernel void scan_sums(ELEMENTS(n), const uint chunk, __global const uint *values, __global uint *sums) {
   FIND_ELEMENTS(n)
   __local uint scratch[ITEMS];
@@ -18,7 +19,8 @@ GROUP __kernel void scan_sums(ELEMENTS(n), const uint chunk, __global const uint
   if (get_local_id(0) == 0) sums[get_group_id(0)] = sum;
 }
 
-// values (n), sums (groups) -> out (n); total[0]: the total, or 0xffffffff if it does not fit 32 bits
+// Scans each chunk: values (n), sums (groups) -> out (n); total[0]: the sum of all values, or 0xffffffff if it does not
+// fit in 32 bits.
 GROUP __kernel void scan_chunks(ELEMENTS(n), const uint chunk, __global const uint *values, __global const uint *sums,
                                 __global uint *out, __global uint *total) {
   FIND_ELEMENTS(n)

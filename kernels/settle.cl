@@ -1,20 +1,22 @@
-// Late Adam: takes the steps that Gaussians missed while no view showed them. Their gradient was zero, so that the
-// moments decayed by powers, and the parameters moved by a sum that is the same for all elements of a group.
+// Late Adam (optimiser.late): takes the steps of Adam that Gaussians missed while no view showed them. In these steps
+// the gradients are zero. So the moments decay by powers of beta1 and beta2, and parameters move along m / (sqrt(v) +
+// epsilon), by a factor that is the same for all elements of a parameter group.
 //
 // Owner: A work-item owns a Gaussian. Built with one lane; LANES and ITEMS do not change its bits.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
-// Buffers: last (n): the last step that a Gaussian took, at most `step`, set to `mark`; with VISIBLE tile_counts (n),
-//   and rows where it is 0 do not change; missed (MOST_MISSED + 1, 6, 3): for each number of missed steps up to `step`
-//   and each parameter group the factors of (190) and (191); readback (READBACK_SIZE); parameters and moments `first`
-//   and `second` in their shapes -> the same. After a stopped pass (duplicate.cl) nothing changes.
+// Buffers: last (n): the last step that a Gaussian took, at most `step`, set to `mark`; with VISIBLE tile_counts (n):
+//   rows where it is 0 do not change; missed (MOST_MISSED + 1, 6, 3): for each number of missed steps up to `step` and
+//   each parameter group, the factors of (190) and (191); readback (READBACK_SIZE) -> parameters and moments `first`
+//   and `second`, updated in place. After a stopped pass (duplicate.cl) nothing changes.
 // Equations: docs/gradients.md, (190) to (192).
 #include "shared/math.h"
 
-#define FACTORS 3 // of a group: of the step's direction, of the first moment, of the second moment
+// Factors of a parameter group: for m / (sqrt(v) + epsilon), for the first moment m, for the second moment v.
+#define FACTORS 3
 #define GROUPS 6
 
-// Settles a row of `width` floats. If the new parameter is not finite or too large, the old one stays. The row's next
-// step of Adam then refuses and counts the element.
+// Takes the missed steps of a row of `width` floats. If a new parameter would be not finite or too large, the old one
+// stays. The row's next step of Adam then refuses and counts the element.
 static inline void settle_row(const size_t row, const uint width, __global const float *factors, const float epsilon,
                               const float limit2, __global float *parameters, __global float *first,
                               __global float *second) {

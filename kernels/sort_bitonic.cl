@@ -1,5 +1,5 @@
-// Bitonic sort of a short array in a single launch, by one group in local memory. For short arrays, the dozen launches
-// of a radix sort take longer. Equal keys are ordered by value; values are positions, so the sort is stable.
+// Bitonic sort of a short array in a single launch, by one group in local memory. For short arrays this is quicker than
+// the dozen launches of a radix sort. Equal keys are ordered by value; values are positions, so the sort is stable.
 //
 // Owner: The group owns the array; a work-item compares every ITEMS-th pair.
 // Launch: One group of ITEMS work-items.

@@ -1,11 +1,11 @@
-// One pass of a stable least-significant-digit radix sort in three launches: each chunk's histogram, the scan of each
-// digit's counts over the chunks, the scatter. It needs no forward progress between groups. If a single work-item sorts
-// all keys, one launch does all passes.
+// One pass of a stable least-significant-digit radix sort in three launches: the histogram of each chunk, the scan of
+// each digit's counts over the chunks, and the scatter. No group waits for another group. If a single work-item sorts
+// all keys, one launch (radix_sort) does all passes.
 //
-// Owner: A group owns a chunk; in radix_offsets some digits. In the scatter, a group of one item takes its keys one by
-//   one. A larger group takes tiles, here of TILE keys instead of pixels. It sorts each by digit in local memory, and
-//   writes a digit's keys side by side.
-// Launch: One group of ITEMS work-items for each chunk, or for each `rows` digits.
+// Owner: A group owns a chunk, and in radix_offsets `rows` digits. In the scatter, a group of one item moves its keys
+//   one by one. A larger group loads TILE keys at a time, sorts them by digit in local memory, and writes the keys of a
+//   digit side by side. Such a batch of keys is called a tile in this file.
+// Launch: One group of ITEMS work-items for each chunk; radix_offsets: for each `rows` digits.
 // Buffers: keys, values (n), histograms (digits, groups), totals (digits) -> keys_out, values_out (n); counters
 //   (digits) in local memory.
 // Equations: none; docs/decisions/0001-split-sort.md.
@@ -22,7 +22,7 @@
 #define COUNT(counter) atomic_inc(&(counter))
 #endif
 
-// keys (n) -> histograms (digits, groups)
+// Counts the digits of each chunk: keys (n) -> histograms (digits, groups).
 GROUP __kernel void radix_histogram(ELEMENTS(n), const uint chunk, const uint base, const uint shift, const uint digits,
                                     __global const uint *keys, __global uint *histograms, __local uint *counters) {
   FIND_ELEMENTS(n)
@@ -37,8 +37,8 @@ GROUP __kernel void radix_histogram(ELEMENTS(n), const uint chunk, const uint ba
   }
 }
 
-// histograms (digits, groups): each count becomes the number of keys with the same digit in earlier chunks; totals
-// (digits): each digit's count over all chunks. A group owns `rows` digits.
+// Scans each digit's counts over the chunks. histograms (digits, groups): each count becomes the number of keys with
+// the same digit in earlier chunks; totals (digits): each digit's count over all chunks. A group owns `rows` digits.
 GROUP __kernel void radix_offsets(const uint groups, const uint digits, const uint rows, __global uint *histograms,
                                   __global uint *totals) {
   __local uint scratch[ITEMS];
@@ -62,8 +62,9 @@ GROUP __kernel void radix_offsets(const uint groups, const uint digits, const ui
       __global const uint *keys, __global const uint *values, __global const uint *histograms,                         \
       __global const uint *totals, __global uint *keys_out, __global uint *values_out, __local uint *places
 
-// The chunk's keys, values (n), histograms and totals from radix_offsets -> keys_out, values_out (n). identity != 0
-// uses positions as values. places[digit]: the destination of the next key with this digit.
+// Moves a chunk's keys to their destinations. keys, values (n), histograms and totals of radix_offsets -> keys_out,
+// values_out (n). If `identity` is not 0, positions are used as values. places[digit]: the destination of the next key
+// with this digit.
 #if ITEMS == 1
 static inline void scatter(const uint begin, const uint end, const uint base, const uint shift, const uint digits,
                            const int identity, __global const uint *keys, __global const uint *values,
@@ -87,7 +88,8 @@ GROUP __kernel void radix_scatter(SCATTER) {
   scatter(begin, end, base, shift, digits, identity, keys, values, keys_out, values_out, places);
 }
 
-// keys (n) -> sorted keys and positions: in keys0 and values0 after an odd number of passes, else in keys1 and values1.
+// Sorts all keys by one work-item: keys (n) -> sorted keys and their positions. They are in keys0 and values0 after an
+// odd number of passes, else in keys1 and values1.
 GROUP __kernel void radix_sort(ELEMENTS(n), const uint base, const uint digit_bits, const uint passes,
                                __global const uint *keys, __global uint *keys0, __global uint *values0,
                                __global uint *keys1, __global uint *values1, __local uint *places) {
@@ -110,15 +112,15 @@ GROUP __kernel void radix_sort(ELEMENTS(n), const uint base, const uint digit_bi
   }
 }
 #else
-// RUN: consecutive keys of a tile that one item ranks. WORDS: an item's counters, one for each value of four bits, two
-// to a word. Arrays in local memory have a gap after each 32 words, so that 32 items that read 8 or 16 words apart use
-// 32 different banks.
+// RUN: number of consecutive keys of a tile that one item ranks. WORDS: number of words of an item's 16 counters, one
+// counter for each value of four bits and two counters to a word. Arrays in local memory have a gap after each 32
+// words. So 32 items that read 8 or 16 words apart use 32 different banks.
 #define RUN 16
 #define WORDS 8
 #define TILE (RUN * ITEMS)
 #define GAPPED(i) ((i) + ((i) >> 5))
 
-// Stable sort of the tile by the four bits that start at `shift`.
+// Sorts a tile stably by the four bits that start at bit `shift`.
 static inline void sort_tile(uint shift, __local uint *tile, __local uint *counters, __local uint *scratch) {
   const uint item = get_local_id(0);
   uint entries[RUN], ranks[RUN], words[WORDS], all;
@@ -140,7 +142,7 @@ static inline void sort_tile(uint shift, __local uint *tile, __local uint *count
     sum += words[word];
   }
   uint before = group_exclusive_scan(sum, scratch, &all);
-  before += all << 16; // keys of the upper eight values follow those of the lower
+  before += all << 16; // keys with the values 8 to 15 follow those with 0 to 7
 #pragma unroll
   for (uint word = 0; word < WORDS; ++word) {
     counters[GAPPED(item * WORDS + word)] = before;
@@ -156,7 +158,7 @@ static inline void sort_tile(uint shift, __local uint *tile, __local uint *count
   BARRIER_LOCAL();
 }
 
-// For digits of at most 8 bits.
+// Moves a chunk's keys to their destinations, a tile at a time. Digits have at most 8 bits.
 GROUP __kernel void radix_scatter(SCATTER) {
   FIND_ELEMENTS(n)
   __local uint tile[GAPPED(TILE)]; // digit << 16 | position in the tile
@@ -182,7 +184,7 @@ GROUP __kernel void radix_scatter(SCATTER) {
     }
     BARRIER_LOCAL();
     for (uint bits = 0; digits >> bits > 1; bits += 4) sort_tile(16 + bits, tile, counters, scratch);
-    // During the writing of a tile, places[digit] is reduced by the tile position of the digit's first key.
+    // While a tile is written, places[digit] is reduced by the position in the tile of the digit's first key.
     for (uint i = item; i < count; i += ITEMS) {
       const uint digit = tile[GAPPED(i)] >> 16;
       if (i == 0 || tile[GAPPED(i - 1)] >> 16 != digit) places[digit] -= i;

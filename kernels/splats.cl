@@ -1,11 +1,13 @@
-// Splats from arrays of projected Gaussians: the whitening of a conic, and the extent and tiles of its ellipse.
+// Computes splats from arrays of projected Gaussians: the whitening of each conic, and the extent and tiles of its
+// ellipse.
 //
-// Owner: A work-item owns LANES Gaussians. The common part runs in vectors, the rest one visible Gaussian at a time.
+// Owner: A work-item owns LANES Gaussians. It computes splats in vectors, and counts tiles and writes splats one
+//   visible Gaussian at a time.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
 // Buffers: radii (n, 2) in whole pixels, a radius of 0 culls; means2d (n, 2) in pixels; conics (n, 3): a, b, c of the
-//   inverse covariance; opacities (n) in [0, 1]; depths (n); values (n, width): the first three, or zeros if there are
-//   fewer, are the colour -> splats (n, SPLAT_SIZE), written where visible; tile_counts (n): 0 where culled. With
-//   LISTED the tile lists are the caller's, so every splat is written; that of a culled Gaussian has an alpha of 0.
+//   inverse covariance; opacities (n) in [0, 1]; depths (n); values (n, width): the first three are the colour; missing
+//   ones count as 0 -> splats (n, SPLAT_SIZE), written where visible; tile_counts (n): 0 where culled. With LISTED the
+//   caller makes the tile lists, so every splat is written; a culled Gaussian's splat has alpha 0.
 // Equations: docs/gradients.md, (170) to (172), with (44) to (47).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -13,16 +15,16 @@
 #include "shared/splat.h"
 #include "shared/tile.h"
 
-// Limits of a and c of a conic, between which float32 can represent the determinant; and of a mean's position in
-// pixels.
+// Limits of a conic's a and c, within which float32 can represent the determinant; and the limit of a mean's position
+// in pixels.
 #define LEAST_CONIC 1e-15f
 #define LARGEST_CONIC 1e15f
 #define FARTHEST_PIXEL 1e9f
 
-// Rounding of a, b and c may change the determinant by this fraction of a c.
+// Rounding a, b and c can change a conic's determinant by this fraction of a times c.
 #define ROUNDING 5.9604645e-8f
 
-// log2 of an alpha that is too small to show in any pixel.
+// log2 of an alpha too small to show in any pixel.
 #define NO_ALPHA -1e3f
 
 __kernel void splats(const uint n, const int tiles_x, const int tiles_y, const int width, __global const int *radii,

@@ -1,13 +1,14 @@
-// The gradient of splats: sums a Gaussian's slots in the order of its tiles, then applies the chain rule down to the
-// arrays.
+// The gradient of splats.cl: sums a Gaussian's slots in the order of its tiles, then applies the chain rule to get the
+// gradients with respect to the inputs of splats.cl.
 //
 // Owner: A work-item owns one Gaussian.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
 // Buffers: slots (pairs, FIELDS) of blend_grad.cl or values_grad.cl: sums of g and its moments, gradients with respect
-//   to VALUES values, with ABSOLUTE_GRADIENTS absolute gradients with respect to the mean; tile_counts, first_slots
-//   (n): its prefix sums; splats of splats.cl -> d_means2d (n, 2), d_conics (n, 3), d_opacities (n), in loss per unit;
-//   d_values (n, width): up to VALUES columns, from `first` on; absolute (n, 2): with respect to means2d. Rows of
-//   Gaussians without tiles are zero. add_values: slots (pairs, VALUES) -> d_values only.
+//   to VALUES values, with ABSOLUTE_GRADIENTS absolute gradients with respect to the mean; tile_counts (n), and
+//   first_slots (n), the prefix sums of tile_counts; splats of splats.cl -> d_means2d (n, 2), d_conics (n, 3),
+//   d_opacities (n), in loss per unit; d_values (n, width): up to VALUES columns, from `first` on; absolute (n, 2):
+//   absolute gradients with respect to means2d. Rows of Gaussians without tiles are zero. add_values turns slots
+//   (pairs, VALUES) of a further pass into d_values only.
 // Equations: docs/gradients.md, (173) to (176).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -55,8 +56,8 @@ __kernel void splats_grad(const uint n, const int width, const int first, __glob
     const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
     by_mean[0] = -INVERSE_WHITEN2 * (l11 * sums[SLOT_GU]); // (173)
     by_mean[1] = -INVERSE_WHITEN2 * fma1(l12, sums[SLOT_GU], l22 * sums[SLOT_GV]);
-    // (174): moments of the offsets in pixels. In a needle, the moment along its axis is by far the largest; it is
-    // added last.
+    // (174): moments of the offsets in pixels. If the ellipse is a needle, the moment along the needle is by far the
+    // largest, so it is added last.
     const float in_x = splat[SPLAT_INVERSE_L11], in_y = 1.0f / l22, lean = l12 * in_y;
     const float uv = fma1(-lean, sums[SLOT_GVV], sums[SLOT_GUV]);
     const float uu = fma1(-lean, sums[SLOT_GUV] + uv, sums[SLOT_GUU]);

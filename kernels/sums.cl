@@ -1,10 +1,10 @@
-// Sums along the rows of an array, in the same order on every device. They are used for gradients with respect to a
-// camera, summed over Gaussians.
+// Sums along the rows of an array, in the same order on every device. Gradients with respect to a camera are summed
+// over Gaussians in this way.
 //
 // Owner: A work-item owns SUM_ROWS adjacent numbers of a row.
 // Launch: One work-item for each SUM_ROWS numbers of each row, in groups of 64; work-items past the end do nothing.
 // Buffers: parts (rows, padded), padded a multiple of SUM_ROWS -> sums (rows, stride), stride at least padded /
-//   SUM_ROWS; the rest of a row of sums is zero.
+//   SUM_ROWS; elements of sums from padded / SUM_ROWS on are zero in each row.
 // Equations: docs/gradients.md, section 23.
 #include "shared/math.h"
 

@@ -1,12 +1,12 @@
 // Copies a photograph to planes in the layout of blend.cl. A photograph with alpha is composited over the render's
 // background.
 //
-// Owner: A work-item owns OWNED pixels of a row of the padded planes: a row of a tile with vectors, otherwise a pixel.
-// Launch: A grid of stride / OWNED x rows, whole tiles.
+// Owner: A work-item owns OWNED pixels of a row of the padded planes: if LANES > 1 a row of a tile, otherwise a pixel.
+// Launch: A grid of stride / OWNED x rows work-items, which covers whole tiles.
 // Buffers: source (height, width, channels), bytes or floats, interleaved; background (3) -> planes (3, rows, stride):
 //   colour, in [0, 1] for bytes, 0 in padding; with ALPHA a fourth plane, alpha. With MASKED the source's fifth channel
-//   is 0 in pixels that do not count. There the planes and the render's image (3, rows, stride) become 0, and its stops
-//   (rows, stride) -1, as in padding, so that blend_grad skips these pixels.
+//   is 0 in pixels that do not count. In these pixels the planes and the render's image (3, rows, stride) become 0, and
+//   the render's stops (rows, stride) become -1, as in padding, so that blend_grad skips them.
 // Equations: alpha c + (1 - alpha) background.
 #include "shared/math.h"
 #include "shared/photograph.h"
@@ -21,7 +21,7 @@
 #define OPAQUE_ROWS
 typedef uchar16 uchar16U __attribute__((aligned(1)));
 typedef float16 float16U __attribute__((aligned(4)));
-// The colours of a tile's row, three bytes per pixel.
+// Copies the colours of a tile's row from a photograph without alpha, three bytes per pixel.
 static inline void opaque_row(__global const uchar *source, const int plane, __global float *planes) {
   __global const uchar16U *from = (__global const uchar16U *)source;
   const uchar16 a = from[0], b = from[1], c = from[2];

@@ -1,9 +1,10 @@
-// Blends values of Gaussians with the image's weights, VALUES per pass. Their number per Gaussian is not limited.
+// Blends any number of values per Gaussian with the image's weights, VALUES of them per pass.
 //
-// Owner: A group owns a tile, as in blend.cl; transmittance has the same bits as there.
+// Owner: A group owns a tile, as in blend.cl; the transmittance has the same bits as in blend.cl.
 // Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
-// Buffers: blend's ranges, gaussian_from_sorted, splats and stops, with RECORD_CELLS its cells_from_sorted; values (n,
-//   depth), background (depth) -> pixels (height, width, depth): VALUES values of each pixel, from `first` on.
+// Buffers: blend's ranges, gaussian_from_sorted, splats and stops, with RECORD_CELLS blend's cells_from_sorted;
+//   value_rows (n, depth), background (depth) -> pixels (height, width, depth): VALUES values of each pixel, from
+//   `first` on.
 // Equations: docs/gradients.md, (177), with (14) to (16).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -14,7 +15,8 @@
 #include "shared/prefetch.h"
 #include "shared/values.h"
 
-// Adds the i-th pair to a cell of pixels.
+// Adds the i-th pair's values to the sums of a cell's pixels. power: log2 of the uncapped alpha; own (VALUES): the
+// Gaussian's values.
 static inline void add_values(floatL power, intL stop, int i, __global const float *own, floatL *t, floatL *sums) {
   const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop);
   if (!ANYL(taken)) return;

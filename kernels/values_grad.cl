@@ -1,15 +1,15 @@
-// The gradient of values.cl, back to front: partial sums for each pair, with VALUES values per pass.
+// The gradient of values.cl, back to front: for each pair, partial sums over the tile's pixels. A pass covers VALUES
+// values.
 //
-// Owner: A group owns a tile and writes one slot for each of its pairs, as in blend_grad.cl; in gradient_by_cell it
-//   owns a tile's pixels.
+// Owner: A group owns a tile and writes one slot for each of its pairs, as in blend_grad.cl; in gradient_by_cell a
+//   group owns a tile's pixels.
 // Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
 // Buffers: gradient_by_cell: d_pixels (height, width, depth), background (depth), with ALPHA_GRADIENT d_alpha (height,
 //   width) -> by_cell (tiles, (depth + 1) * TILE * TILE): for each cell, the gradients with respect to all values, then
-//   with respect to the final transmittance (background included); 0 in padding. values_grad:
-//   blend_grad's lists and planes, value_rows (n, depth), by_cell -> slots (pairs, FIELDS), all written: sums over the
-//   tile's pixels of the gradients with respect to VALUES values, from `first` on. With GEOMETRY, g and its moments,
-//   computed from all values, come before them; with ABSOLUTE_GRADIENTS, absolute gradients with respect to the mean
-//   come last.
+//   with respect to the final transmittance (background included); 0 in padding. values_grad: blend_grad's lists and
+//   planes, value_rows (n, depth), by_cell -> slots (pairs, FIELDS), all written: sums over the tile's pixels of the
+//   gradients with respect to VALUES values, from `first` on. With GEOMETRY, these follow g and its moments, which are
+//   computed from all values. With ABSOLUTE_GRADIENTS, absolute gradients with respect to the mean come last.
 // Equations: docs/gradients.md, (178) to (180), with (22) to (26), (48) and (49).
 #include "shared/math.h"
 #include "shared/splat.h"
@@ -34,7 +34,8 @@
 #define FIELDS ABSOLUTE
 #endif
 
-// Number of floats per tile in by_cell, and the index of a value of a cell: lanes, or items, are adjacent.
+// BY_TILE: number of floats per tile in by_cell. IN_CELL: the index in a tile's part of by_cell of value k of a cell.
+// The values of neighbouring lanes or items are adjacent.
 #define BY_TILE ((size_t)(depth + 1) * (TILE * TILE))
 #if ITEMS == 1
 #define IN_CELL(cell, k) (((cell) * (depth + 1) + (k)) * LANES)
@@ -74,8 +75,8 @@ typedef struct {
   intL stop;
 } Pixels;
 
-// The sum over all values of the pixels' gradient times the Gaussian's value. There are four partial sums, because a
-// single sum would be a chain of dependent additions.
+// The dot product of the pixels' gradients and the Gaussian's values, over all values. There are four partial sums,
+// because a single sum would be a chain of dependent additions.
 static inline floatL shade_of(__global const float *by_pixels, int depth, int cell, __global const float *own) {
   floatL shade[4];
   for (int k = 0; k < 4; ++k) shade[k] = (floatL)(0.0f);
@@ -87,7 +88,7 @@ static inline floatL shade_of(__global const float *by_pixels, int depth, int ce
   return (shade[0] + shade[1]) + (shade[2] + shade[3]);
 }
 
-// Removes the i-th pair from the pixels of a cell, and adds their gradients to the pair's sums (FIELDS).
+// Removes the i-th pair from the pixels of a cell, and adds the pixels' gradients to the pair's sums (FIELDS).
 static inline void take_pair(Pixels *p, int i, floatL u, floatL v, float l11, float l12, float l22, float log2o,
                              __global const float *by_pixels, int depth, int first, int cell, __global const float *own,
                              floatL *sums) {
@@ -122,9 +123,10 @@ static inline void take_pair(Pixels *p, int i, floatL u, floatL v, float l11, fl
 
 #if ITEMS > 1
 #undef SLOT_STRIDE
-#define SLOT_STRIDE FIELDS // the sums of a pair, for item_sums.h
+#define SLOT_STRIDE FIELDS // number of sums of a pair, for item_sums.h
 #include "shared/item_sums.h"
-#define TOGETHER (3 * SLOT_STRIDE * ROW <= 4096 ? 3 : 1) // pairs that are summed together, in 16 KiB
+// Number of pairs whose rows fit together in 16 KiB of local memory.
+#define TOGETHER (3 * SLOT_STRIDE * ROW <= 4096 ? 3 : 1)
 #endif
 
 GROUP SUBGROUPED __kernel void values_grad(const int first_tile, const int tiles_x, const int height, const int depth,
@@ -179,7 +181,7 @@ GROUP SUBGROUPED __kernel void values_grad(const int first_tile, const int tiles
   __local Staged staged[BATCH];
   __local float rows[TOGETHER * SLOT_STRIDE * ROW] __attribute__((aligned(16)));
   for (int batch = last; batch > begin; batch -= BATCH) {
-    const int count = min(BATCH, batch - begin); // of the pairs before `batch`, the last first
+    const int count = min(BATCH, batch - begin); // number of pairs in this batch, which ends before index `batch`
     for (int j = ITEM; j < BATCH; j += ITEMS) {
       const int i = max(batch - 1 - j, begin);
       const uint gaussian = gaussian_from_sorted[i];

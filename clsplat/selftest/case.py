@@ -23,7 +23,7 @@ from clsplat.selftest.harness import Array, CaseBench, StageOutcome, joined
 
 Arrays = dict[str, Array]
 Read = Callable[[], Arrays]
-"""Function that reads the results of a launch, by name."""
+"""Function that reads the results of a launch from the device, by name."""
 Mask = NDArray[np.bool_] | EllipsisType
 """Mask of the elements that are compared; `...` compares all."""
 
@@ -33,21 +33,22 @@ class Inputs(SimpleNamespace):
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) of the image."""
+        """The (width, height) of `image`."""
         return self.image.shape[1], self.image.shape[0]
 
     def wide(self, *names: str) -> list[NDArray[np.float64]]:
-        """The named arrays in float64."""
+        """Convert the inputs with these names to float64."""
         return [getattr(self, name).astype(np.float64) for name in names]
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """The twin's values of a result, and how to compare them.
+    """The twin's values of a result, and how the device's values are compared with them.
 
-    bound: the largest error allowed. The reason for it is a comment beside it.
-    magnitudes: errors are relative to these. None compares by the relative error in the 2-norm of all values.
-    compared: mask of the elements that are compared; the others depend on rounding.
+    bound: the largest allowed error. A comment beside each bound gives the reason for it.
+    magnitudes: the sizes to which errors are relative, by element. None: the error is the relative error in the 2-norm
+    of all values.
+    compared: mask of the elements that are compared; all other elements depend on rounding.
     exact: True for results that must be equal, such as integers.
     """
 
@@ -58,7 +59,8 @@ class Expected:
     exact: bool = False
 
     def error_of(self, got: Array) -> float:
-        """The largest error, relative to the magnitudes. For exact results, the number of wrong elements."""
+        """The largest error of the device's values `got`, relative to the magnitudes; if `exact`, the number of wrong
+        elements."""
         if got.shape != self.values.shape:
             return float("inf")
         found, wanted = got[self.compared], self.values[self.compared]
@@ -75,19 +77,19 @@ class Expected:
 
 
 def exactly(values: Array) -> Expected:
-    """Values to which a result must be equal."""
+    """Expect a result to be equal to the twin's values."""
     return Expected(values, 0.0, exact=True)
 
 
 class Deviation(NamedTuple):
-    """An error and its bound."""
+    """The error of a result, and the bound of the error."""
 
     error: float
     bound: float
 
 
 def faults(found: Mapping[str, Deviation]) -> list[str]:
-    """A text for each error that exceeds its bound."""
+    """Describe each error that exceeds its bound, by the name of the result."""
     return [f"{name} {error:.2g} over {bound:g}" for name, (error, bound) in found.items() if not error <= bound]
 
 
@@ -95,16 +97,17 @@ def faults(found: Mapping[str, Deviation]) -> list[str]:
 class Case:
     """The comparison of a stage with its float64 twin.
 
-    sizes: numbers of rows, or (width, height), at the edges of its kernels, such as one row more than a group has.
+    sizes: numbers of rows, or (width, height) of images, that are edge cases of the kernels, such as one row more than
+    a group has.
     random: function that makes random inputs of a size.
     launch: function that launches the kernels, and returns a function that reads the results.
-    twin: function from inputs and results to the wanted values by name. It gets the device's results because a
+    twin: function from inputs and the device's results to the wanted values by name. It gets the results because a
     gradient, for example, depends on the device's projection.
-    frozen: function from the self-test's scene, which never changes, to a list of inputs; None if this is no stage of
-    the self-test.
+    frozen: function from a frozen scene of the self-test to a list of inputs; None if the case is not a stage of the
+    self-test.
     digested: names of the results in the self-test's digest, in order.
     by_shape: True if the kernels or their launches depend on the kernel shape.
-    own_bits_of_groups: True if kernel shapes of several items have another digest than shapes of one item.
+    own_bits_of_groups: True if kernel shapes with several items have another digest than those with one item.
     """
 
     sizes: Sequence[Any]
@@ -117,17 +120,18 @@ class Case:
     own_bits_of_groups: bool = False
 
     def errors(self, device: Device, given: Inputs, work: Workspace | None = None) -> dict[str, Deviation]:
-        """Launch the kernels on the inputs. Returns errors and bounds by name."""
+        """Launch the kernels on the inputs. Returns the error and the bound of each result by name."""
         got = self.launch(device, work or Workspace(device), given)()
         return {name: Deviation(each.error_of(got[name]), each.bound) for name, each in self.twin(given, got).items()}
 
     def outcome(self, bench: CaseBench) -> StageOutcome:
-        """The outcome of this case as a stage of the self-test."""
+        """Run this case as a stage of the self-test, on the bench's frozen scene."""
         assert self.frozen is not None
         return joined([self._outcome(bench, given) for given in self.frozen(bench)])
 
     def _outcome(self, bench: CaseBench, given: Inputs) -> StageOutcome:
-        work = Workspace(bench.device)  # a workspace of its own: later stages need the results in the bench's
+        # A separate workspace, because later stages need the results in the bench's workspace.
+        work = Workspace(bench.device)
         got: Arrays = {}
 
         def take(read: Read) -> list[Array]:
@@ -146,10 +150,10 @@ class Case:
 
 
 def read_of(**arrays: DeviceArray) -> Read:
-    """Function that reads these arrays."""
+    """Return a function that reads these arrays from the device."""
     return lambda: {name: array.get() for name, array in arrays.items()}
 
 
 def fresh_readback(device: Device) -> DeviceArray:
-    """A READBACK array of zeros: the step has not stopped."""
+    """A READBACK array of zeros on the device: no step has stopped."""
     return upload(device, np.zeros(len(READBACK), np.uint32))

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check of a driver: the self-test, in a worker process that the driver may crash, and the driver records.
+"""Check if a driver can be trusted: run the self-test in a worker process, which the driver may crash, and record
+passes and failures.
 
-A record is keyed by device, driver version, kernel shape and kernel sources. `clsplat selftest` does not use the
-records: it always tests, and deletes a recorded failure if the test passes.
+A driver record is keyed by device, driver version, kernel shape and kernel sources. `clsplat selftest` always tests,
+whatever the records say. If the test passes, it deletes a recorded failure.
 """
 
 from __future__ import annotations
@@ -32,15 +33,16 @@ from clsplat.selftest.result import FORWARD_STAGES, SELFTEST_STAGES, TRAINING_ST
 
 @dataclass
 class DriverReport:
-    """The self-test result of a device.
+    """The self-test's results for a device.
 
-    digests: digest of each stage's output, by "scene/stage".
+    digests: digests of the stages' results, by "scene/stage".
     build_seconds: seconds to build all kernels; None if they were not built before the test.
-    end: description of how the worker process ended if it did not finish its work, or empty.
+    end: description of how the worker process ended, if it did not finish its work; otherwise empty.
     crashed: True if the driver ended the process.
     hung: True if the process did not answer in time.
+    wanted: names of the stages that were to be tested.
     kernels: the kernels that were built and launched, named as in `device.sandbox`.
-    remembered: a recorded failure in this shape that this test did not clear, or empty.
+    remembered: a recorded failure in this kernel shape that this test did not clear, or empty.
     """
 
     results: list[Result] = field(default_factory=list)
@@ -66,12 +68,12 @@ class DriverReport:
 
     @property
     def other_bits(self) -> list[str]:
-        """Stages that passed, but with other bits than the stored digests."""
+        """Names of the stages that passed, but whose bits differ from the stored digests."""
         return [result.stage for result in self.results if result.same_bits is False and result.passed]
 
     @property
     def verdict(self) -> str:
-        """The verdict in one sentence."""
+        """The verdict as a predicate, such as "can be trusted", for a sentence that begins with "the driver"."""
         if self.failure:
             return f"cannot be trusted: {self.failure}"
         if not self.other_bits:
@@ -86,8 +88,8 @@ class DriverReport:
 
 
 def examine(index: int, shape: Shape, stages: Sequence[str] = SELFTEST_STAGES, *, quick: bool = False) -> DriverReport:
-    """Test the `index`-th device in a worker process. stages: a part of SELFTEST_STAGES in the same order, which
-    includes FORWARD_STAGES."""
+    """Test the `index`-th device in a worker process. stages: some of SELFTEST_STAGES, in that order and with all of
+    FORWARD_STAGES."""
     report = DriverReport(wanted=tuple(stages))
     begun, seconds = "starting", driver_timeout()
     words = [str(index), shape.label, ",".join(stages), *(["quick"] if quick else [])]
@@ -111,13 +113,14 @@ def examine(index: int, shape: Shape, stages: Sequence[str] = SELFTEST_STAGES, *
 
 
 def require(device: Device, stages: Sequence[str] = TRAINING_STAGES) -> Device:
-    """Test a device on its first use and record that it passed. It takes a second, and the time to build kernels.
+    """Test a device at its first use, and record that it passed. The test takes a second, and the time to build
+    kernels.
 
-    Nothing is tested if there is a record of these stages, or if CLSPLAT_TRUST_DRIVER=1.
+    Nothing is tested if a record says that the stages have passed, or if CLSPLAT_TRUST_DRIVER=1.
 
-    stages: the stages of SELFTEST_STAGES that will be used; the stages of a frame are tested in any case.
-    Returns the device. If its driver crashes or hangs in the present kernel shape, it warns and returns the device in
-    another shape. Raises DriverError if this happens in every shape, and DeviceError if results are wrong.
+    stages: the stages of SELFTEST_STAGES that will be used. FORWARD_STAGES are always tested too. Returns the device.
+    If the driver crashes or hangs in the device's kernel shape, this warns and returns the device in another shape.
+    Raises DriverError if the driver crashes or hangs in every shape, and DeviceError if results are wrong.
     """
     if regardless():
         return device
@@ -129,7 +132,7 @@ def require(device: Device, stages: Sequence[str] = TRAINING_STAGES) -> Device:
         known = entries.get(shape.label, driver_records.Entry())
         if known.failed or not set(stages) <= known.stages:
             if shape == shapes[0]:
-                print(f"{title(cl_device)}: first use, a short test of its driver", file=sys.stderr)
+                print(f"{title(cl_device)}: testing its driver briefly before its first use", file=sys.stderr)
             if failure := _short_test(tried, stages):
                 driver_records.remember(cl_device, shape.label, failed=failure)
                 failed[shape.label] = failure
@@ -140,22 +143,24 @@ def require(device: Device, stages: Sequence[str] = TRAINING_STAGES) -> Device:
         return tried
     raise DriverError(
         f"{title(cl_device)}, kernels in the shape {given.label}: {failed[given.label]}; none of "
-        f"{', '.join(failed)} works; {_ADVICE}"
+        f"the kernel shapes {', '.join(failed)} works; {_ADVICE}"
     )
 
 
-_ADVICE = f"clsplat selftest has details, CLSPLAT_DEVICE selects another device, {TRUST_DRIVER_VARIABLE}=1 ignores this"
+_ADVICE = (
+    f"clsplat selftest has details; CLSPLAT_DEVICE selects another device; {TRUST_DRIVER_VARIABLE}=1 skips the test"
+)
 
 
 def _short_test(device: Device, stages: Sequence[str]) -> str:
-    """Run the short test, and record the stages that passed.
+    """Test the stages on the smaller frozen scenes, and record the stages that passed.
 
-    Returns a description if the driver crashed or hung in the device's shape, otherwise an empty string. Raises
-    DriverError if the test could not run, and DeviceError if results are wrong.
+    Returns a description of the crash if the driver crashed or hung in the device's shape, otherwise an empty string.
+    Raises DriverError if the test could not run, and DeviceError if results are wrong.
     """
     wanted = [name for name in SELFTEST_STAGES if name in FORWARD_STAGES or name in stages]
     report = examine(device.index, device.shape, wanted, quick=True)
-    if report.crashed and not report.hung:  # another program may have killed the driver's linker
+    if report.crashed and not report.hung:  # once more: another program may have killed the driver's linker
         report = examine(device.index, device.shape, wanted, quick=True)
     if report.crashed:
         return report.end
@@ -170,9 +175,9 @@ def _short_test(device: Device, stages: Sequence[str]) -> str:
 
 
 def examine_device(index: int) -> DriverReport:
-    """Run the whole test in the device's preferred shape.
+    """Run the whole self-test on the `index`-th device, in the kernel shape that is preferred for it.
 
-    If it passes, a recorded failure in this shape is deleted, unless the kernel that failed then fails again.
+    If the test passes, a recorded failure in this shape is deleted, unless the kernel that failed then fails again.
     """
     device = all_devices()[index]
     shape = wanted_shape(device)
@@ -186,7 +191,7 @@ def examine_device(index: int) -> DriverReport:
 
 
 def _still(index: int, entry: driver_records.Entry, report: DriverReport) -> str:
-    """The reason why a recorded failure is kept, or an empty string."""
+    """The reason why a recorded failure is kept after a self-test that passed, or an empty string if it is cleared."""
     name, build = entry.trial.get("name"), entry.trial.get("build")
     if not entry.trial or name in report.kernels:  # this test has covered the failure
         return ""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Harness of the self-test: a frozen scene on a device, errors and digests."""
+"""Harness of the self-test: frozen scenes on a device, errors in ulp, and digests of results."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ Array = NDArray[Any]
 
 WHITENING_FACTOR = np.sqrt(0.5 * np.log2(np.e))
 MIN_DECISION_MARGIN = 1e-4
-"""Relative distance of alpha or transmittance to a threshold, below which a pixel depends on rounding and is not
-compared. It is a hundred times the rounding error."""
+"""Least relative distance of alpha and transmittance from their thresholds for a pixel to be compared. Nearer pixels
+depend on rounding. The distance is a hundred times the rounding error."""
 
 
 @dataclass(frozen=True)
 class StageOutcome:
     """The outcome of a stage on a scene.
 
-    arrays: the arrays in the digest.
-    errors: absolute error and error in ulp, by the name of the compared quantity.
+    arrays: the results that the digest covers.
+    errors: the largest absolute error and the largest error in ulp, by the name of the compared quantity.
     trouble: description of a fault, or empty.
-    otherwise: operations that do not round like IEEE 754.
+    otherwise: names of the operations that do not round as IEEE 754 demands.
     """
 
     arrays: list[Array] = field(default_factory=list)
@@ -52,15 +52,15 @@ class StageOutcome:
     otherwise: tuple[str, ...] = ()
 
     def compared(self, parts: Mapping[str, tuple[Array, Array]], **wrong: int) -> StageOutcome:
-        """The outcome with the errors of each pair (got, wanted). wrong: for results of integers, the numbers of wrong
-        elements by name."""
+        """The outcome with the errors of the values by name. parts: (got, wanted) of float results; wrong: for integer
+        results, the numbers of wrong elements."""
         errors = {name: error_of(got, wanted) for name, (got, wanted) in parts.items()}
         counts = ", ".join(f"{count} {name.replace('_', ' ')} wrong" for name, count in wrong.items() if count)
         return replace(self, errors=errors, trouble=self.trouble or counts)
 
 
 def joined(outcomes: Sequence[StageOutcome]) -> StageOutcome:
-    """The outcome of a stage that was run in several ways: all arrays, the worst errors, and the first fault."""
+    """Join the outcomes of a stage on several inputs: all arrays, the largest errors, and the first fault."""
     every = [item for outcome in outcomes for item in outcome.errors.items()]
     return StageOutcome(
         [array for outcome in outcomes for array in outcome.arrays],
@@ -73,8 +73,8 @@ def joined(outcomes: Sequence[StageOutcome]) -> StageOutcome:
 def error_of(got: Array, wanted: Array) -> tuple[float, float]:
     """The largest absolute error, and the largest error in ulp; infinite if a value is not finite.
 
-    An ulp is that of the wanted value or of the array's root mean square, whichever is larger: a sum that cancels has
-    no accurate digits.
+    The ulp is that of the wanted value or of the array's root mean square, whichever is larger, because a sum that
+    cancels has no accurate digits.
     """
     if wanted.size == 0:
         return 0.0, 0.0
@@ -88,7 +88,7 @@ def error_of(got: Array, wanted: Array) -> tuple[float, float]:
 
 
 def digest_of(arrays: Sequence[Array]) -> str:
-    """CRC-32 of the arrays' bytes in order."""
+    """The CRC-32 of the arrays' bytes in order, as eight hexadecimal digits."""
     total = 0
     for array in arrays:
         total = zlib.crc32(np.ascontiguousarray(array).tobytes(), total)
@@ -96,16 +96,17 @@ def digest_of(arrays: Sequence[Array]) -> str:
 
 
 def cropped(planes: Array, size: Camera | tuple[int, int]) -> Array:
-    """Crop padded planes to (H, W) or (H, W, fields). size: a camera, or (width, height)."""
+    """Crop padded planes (rows, stride) or (C, rows, stride) to (H, W) or (H, W, C). size: a camera, or (width,
+    height)."""
     width, height = (size.width, size.height) if isinstance(size, Camera) else size
     inside = planes[..., :height, :width]
     return inside.transpose(1, 2, 0) if inside.ndim == 3 else inside
 
 
 def planes_of(image: Array, beside: float = 0.0) -> Float32:
-    """Planes (C, rows, stride) of an image (H, W, C).
+    """Convert an image (H, W, C) to planes (C, rows, stride), padded to whole tiles.
 
-    beside: the value of the pixels beside the image, which pad the planes.
+    beside: the value of the padding.
     """
     height, width, channels = image.shape
     planes = np.full((channels, *padded_size(width, height)), beside, np.float32)
@@ -114,7 +115,7 @@ def planes_of(image: Array, beside: float = 0.0) -> Float32:
 
 
 class CaseBench:
-    """A frozen scene on a device, with the results of the stages so far."""
+    """A frozen scene on a device, with the results of the stages that have run."""
 
     def __init__(self, device: Device, frozen: Frozen) -> None:
         self.device, self.frozen = device, frozen
@@ -134,9 +135,11 @@ class CaseBench:
         self.slices: DeviceArray
 
     def twice(self, launch: Callable[[], T], take: Callable[[T], list[Array]]) -> tuple[T, StageOutcome]:
-        """Run a stage twice. Returns its second result, and the outcome with the arrays on the host and milliseconds.
+        """Run a stage twice. Returns the result of the second run, and an outcome with its arrays and milliseconds.
 
-        A difference from the first run, which includes the kernel builds, is reported as a fault.
+        The first run includes the kernel builds. It is a fault if the bits of the two runs differ.
+
+        launch: runs the stage on the device; take: reads the arrays of the digest from the stage's result.
         """
         first = take(launch())
         value, ms = self.device.timed(launch)
@@ -147,7 +150,7 @@ class CaseBench:
 
     @property
     def inputs(self) -> ImageInputs:
-        """Input of the stages that process pixels."""
+        """The inputs of the stages that process pixels."""
         return ImageInputs(self.projected.splats, self.background, self.camera.width, self.camera.height)
 
     @property
@@ -156,7 +159,7 @@ class CaseBench:
         return shown
 
     def splats(self) -> reference_project.ProjectedTwin:
-        """The device's splats, in the form of the reference."""
+        """The device's splats, converted to the float64 reference's form."""
         visible = self.visible
         raw = self.projected.splats.get()
         raw[~visible] = 1.0  # replaces uninitialised memory
@@ -179,7 +182,8 @@ class CaseBench:
         )
 
     def blend_reference(self) -> tuple[reference_blend.BlendedTwin, NDArray[np.bool_]]:
-        """The reference's frame from the device's splats, and the mask of pixels to compare (MIN_DECISION_MARGIN)."""
+        """The reference's frame, blended from the device's splats, and the mask of the pixels to compare
+        (MIN_DECISION_MARGIN)."""
         splats = self.splats()
         camera, background = self.camera, self.frozen.background.astype(np.float64)
         frame = reference_blend.blend(splats, camera.width, camera.height, background)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-test stages, their error bounds and their results, shared by the parent and the worker process."""
+"""Stages of the self-test, their error bounds and their results, shared by the parent and the worker process."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FORWARD_STAGES = ("arithmetic", "project", "duplicate", "sort", "ranges", "blend
 CHANNEL_STAGES = ("features", "channels")
 """Further stages for a frame with channels other than colour and alpha."""
 DEEP_STAGES = ("deep", "deep_merge")
-"""Further stages for deep pictures, and for a merge of several."""
+"""Further stages for deep pictures, and for merging several deep pictures."""
 HOLDOUT_STAGES = ("holdout",)
 """Further stage for a frame with holdout surfaces."""
 RAY_STAGES = ("rays",)
@@ -43,32 +43,32 @@ INDEX_STAGES = ("project", "duplicate", "sort", "ranges", "append")
 
 STAGE_BOUNDS_ULP: dict[str, tuple[float, str]] = {
     "arithmetic": (3.01, "OpenCL 1.2 allows 3 ulp for a square root and 2.5 for a division"),
-    "project": (256, "30 measured, at opacities near 1; six times as many if roots and divisions are off by 3 ulp"),
+    "project": (256, "30 measured, at opacities near 1; six times as much if roots and divisions are off by 3 ulp"),
     "duplicate": (0, "whole numbers"),
     "sort": (0, "whole numbers"),
     "ranges": (0, "whole numbers"),
     "append": (0, "whole numbers"),
     "blend": (256, "11 measured; 256 ulp of a colour of 0.5 are 1.5e-5, and a frame may be off by 2e-5"),
     "features": (64, "6 measured; two divisions and a root in sequence"),
-    "channels": (256, "13 measured, in normals that cancel; otherwise as blend"),
+    "channels": (256, "13 measured, in normals whose sum nearly cancels; otherwise as blend"),
     "deep": (256, "27 measured; as blend"),
     "deep_merge": (256, "4 measured; as blend"),
     "holdout": (256, "8 measured; as blend"),
     "rays": (512, "47 measured; directions and rays have several quotients and roots, which may be off by 3 ulp"),
     "masks": (128, "as loss"),
-    "loss": (128, "9 measured; six times as many if the quotients of SSIM are off by 3 ulp"),
+    "loss": (128, "9 measured; six times as much if the quotients of SSIM are off by 3 ulp"),
     "blend_grad": (1024, "32 measured; up to 64 divisions in sequence recover the transmittance"),
-    "project_grad": (512, "39 measured, at opacities near 1; six times as many if divisions are off by 3 ulp"),
+    "project_grad": (512, "39 measured, at opacities near 1; six times as much if divisions are off by 3 ulp"),
     "penalties": (32, "2 measured; an exponential and a product"),
     "adam": (32, "2 measured; one root and one division"),
-    "noise": (256, "15 measured; an ulp of o is 16 ulp of 100 (o - dead), and rotated axes cancel"),
+    "noise": (256, "15 measured; 1 ulp of the opacity o is 16 ulp of 100 (o - dead), and sums over axes cancel"),
     "statistics": (32, "1 measured; one root"),
     **dict.fromkeys(
-        COLOUR_MODELS, (1024, "202 measured; beta2 in float32 is off by 1e-5 of 1 - beta2, 84 ulp; sums of a picture")
+        COLOUR_MODELS, (1024, "202 measured; float32 beta2 is off by 1e-5 of 1 - beta2, 84 ulp; sums over a picture")
     ),
     "grid": (1024, "227 measured; as exposure"),
     "depth": (1024, "as blend_grad"),
-    "pose": (1024, "as exposure; sums of terms of both signs"),
+    "pose": (1024, "as exposure; sums of terms with both signs"),
     "lens": (1024, "19 measured; as pose"),
     "bounds": (0, "minima and maxima"),
     "chunks": (512, "211 measured, in second moments: beta2 in float32 is off by 1.3e-5 of 1 - beta2, up to 216 ulp"),
@@ -81,22 +81,22 @@ STAGE_BOUNDS_ULP: dict[str, tuple[float, str]] = {
 }
 """Error bound of each stage in ulp, and the reason for it.
 
-The errors are measured where every operation rounds like IEEE 754. The bounds leave room for GPUs whose divisions and
-roots do not. With a wrong operation, a result is off by thousands.
+"N measured" is the largest error in ulp on a device whose operations all round as IEEE 754 demands. The bounds leave
+room for GPUs whose divisions and roots do not. If an operation is wrong, results are off by thousands of ulp.
 """
 
 
 @dataclass(frozen=True)
 class Result:
-    """The result of a stage over all frozen scenes.
+    """The self-test's result of a stage over all frozen scenes.
 
     absolute, ulp: the largest absolute error, and the largest error in ulp.
     bound: the error bound in ulp.
-    same_bits: True if the bits match the stored digest; None if no digest is stored for this shape.
-    ms: milliseconds of all scenes.
-    trouble: description of a fault other than the error, or empty.
-    where: the place of the largest error in ulp.
-    otherwise: operations that do not round like IEEE 754.
+    same_bits: True if the bits of the results match the stored digest; None if no digest is stored for this shape.
+    ms: milliseconds that the stage took on all scenes.
+    trouble: description of a fault other than too large an error, or empty.
+    where: name of the quantity with the largest error in ulp, such as "image".
+    otherwise: names of the operations that do not round as IEEE 754 demands, such as "division".
     """
 
     stage: str
@@ -111,5 +111,5 @@ class Result:
 
     @property
     def passed(self) -> bool:
-        """True if the stage can be trusted. Different bits alone are no failure."""
+        """True if the stage can be trusted. Bits that differ from the digest are no failure."""
         return not self.trouble and self.ulp <= self.bound

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frozen scenes of the self-test, which are the same on every machine, to the last bit.
+"""Frozen scenes of the self-test: synthetic models and cameras that have the same bits on every machine.
 
-All numbers come from an integer hash and are multiples of a power of two. They do not depend on NumPy's generators or
-on mathematical libraries. The digests in digests.json are of these scenes.
+All numbers come from an integer hash and are multiples of a power of two. So they do not depend on NumPy's generators
+or on mathematical libraries. The digests in digests.json belong to these scenes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.stages.device_camera import padded_size
 
 HASH_STEPS = 1 << 12
-"""Number of different values, equally spaced, in a range of `evenly`."""
+"""Number of equally spaced values from which `evenly` chooses."""
 
 
 def hashed(seed: int, count: int) -> NDArray[np.uint64]:
@@ -37,14 +37,14 @@ def evenly(seed: int, shape: tuple[int, ...], low: float, high: float, steps: in
 
 
 def keys(seed: int, count: int, bits: int) -> NDArray[np.uint32]:
-    """Sort keys (count,) of `bits` bits; each occurs about three times."""
+    """Sort keys (count,) of `bits` bits; each value occurs about three times."""
     pool = (hashed(seed, count // 3 + 1) >> np.uint64(64 - bits)).astype(np.uint32)
     return pool[(hashed(seed + 1, count) % np.uint64(len(pool))).astype(np.int64)]
 
 
 @dataclass(frozen=True, eq=False)
 class Frozen:
-    """A model, a view of it, its background, and a photograph for the loss.
+    """A frozen scene: a model, a camera that views it, a background colour, and a photograph for the loss.
 
     photograph: planes (3, rows, stride), zero in the padding.
     """
@@ -57,7 +57,7 @@ class Frozen:
 
 
 def padded(camera: Camera, seed: int, low: float, high: float) -> Float32:
-    """Planes (3, rows, stride) of noise in the image and zeros in the padding."""
+    """Planes (3, rows, stride) of random values in [low, high), with zeros in the padding."""
     height, width = camera.height, camera.width
     planes = np.zeros((3, *padded_size(width, height)), np.float32)
     planes[:, :height, :width] = evenly(seed, (3, height, width), low, high)
@@ -65,10 +65,10 @@ def padded(camera: Camera, seed: int, low: float, high: float) -> Float32:
 
 
 def cloud(name: str, count: int, width: int, height: int, seed: int) -> Frozen:
-    """Gaussians of all sizes, orientations and opacities, inside and around the view of a tilted camera.
+    """A scene of Gaussians of all sizes, orientations and opacities, inside and around the view of a tilted camera.
 
     The principal point is not in the middle. Some Gaussians are behind the camera, some at its near plane, and some
-    fainter than 1/255. The SH degree is 3.
+    have an opacity below 1/255. The SH degree is 3.
     """
     unit = 0.125
     z = evenly(seed, (count,), 1.5, 8.5)
@@ -90,7 +90,7 @@ def cloud(name: str, count: int, width: int, height: int, seed: int) -> Frozen:
 def wall() -> Frozen:
     """A scene of nearly opaque layers, two at each depth.
 
-    Alpha reaches its cap, pixels saturate after a few layers, and Gaussians of equal depth are ordered by index.
+    Alpha reaches its cap, pixels become opaque after a few layers, and Gaussians of equal depth are ordered by index.
     """
     count, width, height = 64, 40, 36
     depths = 1.5 + 0.0625 * (np.arange(count) // 2)
@@ -107,7 +107,7 @@ def wall() -> Frozen:
 
 
 def scenes(*, quick: bool) -> list[Frozen]:
-    """The frozen scenes on which the stages run."""
+    """The frozen scenes on which the self-test runs: two if `quick`, otherwise three."""
     few = [cloud("cloud", 240, 70, 45, 1), wall()]
     return few if quick else [*few, cloud("crowd", 1500, 120, 75, 41)]
 
@@ -122,5 +122,5 @@ def _gaussians(*arrays: NDArray[np.float64]) -> Gaussians:
 
 
 def _rotation() -> NDArray[np.float64]:
-    """The rotation matrix of the quaternion (15, 2, -3, 1), w first. Each entry is a quotient of whole numbers."""
+    """The rotation matrix of the quaternion (15, 2, -3, 1), w first. Each entry is a quotient of integers."""
     return np.array([[219, -42, -86], [18, 229, -66], [94, 54, 213]]) / 239

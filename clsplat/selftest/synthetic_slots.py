@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Synthetic slots of pairs and the gradients that follow from them, to test stages without the gradient of blending."""
+"""Synthetic slots of pairs and the gradients that follow from them. They replace the output of the gradient of blending
+in tests of later stages."""
 
 from __future__ import annotations
 
@@ -17,11 +18,13 @@ from clsplat.selftest.scenes import evenly
 from clsplat.stages.project import Slots
 
 SLOT_MOMENTS = slice(SLOT.index("G"), SLOT.index("GVV") + 1)
+"""Columns of a slot: the sum of g, then the first and second moments of g."""
 SLOT_COLOURS = slice(SLOT.index("RED"), SLOT.index("BLUE") + 1)
+"""Columns of a slot: the gradient with respect to red, green and blue."""
 
 
 def slot_sums(bench: CaseBench, slots: Array) -> Float64:
-    """Sums (n, 9) of each Gaussian's slots in float64."""
+    """Sum each Gaussian's slots in float64. Returns (n, SLOT_PLAIN)."""
     sums = np.zeros((bench.model.count, SLOT_PLAIN))
     np.add.at(
         sums, bench.lists.gaussian_from_sorted.get(), slots[bench.lists.slot_from_sorted.get()].astype(np.float64)
@@ -31,26 +34,26 @@ def slot_sums(bench: CaseBench, slots: Array) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class MadeUpSlots:
-    """Synthetic slots, one for each pair, and their float64 sums (n, 9) for each Gaussian."""
+    """Synthetic slots, one for each pair, and their float64 sums (n, SLOT_PLAIN) for each Gaussian."""
 
     slots: Slots
     sums: Float64
 
     @classmethod
     def of(cls, bench: CaseBench) -> MadeUpSlots:
-        """Synthetic slots of the scene's pairs."""
+        """Make synthetic slots for the pairs of the bench's scene."""
         values = evenly(33, (bench.counted.pairs, SLOT_PLAIN), -1.0, 1.0).astype(np.float32)
         return cls(Slots(upload(bench.device, values), bench.counted.first_slots), slot_sums(bench, values))
 
     def d_means(self, bench: CaseBench) -> Float64:
-        """Gradients (n, 2) with respect to the means on the image, per pixel: docs/gradients.md (50)."""
+        """Gradients (n, 2) with respect to the means' image positions, per pixel: docs/gradients.md, (50)."""
         l11, l12, l22 = (WHITENING_FACTOR * bench.splats().whitening).T
         _, u, v, *_ = self.sums[:, SLOT_MOMENTS].T
         found: Float64 = -np.stack([l11 * u, l12 * u + l22 * v], axis=1) / WHITENING_FACTOR**2
         return found
 
     def on_image(self, bench: CaseBench) -> reference_project.ProjectedGradients:
-        """Gradients with respect to the twin's projected Gaussians of the scene."""
+        """Gradients with respect to the scene's projected Gaussians, in the form of the float64 reference."""
         l11, l12, l22 = (WHITENING_FACTOR * bench.splats().whitening).T
         *_, uu, uv, vv = self.sums[:, SLOT_MOMENTS].T
         entries = [l11 * l11 * uu, l11 * (l12 * uu + l22 * uv), l12 * l12 * uu + 2 * l12 * l22 * uv + l22 * l22 * vv]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The self-test: compares every stage on frozen scenes with the float64 reference and with stored digests.
+"""Run the self-test: every stage on frozen scenes, compared with the float64 reference and with stored digests.
 
-Run as a program, this is the worker process of `clsplat.selftest.driver_check`, as a driver may crash or hang. It
-reports steps and results in lines of JSON.
+As a program, this module is the worker process of `clsplat.selftest.driver_check`: a driver may crash it or make it
+hang. The process reports its steps and results as lines of JSON.
 """
 
 from __future__ import annotations
@@ -47,18 +47,20 @@ DEFAULT_DEFINES: dict[str, dict[str, object]] = {
     "values": {"VALUES": 3},
     "values_grad": {"VALUES": 3, "GEOMETRY": True},
 }
-"""Defines without which these kernel files cannot be built."""
+"""Preprocessor defines without which a kernel file cannot be built, by the file's name without ".cl"."""
 
 
 @cache
 def stored_digests() -> dict[str, str | dict[str, str]]:
-    """Digests by scene and stage: one for all drivers and shapes, or by shape if the order of sums depends on it."""
+    """The stored digests by "scene/stage": one digest for all drivers and kernel shapes, or a digest for each shape
+    where the order of sums depends on the shape."""
     digests: dict[str, str | dict[str, str]] = json.loads(DIGESTS_PATH.read_text())["digests"]
     return digests
 
 
 def shape_label(device: Device) -> str:
-    """The shape's label for digests: with the number of work-items that share a tile, and without sub-groups."""
+    """The label of the device's kernel shape in digests.json: with the number of work-items that share a tile, and
+    without sub-groups."""
     return replace(device.shape, items=tile_items(device), subgroups=False).label
 
 
@@ -72,10 +74,10 @@ def run(
 ) -> Iterator[Result]:
     """Run the stages in order, each on all scenes, and yield their results.
 
-    The run ends early if wrong results could make the next stage read or write outside its arrays.
+    The run ends early if the next stage could read or write outside its arrays because of wrong indices.
 
     say: function that is called with the name of each stage before it runs.
-    digests: dictionary to fill with the digests of this run, by "scene/stage".
+    digests: dictionary that is filled with the digests of this run, by "scene/stage".
     """
     benches = [CaseBench(device, frozen) for frozen in scenes(quick=quick)]
     for name in stages:
@@ -84,7 +86,7 @@ def run(
         for bench in benches:
             try:
                 outcomes.append(OUTCOMES_BY_STAGE[name](bench))
-            except DriverError:  # the caller may try another shape
+            except DriverError:  # The caller may try another kernel shape.
                 raise
             except Exception as error:  # noqa: BLE001  # drivers, and sizes from a wrong kernel, raise anything
                 text = " ".join(str(error).split())[:300]
@@ -121,7 +123,8 @@ def _result(name: str, benches: list[CaseBench], outcomes: list[StageOutcome]) -
 
 
 def _child(index: int, shape: str, stages: Sequence[str], *, quick: bool) -> None:
-    """Build and run the stages on the `index`-th device. Prints JSON before each step and for each result."""
+    """Build all kernels and run the stages on the `index`-th device. Prints a line of JSON before each step and for
+    each result. quick: build only the kernels that the stages use."""
     end_with_parent()
     tell(begins="opening the device")
     device = Device(all_devices()[index]).with_shape(shape)

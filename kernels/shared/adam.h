@@ -1,14 +1,14 @@
 // Adam, (42) of docs/gradients.md (Kingma and Ba 2015, algorithm 1), for one element and for ABREAST consecutive
 // elements.
 //
-// No parameter and no moment becomes NaN or infinite here. The step of an element is refused if its new values would be
-// NaN or infinite, or if the square of its new parameter would reach `limit2`. The last four entries of `readback`
-// count refusals by cause: the old parameter, the gradient, the moments, or only the new values. Moments that are not
-// finite restart at zero. In the other cases the second moment becomes infinite and the first 0, so that all later
-// steps are refused until the host repairs the row (docs/decisions/0016-never-a-nan.md).
+// Adam writes no NaN, and no infinity except as a mark of refusal. It refuses the step of an element if the new values
+// would be NaN or infinite, or if the square of the new parameter would reach `limit2`. The last four entries of
+// `readback` count refusals by cause: the old parameter, the gradient, the moments, or only the new values. If only the
+// old moments are not finite, they restart at zero. Otherwise the first moment becomes 0 and the second infinite, so
+// that all later steps are refused until the host repairs the row (docs/decisions/0016-never-a-nan.md).
 
-// Number of elements that a work-item updates together: a vector of the shape, otherwise four. A GPU then reads 16
-// bytes at a time, and issues three reads before it waits for the first.
+// Number of elements that a work-item updates together: LANES, or four if LANES is 1. So a GPU reads 16 bytes at a
+// time, and issues three reads before it waits for the first.
 #if LANES > 1
 #define ABREAST LANES
 #define fmaA fmaL
@@ -25,8 +25,8 @@
 typedef CAT(float, ABREAST) floatA;
 typedef CAT(int, ABREAST) intA;
 
-// Constants of a step, and the counters of refusals. rate: the learning rate / (1 - beta1^t); root: 1 / sqrt(1 -
-// beta2^t).
+// The constants of a step of Adam. rate: the learning rate / (1 - beta1^t); root: 1 / sqrt(1 - beta2^t); limit2: the
+// square of the limit of a parameter; readback: counts refusals.
 typedef struct {
   float rate, root, beta1, beta2, epsilon, limit2;
   __global uint *readback;
@@ -37,7 +37,8 @@ typedef struct {
   __global float *parameters, *first, *second;
 } Stepped;
 
-// Refuses the step of an element; p, g, m and v are its values before the step.
+// Refuses the step of element i: sets its moments and counts the refusal by cause. p, g, m, v: the element's parameter,
+// gradient and moments before the step.
 static inline void refuse(size_t i, Step s, float p, float g, float m, float v, __global float *first,
                           __global float *second) {
   const int parameter = p * p < s.limit2, gradient = fabs(g) < INFINITY;
@@ -51,8 +52,8 @@ static inline void refuse(size_t i, Step s, float p, float g, float m, float v, 
                                        : READBACK_REFUSED_STEPS));
 }
 
-// With vectors, single elements are updated only where one is refused. That is rare, and a compiler took half a minute
-// to inline this function everywhere.
+// If LANES > 1, step_element runs only where an element of a vector is refused. That is rare, and a compiler took half
+// a minute to inline the function everywhere.
 #if LANES > 1
 #define RARE __attribute__((noinline)) static
 #else
@@ -76,15 +77,15 @@ RARE void step_element(size_t i, float g, Step s, Stepped model) {
   model.parameters[i] = p;
 }
 
-// How far a step moves parameters, from the moments after it.
+// The amount that a step subtracts from parameters. m, v: the moments after the step.
 __attribute__((always_inline)) static inline floatA movement(float rate, float root, float epsilon, floatA m,
                                                              floatA v) {
   return rate * m / fmaA(sqrt(v), (floatA)(root), (floatA)(epsilon));
 }
 
-// Updates those of ABREAST elements from i on that are `taken`; i is a multiple of 4 unless LANES > 1. Returns 0 and
-// stores nothing if one must be refused. The second moment and p * p are not negative, so a test of their sum checks
-// both. Always inlined, because AMD's compiler would otherwise keep Step in memory.
+// Updates those of the ABREAST elements from i on that are `taken`. If LANES is 1, i is a multiple of 4. Returns 0 and
+// stores nothing if the step of some element must be refused. The second moment and p * p are not negative, so one test
+// of their sum checks both. The function is always inlined, because AMD's compiler would otherwise keep Step in memory.
 __attribute__((always_inline)) static inline int step_vector(size_t i, floatA g, intA taken, Step s, Stepped model) {
   const floatA before = LOADA(model.parameters + i), m_before = LOADA(model.first + i);
   const floatA v_before = LOADA(model.second + i);

@@ -1,5 +1,5 @@
-// A Gaussian's alpha in a tile's pixels. blend and blend_grad must agree to the last bit, because the gradient recovers
-// the transmittance of the image by division.
+// A Gaussian's alpha in a tile's pixels. blend.cl and blend_grad.cl must compute the same bits, because the gradient
+// recovers the image's transmittance by division.
 
 // A Gaussian's nearness, 1 / depth, is blended like a colour (docs/gradients.md, (120)).
 #ifdef NEARNESS
@@ -17,7 +17,8 @@ static inline floatL whitened_u(float l11, float l12, floatL dx, floatL dy) {
   return fmaL((floatL)(l12), dy, l11 * dx);
 }
 
-// Adds g and its moments to the first fields of a slot; by_u, by_v: the addends of the first-order moments.
+// Adds g and its moments in (u, v) to the first fields of a slot's sums. by_u, by_v: what is added to the two
+// first-order moments.
 static inline void add_moments_by(floatS g, floatS u, floatS v, floatS by_u, floatS by_v, floatS *sums) {
   const floatS gu = g * u, gv = g * v;
   sums[SLOT_G] += g;
@@ -32,7 +33,8 @@ static inline void add_moments(floatS g, floatS u, floatS v, floatS *sums) {
   add_moments_by(g, u, v, g * u, g * v, sums);
 }
 
-// Variables of a Gaussian for a loop over cells, and log2 of its uncapped alpha in cell `cell`.
+// SPLAT_HERE defines a Gaussian's variables for a loop over cells. LOG2_ALPHA is log2 of the Gaussian's uncapped alpha
+// in the pixels of `cell`. With RAYS, RAY_TABLES defines the direction of each pixel.
 #ifdef RAYS
 #include "shared/camera.h"
 #include "shared/rays.h"
@@ -58,7 +60,7 @@ static inline void add_moments(floatS g, floatS u, floatS v, floatS *sums) {
 // log2 of the uncapped alpha from the mean's offset in (u, v).
 static inline floatL log2_alpha(floatL u, floatL v, float log2o) { return fmaL(-u, u, fmaL(-v, v, (floatL)(log2o))); }
 
-// Alpha from the log2 of the uncapped alpha; 0 in lanes that are not `taken`.
+// The capped alpha from `power`, the log2 of the uncapped alpha; 0 in lanes that are not `taken`.
 static inline floatL alpha_where(intL taken, floatL power) {
   floatL alpha = exp2L(power);
   alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);

@@ -1,9 +1,9 @@
-// Angles of directions, as scalars, with the same bits on every driver. Needs math.h.
+// Angles by arctangents, as scalars, with the same bits on every driver. Include math.h before.
 #define HALF_TURN 3.14159265f
 #define QUARTER_TURN 1.57079633f
 
-// atan(x) for x in [0, 1], relative error 6e-8: x + x^3 times this minimax polynomial in x^2, highest coefficient
-// first.
+// Coefficients for atan(x) with x in [0, 1], relative error 6e-8: atan(x) is x + x^3 times this minimax polynomial in
+// x^2, highest coefficient first.
 #define ATAN0 2.849871991e-03f
 #define ATAN1 -1.606855914e-02f
 #define ATAN2 4.269140586e-02f
@@ -28,12 +28,12 @@ static inline float quarter_atan(float y, float x) {
   return steep ? QUARTER_TURN - p : p;
 }
 
-// The angle of (x, y) from the x axis, for y >= 0: up to half a turn.
+// The angle of (x, y) from the x axis, for y >= 0: 0 to half a turn, in radians.
 static inline float half_atan(float y, float x) {
   return x < 0.0f ? HALF_TURN - quarter_atan(y, -x) : quarter_atan(y, x);
 }
 
-// The angle of (x, y) from the x axis for any y, with the sign of y; 0 for (0, 0).
+// The angle of (x, y) from the x axis, with the sign of y, in radians; 0 for (0, 0).
 static inline float signed_atan(float y, float x) {
   if (!(x != 0.0f || y != 0.0f)) return 0.0f;
   return y < 0.0f ? -half_atan(-y, x) : half_atan(y, x);

@@ -1,16 +1,18 @@
-// The light behind a pair in a pixel, as a scalar. A single item keeps R of (48) in docs/gradients.md. A group of items
-// keeps D . B of (22), which takes fewer instructions and is more precise.
+// The light behind a pair in a pixel, reduced to one number by the pixel's gradient. With ITEMS == 1 this is R of (48)
+// in docs/gradients.md. A group of several items keeps D . B of (22), which takes fewer instructions and is more
+// precise.
 
-// BEHIND: the light behind all pairs. t: final transmittance; at_end: gradient with respect to it.
+// BEHIND: the light behind all pairs. t: the final transmittance; at_end: the gradient with respect to t.
 #if ITEMS == 1
 #define BEHIND(t, at_end) ((t) * (at_end))
 #else
 #define BEHIND(t, at_end) (at_end)
 
-// t / x for x in [0.01, 1], and t itself for x = 1. An estimate of 1 / x by its bits is off by up to 5 %, and by 3.3e-5
-// after a step with e^2 + 1.001926 e + 1 for 1 / (1 - e). The quotient by it is then corrected by its own remainder. A
-// division takes twice as many instructions, and its rounding depends on the driver. The result is the rounded quotient
-// in all but 0.7 % of cases, and on average too small by 6e-10, so that a long list's errors do not add up.
+// t / x for x in [0.01, 1]; exactly t for x = 1. A division would take twice as many instructions, and its rounding
+// depends on the driver. The bits of x give an estimate of 1 / x, which is off by up to 5 %. A polynomial step, with
+// e^2 + 1.001926 e + 1 for 1 / (1 - e), reduces the error to 3.3e-5. Then the remainder of the quotient corrects the
+// quotient. The result is the correctly rounded quotient in all but 0.7 % of cases. On average it is too small by only
+// 6e-10, so that errors do not add up over a long list.
 static inline float quotient(float t, float x) {
   const float estimate = as_float(0x7ef331c7 - as_int(x));
   const float d = fma1(-x, estimate, 1.500963f);
@@ -18,8 +20,9 @@ static inline float quotient(float t, float x) {
   return fma1(fma1(-near, x, t), inverse, near);
 }
 
-// Removes a pair from a pixel. *t: transmittance; *behind: D . B; difference: D . c - *behind; uncapped: the pair's
-// alpha before the cap. Where that is 0, nothing changes.
+// Removes a pair from a pixel, and returns the pair's g and weight. *t: transmittance; *behind: D . B, the pixel's
+// gradient D times the light B behind the pair; difference: D . c - *behind, with the pair's colour c; uncapped: the
+// pair's alpha before the cap. If `uncapped` is 0, nothing changes.
 static inline Share take_out_of(float *t, float *behind, float uncapped, float difference) {
   const float alpha = uncapped < ALPHA_MAX ? uncapped : ALPHA_MAX;
   const float before = quotient(*t, 1.0f - alpha), weight = alpha * before;

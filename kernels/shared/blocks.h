@@ -1,10 +1,11 @@
-// cells.h for a group of ITEMS work-items that share a tile. A cell is one pixel of a block of 4 x 8 pixels. Each block
-// has 32 items, one per pixel, so that items that run together skip a block together. Groups of fewer items have lower
-// blocks. Items that own the same blocks are a warp here, whether or not the device runs 32 items together.
+// The counterpart of cells.h for a group of ITEMS work-items that share a tile. A cell is one pixel of a block of 4 x 8
+// pixels. Each block has 32 items, one per pixel, so that items that run together skip a block together. In groups of
+// fewer than 32 items, blocks have fewer rows. Items that own the same blocks are called a warp here, whether or not
+// the device runs 32 items together.
 //
-// Item i owns pixel i % 32 of OWNED blocks; these pixels are its cells 0, 1 and so on. An item's blocks in a row of
-// blocks are side by side, so that it computes once for them what depends on y alone. Splats pass through local memory
-// in batches, each with the blocks that its ellipse reaches.
+// Item i owns pixel i % 32 of each of OWNED blocks; these pixels are its cells 0, 1 and so on. An item's blocks in a
+// row of blocks are side by side, so that the item computes values that depend only on y once for all of them. Splats
+// pass through local memory in batches, each splat with the set of blocks that its ellipse reaches.
 #if LANES > 1
 #error "a group of work-items has one pixel a vector"
 #endif
@@ -58,7 +59,8 @@ typedef uint Reach;
 #define FROM_OWN(blocks) ((blocks) >> (WARP * OWNED))
 #define FOR_CELLS(cell, reach) ALL_CELLS(cell) if ((reach) >> cell & 1)
 
-// All blocks: in kernels that read one splat at a time, a test would cost more than the pixels.
+// Returns all blocks: in kernels that read one splat at a time, testing blocks would cost more than blending their
+// pixels.
 static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y) { return ALL_BLOCKS; }
 
 #if defined(RAYS) || (defined(NO_ROW_SKIP) && defined(NO_COLUMN_SKIP))
@@ -66,8 +68,8 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
 static inline uint blocks_of(const float *splat, int tile_x, int tile_y) { return ALL_BLOCKS; }
 #else
 #define ALL_REACHED 0
-// The right edge of an ellipse, relative to its mean, over the offsets [d0, d1] in y (docs/gradients.md, (47)). The
-// square root, and so the edge, may be up to 0.2 % too large.
+// The right edge of an ellipse in the rows whose offsets from the mean are in [d0, d1], relative to the mean
+// (docs/gradients.md, (47)). The square root, and so the edge, may be up to 0.2 % too large.
 static inline float block_edge(float d0, float d1, float tangent, float half_w, float l12, float l22, float inverse_l11,
                                float budget) {
   const float dy = tangent < d0 ? d0 : d1, v = l22 * dy;
@@ -77,7 +79,7 @@ static inline float block_edge(float d0, float d1, float tangent, float half_w, 
   return tangent >= d0 && tangent <= d1 ? half_w : edge;
 }
 
-// The blocks that an ellipse reaches, as bits.
+// The blocks that an ellipse reaches, a bit for each block.
 static inline uint blocks_of(const float *splat, int tile_x, int tile_y) {
   const float mx = (splat[SPLAT_PIXEL_X] - (float)tile_x) + splat[SPLAT_SUB_X];
   const float my = (splat[SPLAT_PIXEL_Y] - (float)tile_y) + splat[SPLAT_SUB_Y];
@@ -89,7 +91,7 @@ static inline uint blocks_of(const float *splat, int tile_x, int tile_y) {
   for (int row = 0; row < BLOCK_ROWS; ++row) {
     float d0 = (float)(row * BLOCK_H) + (0.5f - TILE_SLACK) - my;
     float d1 = d0 + ((float)BLOCK_H - 1.0f + 2.0f * TILE_SLACK);
-#ifdef NO_ROW_SKIP // RasterizerConfig.row_skip
+#ifdef NO_ROW_SKIP // RasterizerConfig.row_skip is off
     d0 = -half_h;
     d1 = half_h;
 #endif
@@ -99,7 +101,7 @@ static inline uint blocks_of(const float *splat, int tile_x, int tile_y) {
     const float left = mx - block_edge(-d1, -d0, tangent, half_w, l12, l22, inverse_l11, budget);
     for (int column = 0; column < BLOCK_COLUMNS; ++column) {
       const float first = (float)(column * BLOCK_W) + (0.5f - TILE_SLACK);
-#ifdef NO_COLUMN_SKIP // RasterizerConfig.column_skip
+#ifdef NO_COLUMN_SKIP // RasterizerConfig.column_skip is off
       const int reached = d0 <= d1;
 #else
       const int reached = d0 <= d1 && right >= first && left <= first + ((float)BLOCK_W - 1.0f + 2.0f * TILE_SLACK);
@@ -111,32 +113,35 @@ static inline uint blocks_of(const float *splat, int tile_x, int tile_y) {
 }
 #endif
 
-// A batch: splats that the group's items fetch together and all read. Every item fetches the same number, repeating the
-// last splat at the list's end: a compiler that vectorises across items may read memory for idle items too.
+// BATCH: number of splats that the group's items fetch together into local memory, where all items read them. Every
+// item fetches the same number of splats, at the list's end the last splat again: a compiler that vectorises across
+// items may read memory for idle items too.
 #ifndef BATCH
 #define BATCH (ITEMS < 64 ? 64 : ITEMS)
 #endif
-#define FETCHES ((BATCH + ITEMS - 1) / ITEMS) // splats of a batch that an item fetches
+#define FETCHES ((BATCH + ITEMS - 1) / ITEMS) // number of splats of a batch that each item fetches
 #define FOR_FETCHES(fetch) UNROLLED for (int fetch = 0; fetch < FETCHES; ++fetch)
 typedef struct {
   float mx, my, l11, l12; // mx, my: the mean, relative to the tile's first pixel
   float l22, log2o, red, green;
   float blue;
-  uint kept, blocks, slot; // kept: the Gaussian, or the number that a kernel needs in its place
+  uint kept, blocks, slot; // kept: see KEPT; blocks: those that the ellipse reaches; slot: the pair's slot
 #ifdef NEARNESS
   float near;     // nearness, 1 / depth
-  uint unused[3]; // padding to 16 bytes; set, so that copies read no uninitialised memory
+  uint unused[3]; // padding to 16 bytes; set to 0, so that copies read no uninitialised memory
 #endif
 } __attribute__((aligned(16))) Staged;
 
-// The number that blending keeps of a pair. With RAYS it is the Gaussian's, whose splat each pixel reads.
+// The index that blending keeps of a staged pair. With RAYS it is the Gaussian's index, because each pixel reads the
+// splat; otherwise it is the pair's index.
 #ifdef RAYS
 #define KEPT(gaussian, pair) (gaussian)
 #else
 #define KEPT(gaussian, pair) (pair)
 #endif
 
-// Copies a splat to local memory, in loads that are under way together. Returns the blocks of `among` that it reaches.
+// Copies a splat to *place in local memory, in loads that are under way together. Returns those blocks of the set
+// `among` that the splat reaches.
 static inline uint stage(__local Staged *place, uint gaussian, uint kept, uint slot, uint among,
                          __global const float *splats, int tile_x, int tile_y) {
   __global const float4 *row = (__global const float4 *)splats + (size_t)(SPLAT_SIZE / 4) * gaussian;
@@ -162,33 +167,35 @@ static inline uint stage(__local Staged *place, uint gaussian, uint kept, uint s
   return blocks;
 }
 
-// The blocks b for which numbers[b] is above `floor`, a bit each.
+// The set of blocks b for which numbers[b] is above `floor`, a bit for each block.
 static inline uint blocks_above(int floor, __local const int *numbers) {
   uint blocks = 0;
   _Pragma("unroll") for (int block = 0; block < BLOCKS; ++block) blocks |= (uint)(numbers[block] > floor) << block;
   return blocks;
 }
 
-// A warp can walk a list of only the pairs of a batch that reach one of its blocks. First each pair is marked for each
-// set of blocks that has a list, then the marked pairs are listed in order.
-#define LIST (BATCH + 2) // room of a list; the places after its end are read ahead, and not used
+// Lists of pairs: a warp loops over only those pairs of a batch that reach one of its blocks. First each pair is marked
+// for each set of blocks that has a list. Then the marked pairs of each set are listed in order.
+#define LIST (BATCH + 2) // capacity of a list; elements after its end are read ahead, but not used
 
-// Marks the j-th pair of a batch for `sets` sets of `own` blocks each: a byte for each pair, 1 or 0.
+// Marks the j-th pair of a batch for each of `sets` sets of `own` blocks: `marks` has a byte for each set and pair, 1
+// or 0. blocks: the blocks that the pair reaches.
 static inline void mark(__local uint *marks, int j, uint blocks, int sets, int own) {
   _Pragma("unroll") for (int set = 0; set < sets; ++set)((__local uchar *)marks)[set * BATCH + j] =
       (blocks >> set * own & FIRST_BLOCKS(own)) != 0;
 }
 
-// An entry of a list: the pair's number in its batch, and DENSE if it reaches more than half of the set's blocks, so
-// that `spare` is negative. It is then quicker to take all of the item's cells without a branch.
+// An entry of a list: the pair's number in its batch, with the bit DENSE if the pair reaches more than half of the
+// set's blocks. It is then quicker to process all of the item's cells without a branch. spare: SPARSE minus the number
+// of reached blocks, negative for DENSE.
 #define DENSE 0x80000000u
 #define ENTRY_OF(j, spare) ((uint)(j) | ((uint)(spare) & DENSE))
 #define PAIR_OF(entry) ((int)((entry) & ~DENSE))
 #define SPARSE(own) (ALL_REACHED ? (own) : (own) / 2)
 #define IS_DENSE(entry, own) (SPARSE(own) == 0 || (SPARSE(own) < (own) && ((entry) & DENSE)))
 
-// The marks of BLOCK_ITEMS pairs of a batch from `begin` on, as bits. The top byte of each product has the marks of
-// four pairs.
+// The marks of BLOCK_ITEMS pairs of a batch from `begin` on, a bit for each pair. The top byte of each product has the
+// marks of four pairs.
 static inline uint marked_from(__local const uint *marks, int begin) {
   uint marked = 0;
   _Pragma("unroll") for (int four = 0; four < BLOCK_ITEMS; four += 4) marked |=
@@ -201,12 +208,12 @@ static inline uint marked_from(__local const uint *marks, int begin) {
 #define LIST_MARKED(count, marks, list, ENTRY)                                                                         \
   int count = 0;                                                                                                       \
   _Pragma("unroll") for (int begin_ = 0; begin_ < BATCH; begin_ += BLOCK_ITEMS) {                                      \
-    const uint marked = marked_from(marks, begin_), until = marked << (31 - LANE); /* those up to the item's pair */   \
+    const uint marked = marked_from(marks, begin_), until = marked << (31 - LANE); /* marks up to the item's pair */   \
     if (until >> 31) (list)[count + popcount(until) - 1] = ENTRY(begin_ + LANE);                                       \
     count += popcount(marked);                                                                                         \
   }
 
-// Gives a staged splat the names that LOG2_ALPHA and the kernels use for a splat in global memory.
+// Defines for a staged splat the variables that LOG2_ALPHA and the kernels use for a splat in global memory.
 #define SPLAT_STAGED(s)                                                                                                \
   __global const float *splat = splats + (size_t)SPLAT_SIZE * s.kept;                                                  \
   const float mx = s.mx, my = s.my, l11 = s.l11, l12 = s.l12, l22 = s.l22, log2o = s.log2o;                            \

@@ -1,5 +1,5 @@
-// The camera model of this build, a header of shared/camera/. All camera models have the same functions and macros,
-// which docs/cameras.md (Adding a camera model) lists. Needs math.h and lanes.h.
+// Includes the camera model of this build, a header of shared/camera/. All camera models have the same functions and
+// macros, which docs/cameras.md (Adding a camera model) lists. Include math.h and lanes.h before.
 //
 // Before the first include, a kernel defines the macros of the parts that it needs:
 //   NEEDS_PROJECTION   a Gaussian's position on the image plane; gaussian.h and ewa.h define this macro
@@ -18,14 +18,14 @@
 
 #ifdef NEEDS_TANGENTS
 typedef struct {
-  float e1[3], e2[3]; // right and down on the tangent plane
-  float k[4];         // d(tangent plane) / d(pixel): a pixel's footprint there
+  float e1[3], e2[3]; // unit vectors to the right and down on the tangent plane
+  float k[4];         // d(point on the tangent plane) / d(pixel), the footprint of a pixel, row by row
 } Tangent;
 #endif
 #ifdef NEEDS_BOXES
 typedef struct {
   float low_x, high_x, low_y, high_y; // in pixels, not clamped
-  int whole_rows;                     // the box goes all the way round the panorama
+  int whole_rows;                     // 1 if the box goes all the way round the panorama
 } Box;
 #endif
 #ifdef RAYS
@@ -36,7 +36,7 @@ typedef struct {
 #include "shared/camera/orthographic.h"
 #elif defined(EQUIRECTANGULAR)
 #include "shared/camera/equirectangular.h"
-#elif defined(FISHEYE_RAYS) // BENT_FISHEYE adds its coefficients
+#elif defined(FISHEYE_RAYS) // with BENT_FISHEYE the radius is a polynomial of the angle
 #include "shared/camera/fisheye.h"
 #elif defined(PERSPECTIVE_RAYS)
 #include "shared/camera/perspective_rays.h"
@@ -48,10 +48,10 @@ typedef struct {
 #include "shared/camera/plane.h"
 #endif
 
-// A component of the view direction at a Gaussian, in world axes, and of the gradient through this direction. offset:
-// component of the vector from the camera's centre to the mean; length: length of this vector; axis: component of the
-// camera's axis.
-#ifdef PARALLEL_RAYS // one direction for all Gaussians
+// SEEN_ALONG: a component of the view direction at a Gaussian, in world axes. BY_DIRECTION: a component of the gradient
+// with respect to the mean, through this direction. offset: the component of the vector from the camera's centre to the
+// mean; length: the length of this vector; axis: the component of the camera's viewing axis.
+#ifdef PARALLEL_RAYS // all Gaussians are seen along the same direction
 #define SEEN_ALONG(offset, length, axis) (axis)
 #define BY_DIRECTION(gradient, length) (0.0f)
 #else

@@ -1,7 +1,7 @@
-// The pixels of a tile as cells, and the cells that a Gaussian reaches. Where several work-items share a tile, blocks.h
-// is used. Otherwise a work-item has the tile, and a cell is a block of CELL_W x CELL_H pixels in a vector, row by row.
-// An ellipse reaches fewer such blocks than rows of the same number of pixels. Cell c is at column c % COLUMNS and row
-// c / COLUMNS.
+// Divides the pixels of a tile into cells, and finds the cells that a Gaussian reaches. If several work-items share a
+// tile, blocks.h does this. Otherwise one work-item has the whole tile, and a cell is a block of CELL_W x CELL_H pixels
+// in a vector, row by row. An ellipse reaches fewer such blocks than rows with as many pixels. Cell c is in column c %
+// COLUMNS and row c / COLUMNS.
 #if ITEMS > 1
 #include "shared/blocks.h"
 #else
@@ -18,10 +18,11 @@
 // The index of a cell's first pixel in a plane.
 #define CELL_IN_PLANE(cell) (stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell))
 
-// The index of a lane's pixel, relative to its cell's first pixel.
+// The index in a plane of a lane's pixel, relative to the first pixel of the cell.
 #define LANE_IN_PLANE(lane) (stride * ((lane) / CELL_W) + (lane) % CELL_W)
 
-// The coordinates of a cell's pixels in the tile, and access to the cell in a plane of rows of `stride` values.
+// PIXELS_X, PIXELS_Y: the coordinates in the tile of a cell's pixels. LOAD_CELL, STORE_CELL: access to a cell at
+// address p of a plane with rows of `stride` values.
 #define PIXELS_X(cell) ((floatL)(CELL_X(cell)) + LANE_X)
 #define PIXELS_Y(cell) ((floatL)(CELL_Y(cell)) + LANE_Y)
 #if LANES == 1
@@ -56,8 +57,8 @@ typedef int4 int4U __attribute__((aligned(4)));
 #endif
 #endif
 
-// The cells that a Gaussian reaches. If a tile has at most 32 cells, this is a bit for each cell that has a pixel in
-// the ellipse, otherwise the range of cells that the ellipse's box reaches.
+// Reach: the set of cells that a Gaussian reaches. If a tile has at most 32 cells, it has a bit for each cell with a
+// pixel in the ellipse. Otherwise it is the range of cells that the ellipse's box reaches.
 #if LANES >= 8
 #ifndef RAYS // with RAYS every cell of a tile is visited
 #define CELLS_BY_ELLIPSE
@@ -80,8 +81,9 @@ static inline float8 over_sqrt(float8 x) {
   return root * (1.502f - 0.5f * (root * y));
 }
 
-// The chords of the ellipse in eight rows of pixels, from *low to *end, in pixels and not clamped: |l11 (mx - x) + l12
-// (my - y)| <= sqrt(rest), rest = budget - (l22 (my - y))^2. A chord is a point where rest < 0.
+// Computes the ellipse's chords in eight rows of pixels: *low and *end are their ends, in pixels and not clamped. In
+// row y a chord is |l11 (mx - x) + l12 (my - y)| <= sqrt(rest), with rest = budget - (l22 (my - y))^2. Returns rest;
+// where it is negative the ellipse misses the row, and the chord is a single point.
 static inline float8 chord(float8 dy, float mx, float l12, float l22, float inverse_l11, float budget, float8 *low,
                            float8 *end) {
   const float8 v = l22 * dy, shift = l12 * dy;
@@ -92,7 +94,7 @@ static inline float8 chord(float8 dy, float mx, float l12, float l22, float inve
   return rest;
 }
 
-// Bits of the columns that the ellipse reaches in eight pairs of pixel rows.
+// The columns of cells that the ellipse reaches in eight pairs of pixel rows, a bit for each column.
 static inline int8 reached_columns(float my, float mx, float l12, float l22, float inverse_l11, float budget) {
   const float8 dy = my - (float8)(0, 2, 4, 6, 8, 10, 12, 14);
   float8 low, end, low2, end2;
@@ -126,10 +128,10 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
   const float l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22], inverse = splat[SPLAT_INVERSE_L11];
   const float budget = EXTENT(splat[SPLAT_LOG2O]) + 0.01f;
   int8 bits = reached_columns(my, mx, l12, l22, inverse, budget);
-#ifdef NO_COLUMN_SKIP // RasterizerConfig.column_skip
+#ifdef NO_COLUMN_SKIP // RasterizerConfig.column_skip is off
   bits = bits != 0 ? (int8)(15) : (int8)(0);
 #endif
-#ifdef NO_ROW_SKIP // RasterizerConfig.row_skip
+#ifdef NO_ROW_SKIP // RasterizerConfig.row_skip is off
   bits = (int8)((int)join_rows(bits));
 #endif
 #if LANES == 8
@@ -140,7 +142,7 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
 #endif
 }
 
-// Tables of the pixels' coordinates, because some compilers make integer conversions in the inner loop a long chain of
+// Tables of the pixels' coordinates. Without them, some compilers convert integers in the inner loop by a long chain of
 // dependent instructions. A cell has the same index in all tables and arrays, which saves address arithmetic.
 #define PIXEL_TABLES                                                                                                   \
   floatL table_x[CELLS], table_y[CELLS];                                                                               \
@@ -163,9 +165,10 @@ typedef uint Open;
 
 #define FOR_CELLS(cell, reach) for (uint left = (reach), cell = 0; left && ((cell = LOWEST(left)), 1); left &= left - 1)
 
-// A record has a bit for each vector of the shape's width; a cell has VECTORS of these. RECORDED(mask) <<
-// FIRST_RECORDED(cell): the bits of a cell's vectors that have a lane set in `mask`. CELLS_OF(recorded): the cells of
-// the recorded vectors. PLACE_OF(each): index of a recorded vector in an array of cells, as an array of floatS.
+// Records of cells, which blend.cl writes for blend_grad.cl. A record has a bit for each vector of the shape's width,
+// and a cell consists of VECTORS vectors. RECORDED(mask) << FIRST_RECORDED(cell): the bits of those vectors of a cell
+// that have a lane set in `mask`. CELLS_OF(recorded): the cells of the recorded vectors. PLACE_OF(each): the index of a
+// recorded vector in an array of cells, taken as an array of floatS.
 #if VECTORS == 1
 #define FIRST_RECORDED(cell) (cell)
 #define RECORDED(mask) ((uint)(ANYL(mask) != 0))

@@ -1,25 +1,27 @@
-// The rows of a launch that covers only some chunks of a model. With CHUNKS, a kernel has the parameters
-// CHUNK_PARAMETERS at its end: `chunks` (n / CHUNK_ROWS), for each CHUNK_ROWS rows of the launch the chunk of the model
-// that they are, then NO_CHUNK; and `model_rows`, the number of rows of the model. Of a streamed model, whose chunks
-// are in the slots of a pool in any order, `chunks` has slots and `model_rows` the rows of all slots. Arrays by view,
-// such as splats and tile_counts, have the rows of the launch; parameters, moments and statistics those of the model.
+// Maps the rows of a launch that covers only some chunks of a model to rows of the model. With CHUNKS, a kernel has the
+// parameters CHUNK_PARAMETERS at its end. `chunks` (n / CHUNK_ROWS): the model's chunk for each CHUNK_ROWS rows of the
+// launch, then NO_CHUNK; `model_rows`: the number of rows of the model. The chunks of a streamed model lie in the slots
+// of a pool, in any order; then `chunks` has slots, and `model_rows` counts the rows of all slots.
+//
+// Arrays of a view, such as splats and tile_counts, have the rows of the launch. Parameters, moments and statistics
+// have the rows of the model.
 #ifdef CHUNKS
 #define CHUNK_PARAMETERS , __global const uint *chunks, const uint model_rows
 
-// How far the model's row is ahead of the row of the launch, for all rows of a chunk. Negative where a slot stands
-// before the chunk's place in the launch.
+// The model's row minus the launch's row, which is the same for all rows of a chunk. It is negative if the chunk's slot
+// comes before the chunk's place in the launch.
 static inline long rows_ahead(__global const uint *chunks, uint row) {
   const uint place = row / CHUNK_ROWS;
   return (long)CHUNK_ROWS * ((long)chunks[place] - place);
 }
 
-// Where the rows of a launch that has `n` rows end: at n, or earlier in the model's last chunk. `row` if the model has
-// no such row.
+// The end of the rows of a launch with `n` rows: n, or less if the model's last chunk is not full. `row` itself if the
+// model does not have the row.
 static inline uint end_of_rows(uint row, uint n, long ahead, uint model_rows) {
   return row + ahead >= model_rows ? row : (uint)min((long)n, model_rows - ahead);
 }
 
-// Moves pointers to a model's arrays, so that they are indexed by rows of the launch.
+// Shifts the pointers to a model's arrays by `ahead` rows, so that rows of the launch index them.
 #define MOVE_ROWS(ahead, prefix)                                                                                       \
   prefix##means += 3 * (ahead), prefix##quaternions += 4 * (ahead), prefix##log_scales += 3 * (ahead);                 \
   prefix##opacity_logits += (ahead), prefix##sh_dc += 3 * (ahead);                                                     \

@@ -1,28 +1,31 @@
-// The kernels of a colour model: they remove a photograph's own colours pixel by pixel, and compute the gradient with
-// respect to the model's entries. appearance.cl updates the entries. A model's file defines, before it includes this
-// header:
+// The kernels of a colour model (exposure.cl, ppisp.cl). They remove a photograph's own colours pixel by pixel, and
+// compute the gradient with respect to the model's entries. appearance.cl updates the entries. A colour model's file
+// defines, before it includes this header:
 //   ENTRIES, LENS_ENTRIES: numbers of entries of a photograph, of which the first three are gains, and of a lens.
-//   developed: converts LANES pixels of a photograph to the model's colours, in place.
-//   add_terms: adds the terms of LANES pixels to the gradient's ENTRIES + LENS_ENTRIES sums. Those of gains and lenses
+//   developed: removes a photograph's own colours from LANES pixels, in place.
+//   add_terms: adds the terms of LANES pixels to the gradient's ENTRIES + LENS_ENTRIES sums. Sums of gains and lenses
 //     are divided by ln 2.
-// s is the pixels' squared distance from the principal point, in half diagonals; 0 for panoramas.
+// The argument s of both functions is the squared distance of the pixels from the principal point, in squared half
+// diagonals; 0 for panoramas.
 //
 // Owner: A work-item owns LANES neighbouring pixels (develop), or LANES columns of a tile row (entry_sums). Sums are
-//   added in the same order on every device, with any LANES and ITEMS.
-// Launch: Grids of stride / LANES x rows and stride / LANES x tiles_y.
-// Buffers: Planes (3, rows, stride) of colour, or the loss's gradient with respect to it; gains, logs (photographs,
-//   ENTRIES): gains are 2^logs; lenses (lenses, LENS_ENTRIES); partials (ENTRIES + LENS_ENTRIES, tiles_y, stride).
+//   added in the same order on every device, and with any LANES and ITEMS.
+// Launch: Grids of work-items: stride / LANES x rows (develop) and stride / LANES x tiles_y (entry_sums).
+// Buffers: target, image, gradient (3, rows, stride): colour, or the loss's gradient with respect to colour; gains,
+//   logs (photographs, ENTRIES): gains are 2^logs; lenses (lenses, LENS_ENTRIES); partials (ENTRIES + LENS_ENTRIES,
+//   tiles_y, stride).
 
 #define SUMS (ENTRIES + LENS_ENTRIES)
 
-// Squared distances of pixels from (across, down), times scale.
+// The squared distances of LANES pixels from the point (across, down) of the image, times `scale`.
 static inline floatL spread(const int x, const int y, const float across, const float down, const float scale) {
   const floatL from_x = (floatL)((float)x + 0.5f) + LANE_INDEX - across;
   const float from_y = (float)y + 0.5f - down;
   return fmaL(from_x, from_x, (floatL)(from_y * from_y)) * scale;
 }
 
-// gains, logs, lenses, target -> target: the photograph without them, to which the render is compared.
+// Removes a photograph's own colours: gains, logs, lenses, target -> target, in place. The render is compared with the
+// result.
 __kernel void develop(const int photograph, const int lens, const int stride, const int plane, const float across,
                       const float down, const float scale, __global const float *gains, __global const float *logs,
                       __global const float *lenses, __global float *target) {
@@ -34,7 +37,8 @@ __kernel void develop(const int photograph, const int lens, const int stride, co
   STOREL(colour[0], target + at), STOREL(colour[1], target + next), STOREL(colour[2], target + last);
 }
 
-// image, gradient with respect to image -> partials: sums of the gradients with respect to the entries.
+// Sums the gradients with respect to the entries over the rows of a tile: image, gradient with respect to image ->
+// partials.
 __kernel void entry_sums(const int height, const int stride, const int plane, const int tiles_y, const float across,
                          const float down, const float scale, __global const float *image,
                          __global const float *gradient, __global float *partials) {

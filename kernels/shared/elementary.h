@@ -1,6 +1,6 @@
 // Elementary functions and two-float sums in the lanes of a vector, with the same bits on every driver.
 
-// e^x for x in [-87, 87] (clamped), about 1 ulp: Cody-Waite reduction and a degree 6 polynomial.
+// e^x, with x clamped to [-87, 87], to about 1 ulp: Cody-Waite reduction and a polynomial of degree 6.
 static inline floatL expL(floatL x) {
   x = x < -87.0f ? (floatL)(-87.0f) : x;
   x = x > 87.0f ? (floatL)(87.0f) : x;
@@ -16,7 +16,7 @@ static inline floatL expL(floatL x) {
   return AS_FLOATL(AS_INTL(p) + (TO_INTL(k) << 23));
 }
 
-// log2(x) for normal x > 0: exponent, then the atanh series of the mantissa in [sqrt(1/2), sqrt(2)).
+// log2(x) for normal x > 0: the exponent plus the atanh series of the mantissa in [sqrt(1/2), sqrt(2)).
 static inline floatL log2L(floatL x) {
   const intL bits = AS_INTL(x) - 0x3f3504f3;
   const floatL m = AS_FLOATL((bits & 0x007fffff) + 0x3f3504f3);
@@ -31,7 +31,7 @@ static inline floatL log2L(floatL x) {
 
 static inline floatL sigmoidL(floatL x) { return 1.0f / (1.0f + expL(-x)); }
 
-// In some drivers floor and fabs are function calls. Floats from 2^23 on are integers.
+// floor(x), which is a function call in some drivers. Floats from 2^23 on are integers already.
 static inline floatL floorL(floatL x) {
   const floatL cut = TO_FLOATL(TO_INTL(x));
   const floatL whole = cut > x ? cut - 1.0f : cut;
@@ -39,7 +39,7 @@ static inline floatL floorL(floatL x) {
   return x > -8388608.0f ? below : x;
 }
 
-// A number as the sum of two floats, with twice the precision of one (Dekker 1971).
+// A number in two floats: the sum high + low has twice the precision of one float (Dekker 1971).
 typedef struct {
   floatL high, low;
 } Double;
@@ -51,7 +51,7 @@ static inline Double sum2(floatL a, floatL b) {
   return sum;
 }
 
-// s + (a + a_low) * b, with b exact.
+// s + (a + a_low) * b in two floats; b has no low part.
 static inline Double multiply_add2(float a, float a_low, floatL b, Double s) {
   const floatL product = a * b;
   const Double sum = sum2(s.high, product);
@@ -74,7 +74,7 @@ static inline Double twice2(Double a) {
   return result;
 }
 
-// a * b, exactly.
+// The exact product a * b in two floats.
 static inline Double product2(floatL a, floatL b) {
   const floatL high = a * b;
   const Double product = {high, fmaL(a, b, -high)};
@@ -92,8 +92,9 @@ static inline Double scaled2(float a, float a_low, Double b) {
   return multiply2(factor, b);
 }
 
-// The difference s1 - s2 of two scales, where x is the difference of their logarithms. For close scales it is a series
-// of exp(x) - 1. Without the series, rounding in the difference of equal scales would rotate every spherical Gaussian.
+// The difference s1 - s2 of two scales; x is the difference of their logarithms. For close scales it is computed as s2
+// times a series for exp(x) - 1. Without the series, rounding errors in the difference of nearly equal scales would
+// rotate every spherical Gaussian.
 static inline floatL scale_difference(floatL x, floatL s1, floatL s2) {
   floatL series = fmaL(x, (floatL)(1.0f / 720.0f), (floatL)(1.0f / 120.0f));
   series = fmaL(x, series, (floatL)(1.0f / 24.0f));

@@ -1,33 +1,34 @@
-// From LANES Gaussians to their ellipses on the image, with gsplat's conventions; shared by ewa.cl and its gradient.
-// Equation numbers refer to docs/gradients.md. The view matrix need not be a rotation, and all its twelve numbers have
-// gradients: (154) uses cofactors instead of rows. With ORTHOGRAPHIC the image is linear in x and y, with FISHEYE in
-// the angle from the axis. With COVARIANCES, covariances replace quaternions and scales.
+// Projects LANES Gaussians to ellipses on the image (EWA) with gsplat's conventions. ewa.cl and ewa_grad.cl share this
+// code. Equation numbers refer to docs/gradients.md. The view matrix need not be a rotation, and all its twelve numbers
+// have gradients; therefore (154) uses the matrix's cofactors instead of its rows. With ORTHOGRAPHIC the image is
+// linear in x and y, with FISHEYE in the angle from the axis. With COVARIANCES, covariances replace quaternions and
+// scales.
 #include "shared/place.h"
 #define NEEDS_PROJECTION
 #include "shared/camera.h"
 
-// A compensation has a gradient only if the determinant without the low-pass is this or more.
+// Least determinant of the covariance without the low-pass for which the compensation has a gradient.
 #define LEAST_DETERMINANT 1e-30f
 
 typedef struct {
-  intL valid;        // not culled, for its depth, its size or a value that is not finite
+  intL valid;        // not culled: depth and size are within the limits, and all values are finite
   floatL x, y, z;    // mean in the camera's axes
-  floatL lx, ly, lz; // rounding errors of the mean
+  floatL lx, ly, lz; // low parts of x, y and z
 #ifdef FISHEYE
-  floatL away;         // theta / r: distance on the image over distance from the axis
-  floatL bend, bend2;  // (1/r d/dr) of `away`, once and twice
+  floatL away;         // theta / r: distance on the image divided by distance from the axis
+  floatL bend, bend2;  // the operator (1/r d/dr) applied to `away` once and twice
   floatL inverse;      // 1 / (x^2 + y^2 + z^2)
   floatL j1[3], j2[3]; // rows of the Jacobian
 #else
-  floatL rx, ry; // x/z and y/z as in the Jacobian, clamped; orthographic: 0
+  floatL rx, ry; // x/z and y/z, clamped for the Jacobian; orthographic: 0
   floatL jx, jy; // the Jacobian's rows are jx (1, 0, -rx) and jy (0, 1, -ry)
 #endif
   floatL t1[3], t2[3]; // rows of the Jacobian times the view matrix
-  floatL n[3];         // their cross product
+  floatL n[3];         // cross product of t1 and t2
 #ifdef COVARIANCES
-  floatL v[6];   // xx, xy, xz, yy, yz, zz
+  floatL v[6];   // the Gaussian's covariance V: xx, xy, xz, yy, yz, zz
   floatL v2[3];  // V times t2
-  floatL adj[6]; // V's adjugate, in the same order
+  floatL adj[6]; // adjugate of V, in the order of v
 #else
   floatL q[4];         // unit quaternion w x y z
   floatL length;       // length of the raw quaternion
@@ -37,7 +38,7 @@ typedef struct {
   floatL c[3];         // n along the Gaussian's axes
 #endif
   floatL sxx, sxy, syy; // projected covariance with the low-pass
-  floatL det, det0;     // determinants with and without the low-pass
+  floatL det, det0;     // determinants of the covariance with and without the low-pass
 } Ellipse2;
 
 #ifdef COVARIANCES
@@ -54,19 +55,19 @@ typedef struct {
 
 static inline floatL dotL(const floatL *a, const floatL *b) { return fmaL(a[0], b[0], fmaL(a[1], b[1], a[2] * b[2])); }
 
-// The dot product of a and a row of three numbers of the camera.
+// The dot product of a and three consecutive numbers of the camera's array.
 static inline floatL dot_row(const floatL *a, __constant float *row) {
   return fmaL(a[0], (floatL)(row[0]), fmaL(a[1], (floatL)(row[1]), a[2] * row[2]));
 }
 
-// a b - c d, accurate to the last digits of the result.
+// a b - c d, accurate to the last digits even where the products nearly cancel.
 static inline floatL product_difference(floatL a, floatL b, floatL c, floatL d) {
   const floatL cd = c * d;
   return fmaL(a, b, -cd) + fmaL(-c, d, cd);
 }
 
 #ifdef COVARIANCES
-// A symmetric matrix, given by its upper triangle, times a vector.
+// The product of a symmetric 3x3 matrix, given by its upper triangle v, and the vector a.
 static inline void symmetric_times(const floatL *v, const floatL *a, floatL *result) {
   result[0] = fmaL(v[0], a[0], fmaL(v[1], a[1], v[2] * a[2]));
   result[1] = fmaL(v[1], a[0], fmaL(v[3], a[1], v[4] * a[2]));
@@ -75,7 +76,7 @@ static inline void symmetric_times(const floatL *v, const floatL *a, floatL *res
 #endif
 
 #ifdef FISHEYE
-// atan(x) for x in [0, 1], as in quarter_atan.
+// atan(x) for x in [0, 1], by the polynomial of quarter_atan (angles.h).
 static inline floatL atan_of_ratio(floatL x) {
   const floatL t = x * x;
   floatL p = fmaL(t, (floatL)(ATAN0), (floatL)(ATAN1));
@@ -88,7 +89,8 @@ static inline floatL atan_of_ratio(floatL x) {
   return fmaL(t * p, x, x);
 }
 
-// (157), (158): near the axis by series, because terms of the closed forms nearly cancel there.
+// Computes `away`, `bend`, `bend2` and `inverse` of a fisheye's projection, (157) and (158). Near the axis series are
+// used, because terms of the closed forms nearly cancel there.
 static inline void fisheye_of(Ellipse2 *p) {
   const floatL q = fmaL(p->x, p->x, p->y * p->y), d = fmaL(p->z, p->z, q);
   const floatL up = 1.0f / p->z, up2 = up * up, t = q * up2;
@@ -114,7 +116,7 @@ static inline void fisheye_of(Ellipse2 *p) {
   k = fmaL(t, -k, (floatL)(48.0f / 9.0f));
   k = fmaL(t, -k, (floatL)(24.0f / 7.0f));
   k = fmaL(t, -k, (floatL)(8.0f / 5.0f));
-  // elsewhere by the closed forms
+  // The closed forms, used elsewhere.
   const floatL r = sqrt(q), z = p->z < 0.0f ? -p->z : p->z;
   const intL steep = r > z;
   const floatL angle = atan_of_ratio(steep ? z / r : r / z);
@@ -128,7 +130,8 @@ static inline void fisheye_of(Ellipse2 *p) {
 }
 #endif
 
-// (153) to (155): the covariance with the low-pass. The determinants are sums of squares or of positive terms.
+// Computes the projected covariance with the low-pass eps, (153) to (155). The determinants are sums of squares or of
+// positive terms.
 static inline void covariance2(float eps, Ellipse2 *p) {
   floatL xx, xy, yy;
 #ifdef COVARIANCES
@@ -169,7 +172,7 @@ static inline void covariance2(float eps, Ellipse2 *p) {
 #define EWA_NUMBER2(name, index)                                                                                       \
   {(floatL)(camera[EWA_##name##0 + (index)]), (floatL)(camera[EWA_##name##0_LOW + (index)])}
 
-// (57): recomputes b1, b2 and c in the lanes of `which`, in two floats up to the last step where terms cancel.
+// Recomputes b1, b2 and c in the lanes of `which`, (57). It uses two floats up to the last step in which terms cancel.
 static inline void refine2(const uint *row, __global const float *quaternions, __constant float *camera, intL which,
                            Ellipse2 *p) {
   Double r[9];
@@ -199,8 +202,8 @@ static inline void refine2(const uint *row, __global const float *quaternions, _
 }
 #endif
 
-// Fills *p: (150) to (155). Conditions are written so that NaN culls. `row` comes from ROWS_OF_ITEM. Returns 0 if every
-// lane is culled.
+// Projects LANES Gaussians, (150) to (155): fills *p, and returns 0 if every lane is culled. Conditions are written so
+// that NaN culls. row (LANES): the Gaussians' rows, from ROWS_OF_ITEM.
 static inline int project_ellipses(const uint *row, __global const float *means, EWA_SHAPES, __constant float *camera,
                                    Ellipse2 *p) {
   const floatL x = GATHER(means, 3, 0), y = GATHER(means, 3, 1), z = GATHER(means, 3, 2);
@@ -274,7 +277,7 @@ static inline int project_ellipses(const uint *row, __global const float *means,
     p->c[k] = fmaL(p->n[0], p->r[k], fmaL(p->n[1], p->r[3 + k], p->n[2] * p->r[6 + k]));
   }
   covariance2(camera[EWA_EPS], p);
-#ifndef FISHEYE // as in gaussian.h: rounding must move the end of a long axis by little, compared to the short axis
+#ifndef FISHEYE // as in gaussian.h, refines if rounding moves the end of a long axis by much compared to the short axis
   floatL longest2 = p->s[0] * p->s[0];
   longest2 = p->s[1] * p->s[1] > longest2 ? p->s[1] * p->s[1] : longest2;
   longest2 = p->s[2] * p->s[2] > longest2 ? p->s[2] * p->s[2] : longest2;
@@ -295,5 +298,5 @@ static inline int project_ellipses(const uint *row, __global const float *means,
   return 1;
 }
 
-// (156): the factor by which opacity compensates for the low-pass.
+// The factor by which opacity compensates for the low-pass, (156).
 static inline floatL compensation2(const Ellipse2 *p) { return sqrt(p->det0 / p->det); }

@@ -1,10 +1,11 @@
-// From the parameters of LANES Gaussians to their ellipses on the image, shared by projection and its gradient.
-// Equation numbers refer to docs/gradients.md. With RAYS, tangent.h has the projection; it uses the code that is not
-// inside #ifndef RAYS here.
+// Projects LANES Gaussians to ellipses on the image (EWA splatting). Projection and its gradient share this code.
+// Equation numbers refer to docs/gradients.md. With RAYS the projection is in tangent.h, which uses the rest of this
+// file.
 
 #include "shared/place.h"
 
-// Variance added to the projected covariance, in px^2; with ANTIALIASED also the minimum factor of the opacity in (83).
+// LOW_PASS: variance added to the projected covariance, in px^2. LEAST_COMPENSATION: the minimum factor of the opacity
+// in (83).
 #ifdef ANTIALIASED
 #define LOW_PASS 0.1f
 #define LEAST_COMPENSATION 0.005f
@@ -15,14 +16,14 @@
 typedef struct {
   intL valid;           // not culled
   floatL x, y, z;       // mean in the camera's axes
-  floatL lx, ly, lz;    // rounding errors of the mean
-  floatL rx, ry;        // x/z and y/z as in the Jacobian, clamped; orthographic: 0
+  floatL lx, ly, lz;    // low parts of x, y and z
+  floatL rx, ry;        // x/z and y/z, clamped for the Jacobian; orthographic: 0
   floatL jx, jy;        // the Jacobian's rows are jx (1, 0, -rx) and jy (0, 1, -ry)
   floatL q[4];          // unit quaternion w x y z
   floatL length;        // length of the raw quaternion
-  floatL a2[3];         // last row of A, camera from Gaussian: depths of the axes
+  floatL a2[3];         // last row of A (camera from Gaussian): depths of the Gaussian's axes
   floatL b1[3], b2[3];  // the two rows of J A
-  floatL c[3];          // minors: b1[k] b2[l] - b1[l] b2[k] is c[m], for cyclic k, l, m
+  floatL c[3];          // minors of J A: c[m] is b1[k] b2[l] - b1[l] b2[k], for cyclic k, l, m
   floatL s[3];          // scales
   floatL sxx, sxy, syy; // projected covariance with the low-pass
   floatL det;
@@ -34,12 +35,12 @@ typedef struct {
 #define NEEDS_PROJECTION
 #include "shared/camera.h"
 
-// Component along a world axis of the vector from the camera's centre to the mean.
+// The component along a world axis of the vector from the camera's centre to the mean.
 #define FROM_CAMERA(means, axis, index)                                                                                \
   ((GATHER(means, 3, index) - camera[CAMERA_P##axis]) - camera[CAMERA_P##axis##_LOW])
 
 #ifndef RAYS
-// (5) to (7) from J A and S, with the determinant as a sum of squares (56).
+// Computes the projected covariance from J A and S, (5) to (7), and the determinant as a sum of squares, (56).
 static inline void covariance(Projection *p) {
   floatL xx = (floatL)(0.0f), yy = xx, xy = xx, minors = (floatL)(LOW_PASS * LOW_PASS);
 #ifdef ANTIALIASED
@@ -64,8 +65,8 @@ static inline void covariance(Projection *p) {
 #endif
 
 #ifdef ANTIALIASED
-// (83): the factor of the opacity that compensates for the low-pass. det0, det: determinants of the covariance without
-// and with the low-pass.
+// The factor by which opacity compensates for the low-pass, (83). det0, det: determinants of the covariance without and
+// with the low-pass.
 static inline floatL compensation(floatL det0, floatL det) {
   const floatL part = det0 / det;
   return part > LEAST_COMPENSATION * LEAST_COMPENSATION ? sqrt(part) : (floatL)(LEAST_COMPENSATION);
@@ -73,7 +74,8 @@ static inline floatL compensation(floatL det0, floatL det) {
 #endif
 
 #ifndef RAYS
-// (57): recomputes J A and its minors in the lanes of `which`, in two floats up to the last step where terms cancel.
+// Recomputes J A and its minors in the lanes of `which`, (57). It uses two floats up to the last step in which terms
+// cancel.
 static inline void refine(const uint *row, __global const float *quaternions, __constant float *camera, intL which,
                           Projection *p) {
   Double r[9];
@@ -100,8 +102,8 @@ static inline void refine(const uint *row, __global const float *quaternions, __
   }
 }
 
-// Fills *p: (1), (3) to (7). Conditions are written so that NaN culls. `row` comes from ROWS_OF_ITEM. Returns 0 if
-// every lane is culled.
+// Projects LANES Gaussians, (1) and (3) to (7): fills *p, and returns 0 if every lane is culled. Conditions are written
+// so that NaN culls. row (LANES): the Gaussians' rows, from ROWS_OF_ITEM.
 static inline int project_gaussians(const uint *row, __global const float *means, __global const float *quaternions,
                                     __global const float *log_scales, __constant float *camera, Projection *p) {
   const floatL x = GATHER(means, 3, 0), y = GATHER(means, 3, 1), z = GATHER(means, 3, 2);
@@ -146,8 +148,8 @@ static inline int project_gaussians(const uint *row, __global const float *means
   covariance(p);
 
   // Rounding of the rotation moves the end of a long axis by 1e-7 of its length. This error must be small compared to
-  // the short axis of the ellipse, which is between 1 and 1.42 times sqrt(det / (sxx + syy)). For the gradient, an axis
-  // that points to the camera must also be accurate.
+  // the ellipse's short axis, which is between 1 and 1.42 times sqrt(det / (sxx + syy)). The gradient also needs an
+  // accurate axis where the axis points to the camera.
   floatL longest = p->s[0] > p->s[1] ? p->s[0] : p->s[1];
   longest = longest > p->s[2] ? longest : p->s[2];
   const floatL across2 = fmaL(p->jx, p->jx, p->jy * p->jy);

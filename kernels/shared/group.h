@@ -1,4 +1,5 @@
-// Operations of a whole work-group. With ITEMS == 1 a group is one work-item, and the operations compile to nothing.
+// Operations of a whole work-group: barriers, maximum, prefix sum and sum. With ITEMS == 1 a group is one work-item,
+// and the operations compile to nothing.
 #ifndef ITEMS
 #error "ITEMS must be defined: work-items per group, 1 on CPUs"
 #endif
@@ -25,19 +26,21 @@
   value = group_max;
 #endif
 
-// A 64-bit sum in 32 bits; 0xffffffff if it does not fit. A saturated sum does not depend on the order of addition.
+// A 64-bit sum as 32 bits, or 0xffffffff if it does not fit. Such a saturating sum does not depend on the order of
+// addition.
 #define CAPPED(sum) ((sum) > 0xffffffff ? 0xffffffff : (uint)(sum))
 
-// Intel's CPU runtime unrolls five rounds. A pass of its compiler (sycl-kernel-reduce-cross-barrier-values) then reads
-// freed memory in kernels with barriers and about 50 basic blocks.
+// Keeps the rounds of group_exclusive_scan from being unrolled. Intel's CPU runtime would unroll five rounds. A pass of
+// its compiler (sycl-kernel-reduce-cross-barrier-values) then reads freed memory in kernels with barriers and about 50
+// basic blocks.
 #if ITEMS < 64
 #define ROUNDS _Pragma("unroll 1")
 #else
 #define ROUNDS
 #endif
 
-// The exclusive prefix sum: the sum of the values of all items before this item. *total: the sum over all items. Sums
-// saturate at 0xffffffff. scratch has ITEMS elements.
+// The exclusive prefix sum over the group: returns the sum of the values of all items before this item, and sets *total
+// to the sum over all items. Sums saturate at 0xffffffff. scratch: ITEMS elements.
 static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint *total) {
 #if ITEMS == 1
   *total = value;
@@ -59,7 +62,8 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
 #endif
 }
 
-// The place of a group's tile in the lists: the group's number, or as tile_order (tiles) says.
+// The number of a group's tile within the launch: the group's number, or tile_order[group's number] with TILE_ORDER.
+// tile_order (tiles) lists the tiles in the order in which groups take them.
 #ifdef TILE_ORDER
 #define TILE_ORDER_PARAMETER , __global const uint *tile_order
 #define LISTED_TILE tile_order[get_group_id(0)]
@@ -68,8 +72,8 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
 #define LISTED_TILE get_group_id(0)
 #endif
 
-// Defines the group's tile from the kernel's first_tile, tiles_x, height and ranges: its first pixel, its pairs [begin,
-// end), and the strides between rows and between planes, in floats.
+// Defines the group's tile, from the kernel's arguments first_tile, tiles_x, height and ranges: (tile_x, tile_y), the
+// tile's first pixel; [begin, end), the tile's pairs; stride and plane, the distances of rows and of planes in floats.
 #define TILE_OF_GROUP                                                                                                  \
   const int listed_tile = LISTED_TILE, tile = first_tile + listed_tile;                                                \
   const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;                                        \
@@ -77,7 +81,7 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
   const size_t stride = (size_t)tiles_x * TILE;                                                                        \
   const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
 
-// The sum of values (count), returned to every item; it saturates at 0xffffffff. scratch has ITEMS elements.
+// The sum of values (count), returned to every item of the group; it saturates at 0xffffffff. scratch: ITEMS elements.
 static inline uint group_sum(__global const uint *values, uint count, __local uint *scratch) {
   ulong sum = 0;
   uint total;

@@ -1,5 +1,6 @@
-// Arguments that harmonics.cl and its gradient share: the directions in which colours are evaluated, and the mask of
-// the rows to evaluate. With DEGREE_4 also the SH band of degree 4, which models do not have; sh.h has the lower bands.
+// Arguments that harmonics.cl and harmonics_grad.cl share: the directions in which colours are evaluated, and the mask
+// of the rows to evaluate. With DEGREE_4 this file adds the SH band of degree 4, which models do not have; sh.h has the
+// lower bands.
 #ifdef DEGREE_4
 #define MOST_COEFFICIENTS 25
 #else
@@ -22,7 +23,8 @@
 #define HIDDEN(i) 0
 #endif
 
-// v: the unit direction; scale: 1 / the length of the given direction. Both are 0 for a direction of length 0.
+// A normalised direction. v: the unit direction; scale: 1 / the length of the given direction. Both are 0 for a
+// direction of length 0.
 typedef struct {
   floatL v[3], scale;
 } Direction;
@@ -56,7 +58,8 @@ static inline void band_4(floatL x, floatL y, floatL z, floatL *basis) {
   basis[24] = 0.6258357354491761f * (xx * (xx - 3.0f * yy) - yy * (3.0f * xx - yy));
 }
 
-// Adds to d[3], over this band: the sum of weight[k] times the gradient of basis[k] with respect to (x, y, z).
+// Adds to d (3) the part of this band: the sum over k of weight[k] times the gradient of basis[k] with respect to (x,
+// y, z).
 static inline void add_band_4_gradient(floatL x, floatL y, floatL z, const floatL *weight, floatL *d) {
   const float c0 = 2.5033429417967046f, c1 = 1.7701307697799304f, c2 = 0.9461746957575601f, c3 = 0.6690465435572892f;
   const float c4 = 0.10578554691520431f, c6 = 0.47308734787878004f, c8 = 0.6258357354491761f;

@@ -1,10 +1,13 @@
-// A holdout: in each pixel, surfaces of other elements. Each transmits a fraction of the light from behind it.
+// Holdout: surfaces of CG elements in each pixel. Each surface transmits a fraction of the light from behind it.
 //
-// held_starts (pixels of a plane + 1): the first surface of each pixel, then the number of surfaces. held_surfaces
-// (surfaces, HELD_SIZE): the depths of front and back, the transmitted fraction, and its binary logarithm divided by
-// the thickness. Each pixel's surfaces are sorted by the depth of their fronts. Equations: docs/pictures.md, (75).
+// held_starts (pixels of a plane + 1): the index of each pixel's first surface, then the number of all surfaces.
+// held_surfaces (surfaces, HELD_SIZE): the depths of front and back, the transmitted fraction, and log2 of this
+// fraction divided by the thickness. Each pixel's surfaces are sorted by the depth of their fronts. Equations:
+// docs/pictures.md, (75).
 #ifdef HOLDOUT
-// State of a cell: the transmittance of the surfaces so far, and the depth of the next surface's front.
+// State of a cell while depth increases. through: the transmittance of the surfaces passed as a whole; at: the index of
+// the pixel's first surface that is not; next: the depth of the front of that surface; end: the end of the pixel's
+// surfaces.
 typedef struct {
   Lanes through, next;
   uint at[LANES], end[LANES];
@@ -22,10 +25,11 @@ static inline Held held_of(__global const uint *starts, __global const float *su
   return held;
 }
 
-// The transmittance of the surfaces up to `depth`. From call to call, depths must not decrease.
+// The fraction of light from `depth` that passes the surfaces in front of it. From call to call, depths must not
+// decrease.
 static inline floatL let_through(float depth, Held *held, __global const float *surfaces) {
   if (!ANYL(MASKL(held->next.all <= (floatL)(depth)))) return held->through.all;
-  Lanes within; // log2 of the transmittance of surfaces that contain this depth
+  Lanes within; // log2 of the transmittance, up to `depth`, of surfaces that extend beyond `depth`
   Lanes through;
   for (int lane = 0; lane < LANES; ++lane) {
     uint k = held->at[lane];

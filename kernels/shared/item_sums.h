@@ -1,12 +1,13 @@
-// Sums over ADDENDS items, those of a group or of a warp: first neighbours, then pairs, fours and so on. The order and
-// the bits are the same whether items leave their addends in local memory or exchange them in sub-groups of SUBGROUP
-// items. ADDEND: the item's place among them.
+// Sums over ADDENDS items, those of a group or of a warp, by a binary tree: first two neighbours, then two pairs, two
+// fours and so on. The order and the bits are the same whether items leave their addends in local memory or exchange
+// them in sub-groups of SUBGROUP items. ADDEND: the item's number among the ADDENDS items.
 #ifndef ADDENDS
 #define ADDENDS ITEMS
 #define ADDEND ITEM
 #endif
-#define EXCHANGING (SUBGROUP < ADDENDS ? SUBGROUP : ADDENDS) // items that exchange their sums of a row
-#define PARTS (ADDENDS / EXCHANGING)                         // number of addends of a row in local memory
+// Number of items that exchange values and leave one sum per row.
+#define EXCHANGING (SUBGROUP < ADDENDS ? SUBGROUP : ADDENDS)
+#define PARTS (ADDENDS / EXCHANGING) // number of sums that local memory holds per row
 
 // Rows are padded so that they begin in different banks of local memory.
 #define ROW (PARTS < 4 ? PARTS : PARTS + 4)
@@ -28,7 +29,7 @@ DOUBLED(32, 64)
 DOUBLED(64, 128)
 DOUBLED(128, 256)
 
-// The sum of a row.
+// The sum of the PARTS numbers of a row in local memory.
 static inline float row_sum(__local const float *row) {
   return PARTS == 1     ? sum_of_1(row)
          : PARTS == 2   ? sum_of_2(row)
@@ -42,12 +43,12 @@ static inline float row_sum(__local const float *row) {
 }
 
 #if SUBGROUP > 1
-// Adds up a pair's fields over a sub-group. In each step an item gives half of its fields to another item, and adds
-// that item's values to the other half, until it has one field, or a few. The sums are stored in the rows of the
-// fields, which start at `rows`, in the sub-group's element.
+// Adds up the fields of a pair over a sub-group, and stores each field's sum in the field's row, in the sub-group's
+// element; `rows` is the first row. In each step an item gives half of its fields to another item, and adds that item's
+// values to the other half, until it has one field, or a few.
 static inline void leave_sums(const float *sums, __local float *rows) {
   float held[SLOT_STRIDE];
-  int n = SLOT_STRIDE, begin = 0, end = SLOT_STRIDE; // this item has the fields [begin, end)
+  int n = SLOT_STRIDE, begin = 0, end = SLOT_STRIDE; // the item holds the fields [begin, end)
   _Pragma("unroll") for (int field = 0; field < SLOT_STRIDE; ++field) held[field] = sums[field];
   _Pragma("unroll") for (int step = 1; step < EXCHANGING; step *= 2) {
     const int upper = (ADDEND & step) != 0;

@@ -1,9 +1,10 @@
-// floatL: LANES pixels, one name for float, float4, float8 and float16. MASKL(comparison) is an intL in which all bits
-// of a lane are set or clear. At LANES == 1 the comparison operators themselves give 0 and 1.
+// Vectors of LANES floats (floatL) and ints (intL), for pixels or Gaussians: float, float4, float8 or float16 under one
+// name. MASKL(comparison) is an intL in which all bits of a lane are set or clear. At LANES == 1 a comparison alone
+// gives 0 or 1.
 #ifndef LANES
 #error "LANES must be defined: pixels per vector, 1, 4, 8 or 16"
 #endif
-#ifndef VECTORS // number of vectors of the shape in a floatL: widened.h
+#ifndef VECTORS // number of the shape's vectors in a floatL; widened.h makes it 2
 #define VECTORS 1
 #endif
 #define CAT_(a, b) a##b
@@ -42,7 +43,7 @@ typedef floatL floatU __attribute__((aligned(4))); // vload and vstore are slow 
 #endif
 
 #if LANES > 1
-// Some drivers do not inline any().
+// True if any lane of a mask is set. Some drivers do not inline any().
 static inline int any_lane(intL m) {
 #if LANES == 16
   const int8 a = m.lo | m.hi;
@@ -103,7 +104,7 @@ static inline int maxL(intL x) {
 #endif
 }
 
-// The sum of the lanes in a fixed order: pairs at distance L/2, L/4, ... 1.
+// The sum of the lanes in a fixed order: adds lanes that are LANES / 2 apart, then LANES / 4, and so on.
 static inline float sumL(floatL x) {
 #if LANES == 16
   const float8 a = x.lo + x.hi;
@@ -154,12 +155,12 @@ static inline float8 sums8(floatS x0, floatS x1, floatS x2, floatS x3, floatS x4
 
 // 2^x for x in [-126, 1], relative error under 2.1e-7; arbitrary for x below -126. x is rounded to the nearest integer
 // by addition of 1.5 * 2^23. The polynomial is minimax of degree 5 on [-1/2, 1/2] and is 1 at 0. An integer addition
-// sets the exponent. The polynomial is in Estrin's order, because the speed of blending depends on the longest chain of
-// dependent instructions.
+// sets the exponent. The polynomial is evaluated in Estrin's order, because the speed of blending depends on the
+// longest chain of dependent instructions.
 //
-// An instruction of a GPU can contain one constant. NVIDIA's compiler loads a second constant into a register before
-// each use, unless it depends on a variable. `zero` is such a variable: always 0, but the compiler does not know that.
-// Callers for which speed does not matter pass the literal 0.
+// `zero` is always 0, but the compiler must not know it. An instruction of a GPU can contain one constant; NVIDIA's
+// compiler loads a second constant into a register before each use. A constant that depends on the variable `zero`
+// stays in a register. Callers for which speed does not matter pass the literal 0.
 #define IN_REGISTER(constant) ((floatL)(as_float(as_int(constant) + zero)))
 static inline floatL exp2_by(floatL x, int zero) {
   const floatL t = x + 12582912.0f;
@@ -173,7 +174,7 @@ static inline floatL exp2_by(floatL x, int zero) {
 }
 static inline floatL exp2L(floatL x) { return exp2_by(x, 0); }
 
-// Element `field` of a row of `width` elements, for the rows row[0] to row[LANES - 1].
+// GATHER: element `field` of each of the rows row[0] to row[LANES - 1] of an array with `width` elements per row.
 #define ROW_(array, width, field, lane) (array)[(size_t)(width) * row[lane] + (field)]
 #define ROW4_(a, w, f, i) ROW_(a, w, f, i), ROW_(a, w, f, i + 1), ROW_(a, w, f, i + 2), ROW_(a, w, f, i + 3)
 #if LANES == 1
@@ -188,7 +189,7 @@ static inline floatL exp2L(floatL x) { return exp2_by(x, 0); }
             ROW4_(array, width, field, 12)))
 #endif
 
-// Unrolls a short loop if LANES is 1, because a GPU keeps an array with variable indices in memory, not in registers.
+// Unrolls a short loop if LANES is 1: a GPU would keep an array with variable indices in memory instead of registers.
 #if LANES == 1
 #define UNROLL _Pragma("unroll")
 #else
@@ -196,7 +197,8 @@ static inline floatL exp2L(floatL x) { return exp2_by(x, 0); }
 #endif
 #define FOR_AXES(k) UNROLL for (int k = 0; k < 3; ++k)
 
-// The rows of a work-item that owns LANES of n rows. Past the end, the last row is repeated.
+// Defines the rows of a work-item that owns LANES of n rows: first_row, row[LANES] and lanes_used. Past the end, `row`
+// repeats the last row.
 #define ROWS_OF_ITEM(n)                                                                                                \
   const uint first_row = get_global_id(0) * LANES;                                                                     \
   if (first_row >= (n)) return;                                                                                        \
@@ -204,7 +206,7 @@ static inline floatL exp2L(floatL x) { return exp2_by(x, 0); }
   for (uint lane = 0; lane < LANES; ++lane) row[lane] = first_row + lane < (n) ? first_row + lane : (n) - 1;           \
   const uint lanes_used = (n) - first_row < LANES ? (n) - first_row : LANES;
 
-// A vector with access to its lanes.
+// A vector whose lanes can be accessed one by one.
 typedef union {
   floatL all;
   float lane[LANES];

@@ -1,9 +1,10 @@
-// The loss in groups of several items: a block's parts, their sums over windows, and the sums of the parts. loss.cl
-// defines TAPS, REACH, C1, C2, `window` and PIXEL_AT before.
+// The loss (L1 and SSIM) for groups of several items: sums over the windows of a block, their derivatives, and the
+// gradient. loss.cl includes this file after it defines TAPS, REACH, C1, C2, `window` and PIXEL_AT.
 //
-// For vertical windows, a part is a column of the block or of its margins; for horizontal windows, a run of RUN pixels.
-// Windows slide over values in registers. They sum differences from a pixel that all windows of the part contain: the
-// middle of the column, or of a cell of ROWS x RUN pixels. The bits do not depend on ITEMS.
+// A block is divided into parts, which the items share. For vertical windows, a part is a column of the block or of its
+// margins; for horizontal windows, a run of RUN pixels. An item holds a part's values in registers and slides the
+// windows over them. Windows sum differences from a pixel that all windows of the part contain: the middle pixel of the
+// column, or of a cell of ROWS x RUN pixels. The bits do not depend on ITEMS.
 #if ITEMS > LOSS_PARTS
 #undef ITEMS
 #define ITEMS LOSS_PARTS
@@ -12,30 +13,30 @@
 #define COLUMNS LOSS_GROUP_COLUMNS
 #define PARTS LOSS_PARTS // COLUMNS + 2 * REACH, a power of four
 #define RUN 6
-#define RUNS (COLUMNS / RUN) // runs in a row; ROWS * RUNS <= PARTS
+#define RUNS (COLUMNS / RUN) // number of runs in a row of a block; ROWS * RUNS <= PARTS
 #define TALL (ROWS + 2 * REACH)
 #define WIDE (RUN + 2 * REACH)
-// adjoint_moments and differences know the middle pixels of a cell and of those next to it, so a window must not reach
-// further. Smaller cells would give wrong gradients.
+// A window must not reach beyond the cells next to its own cell: adjoint_moments and differences know only the middle
+// pixels of these cells. Smaller cells would give wrong gradients.
 #if ROWS < REACH || RUN < REACH
 #error "LOSS_GROUP_ROWS and RUN must be at least REACH, 5"
 #endif
 #if COLUMNS + 2 * REACH != PARTS || COLUMNS % RUN != 0 || ROWS * RUNS > PARTS
 #error "LOSS_PARTS must be the columns of a block and its margins, and at least its runs"
 #endif
-#define INLINE inline __attribute__((always_inline)) // PoCL computes wrong results if it does not inline
+#define INLINE inline __attribute__((always_inline)) // PoCL computes wrong results if these are not inlined
 #define FOR_PARTS(part, count) for (int part = get_local_id(0) % ITEMS; part < (count); part += ITEMS)
 
-// The middle pixel of the cell that contains pixel (x, y). It is inside the image.
+// The middle pixel of the cell that contains pixel (x, y), clamped to the image.
 #define MIDDLE_X(block, x) min((x) / RUN * RUN + RUN / 2, (block).width - 1)
 #define MIDDLE_Y(block, y) min((y) / ROWS * ROWS + ROWS / 2, (block).height - 1)
 
-// Local memory `near`: fields of ROWS x PARTS values.
+// Size of a field of `near` in local memory: ROWS x PARTS values.
 #define FIELD (ROWS * PARTS)
-#define SUMS (PARTS + PARTS / 2) // sums of the parts, and space to add them up
+#define SUMS (PARTS + PARTS / 2) // size of `parts`: a sum for each part, and space to add them up
 
-// A block, whose first pixel is (x0, y0). partials: those of the channel, (strips, height, 3, COLUMNS), with a strip of
-// COLUMNS columns for each block across.
+// A block of one channel, with (x0, y0) as its first pixel. partials: the channel's partial derivatives of SSIM
+// (strips, height, 3, COLUMNS), with a strip of COLUMNS columns for each block across the image.
 typedef struct {
   __global const float *image;
   __global const source_t *target;
@@ -72,26 +73,30 @@ static inline Block block_of_group(const int width, const int height, const int 
 #define BLOCKS (get_num_groups(0) * get_num_groups(1) * get_num_groups(2))
 #define BLOCK_NUMBER ((get_group_id(2) * get_num_groups(1) + get_group_id(1)) * get_num_groups(0) + get_group_id(0))
 
-// Defines x and y of the first of the TALL pixels in a part's column, and which of them are inside the image. As the
-// block's first row is inside, rows before it can only be above the image, and rows after it only below.
+// Defines x and y of the first of the TALL pixels in a part's column, and which of these pixels are inside the image
+// (ROW_INSIDE). The block's first row is inside the image. So earlier rows can only be above the image, and later rows
+// only below it.
 #define COLUMN_OF_PART(block, part)                                                                                    \
   const int x = (block).x0 - REACH + (part), y = (block).y0 - REACH, column_inside = x >= 0 && x < (block).width;      \
   const int above = column_inside ? -y : TALL, below = column_inside ? (block).height - y : 0;
 #define ROW_INSIDE(i) ((i) < REACH ? (i) >= above : (i) < below)
 
-// Defines row, x and y of a part's run. Skips a run outside the block, or outside an image of this `width`.
+// Defines row, x and y of a part's run. Skips a run that is outside the block, or outside an image of the given
+// `width`.
 #define RUN_OF_PART(block, part, width)                                                                                \
   const int run = (part) % RUNS * RUN, row = (part) / RUNS, x = (block).x0 + run, y = (block).y0 + row;                \
   if (row >= ROWS || x >= (width) || y >= (block).height) continue;
 
-// Adds weight * value to sums[k] for each of `count` windows. place: position of the value in window 0.
+// Adds `value`, times the weight of its tap, to sums[k] for each of `count` windows k. place: the tap of the value in
+// window 0.
 #define ADD_TO_WINDOWS(sums, count, place, value)                                                                      \
   UNROLL for (int k = 0; k < (count); ++k) {                                                                           \
     if ((place) - k >= 0 && (place) - k < TAPS) sums[k] = fma1(window[(place) - k], value, sums[k]);                   \
   }
 #define ZEROS(sums, count) UNROLL for (int k = 0; k < (count); ++k) sums[k] = 0.0f;
 
-// near = sums over vertical windows: means of image and target, the sum of their variances, and the covariance.
+// Computes the vertical sums of SSIM: `near` gets the means of image and target, the sum of their variances, and the
+// covariance, over vertical windows.
 static INLINE void moments(const Block block, __local float *near) {
   FOR_PARTS(part, PARTS) {
     COLUMN_OF_PART(block, part)
@@ -125,16 +130,17 @@ static INLINE void moments(const Block block, __local float *near) {
   }
 }
 
-// 1 / x for positive x, if it is a normal float: three steps of Newton's method from a start that is off by up to 12 %.
-// The error is under 2 ulp, and the bits are the same on every device.
+// 1 / x for positive x whose reciprocal is a normal float, with an error under 2 ulp and the same bits on every device.
+// Three steps of Newton's method improve a first estimate that is off by up to 12 %.
 static inline float reciprocal(const float x) {
   const float a = as_float(0x7ef311c7u - as_uint(x)), b = fma1(a, fma1(-x, a, 1.0f), a),
               c = fma1(b, fma1(-x, b, 1.0f), b);
   return fma1(c, fma1(-x, c, 1.0f), c);
 }
 
-// near -> partials: the derivatives of SSIM with respect to the image's mean (relative to the cell's middle pixel), to
-// its variance (doubled), and to the covariance. parts = the parts' sums of SSIM.
+// Computes SSIM and its derivatives by horizontal sums: near -> partials: the derivatives of SSIM with respect to the
+// image's mean (relative to the cell's middle pixel), to its variance (doubled), and to the covariance; parts: each
+// part's sum of SSIM.
 static INLINE void derivatives(const Block block, __local const float *near, __local float *parts) {
   FOR_PARTS(part, PARTS) {
     parts[part] = 0.0f;
@@ -176,10 +182,11 @@ static INLINE void derivatives(const Block block, __local const float *near, __l
   }
 }
 
-// near = sums over vertical windows of the three partials, by mean, variance and covariance; behind these sums in
-// memory, the middle pixels of image and target. Partials of the cells above and below are relative to those cells'
-// middle pixels. To move them to this cell's, the sum by mean gains the partial by variance times the difference of the
-// image's middle pixels, and the partial by covariance times that of the target's.
+// Computes the vertical sums of SSIM's gradient: `near` gets the sums over vertical windows of the three partials (by
+// mean, variance and covariance), followed by the middle pixels of image and target. Partials of the cells above and
+// below are relative to the middle pixels of those cells. To make them relative to this cell's middle pixel, the sum by
+// mean gains two terms: the partial by variance times the difference of the image's middle pixels, and the partial by
+// covariance times the difference of the target's.
 static INLINE void adjoint_moments(const Block block, __local float *near) {
   FOR_PARTS(part, PARTS) {
     COLUMN_OF_PART(block, part)
@@ -222,15 +229,16 @@ static INLINE void adjoint_moments(const Block block, __local float *near) {
   }
 }
 
-// near -> gradient, a plane. parts = the parts' sums of |image - target|, then of its square. l1_scale and ssim_scale
-// are the loss weights divided by the number of pixels and channels.
+// Computes the loss's gradient by horizontal sums: near -> gradient, one plane; parts: each part's sum of |image -
+// target|, then of its square. l1_scale, ssim_scale: the loss weights divided by the number of pixels times channels.
 static INLINE void differences(const Block block, const float l1_scale, const float ssim_scale,
                                __local const float *near, __global float *gradient, __local float *parts) {
   FOR_PARTS(part, PARTS) {
     parts[part] = parts[SUMS + part] = 0.0f;
     RUN_OF_PART(block, part, block.stride)
     __local const float *in = near + (row * PARTS + run), *middle = near + (3 * FIELD + run);
-    const float p0 = middle[REACH], q0 = middle[REACH + PARTS]; // of this cell; next, minus the cells beside it
+    // p0, q0: the middle pixels of this cell; then their differences from the middle pixels of the cells beside it.
+    const float p0 = middle[REACH], q0 = middle[REACH + PARTS];
     const float p_left = p0 - middle[REACH - 1], q_left = q0 - middle[REACH - 1 + PARTS];
     const float p_right = p0 - middle[REACH + RUN], q_right = q0 - middle[REACH + RUN + PARTS];
     float by_mean[RUN], by_variance[RUN], by_covariance[RUN], absolute = 0.0f, squares = 0.0f;
@@ -265,8 +273,8 @@ static INLINE void differences(const Block block, const float l1_scale, const fl
   }
 }
 
-// Adds up the parts' sums of `fields` fields, which are SUMS floats apart, in a fixed order. The total of a field is at
-// TOP. Before the next barrier, only the group's first item may read it.
+// Adds up the sums of all parts in a fixed order, for `fields` fields that are SUMS floats apart in `parts`. Stores the
+// total of a field at the field's index TOP. Before the next barrier, only the group's first item may read the total.
 #define TOP (PARTS + PARTS / 4 + PARTS / 16)
 static INLINE void add_parts(__local float *parts, const int fields) {
   UNROLL for (int count = PARTS / 4; count > 0; count /= 4) {

@@ -1,4 +1,4 @@
-// Scalar arithmetic with the same bits on every driver: multiply-adds fuse only in fma1, and the driver's elementary
+// Scalar arithmetic with the same bits on every driver. Multiply-adds fuse only in fma1, and the driver's elementary
 // functions are not used. Every kernel includes this file first.
 #pragma OPENCL FP_CONTRACT OFF
 #include "shared/layouts.h"
@@ -16,8 +16,9 @@
 #define TRANSMITTANCE_MIN 1e-4f
 #endif
 
-// a*b + c with one rounding. FMA_BY_CONTRACTION is set if a test has shown that the driver's compiler fuses this
-// expression. fma() then gives the same bits more slowly, and crashes some drivers with 16 lanes.
+// a*b + c with one rounding. FMA_BY_CONTRACTION is set if a test has shown that the driver's compiler fuses the
+// expression a * b + c. On such drivers fma() would give the same bits more slowly, and it crashes some of them with 16
+// lanes.
 static inline float fma1(float a, float b, float c) {
 #ifdef FMA_BY_CONTRACTION
 #pragma OPENCL FP_CONTRACT ON
@@ -27,6 +28,6 @@ static inline float fma1(float a, float b, float c) {
 #endif
 }
 
-// sum + x, for a loop over adjacent floats. With AVX-512, Intel's CPU runtime would otherwise recognise the sum and
-// reorder its additions.
+// sum + x, for a loop that adds adjacent floats. With AVX-512, Intel's CPU runtime would otherwise recognise a sum in
+// such a loop and reorder its additions.
 static inline float added(float sum, float x) { return fma(x, 1.0f, sum); }

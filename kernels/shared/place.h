@@ -1,7 +1,7 @@
-// The positions of LANES points and rotated axes in a camera, in two-float arithmetic, for several kernels. Equation
-// numbers refer to docs/gradients.md.
+// Positions and rotated axes of LANES Gaussians in a camera's axes, in two-float arithmetic. project.cl, ewa.cl and
+// their gradients share this code. Equation numbers refer to docs/gradients.md.
 
-// Limit of distances in world units, and of axes in pixels, with which no sum of products overflows.
+// Limit of distances in world units, and of axes in pixels: up to it no sum of products overflows.
 #define FARTHEST 1e18f
 // Ratios above which `refine` is called: of the longest axis to the ellipse's short axis (REFINE_FROM), and of an axis
 // to its projected length (FORESHORTENED). At smaller ratios float32 is accurate to 3e-5.
@@ -22,9 +22,9 @@ static inline void rotation_of(const floatL *q, floatL *r) {
   r[8] = 1.0f - 2.0f * (x * x + y * y);
 }
 
-// (57): the rotation matrix in two floats, times the square of the returned length. length: of the raw quaternion.
+// The rotation matrix in two floats, times the square of the returned length, (57). length: that of the raw quaternion.
 static inline floatL rotation2_of(const uint *row, __global const float *quaternions, floatL length, Double *r) {
-  // Scaled by a power of two, which is exact, so that the low parts of products are not denormal.
+  // The quaternion is scaled by a power of two, which is exact, so that the low parts of products are not denormal.
   const floatL size = AS_FLOATL(AS_INTL(length) & 0x7f800000);
   const floatL w = GATHER(quaternions, 4, 0) / size, x = GATHER(quaternions, 4, 1) / size;
   const floatL y = GATHER(quaternions, 4, 2) / size, z = GATHER(quaternions, 4, 3) / size;
@@ -44,7 +44,8 @@ static inline floatL rotation2_of(const uint *row, __global const float *quatern
   return length / size;
 }
 
-// A row of the camera's matrix times the mean (x, y, z), plus the row's translation.
+// A row of the camera's matrix times the mean (x, y, z), plus the row's translation t, in two floats. Arguments named
+// _low are the low parts.
 static inline Double camera_row(__constant float *r, __constant float *r_low, float t, float t_low, floatL x, floatL y,
                                 floatL z) {
   Double sum = {(floatL)(t), (floatL)(t_low)};
@@ -53,8 +54,8 @@ static inline Double camera_row(__constant float *r, __constant float *r_low, fl
   return multiply_add2(r[2], r_low[2], z, sum);
 }
 
-// A row of cam_from_world times the mean (x, y, z), in two floats. In one float, the error would be 1e-4 pixels, which
-// may change a pixel at the edge of an ellipse.
+// A row of cam_from_world times the mean (x, y, z), in two floats. With one float the error would be 1e-4 pixels, which
+// can change a pixel at the edge of an ellipse.
 #define CAMERA_ROW(index)                                                                                              \
   camera_row(camera + CAMERA_R##index##0, camera + CAMERA_R##index##0_LOW, camera[CAMERA_T##index],                    \
              camera[CAMERA_T##index##_LOW], x, y, z)

@@ -1,6 +1,7 @@
-// Prefetches data of Gaussians that a loop needs a few iterations later. The data may be anywhere in memory, and the
-// loop's body is too long for the processor to look so far ahead. GPUs do not need this: they hide latency with other
-// work-items. NVIDIA's compiler has the built-in function too, but accepts no pointer type of OpenCL C 1.2.
+// Prefetches the data of Gaussians that a loop needs AHEAD iterations later. The data may be anywhere in memory, and
+// the loop's body is too long for the processor to look so far ahead itself. GPUs need no prefetching, because they
+// hide latency with other work-items. NVIDIA's compiler has the built-in function too, but accepts no pointer type of
+// OpenCL C 1.2.
 #define AHEAD 16
 #if ITEMS == 1 && defined(__has_builtin) && !defined(__NV_CL_C_VERSION)
 #if __has_builtin(__builtin_prefetch)

@@ -1,9 +1,9 @@
-// The chain rule from the sums of slots of LANES Gaussians to the gradients of their parameters, and of the camera's
-// lens. Equation numbers refer to docs/gradients.md, with RAYS to docs/cameras.md. Needs splat.h, gaussian.h and sh.h,
-// with RAYS tangent.h; the defines are those of project_grad.cl.
+// The chain rule of projection: from the sums of a Gaussian's slots to the gradients with respect to the parameters of
+// LANES Gaussians and to the camera's lens. Equation numbers refer to docs/gradients.md, with RAYS to docs/cameras.md.
+// project_grad.cl includes this file after splat.h, gaussian.h and sh.h, with RAYS also tangent.h.
 
-// Address space of the gradients of the higher SH bands. The array holds all Gaussians (global), those of a work-item
-// (private), or those of a group (local).
+// The type, with address space, of the gradients of the SH bands from degree 1 on. Their array holds all Gaussians
+// (global), those of a work-item (private), or those of a group (local).
 #if !defined(ADAM)
 #define SH_GRADIENT __global float
 #elif LANES > 1
@@ -13,14 +13,14 @@
 #define SH_IN_PLACE // the gradients overwrite the SH coefficients in local memory
 #endif
 
-// A GPU loads four addends of a Gaussian before it adds them up.
+// Makes a GPU load four slots of a Gaussian before it adds them up.
 #ifdef SH_IN_PLACE
 #define ADDENDS_AHEAD _Pragma("unroll 4")
 #else
 #define ADDENDS_AHEAD
 #endif
 
-// Loops over the SH coefficients after the first, up to `used`.
+// FOR_HIGHER loops over the SH coefficients k from 1 to used - 1. SH_HIGHER: the largest number of such coefficients.
 #define SH_HIGHER 15
 #if LANES == 1
 #define FOR_HIGHER(k, used) UNROLL for (int k = 1; k <= SH_HIGHER; ++k) if (k < (used))
@@ -28,7 +28,8 @@
 #define FOR_HIGHER(k, used) for (int k = 1; k < (used); ++k)
 #endif
 
-// Weights of the penalties, as parameters and as arguments, each after a comma, in the order of `Exploration.weights`.
+// Weights of the penalties on opacity and scales, as parameters and as arguments, each after a comma, in the order of
+// `Exploration.weights` (clsplat/optimisation/step_noise.py).
 #ifdef PENALTIES
 #define PENALTY_PARAMETERS , const float opacity_weight, const float scale_weight
 #define PENALTY_WEIGHTS , opacity_weight, scale_weight
@@ -37,15 +38,15 @@
 #define PENALTY_WEIGHTS
 #endif
 
-// Gradients with respect to the parameters of LANES Gaussians, except for the higher SH bands. colour: red, green and
-// blue, zero where clamped.
+// Gradients with respect to the parameters of LANES Gaussians, except for the SH bands from degree 1 on. scale: with
+// respect to the log scales; opacity: to the logit; colour: to red, green and blue, zero where the colour is clamped.
 typedef struct {
   Lanes mean[3], quaternion[4], scale[3], opacity, colour[3];
 } Gradients;
 
-// Gradients of the visible rows among LANES rows from first_row on. Returns 0 if none is visible. Sets `shown` (LANES)
-// to 1 for visible rows, and fills screen, contributions and by_lens. Row 0 of d_sh_rest is first_row; only visible
-// rows are written.
+// Computes the gradients *d of the visible Gaussians among LANES rows from first_row on. Returns 0 if none is visible.
+// Sets `shown` (LANES) to 1 for visible rows, and writes their rows of screen, contributions, by_lens and d_sh_rest.
+// Row 0 of d_sh_rest belongs to first_row.
 static inline int gradients_of(const uint n, const uint first_row, const int coefficients, __constant float *camera,
                                __global const uint *tile_counts, __global const uint *first_slots,
                                __global const float *slots, __global const float *splats, __global const float *means,
@@ -65,7 +66,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   Lanes m[SLOT_STRIDE];
   int any = 0;
   for (int field = 0; field < SLOT_STRIDE; ++field) m[field].all = (floatL)(0.0f);
-  Lanes whitening[3]; // zero for Gaussians that are not visible, whose splats are uninitialised
+  Lanes whitening[3]; // zero for invisible Gaussians, whose splats are uninitialised
   for (int k = 0; k < 3; ++k) whitening[k].all = (floatL)(0.0f);
   for (uint lane = 0; lane < LANES; ++lane) {
     const uint count = lane < lanes_used ? tile_counts[first_row + lane] : 0;
@@ -113,7 +114,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   d->opacity.all = fmaL(opacity_weight * opacity, sigmoidL(-GATHER(opacity_logits, 1, 0)), d->opacity.all);
 #endif
 
-#ifdef RAYS // along e1 and e2 of the tangent plane; `screen` is per pixel at the mean
+#ifdef RAYS // d_mx, d_my: along e1 and e2 of the tangent plane; d_screen: per pixel at the mean
   const floatL d_mx = INVERSE_WHITEN2 * m_gu, d_my = INVERSE_WHITEN2 * m_gv;
   const float side_x = sqrt(fma1(p.t.k[0], p.t.k[0], p.t.k[1] * p.t.k[1]));
   const float side_y = sqrt(fma1(p.t.k[2], p.t.k[2], p.t.k[3] * p.t.k[3]));
@@ -137,8 +138,8 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
 #endif
 
-  // (58): the whitened columns of M = J A S, which are w[k] times the scale. They are of order one, and no large
-  // numbers are subtracted.
+  // (58): the whitened columns of M = J A S are (wu[k], wv[k]) times the scale s[k]. They are of order one, and no
+  // large numbers are subtracted.
   const float unwhiten = INVERSE_WHITEN2 * INVERSE_WHITEN2;
 #ifdef ANTIALIASED
   // (84): the compensated opacity falls with p.det (low-pass included) and rises with p.det0 (without low-pass).
@@ -154,7 +155,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   floatL wu[3], wv[3];
   const floatL lean = l11 / p.syy;
   FOR_AXES(k) {
-#ifdef RAYS // as above, with the minors of the tangent plane, low-pass columns included
+#ifdef RAYS // as in the branch below, with the minors of M on the tangent plane, low-pass columns included
     const float inverse = 1.0f / p.distance, b1 = inverse * p.c1[k], b2 = inverse * p.c2[k];
     float minors = 0.0f;
     for (int j = 3; j < 5; ++j) minors = fma1(p.m2[j], fma1(p.m2[j], b1, -(p.m1[j] * b2)), minors);
@@ -171,7 +172,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
   }
 
-  // (122): the gradient through nearness, 1 / depth, along the camera's axis.
+  // (122): the gradient through nearness, 1 / depth, with respect to the depth z.
 #ifndef NEARNESS
 #define LESS_NEAR(z)
 #else
@@ -280,8 +281,8 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   lens[3].all = d_my + beyond[1];
 #endif
 
-  // Colour, (38) to (40): a clamped channel has no gradient. The basis depends on the mean through the view direction;
-  // this part is omitted if it overflows for very large SH coefficients.
+  // Colour, (38) to (40): a clamped channel has no gradient. The SH basis depends on the mean through the view
+  // direction; the gradient through the direction is omitted if it overflows for very large SH coefficients.
   floatL vx = FROM_CAMERA(means, X, 0), vy = FROM_CAMERA(means, Y, 1), vz = FROM_CAMERA(means, Z, 2);
   const floatL length = sqrt(fmaL(vx, vx, fmaL(vy, vy, vz * vz)));
   vx = (floatL)(SEEN_ALONG(vx, length, camera[CAMERA_R20]));
@@ -308,7 +309,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     FOR_HIGHER(k, SH_USED(coefficients)) {
       weight[k].lane[lane] = fma1(d_colour.x, f[0], fma1(d_colour.y, f[1], d_colour.z * f[2]));
       f += 3;
-#ifndef NO_SH_REST // OptimiserConfig.sh_rest_every
+#ifndef NO_SH_REST // set in steps that do not update sh_rest (OptimiserConfig.sh_rest_every)
       const float along = basis[k].lane[lane];
       d_f[0] = along * d_colour.x;
       d_f[1] = along * d_colour.y;

@@ -1,10 +1,11 @@
-// Real spherical harmonics to degree 3, signs and order of Kerbl et al. 2023; basis[k] at the unit direction (x, y, z).
+// Real spherical harmonics up to degree 3, with the signs and order of Kerbl et al. 2023, at the unit direction (x, y,
+// z); and the colour of a Gaussian.
 
 #define SH_CONSTANT 0.28209479177387814f
-// Limit of a colour channel. Below it the squares in SSIM are finite, and no picture is so bright.
+// Limit of a colour channel. No picture is so bright, and below it the squares in SSIM are finite.
 #define COLOUR_LIMIT 1e9f
 
-// The number of stored coefficients that are used (RasterizerConfig.sh_degree_limit).
+// The number of stored coefficients per channel that are used (RasterizerConfig.sh_degree_limit).
 #ifdef SH_LIMIT
 #define SH_USED(coefficients) ((coefficients) < SH_LIMIT ? (coefficients) : SH_LIMIT)
 #else
@@ -34,7 +35,7 @@ static inline void sh_basis(int coefficients, floatL x, floatL y, floatL z, floa
   basis[15] = -0.5900435899266435f * x * (xx - 3.0f * yy);
 }
 
-// d[3]: the sum over k of weight[k] times the gradient of basis[k] with respect to (x, y, z).
+// Computes d (3): the sum over k of weight[k] times the gradient of basis[k] with respect to (x, y, z).
 static inline void sh_direction_gradient(int coefficients, floatL x, floatL y, floatL z, const floatL *weight,
                                          floatL *d) {
   d[0] = d[1] = d[2] = (floatL)(0.0f);
@@ -61,21 +62,22 @@ static inline void sh_direction_gradient(int coefficients, floatL x, floatL y, f
           8.0f * c11 * x * z * weight[13] + c14 * (xx - yy) * weight[14];
 }
 
-// Exact floats from the bits of finite halves, including denormal ones; faster than vload_half.
+// Converts the bits of finite 16-bit floats, including denormal ones, to floats exactly; faster than vload_half.
 static inline float4 float_from_half(int4 bits) {
   const int4 magnitude = bits & 0x7fff;
   const float4 normal = as_float4((magnitude << 13) + (112 << 23));
-  const float4 tiny = as_float4(magnitude + 0x3f000000) - 0.5f; // steps of 2^-24, like the floats from 0.5 to 1
+  // Denormal halves have steps of 2^-24, like floats from 0.5 to 1.
+  const float4 tiny = as_float4(magnitude + 0x3f000000) - 0.5f;
   const float4 positive = magnitude < 0x400 ? tiny : normal;
   return as_float4(as_int4(positive) | (bits & 0x8000) << 16);
 }
 
-// The three channels of a coefficient; for the last coefficient, a load of four floats would read past the row's end.
-// shT: storage type of the bands above 0 (RasterizerConfig.sh_storage).
+// Loads the three channels of a coefficient. last: true for the row's last coefficient, where a load of four floats
+// would read past the row's end. shT: storage type of the bands above 0 (RasterizerConfig.sh_storage).
 #ifdef SH_HALF
 typedef ushort shT;
 static inline float4 sh_channels(__global const shT *f, int last) {
-  return float_from_half((int4)(f[0], f[1], f[2], 0)); // in PoCL 3.0 a ushort4 takes longer to convert
+  return float_from_half((int4)(f[0], f[1], f[2], 0)); // converting a ushort4 takes longer in PoCL 3.0
 }
 #else
 typedef float shT;
@@ -94,15 +96,15 @@ static inline float4 sh_fma(float a, float4 b, float4 c) {
 #endif
 }
 
-// The number of coefficients in the colour of Gaussian i; with SH_DEGREES each Gaussian has its own degree.
+// The number of coefficients per channel that Gaussian i uses; with SH_DEGREES each Gaussian has its own degree.
 #ifdef SH_DEGREES
 #define SH_OF_GAUSSIAN(i, coefficients) min(SH_USED(coefficients), (sh_degrees[i] + 1) * (sh_degrees[i] + 1))
 #else
 #define SH_OF_GAUSSIAN(i, coefficients) SH_USED(coefficients)
 #endif
 
-// A Gaussian's colour before it is clamped at 0, (12) of docs/gradients.md, from one lane of the basis. dc (3) and rest
-// (coefficients - 1, 3): its SH coefficients, of which the first `used` are evaluated, dc included.
+// A Gaussian's colour before it is clamped at 0, (12) of docs/gradients.md, from one lane of the basis. dc (3), rest
+// (coefficients - 1, 3): the Gaussian's SH coefficients, of which the first `used` are evaluated, dc included.
 static inline float4 sh_colour(const Lanes *basis, uint lane, int used, int coefficients, __global const float *dc,
                                __global const shT *rest) {
   float4 colour = sh_fma(SH_CONSTANT, (float4)(dc[0], dc[1], dc[2], 0.0f), (float4)(0.5f));
@@ -111,7 +113,7 @@ static inline float4 sh_colour(const Lanes *basis, uint lane, int used, int coef
   return colour;
 }
 
-// False for a colour that is not finite or at least COLOUR_LIMIT: a single such pixel would dominate the loss.
+// True if all channels are below COLOUR_LIMIT, and so finite: a single pixel of another colour would dominate the loss.
 static inline int colour_is_drawn(float4 colour) {
   return colour.x < COLOUR_LIMIT && colour.y < COLOUR_LIMIT && colour.z < COLOUR_LIMIT;
 }

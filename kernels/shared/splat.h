@@ -1,6 +1,7 @@
-// Conventions of splats and slots, in addition to layouts.h.
+// Units of splats and slots, and the number of floats per slot. Their columns are in layouts.h.
 
-// A splat's L11, L12 and L22 are the whitening W times WHITEN = sqrt(log2(e) / 2). Moments in slots use WHITEN W too.
+// A splat's L11, L12 and L22 are the whitening W (docs/gradients.md, (44)) times WHITEN = sqrt(log2(e) / 2). Moments in
+// slots use WHITEN W too.
 #define WHITEN 0.84932180028801904f
 #define INVERSE_WHITEN2 1.38629436111989062f // 1 / WHITEN^2 = 2 ln 2
 
@@ -13,8 +14,8 @@ static inline float larger_eigenvalue(float l11, float l12, float l22) {
   return middle + sqrt(fma1(half_difference, half_difference, sxy * sxy));
 }
 
-// Floats per slot. After the gradients come, both optional, the contribution and the gradient with respect to nearness,
-// 1 / depth.
+// SLOT_STRIDE: number of floats per slot. The gradients come first, then the contribution with CONTRIBUTIONS, then the
+// gradient with respect to nearness, 1 / depth, with NEARNESS.
 #ifdef ABSOLUTE_GRADIENTS
 #define SLOT_GRADIENTS SLOT_SIZE
 #else
@@ -33,7 +34,7 @@ static inline float larger_eigenvalue(float l11, float l12, float l22) {
 #define SLOT_STRIDE SLOT_KEPT
 #endif
 
-// The mean relative to the centre of the first pixel. Whole pixels and fraction are subtracted separately, because
-// their sum in float32 would lose digits.
+// A mean's coordinate relative to the centre of the tile's first pixel. Whole pixels and fraction are subtracted
+// separately, because their sum in float32 would lose digits.
 #define FROM_TILE(splat, axis, origin)                                                                                 \
   ((splat[SPLAT_PIXEL_##axis] - (float)(origin)) + (splat[SPLAT_SUB_##axis] - 0.5f))

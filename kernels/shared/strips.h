@@ -1,11 +1,12 @@
-// Sums over a tile's pixels for blend_grad.cl, in a group of work-items. From 32 items on, the order of addition does
-// not depend on their number. A strip is a row of blocks, half of the tile. Each of its 32 lanes adds its pixels from
-// left to right, and applies v, which is the same for all of them. A tree then adds the lanes, and the strips are added
-// from top to bottom.
+// Sums over a tile's pixels for blend_grad.cl, in a group of several work-items. From 32 items on, the order of
+// addition does not depend on the number of items. A strip is a row of blocks (blocks.h); with 32 items or more it is
+// half of the tile. Each of the 32 lanes of a strip adds its pixels from left to right, and applies v, which is the
+// same for all of them. A tree then adds the lanes, and the strips are added from top to bottom.
 //
-// A team of items owns a strip, or several one after the other, and walks TOGETHER of the strip's pairs at a time. Its
-// items leave their sums in rows of local memory, one row for each field. Then each item adds up a row.
-#define STRIP_CELLS (OWNED < BLOCK_COLUMNS ? OWNED : BLOCK_COLUMNS) // cells of an item in a strip
+// A team of items owns one strip, or several strips one after the other, and processes TOGETHER of the strip's pairs at
+// a time. The items of the team leave their sums in rows of local memory, one row for each field. Then each item adds
+// up a row.
+#define STRIP_CELLS (OWNED < BLOCK_COLUMNS ? OWNED : BLOCK_COLUMNS) // number of an item's cells in a strip
 #define OWN_STRIPS (OWNED / STRIP_CELLS)
 #define TEAMS (BLOCK_ROWS / OWN_STRIPS)
 #define TEAM_WARPS (WARPS / TEAMS)
@@ -15,24 +16,26 @@
 
 #define ADDENDS BLOCK_ITEMS
 #define ADDEND LANE
-#if TEAM_WARPS > 1 // items of several warps exchange nothing
+#if TEAM_WARPS > 1 // items of several warps add up a strip's lanes through local memory
 #undef SUBGROUP
 #undef SUBGROUPED
 #define SUBGROUP 1
 #define SUBGROUPED
 #endif
 #include "shared/item_sums.h"
-#define ACROSS_TEAMS (SUBGROUP > BLOCK_ITEMS) // a sub-group has items of two teams, which then go on together
-#define ABREAST (ITEMS < SLOT_STRIDE ? ITEMS : SLOT_STRIDE) // items that write a slot
+// True if a sub-group has items of two teams. The two teams then run the same number of iterations.
+#define ACROSS_TEAMS (SUBGROUP > BLOCK_ITEMS)
+#define ABREAST (ITEMS < SLOT_STRIDE ? ITEMS : SLOT_STRIDE) // number of items that write a slot together
 
-// True if a pair reaches all blocks of a strip. It is then quicker to take all of the item's pixels without a branch.
+// True if a pair reaches all blocks of a strip. It is then quicker to process all of the item's pixels without a
+// branch.
 #define IS_WHOLE(reach) (!ALL_REACHED && ((reach) & FIRST_BLOCKS(BLOCK_COLUMNS)) == FIRST_BLOCKS(BLOCK_COLUMNS))
 
 #define FOR_FIELDS(field) _Pragma("unroll") for (int field = 0; field < SLOT_STRIDE; ++field)
 #define FOR_STRIP(c) _Pragma("unroll") for (int c = 0; c < STRIP_CELLS; ++c)
 
-// Rows of a pair: one for each field. If several warps share the strip, the same memory first holds LEFT rows for each
-// block.
+// Rows of a pair in local memory: one for each field. If several warps share the strip, the same memory first holds
+// LEFT rows for each block, with what leave_pixel stores.
 #ifdef RAYS
 #define LEFT 4 // g, weight, u and v
 #else
@@ -45,12 +48,15 @@
 #else
 #define TOGETHER (BLOCK_ITEMS < SLOT_STRIDE ? 1 : BLOCK_ITEMS / SLOT_STRIDE)
 #endif
-#define TOTALS (BATCH + 1) // pairs of which a strip's totals are kept, padded: a pair's totals are in different banks
+// Number of pairs for which `totals` has space, plus 1 so that the totals of a pair are in different banks.
+#define TOTALS (BATCH + 1)
 
-// A lane's sums begin at -0. As x + -0 is x for every x, a compiler leaves the first addition out; x + 0 is not -0.
+// Starts a lane's sums at -0. Because x + -0 is x for every x, a compiler can leave the first addition out; from 0 it
+// could not, because -0 + 0 is 0.
 #define BEGIN_SUMS(sums) FOR_FIELDS(field) sums[field] = -0.0f;
 
-// Computes the fields of a lane that follow from the others. With RAYS each pixel has its own v.
+// Computes those fields of a lane's sums that equal v times other fields, so that they are not added pixel by pixel.
+// With RAYS the fields stay as add_gradients added them, because each pixel has its own v.
 static inline void finish_row(float v, float *sums) {
 #ifndef RAYS
   sums[SLOT_GV] = v * sums[SLOT_G];
@@ -62,7 +68,7 @@ static inline void finish_row(float v, float *sums) {
 #define SHARE_IN(cell)                                                                                                 \
   take_out(&pixels, cell, as_float(as_int(exp2_by(power, zero)) & taken), c_red, c_green, c_blue NEAR_ARGUMENT)
 
-// Adds a pixel of a lane to its sums.
+// Adds a pixel to the lane's sums, if `where` is true.
 #define ADD_PIXEL(cell, where)                                                                                         \
   {                                                                                                                    \
     ALPHA_IN(cell)                                                                                                     \
@@ -73,7 +79,7 @@ static inline void finish_row(float v, float *sums) {
   }
 
 #if TEAM_WARPS > 1
-// Leaves what another lane needs to add a pixel to its sums.
+// Stores a pixel's values in local memory, for the lane that adds them up in join_blocks.
 #define LEAVE_PIXEL(cell, block_rows)                                                                                  \
   {                                                                                                                    \
     ALPHA_IN(cell)                                                                                                     \
@@ -90,8 +96,8 @@ static inline void leave_pixel(Share share, float u, float v, __local float *blo
 #endif
 }
 
-// Adds up what lanes have left for a pair that reaches these blocks, and leaves the sums in the pair's first rows.
-// strip: the image's gradient in the lane's pixel of each block.
+// Adds up what leave_pixel has stored for a pair that reaches these blocks, and stores the sums in the pair's first
+// rows. strip: the image's gradient in the lane's pixel of each block.
 static inline void join_blocks(uint blocks, const Pixels *strip, float v, float l11, float l12, float l22,
                                __local float *pair_rows) {
   float sums[SLOT_STRIDE];
@@ -107,12 +113,13 @@ static inline void join_blocks(uint blocks, const Pixels *strip, float v, float 
   FOR_FIELDS(field) pair_rows[field * ROW + LANE] = sums[field];
 }
 
-// Loads the image's gradient in the lane's pixel of each block of a strip; first_pixel: that of the first block.
+// Loads the image's gradient in the lane's pixel of each block of a strip; first_pixel: the index of the lane's pixel
+// in the first block.
 static inline void load_strip(__global const float *image_gradient, __global const int *stops, size_t first_pixel,
                               size_t plane, Pixels *strip) {
   _Pragma("unroll") for (int c = 0; c < BLOCK_COLUMNS; ++c) {
     const size_t pixel = first_pixel + c * BLOCK_W;
-    const int inside = stops[pixel] >= 0; // in padding, which lanes add too, the gradient is not written
+    const int inside = stops[pixel] >= 0; // lanes add padding too, and its gradient is uninitialised
     strip[c].red[0] = inside ? image_gradient[pixel] : 0.0f;
     strip[c].green[0] = inside ? image_gradient[plane + pixel] : 0.0f;
     strip[c].blue[0] = inside ? image_gradient[2 * plane + pixel] : 0.0f;
@@ -123,7 +130,8 @@ static inline void load_strip(__global const float *image_gradient, __global con
 }
 #endif
 
-// Loads the Gaussian and the slot of an item's fetch number `fetch`. A batch's pairs run backwards from `batch` - 1.
+// Loads the indices of the Gaussian and the slot for an item's fetch number `fetch`. The pairs of a batch run backwards
+// from index `batch` - 1.
 #define FETCH_INDICES(fetch, batch)                                                                                    \
   {                                                                                                                    \
     const int from = max((batch) - 1 - ITEM - fetch * ITEMS, begin);                                                   \

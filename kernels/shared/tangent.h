@@ -1,22 +1,23 @@
-// A Gaussian's ellipse on the plane that touches the sphere of directions at its mean, shared by projection and its
-// gradient. Built with one lane. Equation numbers refer to docs/cameras.md. Needs gaussian.h, and NEEDS_TANGENTS of
-// camera.h.
+// Projects a Gaussian to an ellipse on the plane that touches the sphere of directions at the Gaussian's mean.
+// Projection and its gradient share this code. Built with one lane. Equation numbers refer to docs/cameras.md. Include
+// gaussian.h before, with NEEDS_TANGENTS (camera.h).
 
 typedef struct {
-  float f[3], distance; // direction and distance of the mean, in the camera
+  float f[3], distance; // unit direction and distance of the mean, in the camera's axes
   Tangent t;
   float q[4], length;       // unit quaternion, and length of the raw quaternion
-  float a[9];               // the Gaussian's axes in the camera, as columns
+  float a[9];               // the Gaussian's axes in the camera's axes, as columns of a 3x3 matrix
   float s[3];               // scales
-  float c1[3], c2[3];       // the axes along e1 and e2
-  float m1[5], m2[5];       // M, with two more columns for the low-pass
+  float c1[3], c2[3];       // components of the Gaussian's axes along e1 and e2
+  float m1[5], m2[5];       // the rows of M of (11), with two more columns for the low-pass
   float sxx, sxy, syy, det; // covariance with the low-pass
 #ifdef ANTIALIASED
   float det0; // determinant without the low-pass
 #endif
 } RayProjection;
 
-// (8) to (12); returns 0 if the Gaussian is culled. Conditions are written so that NaN culls.
+// Projects Gaussian i, (8) to (12): fills *p, and returns 0 if the Gaussian is culled. Conditions are written so that
+// NaN culls.
 static inline int project_ray(size_t i, __global const float *means, __global const float *quaternions,
                               __global const float *log_scales, __constant float *camera, RayProjection *p) {
   const float x = means[3 * i], y = means[3 * i + 1], z = means[3 * i + 2];
@@ -30,7 +31,8 @@ static inline int project_ray(size_t i, __global const float *means, __global co
   if (!is_shown(p->f, camera)) return 0;
   tangent_of(p->f, camera, &p->t);
 
-  // (11), (12): M = e A S / distance, with two more columns for the low-pass; the determinant is from the minors.
+  // (11), (12): M = e A S / distance, with two more columns for the low-pass. The determinant is the sum of the squared
+  // minors.
   const Tangent t = p->t;
   __global const float *raw = quaternions + 4 * i;
   float norm2 = 0.0f, r[9];
@@ -42,7 +44,7 @@ static inline int project_ray(size_t i, __global const float *means, __global co
   for (int k = 0; k < 3; ++k) {
     p->s[k] = expL(log_scales[3 * i + k]);
     const float scale = p->s[k] / distance;
-    float a[3]; // the axis in the camera
+    float a[3]; // the Gaussian's axis k in the camera's axes
     for (int row = 0; row < 3; ++row)
       p->a[3 * row + k] = a[row] =
           fma1(camera[CAMERA_R00 + 3 * row], r[k],
@@ -81,7 +83,7 @@ static inline float depth_of_axis(const RayProjection *p, int k) {
   return fma1(p->f[0], p->a[k], fma1(p->f[1], p->a[3 + k], p->f[2] * p->a[6 + k]));
 }
 
-// The minor of the unscaled M that omits axis k.
+// The minor of M that omits the Gaussian's axis k, without the factors of the scales.
 static inline float minor_of_axis(const RayProjection *p, __constant float *camera, int k) {
   const float inverse = 1.0f / p->distance;
   return camera[CAMERA_HAND] * depth_of_axis(p, k) * (inverse * inverse);

@@ -1,21 +1,23 @@
-// The only code that decides which tiles a projected Gaussian reaches. Counting and emitting must both use it: if they
-// disagreed by one tile, the emitted pairs would overrun, or leave gaps in, the arrays sized by the count.
+// Decides which tiles a projected Gaussian reaches. The kernels that count pairs and those that write pairs must both
+// use this code: if they disagreed by one tile, the pairs would overrun the arrays sized by the count, or leave gaps in
+// them.
 #include "shared/splat.h"
 
-// Slack in pixels. It exceeds float32's rounding here: an extra tile only costs time, but a missing one would be
-// visible.
+// Slack in pixels by which ellipses are enlarged. It exceeds the rounding errors of float32 in this file: an extra tile
+// only costs time, but a missing tile would be visible.
 #define TILE_SLACK 0.01f
 
-// u^2 + v^2 at the edge of a Gaussian's ellipse, where alpha is ALPHA_MIN unless RasterizerConfig.extent says
-// otherwise.
+// u^2 + v^2 at the edge of a Gaussian's ellipse. Alpha is ALPHA_MIN at the edge, unless RasterizerConfig.extent sets
+// another extent.
 #ifdef EXTENT_BUDGET
 #define EXTENT(log2o) EXTENT_BUDGET
 #else
 #define EXTENT(log2o) ((log2o) - LOG2_ALPHA_MIN)
 #endif
 
-// First index of the tiles (at size 1, of the rows) whose last pixel centre is at or after `low`, within [0, count]. It
-// rounds through integers after the clamp, because ceil and floor are calls in some drivers.
+// The first of `count` tiles or cells of `size` pixels whose last pixel centre is at or after the coordinate `low`;
+// `count` if there is none. The function rounds through integers after the clamp, because ceil and floor are calls in
+// some drivers.
 static inline int first_cell(float low, float size, int count) {
   float cell = (low - TILE_SLACK - (size - 0.5f)) * (1.0f / size);
   cell = cell > 0.0f ? cell : 0.0f;
@@ -24,24 +26,25 @@ static inline int first_cell(float low, float size, int count) {
   return whole + ((float)whole < cell);
 }
 
-// One past the last index of the tiles (or rows) whose first pixel centre is at or before `high`, within [0, count].
+// One past the last of `count` tiles or cells of `size` pixels whose first pixel centre is at or before the coordinate
+// `high`; 0 if there is none.
 static inline int end_cell(float high, float size, int count) {
   float cell = (high + TILE_SLACK - 0.5f) * (1.0f / size) + 1.0f;
   cell = cell > 0.0f ? cell : 0.0f;
   return (int)(cell < (float)count ? cell : (float)count);
 }
 
-// The largest box, in tiles, that is listed whole: for so few tiles, testing which of them the ellipse reaches takes
-// longer than letting blend find that no pixel is reached.
+// The largest box, in tiles, of which all tiles are listed. For so few tiles, a test of which tiles the ellipse reaches
+// would take longer than blend.cl takes to find that no pixel of a tile is reached.
 #ifdef BOX_TILE_TEST // RasterizerConfig.tile_test
 #define SMALL_BOX 0x7fffffff
 #elif !defined(SMALL_BOX)
 #define SMALL_BOX 16
 #endif
 
-#ifdef RAYS // pixels are directions; project_rays.cl has computed the box
+#ifdef RAYS // a ray splat holds its box of tiles, computed by project_rays.cl
 typedef struct {
-  int tile_x0, tile_x1, tile_y0, tile_y1; // tiles of the box; if x0 > x1 it wraps: [x0, tiles_x) and [0, x1)
+  int tile_x0, tile_x1, tile_y0, tile_y1; // tiles of the box; if x0 > x1 the box wraps: [x0, tiles_x) and [0, x1)
   int box;                                // number of tiles
 } Ellipse;
 
@@ -52,7 +55,7 @@ static inline Ellipse ellipse_of(__global const float *splat, int tiles_x, int t
   return e;
 }
 
-// The tiles [*x0, *x1) of the box in a tile row; a box that wraps has two parts.
+// The tiles [*x0, *x1) of the box in tile row ty. A box that wraps has two parts, which are selected by `part`.
 #define SPANS 2
 static inline void tile_span(const Ellipse *e, int ty, int part, int tiles_x, int *x0, int *x1) {
   const int wraps = e->tile_x0 > e->tile_x1;
@@ -65,14 +68,14 @@ static inline void tile_span(const Ellipse *e, int ty, int part, int tiles_x, in
 typedef struct {
   float mx, my, l11, l12, l22, half_w, half_h;
   float budget;                           // u^2 + v^2 at the ellipse's edge
-  float tangent;                          // dy from the mean to the rightmost point
-  int tile_x0, tile_x1, tile_y0, tile_y1; // tiles that its box reaches
+  float tangent;                          // y of the ellipse's rightmost point, relative to the mean
+  int tile_x0, tile_x1, tile_y0, tile_y1; // tiles that the ellipse's box reaches
   int box;                                // number of tiles
 } Ellipse;
 
 #ifdef SQUARE_TILE_TEST
-// The longer half axis in pixels, as in Kerbl et al.'s code, from the larger eigenvalue of the covariance. The
-// covariance is recovered from the whitening.
+// The ellipse's longer half axis in pixels, as in Kerbl et al.'s code: from the larger eigenvalue of the covariance,
+// which is recovered from the whitening.
 static inline float longest_half_axis(__global const float *splat) {
   const float larger = larger_eigenvalue(splat[SPLAT_L11], splat[SPLAT_L12], splat[SPLAT_L22]);
   return sqrt(EXTENT(splat[SPLAT_LOG2O]) * larger);
@@ -85,7 +88,7 @@ static inline Ellipse ellipse_of(__global const float *splat, int tiles_x, int t
   e.my = splat[SPLAT_PIXEL_Y] + splat[SPLAT_SUB_Y];
   e.half_w = splat[SPLAT_HALF_W];
   e.half_h = splat[SPLAT_HALF_H];
-#ifdef SQUARE_TILE_TEST // RasterizerConfig.tile_test; at least the box, despite rounding
+#ifdef SQUARE_TILE_TEST // RasterizerConfig.tile_test: a square, which rounding must not make smaller than the box
   const float radius = longest_half_axis(splat);
   e.half_w = radius > e.half_w ? radius : e.half_w;
   e.half_h = radius > e.half_h ? radius : e.half_h;
@@ -105,8 +108,8 @@ static inline Ellipse ellipse_of(__global const float *splat, int tiles_x, int t
   return e;
 }
 
-// The ellipse's right edge, relative to the mean, over the offsets [d0, d1] in y; the left edge follows by symmetry
-// (docs/gradients.md, equation 47).
+// The ellipse's right edge, relative to the mean, in the rows whose offsets from the mean are in [d0, d1]; the left
+// edge follows by symmetry (docs/gradients.md, (47)).
 static inline float right_edge(const Ellipse *e, float d0, float d1) {
   if (e->tangent >= d0 && e->tangent <= d1) return e->half_w;
   const float dy = e->tangent < d0 ? d0 : d1;
@@ -114,7 +117,7 @@ static inline float right_edge(const Ellipse *e, float d0, float d1) {
   return (-e->l12 * dy + sqrt(rest > 0.0f ? rest : 0.0f)) / e->l11;
 }
 
-// The tiles [*x0, *x1) in tile row ty that the ellipse reaches; all tiles of a small box. There is one part.
+// The tiles [*x0, *x1) of tile row ty that the ellipse reaches; all tiles of a small box. `part` is always 0 here.
 #define SPANS 1
 static inline void tile_span(const Ellipse *e, int ty, int part, int tiles_x, int *x0, int *x1) {
   *x0 = e->tile_x0;
@@ -133,7 +136,7 @@ static inline void tile_span(const Ellipse *e, int ty, int part, int tiles_x, in
 }
 #endif
 
-// The number of tiles over all rows.
+// The number of tiles that an ellipse reaches, over all tile rows.
 static inline uint tile_count(const Ellipse *e, int tiles_x) {
   if (e->box <= SMALL_BOX) return e->box;
   uint count = 0;

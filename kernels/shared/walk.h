@@ -1,26 +1,29 @@
-// The gradient of blending with one Gaussian per item, BY_GAUSSIAN. The items of a group process the pixels of a tile
-// one after another. Each item has a Gaussian and its sums in registers; the state of the pixels is in local memory.
+// The gradient of blending with one Gaussian per work-item (BY_GAUSSIAN), for blend_grad.cl. The items of a group pass
+// over the pixels of a tile, one item behind the other. Each item has a Gaussian and its sums in registers; the state
+// of the pixels is in local memory.
 //
-// The pixels are in ITEMS chunks, each a part of a row. In round r item j is at chunk (r - j) % ITEMS, and a barrier
-// ends the round. So each chunk gets the Gaussians in order. When an item has passed all chunks with a Gaussian, it
-// begins its next Gaussian in the next round. Values that are constant in a row are computed once per chunk.
+// The pixels are divided into ITEMS chunks, each a part of a row. In round r item j processes chunk (r - j) % ITEMS,
+// and a barrier ends the round. So the Gaussians come to each chunk in order. After all chunks, an item begins its next
+// Gaussian in the next round. Values that are constant in a row are computed once per chunk.
 #if ITEMS < 16 || ITEMS > 128
 #error "a chunk is a row of a tile, or a part of one of two pixels or more"
 #endif
-#define CHUNK (TILE * TILE / ITEMS) // pixels of a chunk
+#define CHUNK (TILE * TILE / ITEMS) // number of pixels of a chunk
 #define ROW_CHUNKS (TILE / CHUNK)
-#define CHUNK_BLOCKS (CHUNK < BLOCK_W ? 1 : CHUNK / BLOCK_W) // number of blocks that a chunk is in; the first:
+// Number of blocks that a chunk lies in; CHUNK_BLOCK is the first.
+#define CHUNK_BLOCKS (CHUNK < BLOCK_W ? 1 : CHUNK / BLOCK_W)
 #define CHUNK_BLOCK(chunk) ((chunk) / ROW_CHUNKS / BLOCK_H * BLOCK_COLUMNS + (chunk) % ROW_CHUNKS * CHUNK / BLOCK_W)
 
-// Index of a pixel: items at adjacent chunks read adjacent elements.
+// The index of pixel (x, y) in Passing and Fixed: items at adjacent chunks read adjacent elements.
 #define PLACE(x, y) ((x) % CHUNK * ITEMS + (y) * ROW_CHUNKS + (x) / CHUNK)
 
-// Pixels in local memory. Passing: transmittance and `behind`, which change. Fixed: the image's gradient, and the bits
-// of the stop.
+// A pixel in local memory. Passing: the transmittance and `behind`, which change. Fixed: the image's gradient, and the
+// bits of the pixel's entry of `stops`.
 typedef float2 Passing;
 typedef float4 Fixed;
 
-// The Gaussian of an item. i: the index of its pair, less than `begin` if there is none.
+// The Gaussian that an item currently processes. i: the index of the pair, less than `begin` if there is none; blocks:
+// those that the ellipse reaches; slot: the pair's slot.
 typedef struct {
   float mx, my, l11, l12, l22, log2o, red, green, blue;
   int i;
@@ -30,7 +33,8 @@ typedef struct {
 #endif
 } Walker;
 
-// The gradient with respect to the nearness of a tile's pixels, in the order of Passing and Fixed.
+// With NEARNESS, `near` is the gradient with respect to the nearness of a tile's pixels, in the order of Passing and
+// Fixed.
 #ifdef NEARNESS
 #define NEAR_OF_STAGED , s.near
 #define NEAR_PIXELS , near
@@ -41,9 +45,9 @@ typedef struct {
 #define NEAR_PIXELS_PARAMETER
 #endif
 
-// Removes the walker's pair from the pixels of a chunk, and adds their gradients to its sums (SLOT_STRIDE). Pixels to
-// which the pair was not added are processed with alpha 0, without a branch: of 32 items, one nearly always has a pixel
-// to which its pair was added, and branches would serialise the pixels of a chunk.
+// Removes the walker's pair from the pixels of a chunk, and adds the pixels' gradients to the pair's sums
+// (SLOT_STRIDE). Pixels to which the pair was not added are processed with alpha 0, without a branch. Of 32 items, one
+// nearly always has a pixel to which its pair was added, so branches would only serialise the pixels of a chunk.
 static inline void take_chunk(const Walker *w, int chunk, __local Passing *passing, __local const Fixed *fixed,
                               float *sums NEAR_PIXELS_PARAMETER) {
   const float dy = w->my - (float)(chunk / ROW_CHUNKS), v = w->l22 * dy;

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cases of the colour models: photographs without their colours, the gradient, and the update by Adam."""
+"""Cases of the colour models: photographs without their own colours, the gradient, and the update by Adam."""
 
 from __future__ import annotations
 
@@ -31,12 +31,13 @@ from clsplat.stages.appearance import (
 )
 
 MIX_RATE_FACTOR = 0.125
+"""Learning rate of colour mixes, divided by that of gains."""
 MAX_FALLOFF_OCTAVES, MAX_MIX = 16.0, 0.2
-"""Limits in the kernels: octaves of a vignette, and absolute value of entries after the gains."""
+"""Limits in the kernels: the octaves of a vignette, and the absolute value of a colour mix."""
 
 
 def random_gradient(rng: Generator, image: Float32) -> Float32:
-    """A random gradient with respect to an image; its order of magnitude is random too."""
+    """A random gradient with respect to an image, of a random order of magnitude."""
     return (rng.standard_normal(image.shape) * 10 ** rng.uniform(-9, 4)).astype(np.float32)
 
 
@@ -56,8 +57,8 @@ def frozen_pictures(bench: CaseBench, photograph_seed: int, gradient_seed: int) 
 
 
 def _random(model: ColourModel, rng: Generator, size: tuple[int, int]) -> Inputs:
-    """Gains of 1/256 to 256, other entries up to their limits, gradients of any magnitude, and principal points outside
-    the picture too."""
+    """Random inputs: gains of 1/256 to 256, other entries up to their limits, gradients of any magnitude, and principal
+    points inside and outside the picture."""
     image, photograph = random_pictures(rng, size)
     by_image = random_gradient(rng, image)
     scale = float(np.abs(by_image).sum())
@@ -79,9 +80,9 @@ def _random(model: ColourModel, rng: Generator, size: tuple[int, int]) -> Inputs
 
 
 def _frozen(model: ColourModel, bench: CaseBench) -> list[Inputs]:
-    """Inputs with three photographs and two lenses; photograph 1 is used, taken with lens 1.
+    """Inputs with three photographs and two lenses, of which photograph 1 and lens 1 are used.
 
-    In a model of gains alone, two photographs are pulled.
+    In a colour model that has gains alone, two of the photographs are pulled towards `start`.
     """
     pulled = model.sums == GAIN_ENTRIES
     pictures, seed, end = ((45, 42), 41, 1.0) if pulled else ((48, 49), 46, 0.125)
@@ -112,7 +113,7 @@ def _launch(model: ColourModel, device: Device, work: Workspace, given: Inputs) 
     colours = replace(colours, start=upload(device, given.start))
     lenses = _gains(device, given.lenses, given.of_lenses) if model.of_lens else None
     planes, below = planes_of(given.photograph), planes_of(given.by_image)
-    below[:, given.size[1] :] = np.nan  # padding rows, which are never written
+    below[:, given.size[1] :] = np.nan  # rows of padding are never written, and must not be read
     target = upload(device, np.concatenate([planes, planes[:1]]))  # the fourth plane is alpha
     image, gradient = upload(device, planes_of(given.image)), upload(device, below)
     develop(device, model, colours, lenses, given.taken, target, given.size)
@@ -128,23 +129,26 @@ def _launch(model: ColourModel, device: Device, work: Workspace, given: Inputs) 
 
 
 def _pictures_read(given: Inputs, target: DeviceArray, gradient: DeviceArray) -> Arrays:
-    """The photograph after the launch, and the planes that must not change: its alpha, and the gradient."""
+    """Read the photograph after the launch, and the planes that must not change: its alpha, and the gradient."""
     planes, by_image = target.get(), cropped(gradient.get(), given.size)
     return {"target": cropped(planes[:3], given.size), "alpha": planes[3], "gradient": by_image}
 
 
 def moment(values: Float64) -> Expected:
-    """A moment of Adam. The bound: beta2 in float32 is off by 1e-8, which is 1e-5 of 1 - beta2 = 1e-3."""
+    """The expected values of a moment of Adam. The bound: beta2 in float32 is off by 1e-8, which is 1e-5 of 1 - beta2 =
+    1e-3."""
     return Expected(values, 3e-5, np.abs(values).max())
 
 
 def stepped(values: Float64, rate: float | Float64) -> Expected:
-    """Values after a step of Adam. The bound: beta2 is 1e-5 of a step, and a sum of 16 floats may nearly cancel."""
+    """The expected values after a step of Adam. The bound: the error of beta2 is 1e-5 of a step, and a sum of 16 floats
+    may nearly cancel."""
     return Expected(values, 1e-4, rate + 1e-2 * np.abs(values))
 
 
 def _developed(model: ColourModel, given: Inputs, squared: Float64) -> Expected:
-    """The expected photograph after gains, other entries and the lens are removed."""
+    """The expected photograph after gains, other entries and the vignette are removed. squared: squared distances of
+    the pixels from the principal point."""
     twin = import_module(f"clsplat.reference.{model.stem}")
     photograph, entries, lenses = given.wide("photograph", "entries", "lenses")
     own, lens = entries[given.taken.photograph], lenses[given.taken.lens]
@@ -154,7 +158,7 @@ def _developed(model: ColourModel, given: Inputs, squared: Float64) -> Expected:
     white, none = np.ones_like(photograph), np.zeros_like(own)
     octaves, most = (np.log2(twin.developed(white, none, each, squared)) for each in (lens, -np.abs(lens)))
     largest = np.maximum(np.abs(wanted), photograph / np.exp2(own[:GAIN_ENTRIES])).max(axis=2, keepdims=True)
-    # a few roundings for each octave of the lens
+    # the bound covers a few roundings for each octave of the vignette
     return Expected(wanted, 1.2e-6, largest * (0.4 + most), np.abs(octaves) < MAX_FALLOFF_OCTAVES)
 
 
@@ -172,7 +176,7 @@ def _twin(model: ColourModel, given: Inputs, got: Arrays) -> dict[str, Expected]
     got |= {"by gains": found[:GAIN_ENTRIES], "by the rest": found[GAIN_ENTRIES:]}
     sums, sizes = terms.sum(axis=(0, 1)), np.abs(terms).sum(axis=(0, 1))
     by_entries, by_lenses = np.zeros_like(entries), np.zeros_like(lenses)
-    # computed from the device's sums, so that their error does not count again
+    # These gradients are the device's sums, so that the error of the sums does not count again.
     by_entries[taken.photograph] = found[:count] + reference.pull(entries, start, pull)[taken.photograph]
     by_lenses[taken.lens] = found[count:]
     rates = given.rate * np.where(is_gain, 1.0, MIX_RATE_FACTOR)
@@ -183,7 +187,7 @@ def _twin(model: ColourModel, given: Inputs, got: Arrays) -> dict[str, Expected]
     )
     return {
         "target": _developed(model, given, squared),
-        # a few roundings of partial sums, and of distances, relative to the sum of magnitudes
+        # the bound covers a few roundings of partial sums and of distances, relative to the sum of magnitudes
         "by gains": Expected(sums[:GAIN_ENTRIES], 1e-6, sizes[:GAIN_ENTRIES]),
         "by the rest": Expected(sums[GAIN_ENTRIES:], 2e-6, sizes[GAIN_ENTRIES:]),
         "entries": stepped(after, rates),

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cases of chunks: their bounds, a step over some of them, their steps of Adam that were missed, and copies of chunks
-to and from the slots of a pool."""
+"""Cases of a model's chunks: bounds, a training step over some chunks, catching up missed steps of Adam, and copies of
+chunks to and from the slots of a pool."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ SIZES = (1, CHUNK_ROWS + 1, CHUNK_ROWS, 3 * CHUNK_ROWS + 129, 65)
 
 
 def _some_chunks(rng: Generator, count: int) -> NDArray[np.uint32]:
-    """The first chunk, and most of the others."""
+    """Choose the first chunk and about 70 % of the others. count: number of rows of the model."""
     taken = rng.random(-(-count // CHUNK_ROWS)) < 0.7
     taken[0] = True
     return np.flatnonzero(taken).astype(np.uint32)
@@ -51,7 +51,8 @@ def _listed(device: Device, given: Inputs) -> ChunkList:
 
 
 def _random_bounds(rng: Generator, count: int) -> Inputs:
-    """Means and log scales of any magnitude, infinite, or NaN. numbers: chunks whose bounds are measured."""
+    """Random means and log scales: of any magnitude, infinite, or NaN. numbers: the chunks whose bounds are
+    computed."""
     gaussians = random_scene(rng, count).gaussians
     for array in (gaussians.means, gaussians.log_scales):
         values = array * 10 ** rng.uniform(-3, 9, (count, 1))
@@ -61,7 +62,8 @@ def _random_bounds(rng: Generator, count: int) -> Inputs:
 
 
 def _frozen_model(bench: CaseBench) -> Gaussians:
-    """The scene's Gaussians, repeated to two chunks and a part of another one. Repetitions are not at one place."""
+    """The scene's Gaussians, repeated until they fill two chunks and a part of a third. Copies are shifted at
+    random."""
     count = bench.model.count
     rows = np.arange(2 * CHUNK_ROWS + count)
     gaussians = take(bench.frozen.gaussians, rows % count)
@@ -99,21 +101,21 @@ BOUNDS_CASE = Case(
 
 MOMENTS = ("first", "second")
 CURRENT = ("current_totals", "current_largest")
-"""Statistics of contributions that a view changes."""
+"""Statistics of contributions that each view changes."""
 BEGIN = 0.5
-"""Their values before the view."""
+"""Value of the statistics in CURRENT before the view."""
 STEP = 7
-"""Number of the step of Adam."""
+"""Number of the step of Adam, from 1."""
 AREA = 2.0
-"""Full-resolution pixels per pixel of the image, by which contributions are multiplied."""
+"""Factor of contributions: full-resolution pixels per pixel of the image."""
 
 
 def _random_step(rng: Generator, count: int) -> Inputs:
-    """A view of a model, and a step of Adam.
+    """Random inputs of a training step: a view of a model, and the state of Adam.
 
-    numbers: chunks that take part in the step.
-    slots: (n, SLOT_PLAIN), the values of each slot of a Gaussian.
-    contributions: (n,), to the image.
+    numbers: the chunks that take part in the step.
+    slots: (n, SLOT_PLAIN), the values that all slots of a Gaussian have.
+    contributions: (n,), the Gaussians' contributions to the image.
     """
     scene = random_scene(rng, count)
     shapes = group_shapes(count, scene.gaussians.sh.shape[1])
@@ -142,7 +144,7 @@ def _frozen_steps(bench: CaseBench) -> list[Inputs]:
     }
     slots = evenly(111, (count, SLOT_PLAIN), -1.0, 1.0).astype(np.float32)
     contributions = evenly(112, (count,), 0.0, 1.0).astype(np.float32)
-    numbers = np.array([0, *range(2, -(-count // CHUNK_ROWS))], np.uint32)  # all but one
+    numbers = np.array([0, *range(2, -(-count // CHUNK_ROWS))], np.uint32)  # all chunks but chunk 1
     return [
         Inputs(
             gaussians=gaussians,
@@ -158,13 +160,14 @@ def _frozen_steps(bench: CaseBench) -> list[Inputs]:
 
 
 def _rows(given: Inputs) -> NDArray[np.int64]:
-    """Rows of the model, in order, that take part in the step."""
+    """The model's rows that take part in the step, in order."""
     rows = np.arange(len(given.gaussians))
     return rows[np.isin(rows // CHUNK_ROWS, given.numbers)]
 
 
 def _slots(device: Device, projected: Projected, values: Array) -> Slots:
-    """Slots of all pairs. values: those of a Gaussian's slots, by rows of the launch."""
+    """Fill the slots of all pairs. values: (rows, SLOT_PLAIN), the values that all slots of a Gaussian have, by row of
+    the launch."""
     counts = projected.tile_counts.get().astype(np.int64)
     every = np.repeat(values, counts[: len(values)], axis=0)
     if len(every) == 0:
@@ -181,7 +184,8 @@ def _launch_step(device: Device, work: Workspace, given: Inputs) -> Read:
     contributions[: len(rows)] = given.contributions[rows]
     by_row = upload(device, contributions)
     past = counts[len(rows) :].copy()
-    counts[len(rows) :] = 0  # if a broken kernel shows rows past the model, statistics would be written past its end
+    # If a broken kernel shows rows past the model, statistics must not be written past its end.
+    counts[len(rows) :] = 0
     some = Projected(some.splats, upload(device, counts), chunks=chunks)
     screen = Screen(upload(device, np.zeros((chunks.rows, 2), np.float32)), by_row)
     view = (camera_array, some, _slots(device, some, given.slots[rows]), screen)
@@ -204,7 +208,7 @@ def _launch_step(device: Device, work: Workspace, given: Inputs) -> Read:
 
 
 def _launch_whole(device: Device, given: Inputs, held: DeviceGaussians, camera_array: DeviceArray) -> Read:
-    """Projection and gradient of the whole model."""
+    """Launch the projection of the whole model and its gradient."""
     whole = project(device, Workspace(device), held, given.camera, camera_array)
     gradients = allocate_gaussians(device, held.count, held.coefficients, zero=True)
     screen = Screen(upload(device, np.zeros((held.count, 2), np.float32)))
@@ -218,8 +222,8 @@ def _flat(model: DeviceGaussians) -> Array:
 
 
 def _twin_of_step(given: Inputs, got: Arrays) -> dict[str, Expected]:
-    """The rows that take part, after a step over the whole model. Its projection and gradient are the device's, which
-    other stages test."""
+    """The twin's values of the listed rows after a step over the whole model. The projection and its gradient are the
+    device's, because other stages test them."""
     rows, counts = _rows(given), got.pop("whole counts")
     listed = np.isin(np.arange(len(counts)), rows)
     columns = [index for index, name in enumerate(SPLAT) if name != "UNUSED"]
@@ -230,12 +234,12 @@ def _twin_of_step(given: Inputs, got: Arrays) -> dict[str, Expected]:
     wanted = {
         "counts": exactly(counts[rows]),
         "counts past the model": exactly(np.zeros_like(got["counts past the model"])),
-        # a division or a root that is off by 3 ulp, in either projection
+        # in each of the two projections, a division or a root may be off by 3 ulp
         "splats": Expected(splats[rows][shown][:, columns].astype(np.float64), 1e-5),
         **STATISTICS_CASE.twin(Inputs(views=[view], camera=given.camera), got),
     }
     added = np.where(view[1] > 0, np.float32(AREA) * given.contributions, 0).astype(np.float64)
-    wanted["current_totals"] = Expected(BEGIN + added, 1e-6, BEGIN + added)  # a rounding of the sum
+    wanted["current_totals"] = Expected(BEGIN + added, 1e-6, BEGIN + added)  # one rounding of a sum
     wanted["current_largest"] = exactly(np.maximum(BEGIN, added))
     return wanted | _twin_of_adam(given, got, listed)
 
@@ -247,9 +251,10 @@ def _twin_of_adam(given: Inputs, got: Arrays, listed: NDArray[np.bool_]) -> dict
     model = host_gaussians(given.gaussians, len(listed))
     parameters = {group: model[group].get() for group in PARAMETER_GROUPS}
     arrays = {"parameters": parameters, "gradients": gradients, **given.moments}
-    rows = "sparse" if given.sparse else "late"  # which are those with a gradient, and those of `visible`
+    # "sparse" updates the elements with a gradient, "late" the rows of `visible`.
+    rows = "sparse" if given.sparse else "late"
     step = Inputs(arrays=arrays, rows=rows, step=STEP, visible=listed, rates=ADAM_RATES)
-    got["gradients"] = np.zeros(0)  # which Adam by itself sets to zero
+    got["gradients"] = np.zeros(0)  # project_step keeps no gradients in memory
     return dict(ADAM_CASE.twin(step, got))
 
 
@@ -267,19 +272,19 @@ STATE = ("parameters", "first", "second")
 
 
 def _random_missed(rng: Generator, count: int) -> Inputs:
-    """Moments of any magnitude, some of them zero. Some chunks are not listed.
+    """Random inputs of catch-up: moments of any magnitude, some of them zero, of which only some chunks are caught up.
 
-    last: the last step that each listed chunk has taken, by its number.
-    first_step: the first step of the table, at most the first that any chunk missed.
-    rates: learning rates by number of the step and by group.
-    every: steps between updates of the higher SH bands.
+    last: the last step that each chunk to catch up has taken, by the chunk's number.
+    first_step: number of the table's first step, at most that of the first step that any chunk missed.
+    rates: learning rates by the step's number and by parameter group.
+    every: number of steps between updates of the SH bands from degree 1 on.
     """
     span, before = int(rng.choice([1, 7, 40, 300])), int(rng.choice([0, 1, 100, 30_000]))
     chunks = -(-count // CHUNK_ROWS)
     last = {chunk: before + int(rng.integers(span)) for chunk in range(chunks) if chunk == 0 or rng.random() < 0.7}
     made: dict[str, Arrays] = {name: {} for name in STATE}
     for group, shape in group_shapes(count, int(rng.choice([1, 4, 9, 16]))).items():
-        size = 10 ** rng.uniform(-9, 6, shape)  # well over Adam's epsilon
+        size = 10 ** rng.uniform(-9, 6, shape)  # far above Adam's epsilon
         made["parameters"][group] = rng.standard_normal(shape).astype(np.float32)
         made["first"][group] = (rng.standard_normal(shape) * size * (rng.random(shape) < 0.9)).astype(np.float32)
         made["second"][group] = (rng.uniform(0.1, 1.0, shape) * size**2).astype(np.float32)
@@ -332,11 +337,12 @@ def _twin_of_catch_up(given: Inputs, got: Arrays) -> dict[str, Expected]:
             into.append(values.ravel())
     parameters, first, second, moves, listed = (np.concatenate(found) for found in made.values())
     wanted = {
-        # Each step rounds the parameter, to 6e-8 of it, as long as it moves: up to 150 steps. The betas in float32 are
-        # off by 3e-8, which is 1e-6 of a movement of some 30 steps.
+        # As long as a parameter moves, each step rounds it by 6e-8 of its size: up to 150 steps. The betas in float32
+        # are off by 3e-8, which is 1e-6 of a movement over some 30 steps.
         "parameters": Expected(parameters, 1e-5, moves, listed),
-        "first": Expected(first, 3e-5, np.abs(first), listed),  # 300 roundings, and beta1 off by 2.6e-8 in each
-        "second": Expected(second, 3e-5, second, listed),  # likewise
+        # In each of up to 300 steps a moment is rounded, and beta1 or beta2 is off by up to 2.6e-8.
+        "first": Expected(first, 3e-5, np.abs(first), listed),
+        "second": Expected(second, 3e-5, second, listed),
     }
     for name in STATE:
         got[f"{name} of other chunks"] = got[name][~listed]
@@ -355,16 +361,16 @@ CATCH_UP_CASE = Case(
 
 
 SPARE_SLOTS = 2
-"""Slots of a pool that no copy uses."""
+"""Number of the pool's slots that no copy uses."""
 MADE_WORDS = 4999
-"""Words of which records are made, again and again. It divides no record, so that no two are alike."""
+"""Number of words that are repeated to fill records. No record's length is a multiple of it, so all records differ."""
 
 
 def _records_of(words: NDArray[np.uint32], slots: NDArray[np.int64], coefficients: int) -> Inputs:
-    """A pool whose slots have some words each, and as many records.
+    """A pool whose slots are filled with words, and records for some of the slots.
 
     slots: the slots that are copied.
-    words: fills the records, then the pool.
+    words: fill the pool, and in reverse order the records.
     """
     fields: dict[str, tuple[int, ...]] = {"logit": (), "mean": (3,), "rest": (coefficients - 1, 3)}
     record = record_type(fields)
@@ -379,16 +385,17 @@ def _records_of(words: NDArray[np.uint32], slots: NDArray[np.int64], coefficient
 
 
 def _random_records(rng: Generator, count: int) -> Inputs:
-    """Records of any bits, those of NaN among them, of a model of `count` rows. The slots are in any order."""
+    """Records of random words, a third of them NaN, of a model of `count` rows. The slots are in random order."""
     chunks = chunks_of(count)
     words = rng.integers(0, 1 << 32, MADE_WORDS, dtype=np.uint32)
-    words[::3] |= 0x7F800000  # NaN with any payload
+    words[::3] |= 0x7F800000  # NaN with random payloads
     slots = rng.permutation(chunks + SPARE_SLOTS)[:chunks]
     return _records_of(words, slots, int(rng.choice([1, 4, 16])))
 
 
 def _frozen_records(bench: CaseBench) -> list[Inputs]:
-    words = np.arange(1, MADE_WORDS + 1, dtype=np.uint32) * np.uint32(2654435761)  # odd: no word comes twice
+    # The factor is odd, so no word occurs twice.
+    words = np.arange(1, MADE_WORDS + 1, dtype=np.uint32) * np.uint32(2654435761)
     return [_records_of(words, np.array([3, 0, 4]), bench.model.coefficients)]
 
 
@@ -397,7 +404,7 @@ def _words_of(fields: Mapping[str, Array]) -> dict[str, NDArray[np.uint32]]:
 
 
 def _launch_records(device: Device, _: Workspace, given: Inputs) -> Read:
-    """Copies from the slots, then to them."""
+    """Copy chunks from the slots to records, then other records to the slots."""
     slots, read = upload(device, given.slots), upload(device, np.zeros_like(given.records))
     arrays = {name: upload(device, values) for name, values in given.pool.items()}
     copy_chunks(device, slots, read, given.record, arrays, to_records=True)

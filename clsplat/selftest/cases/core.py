@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The core stages of the self-test, each compared with the float64 reference on a frozen scene.
+"""The core stages of the self-test: arithmetic, projection, tile lists, blending, and their gradients with Adam. Each
+is compared with its float64 reference on a frozen scene.
 
 The reference of a stage gets the device's output of the previous stage, so that errors do not add up.
 """
@@ -96,8 +97,8 @@ def _project(bench: CaseBench) -> StageOutcome:
 
 
 def _box_tiles(projected: reference_project.ProjectedTwin, tiles: tuple[int, int]) -> NDArray[np.int64]:
-    """Number of tiles in each Gaussian's bounding box, enlarged by half a pixel: an upper bound. 0 if it is not
-    visible."""
+    """An upper bound of each Gaussian's number of tiles: the tiles of its bounding box, enlarged by half a pixel; 0 for
+    invisible Gaussians."""
     low = np.floor((projected.means2d - projected.half_extents - 0.5) / TILE)
     high = np.floor((projected.means2d + projected.half_extents + 0.5) / TILE) + 1
     spans = np.clip(high, 0, tiles) - np.clip(low, 0, tiles)
@@ -122,9 +123,9 @@ def _duplicate(bench: CaseBench) -> StageOutcome:
     scanned = np.cumsum(counts) - counts
     wrong = int((first_slots != scanned).sum())
     if len(ids) != len(owners):
-        return replace(outcome, trouble=f"{len(ids)} pairs instead of {len(owners)}")
+        return replace(outcome, trouble=f"{len(ids)} pairs were made, expected {len(owners)}")
     wrong += int((ids[:, 1] != owners).sum()) + int((ids[:, 0] != scanned[owners] + place).sum())
-    # each Gaussian's tiles must be in ascending order, and include every tile that it reaches
+    # Each Gaussian's tiles must be in ascending order, and must include every tile that the Gaussian reaches.
     wrong += int((np.diff(tile_keys.astype(np.int64))[place[1:] > 0] <= 0).sum()) + int(
         (tile_keys >= bench.band.end).sum()
     )
@@ -160,7 +161,7 @@ def _blend(bench: CaseBench) -> StageOutcome:
     wanted, clear = bench.blend_reference()
     image, transmittance = (cropped(planes, camera)[clear] for planes in outcome.arrays[:2])
     exact = (wanted.image[clear], wanted.transmittance[clear])
-    # A GPU shares so small a frame's tiles among more work-items, with the same bits.
+    # In a frame as small as this, a GPU divides a tile among more work-items. The bits must be the same.
     other = blend(device, bench.work, bench.lists, bench.inputs)
     wrong = int((other.image.get() != outcome.arrays[0]).sum())
     parts = {"image": (image, exact[0]), "transmittance": (transmittance, exact[1])}
@@ -168,7 +169,7 @@ def _blend(bench: CaseBench) -> StageOutcome:
 
 
 def _pixels(bench: CaseBench, planes: Array) -> Float64:
-    """Crop (3, rows, stride) to (H, W, 3) in float64."""
+    """Crop planes (3, rows, stride) to the camera's image (H, W, 3), in float64."""
     return cropped(planes, bench.camera).astype(np.float64)
 
 
@@ -199,7 +200,7 @@ def _blend_grad(bench: CaseBench) -> StageOutcome:
 
 
 def _moments(splats: reference_project.ProjectedTwin, wanted: reference_blend.BlendGradients) -> Float64:
-    """Moments (n, 6) in the form of a slot, docs/gradients.md (49), from the gradients of eqs. (25) to (29)."""
+    """Compute the moments (n, 6) of a slot, docs/gradients.md, (49), from the twin's gradients, (25) to (29)."""
     l11, l12, l22 = (WHITENING_FACTOR * splats.whitening).T
     gx, gy = -(WHITENING_FACTOR**2) * wanted.means2d.T
     u = gx / l11
@@ -211,7 +212,8 @@ def _moments(splats: reference_project.ProjectedTwin, wanted: reference_blend.Bl
 
 
 def _project_grad(bench: CaseBench) -> StageOutcome:
-    """Test the gradient of projection with synthetic slots, so that errors in the gradient of blending do not count."""
+    """Test the gradient of projection with synthetic slots, so that errors in the gradient of blending do not
+    matter."""
     device, n = bench.device, bench.model.count
     coefficients = bench.model.coefficients
     made, visible = MadeUpSlots.of(bench), bench.visible
@@ -239,11 +241,11 @@ def _project_grad(bench: CaseBench) -> StageOutcome:
 
 
 def _adam(bench: CaseBench) -> StageOutcome:
-    """Test Adam in its own kernel, and in the gradient of projection (`project_step`)."""
+    """Test Adam in its own kernel (adam.cl), and fused with the gradient of projection (`project_step`)."""
     outcome = ADAM_CASE.outcome(bench)
     assert ADAM_CASE.frozen is not None
     wrong = sum(_steps_off(bench, given) for given in ADAM_CASE.frozen(bench))
-    return replace(outcome, trouble=outcome.trouble or (f"{wrong} with projection wrong" if wrong else ""))
+    return replace(outcome, trouble=outcome.trouble or (f"{wrong} elements of project_step wrong" if wrong else ""))
 
 
 def _steps_off(bench: CaseBench, given: Inputs) -> int:
@@ -269,7 +271,7 @@ def _steps_off(bench: CaseBench, given: Inputs) -> int:
         stepped = g != 0 if sparse else np.ones_like(g, np.bool_)
         for kind, model, wanted in zip(before, (parameters, first, second), exact, strict=True):
             got = model[group].get()
-            # beta2 in float32 is off by 1e-8, so that 1 - beta2, a step and a new moment are off by 1e-5 of their size.
+            # beta2 in float32 is off by 1e-8. So 1 - beta2, a step and a new moment are off by 1e-5 of their size.
             off = np.abs(got - wanted) > 1e-5 * np.abs(wanted) + 1e-4 * (rate if kind == "parameters" else g**2 + 1e-6)
             wrong += int(off[stepped].sum()) + int((got[~stepped] != before[kind][group][~stepped]).sum())
     return wrong

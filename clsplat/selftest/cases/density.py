@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cases of density control: its statistics, and the list of rows that it marks."""
+"""Cases of density control: the statistics of Gaussians over views, and the list of the rows that rules mark."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ from clsplat.stages.project import Projected, Screen
 
 MARK_RULES = MarkRules(gradient=2.0, cut_off=(3.0, 40), large=0.5, transparent=-1.0, oversized=2.0, oversized_half=1.5)
 MIN_RADIUS_MARGIN = 1e-4
-"""Relative distance of a radius from a whole number of pixels, below which the number depends on rounding."""
+"""Least relative distance of a radius from a whole number of pixels at which rounding cannot change the radius in whole
+pixels."""
 
 
 def _random(rng: Generator, count: int) -> Inputs:
-    """Three views of ellipses of any size; a third of the Gaussians is not visible."""
+    """Three random views of ellipses of any size. In each a third of the Gaussians is invisible."""
     columns = {name: index for index, name in enumerate(SPLAT)}
     views = []
     for _ in range(3):
@@ -64,7 +65,8 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
         shown = tiles > 0
         sums += np.where(shown, np.hypot(*(to_ndc * screen.astype(np.float64)).T), 0)
         seen += shown
-        rows = np.where(shown[:, None], splats, 1.0).astype(np.float64)  # the others may be uninitialised memory
+        # Splats of invisible Gaussians may be uninitialised memory.
+        rows = np.where(shown[:, None], splats, 1.0).astype(np.float64)
         l11, l12, l22 = (rows[:, SPLAT.index(name)] / WHITENING_FACTOR for name in ("L11", "L12", "L22"))
         sxx, sxy, syy = np.stack([l12 * l12 + l22 * l22, -l11 * l12, l11 * l11]) / (l11 * l22) ** 2
         radius = 3 * np.sqrt(0.5 * (sxx + syy) + np.hypot(0.5 * (sxx - syy), sxy)) * shown
@@ -72,7 +74,7 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
         radii = np.maximum(radii, np.ceil(radius))
     found = got["radii"]
     radii = np.where(doubtful & (np.abs(found - radii) <= 1), found, radii)
-    # rounding of a square root and two sums
+    # the bound covers the rounding of a square root and two sums
     return {"gradient_sums": Expected(sums, 1e-6, sums), "seen": exactly(seen), "radii": exactly(radii)}
 
 
@@ -87,7 +89,7 @@ STATISTICS_CASE = Case(
 
 
 def _random_marks(rng: Generator, count: int) -> Inputs:
-    """Statistics, scales and opacities at the thresholds, next to them, and not finite."""
+    """Random statistics, scales and opacities: at the rules' thresholds, next to them, and not finite."""
 
     def values(*around: float, size: tuple[int, ...] = (count,)) -> Float32:
         at = np.array(around, np.float32)
@@ -138,7 +140,7 @@ MARKS_CASE = Case(
 
 
 def of_statistics(bench: CaseBench) -> StageOutcome:
-    """Test the statistics, and the list of rows. Its thresholds are inside the range of every statistic."""
+    """Test the statistics, and the list of marked rows. The thresholds are inside the range of each statistic."""
     outcome, gaussians = STATISTICS_CASE.outcome(bench), bench.frozen.gaussians
     known = dict(zip(STATISTICS_CASE.digested, outcome.arrays, strict=True))
     middle, limit = 0.500001 * np.median(known["gradient_sums"]), float(np.median(gaussians.log_scales.max(axis=1)))

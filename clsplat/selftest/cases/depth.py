@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-test of the depth stage: nearness, the loss on it, and the gradients of both."""
+"""Self-test of the depth stage: the blended nearness (1 / depth), the depth loss, and the gradients of both."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from clsplat.stages.loss_terms import DepthTerm
 
 NEARNESS_SLOTS = SlotFields(nearness=True)
 DEPTH_LOSS_FACTOR = 0.125
+"""Factor of the depth loss."""
 MIN_NEARNESS_DIFFERENCE = 1e-5
-"""Difference of nearness below which the sign of the gradient depends on rounding."""
+"""Least difference of nearness at which rounding does not change the sign of the gradient."""
 
 
 def of_depth(bench: CaseBench) -> StageOutcome:
-    """Test the scene's nearness with synthetic known depths, a quarter of which are missing.
+    """Test the nearness of the scene and the depth loss, with synthetic known depths. A quarter of these is missing.
 
-    The gradients of pairs are not in the digest, because the order of their sums depends on the kernel shape.
+    The digest leaves out the gradients of pairs, because the order of their sums depends on the kernel shape.
     """
     device, camera = bench.device, bench.camera
     height, width = camera.height, camera.width
@@ -69,7 +70,7 @@ def of_depth(bench: CaseBench) -> StageOutcome:
 
 
 def _slots(bench: CaseBench, blended: Blended, gradient: DeviceArray) -> Array:
-    """Sums (n, fields) of each Gaussian's slots in float64."""
+    """Launch the gradient of blending, and sum each Gaussian's slots (n, fields) in float64."""
     lists, pixels = bench.lists, (bench.inputs, blended, gradient)
     slots = blend_grad(bench.device, bench.work, lists, *pixels, fields=NEARNESS_SLOTS).get()
     sums = np.zeros((bench.model.count, NEARNESS_SLOTS.floats))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Case of bilateral grids: the colours of a photograph, the gradient, and the update by Adam."""
+"""Case of bilateral grids: the render with a photograph's grid, the gradient, and the update by Adam."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ from clsplat.selftest.scenes import evenly
 from clsplat.stages.grid import GRID_SHAPE, Grids, apply_grid, centre_grids, grid_gradient, step_grid
 
 GRID_PHOTOGRAPH = 1
+"""Index of the photograph whose grid is tested; there are two photographs."""
 MIN_LEVEL_DISTANCE = 1e-4
-"""Distance of a luminance from a level: rounding decides which two levels are interpolated if it is less than this."""
+"""Least distance of a luminance from a level at which rounding does not change which two levels are interpolated."""
 
 
 def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
-    """Grids from near the identity to far from it, and colours that include some below 0 and above 1."""
+    """Random grids, from near the identity to far from it, and colours, some of them below 0 and above 1."""
     image, _ = random_pictures(rng, size)
     image = (image * rng.uniform(1.0, 1.5) - rng.choice([0.0, 0.2])).astype(np.float32)
     noise = rng.standard_normal((2, *GRID_SHAPE)) * 10 ** rng.uniform(-4, 0.5)
@@ -41,7 +42,7 @@ def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
 
 
 def _frozen(bench: CaseBench) -> list[Inputs]:
-    """Inputs made from the self-test's scene: its blended image, and random grids of two photographs; one is used."""
+    """Inputs from the self-test's scene: the blended image, and grids of two photographs, of which one is used."""
     grids = (reference.identity(GRID_SHAPE[:3]) + evenly(43, (2, *GRID_SHAPE), -0.25, 0.25)).astype(np.float32)
     by_seen = evenly(44, tuple(bench.blended.image.shape), -0.25, 1.0).astype(np.float32)
     image, by_seen = (cropped(each, bench.camera) for each in (bench.blended.image.get(), by_seen))
@@ -80,8 +81,8 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
     level = image @ reference.LUMINANCE_WEIGHTS * (GRID_SHAPE[0] - 1)
     centred = reference.centre(held)
     return {
-        "seen": Expected(seen, 1.2e-6, max(1.0, terms.max())),  # about twelve roundings
-        # sums of a hundred terms of both signs
+        "seen": Expected(seen, 1.2e-6, max(1.0, terms.max())),  # the bound covers about twelve roundings
+        # sums of a hundred terms with both signs
         "gradient": Expected(by_image, 1e-5, compared=np.abs(level - np.rint(level)) > MIN_LEVEL_DISTANCE),
         "by grid": Expected(by_grid, 1e-5),
         "first": moment(first),

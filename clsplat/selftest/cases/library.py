@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-test of the library's calls and their gradients.
+"""Self-test of the stages behind the library's calls, and of their gradients.
 
-They are projection with any view matrix, SH colours, splats from arrays, and blending of any number of values.
+The stages are EWA projection with any view matrix, SH colours, splats from arrays, and blending of any number of values
+per Gaussian.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ from clsplat.stages.splats import ScreenGaussians, ScreenGradients, splats
 from clsplat.stages.values import ValuePass, values, values_grad
 
 VALUES_PER_GAUSSIAN = 5
-"""Number of values per Gaussian in the test, more than blend.cl supports."""
+"""Number of values per Gaussian in the test: more than the three of blend.cl."""
 WRITTEN_SPLAT_COLUMNS = {name: k for k, name in enumerate(SPLAT) if name != "UNUSED"}
 
 
@@ -110,7 +111,8 @@ def of_ewa(bench: CaseBench) -> StageOutcome:
 
 
 def conics_of(sides: Float64, angles: Float64) -> Float32:
-    """Conics (n, 3) of ellipses with these standard deviations (n, 2) in pixels, rotated by the angles (n,)."""
+    """Conics (n, 3) of ellipses. sides: standard deviations (n, 2) along the axes, in pixels; angles: rotations (n,) in
+    radians."""
     axes = np.stack([np.cos(angles), -np.sin(angles), np.sin(angles), np.cos(angles)], axis=1).reshape(-1, 2, 2)
     inverse = (axes / sides[:, None, :] ** 2) @ axes.transpose(0, 2, 1)
     return np.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], axis=1).astype(np.float32)
@@ -119,9 +121,12 @@ def conics_of(sides: Float64, angles: Float64) -> Float32:
 def random_splats(
     rng: Generator, count: int, *, width: int = 70, height: int = 50, depth: int = 3, opaque: float = 0.1
 ) -> Inputs:
-    """Gaussians of a few pixels, spread over an image and slightly past its edges. A radius of 0 culls a tenth.
+    """Random projected Gaussians of a few pixels, spread over an image and slightly past its edges. About a tenth has a
+    radius of 0 and is culled.
 
-    opaque: fraction of Gaussians of opacity 1, where alpha reaches its cap. Pairs of Gaussians have equal depths.
+    Every two Gaussians have equal depths.
+
+    opaque: fraction of Gaussians with opacity 1, whose alpha reaches its cap.
     depth: number of values per Gaussian.
     """
     sides = np.exp(rng.normal(0.9, 0.5, (count, 2)))
@@ -137,7 +142,7 @@ def random_splats(
 
 
 def _frozen_splats(bench: CaseBench) -> list[Inputs]:
-    """The scene's projected Gaussians as arrays."""
+    """Inputs from the self-test's scene: its projected Gaussians as arrays."""
     camera, seen, rows = bench.camera, bench.visible, bench.splats()
     arrays = {
         "means2d": rows.means2d,
@@ -173,18 +178,18 @@ def _twin_of_splats(given: Inputs, got: Arrays) -> dict[str, Expected]:
     got |= {"whitening": whitening, "half extents": np.stack([column["HALF_W"], column["HALF_H"]], axis=1)}
     got["means"] = np.stack([column["PIXEL_X"] + column["SUB_X"], column["PIXEL_Y"] + column["SUB_Y"]], axis=1)[seen]
     got["values"] = np.stack([column["RED"], column["GREEN"], column["BLUE"]], axis=1)[seen]
-    got["shown"] = (got["tiles"] > 0) & ~wanted.drawn
+    got["tiles of culled Gaussians"] = (got["tiles"] > 0) & ~wanted.drawn
     size = np.abs(wanted.whitenings).max(axis=1, keepdims=True, initial=0)
     logs = np.log2(opacities)
     return {
-        # three roundings, of a root and two quotients; relative to the largest entry, as l12 may be near 0
+        # three roundings, of a root and two quotients; relative to the largest entry, because l12 may be near 0
         "whitening": Expected(wanted.whitenings, 5e-7, size, seen),
         # the extent depends on a difference of logarithms; the tile test has 0.01 px of slack
         "half extents": Expected(wanted.half_extents, 1e-4, 1 + wanted.half_extents, seen),
         "LOG2O": Expected(logs, 1.4e-6, 1.0, seen),  # an ulp of the logarithm changes the opacity by 1e-6
         "means": Expected(given.means2d[seen], 6e-8, 1.0),  # the fraction of a pixel is a float32 below 1
         "values": exactly(given.values[seen]),
-        "shown": exactly(np.zeros_like(got["shown"])),
+        "tiles of culled Gaussians": exactly(np.zeros_like(got["tiles of culled Gaussians"])),
     }
 
 
@@ -241,12 +246,13 @@ def of_values(bench: CaseBench) -> StageOutcome:
 
 
 SH_CENTRE = np.array([0.1, 0.2, 3.3])
-"""A camera's centre; its coordinates are not exact in float32."""
+"""A camera's centre, with coordinates that float32 cannot represent exactly."""
 
 
 def random_harmonics(rng: Generator, count: int, degree: int | None = None, *, camera: bool | None = None) -> Inputs:
     """Random SH coefficients and directions.
 
+    degree: the SH degree; None chooses it at random.
     camera: True for means and a camera's centre in place of directions; None chooses at random.
     """
     degree = int(rng.integers(MAX_SH_BASIS_DEGREE + 1)) if degree is None else degree
@@ -267,7 +273,7 @@ def _frozen_harmonics(bench: CaseBench) -> list[Inputs]:
 
 
 def harmonics_inputs(device: Device, given: Inputs) -> Harmonics:
-    """The inputs, uploaded to the device."""
+    """Upload the inputs of the SH kernels to the device."""
     mask, centre = None, None
     if given.centre is not None:
         mask, centre = upload(device, given.mask), centre_array(device, given.centre)
@@ -275,7 +281,7 @@ def harmonics_inputs(device: Device, given: Inputs) -> Harmonics:
 
 
 def launch_harmonics(device: Device, work: Workspace, given: Inputs, *, add: bool = False, start: float = -7.0) -> Read:
-    """Launch both kernels. start: value with which colours and gradients are filled before."""
+    """Launch harmonics and harmonics_grad. add: add to the gradients; start: value of colours and gradients before."""
     inputs = harmonics_inputs(device, given)
     shapes = ((inputs.count, 3), given.sh.shape, (inputs.count, 3))
     colours, d_sh, d_directions = (allocate(device, shape, np.float32) for shape in shapes)
@@ -305,7 +311,7 @@ def _twin_of_harmonics(given: Inputs, _: Arrays) -> dict[str, Expected]:
     d_sh[:, :used] = basis[:, :, None] * d_colours[:, None]
     by_unit = np.einsum("nkd,nkc,nc->nd", slopes, sh, d_colours)
     d_directions = (by_unit - unit * (unit * by_unit).sum(axis=1, keepdims=True)) / length
-    # sums of up to 25 products near 1, each off by 1e-7
+    # the bounds cover sums of up to 25 products near 1, each off by 1e-7
     wanted = {"colours": Expected(colours, 4e-6, 1.0), "sh": Expected(d_sh, 2e-6)}
     wanted["directions"] = Expected(d_directions, 2e-6) if given.degree else exactly(np.zeros_like(d_directions))
     if given.centre is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cases of the loss: of a photograph, with a mask and alpha, and of known depths."""
+"""Cases of the loss: L1 and SSIM with a photograph, the same with a mask and alpha, and the depth loss."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ Size = tuple[int, int]
 ALPHA_LOSS_WEIGHT = 0.5
 """Weight of the alpha loss."""
 MIN_LOSS_DIFFERENCE = 1e-6
-"""Difference of alphas or colours below which the sign of the gradient depends on rounding."""
+"""Least difference of alphas or colours at which rounding does not change the sign of the gradient."""
 
 
 def random_pictures(rng: Generator, size: Size) -> tuple[Float32, Float32]:
-    """A render and a photograph (H, W, 3): of noise, of one colour, dark, or nearly equal; half are of 8-bit values."""
+    """A random render and photograph (H, W, 3): of noise, of one colour, dark, or nearly equal. Half of the photographs
+    have 8-bit values."""
     width, height = size
     y = rng.random((height, width, 3)) ** rng.choice([0.2, 1.0, 8.0])
     if rng.random() < 0.3:
@@ -46,7 +47,7 @@ def _given(image: Float32, photograph: Float32, weight: float = 0.2) -> Inputs:
 
 
 def _read(result: Loss, size: Size) -> Arrays:
-    planes = result.gradient.get()[:, : size[1]]  # the padding rows are not written
+    planes = result.gradient.get()[:, : size[1]]  # rows of padding are not written
     value, squared = result.read()
     return {
         "planes": planes,
@@ -58,20 +59,22 @@ def _read(result: Loss, size: Size) -> Arrays:
 
 
 def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
-    """Compute the loss with planes of the photograph, then with the photograph itself, if the kernel can read it."""
+    """Compute the loss with the photograph as planes, then with the interleaved photograph, if the kernel can read
+    it."""
     size, background = given.size, upload(device, np.zeros(3, np.float32))
     image, photograph = (upload(device, planes_of(each)) for each in (given.image, given.photograph))
     first = _read(loss(device, work, image, photograph, *size, given.weight), size)
 
     def again(source: Array) -> float:
-        """Number of values that change if the kernel reads this form of the photograph in place of its planes."""
+        """Number of results that change if the kernel reads `source` instead of the planes."""
         as_loaded = target(device, work, source, background, in_planes=False)
         second = _read(loss(device, work, image, as_loaded, *size, given.weight), size)
         return float(sum(np.count_nonzero(second[name] != first[name]) for name in first))
 
     levels = np.rint(given.photograph * 255).astype(np.uint8)
     exact = bool((levels * np.float32(1 / 255) == given.photograph).all())
-    sources = (given.photograph, levels)[: 1 + exact] if tile_items(device) > 1 else ()  # else it reads planes only
+    # With one item per tile the kernel reads planes only.
+    sources = (given.photograph, levels)[: 1 + exact] if tile_items(device) > 1 else ()
     differing = [again(source) for source in sources]
     return lambda: {**first, "photograph": np.array([0.0, *differing])}
 
@@ -81,17 +84,17 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
     value, gradient = l1_dssim(x, y, given.weight)
     squared = np.square(x - y).mean()
     return {
-        # a difference of pixels is off by 1e-7 of their brightness, which is at most 1.5
+        # a difference of two pixels is off by 1e-7 of their brightness, which is at most 1.5
         "gradient": Expected(gradient, 1e-5),
         "beside": exactly(np.zeros_like(got["beside"])),
-        "loss": Expected(np.array([value]), 1e-6, max(1.0, value)),  # roundings of partial sums
+        "loss": Expected(np.array([value]), 1e-6, max(1.0, value)),  # the bound covers roundings of partial sums
         "squared error": Expected(np.array([squared]), 1e-5, squared),
         "photograph": exactly(np.zeros_like(got["photograph"])),
     }
 
 
 LOSS_CASE = Case(
-    # below and above sizes of windows (11), vectors (16 columns), and blocks (32 rows, or 7 x 54 with a border of 5)
+    # sizes around those of windows (11), vectors (16 columns), and blocks (32 rows, or 7 x 54 with a border of 5)
     sizes=(
         *((1, 1), (1, 40), (40, 1), (11, 11), (15, 17), (16, 5), (17, 33), (5, 16), (63, 40), (33, 65)),
         *((54, 7), (55, 8), (53, 6), (59, 12), (60, 13), (64, 2), (65, 14), (109, 9)),
@@ -155,11 +158,11 @@ def _twin_of_masks(given: Inputs, got: Arrays) -> dict[str, Expected]:
     of_alpha, by_left = alpha_loss(left, alpha, counts, ALPHA_LOSS_WEIGHT)
     total, sure = value + of_alpha, (counts > 0) & (np.abs(seen - truth).min(axis=2) > MIN_LOSS_DIFFERENCE)
     return {
-        # the gradient of blending skips masked pixels
+        # masked pixels are not compared, because the gradient of blending skips them
         "gradient": Expected(gradient, 1e-5, compared=sure),
         "gradient by transmittance": Expected(by_left, 1e-6, compared=np.abs(1 - left - alpha) > MIN_LOSS_DIFFERENCE),
         "masked pixels": exactly(np.zeros_like(got["masked pixels"])),
-        # SSIM of masked windows cancels
+        # in masked windows, terms of SSIM cancel
         "loss": Expected(np.array([total]), 1e-6, max(1.0, total, counts.size / counts.sum())),
     }
 
@@ -176,7 +179,7 @@ MASKS_CASE = Case(
 
 
 def _random_depths(rng: Generator, size: Size) -> Inputs:
-    """Nearness of 1e-6 to 1e6, and known values for some, all or none of the pixels."""
+    """Random nearness of 1e-6 to 1e6, with known values for some, all or none of the pixels."""
     image, _ = random_pictures(rng, size)
     scale = 10 ** rng.uniform(-6, 6)
     nearness, aims = (np.float32(scale) * rng.random(image.shape[:2]).astype(np.float32) for _ in range(2))
@@ -201,8 +204,9 @@ def _twin_of_depth_loss(given: Inputs, _: Arrays) -> dict[str, Expected]:
     nearness, aims, weights = given.wide("nearness", "aims", "weights")
     value, gradient = depth_loss(nearness, aims, weights, given.factor)
     return {
-        "gradient": Expected(gradient, 3e-7, np.abs(gradient)),  # rounding of a product
-        "loss": Expected(np.array([value]), 1e-6, max(1.0, value)),  # only the depth term: the pictures are equal
+        "gradient": Expected(gradient, 3e-7, np.abs(gradient)),  # one rounding of a product
+        # The two pictures are equal, so the loss is the depth term alone.
+        "loss": Expected(np.array([value]), 1e-6, max(1.0, value)),
     }
 
 

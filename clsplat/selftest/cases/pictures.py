@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-test of the stages that rendering needs and training does not.
+"""Self-test of the stages that only rendering needs.
 
-They are channels other than colour, deep pictures, holdouts, and cameras without an image plane.
+The stages are channels other than colour, deep pictures, holdouts, and camera models along rays, such as fisheyes.
 """
 
 from __future__ import annotations
@@ -44,33 +44,33 @@ from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.holdout import holdout, upload_held
 
 TESTED_FEATURES = Features.of(name for name in FEATURE_WIDTHS if name != "backward")
-"""All features except backward motion, which uses the same function as motion."""
+"""All features except backward motion, which uses the same function as forward motion."""
 DIGESTED_FEATURE_PLACES = [
     at + field
     for name, at in TESTED_FEATURES.offsets.items()
     if name in ("depth", "normal", "position", "motion")
     for field in range(FEATURE_WIDTHS[name])
 ]
-"""Places of the features in the self-test's digests. Other features are compared with the twin alone."""
+"""Columns of the features that the self-test's digests cover. Other features are compared only with the twin."""
 MIN_NORMAL_COSINE = 1e-4
-"""Cosine of a normal and the direction to the camera, below which the visible side depends on rounding."""
+"""Least cosine between a normal and the direction to the camera at which rounding does not change the visible side."""
 MIN_TRANSMITTANCE_MARGIN = 1e-5
-"""Margin like `harness.MIN_DECISION_MARGIN`, but absolute: distance of the transmittance to one half and to the cuts of
-slices, and difference between the two largest weights."""
+"""Least absolute margin for a pixel to be compared: the distance of the transmittance from 0.5 and from the ends of
+slices, and the difference between the two largest weights."""
 MIN_MERGED_MARGIN = 1e-6
-"""Margin of merged slices, where transmittance is a sum of up to 16 products."""
+"""Least margin for a pixel of merged slices to be compared. Its transmittance is a sum of up to 16 products."""
 DEEP_CASE_SLICES = 4
-"""Slices per pixel."""
+"""Number of slices per pixel in the test of deep pictures."""
 DEEP_SLICE_PARTS = {"colour": slice(0, 3), "alpha": slice(3, 4), "depth": slice(4, 5)}
-"""Fields of a slice that are compared."""
+"""Columns of a slice, by the names of the quantities that are compared."""
 
 MAX_GAUSSIANS_FOR_REFERENCE = 500
-"""Maximum number of Gaussians in a scene whose picture along rays is compared. The reference evaluates each Gaussian at
+"""Largest number of Gaussians in a scene whose picture along rays is compared. The reference evaluates each Gaussian at
 every pixel, which takes a second for this number."""
 
 
 def _after(camera: Camera) -> Camera:
-    """The camera at the end of the motion: moved in x, y and z, with a longer focal length."""
+    """The camera at the end of the motion: moved in x, y and z, with a larger fx."""
     return replace(camera, translation=camera.translation + np.array([-0.0625, 0.03125, 0.125]), fx=camera.fx + 2.0)
 
 
@@ -105,7 +105,7 @@ def _channels(bench: CaseBench) -> StageOutcome:
     wanted = reference_channels.channels(splats, bench.frozen.gaussians, camera, _after(camera))
     means, whole = (cropped(array.get(), camera) for array in (planes.means, planes.whole))
     sure = clear & (wanted.doubt > MIN_TRANSMITTANCE_MARGIN)
-    # at low alpha, normals may cancel in the sum so that no digit of it is accurate
+    # At low alpha, normals may cancel in the sum, so that no digit of the sum is accurate.
     solid = sure & (frame.transmittance < 0.5)
     parts = {
         name: (means[solid, at : at + FEATURE_WIDTHS[name]], wanted.features[name].reshape(*solid.shape, -1)[solid])
@@ -135,12 +135,14 @@ def _deep(bench: CaseBench) -> StageOutcome:
 def random_deep_pictures(
     rng: Generator, size: tuple[int, int], count: int | None = None, bins: int | None = None
 ) -> Inputs:
-    """Pictures (P, bins, H, W, 5) with 0 to `bins` slices per pixel, and weights (P, H, W) whose sum is 1."""
+    """Random deep pictures (P, bins, H, W, 5) with 0 to `bins` slices per pixel, and weights (P, H, W) whose sum is
+    1."""
     count, bins = count or int(rng.choice([1, 2, 3, DEEP_PICTURES])), bins or int(rng.choice([1, 4, 7, 40]))
     shape = (count, bins, size[1], size[0])
-    alpha = (rng.uniform(0.02, 0.95, shape) * min(1, 8 / bins)).astype(np.float32)  # so that some light passes
+    # Alpha is so low that some light passes all slices.
+    alpha = (rng.uniform(0.02, 0.95, shape) * min(1, 8 / bins)).astype(np.float32)
     depth = np.cumsum(rng.uniform(0.01, 1, shape), axis=1).astype(np.float32)
-    depth[:, :, ::3] = np.round(depth[:, :, ::3]) + np.arange(bins, dtype=np.float32)[:, None, None]  # equal depths too
+    depth[:, :, ::3] = np.round(depth[:, :, ::3]) + np.arange(bins, dtype=np.float32)[:, None, None]  # equal depths
     colours = rng.uniform(-0.2, 1.5, (*shape, 3)).astype(np.float32) * alpha[..., None]
     pictures = np.concatenate([colours, alpha[..., None], depth[..., None]], axis=4)
     slices = rng.integers(0, bins + 1, (count, *shape[2:]))
@@ -150,7 +152,8 @@ def random_deep_pictures(
 
 
 def _frozen_deep_pictures(bench: CaseBench) -> list[Inputs]:
-    """The scene's deep picture twice, shifted, and upside down, with equal depths and too many slices."""
+    """Four deep pictures: the scene's own twice, shifted, and upside down. They have equal depths, and together more
+    slices than fit."""
     planes = bench.slices.get()
     pictures = np.stack([planes, np.roll(planes, 3, axis=3), planes[:, :, ::-1], planes]).transpose(0, 1, 3, 4, 2)
     return [Inputs(pictures=pictures, weights=np.full((4, *planes.shape[2:]), 0.25, np.float32))]
@@ -175,7 +178,7 @@ def _twin_of_deep_merge(given: Inputs, _: Arrays) -> dict[str, Expected]:
     pictures, weights = given.wide("pictures", "weights")
     twin = reference_deep_merge.deep_merge(pictures, weights)
     sure = np.broadcast_to(twin.margin > MIN_MERGED_MARGIN, twin.slices.shape[:3])
-    # a slice's colour is a sum of up to 16 x bins products, times a transmittance of as many factors; depth is copied
+    # Colours are sums of up to 16 x bins products, times a transmittance of as many factors. Depths are copied.
     bounds = {"colour": 1e-5, "alpha": 1e-5, "depth": 0.0}
     return {name: Expected(twin.slices[..., at], bounds[name], 1.0, sure) for name, at in DEEP_SLICE_PARTS.items()}
 
@@ -192,7 +195,8 @@ DEEP_MERGE_CASE = Case(
 
 
 def _holdout(bench: CaseBench) -> StageOutcome:
-    """Test a half-transparent surface and an absorbing volume, each before a wall and in some of the pixels."""
+    """Test holdouts with three surfaces, each in some of the pixels: a half-transparent one, an absorbing volume behind
+    it, and an opaque wall inside the volume."""
     device, camera = bench.device, bench.camera
     shape = (camera.height, camera.width)
     at = np.arange(camera.height * camera.width).reshape(shape)
@@ -215,18 +219,18 @@ def _holdout(bench: CaseBench) -> StageOutcome:
     behind = bench.frozen.background.astype(np.float64)
     image, alpha = reference_holdout.held_out(splats, camera.width, camera.height, wanted_surfaces, behind)
     got, left = (cropped(planes, camera) for planes in outcome.arrays)
-    return outcome.compared({"colour": (got[clear], image[clear]), "left": (left[clear], 1 - alpha[clear])})
+    return outcome.compared({"colour": (got[clear], image[clear]), "transmittance": (left[clear], 1 - alpha[clear])})
 
 
 def _rays(bench: CaseBench) -> StageOutcome:
-    """Test each camera model along rays: the projection to tangent planes, and a frame with the channel of depth."""
+    """Test each camera model along rays: the projection to tangent planes, and a frame with the depth channel."""
     models = [model for model in CAMERA_MODELS if model.along_rays and model.self_tested]
     return joined([_of_rays(bench, model.projection, _camera_of(bench.camera, model)) for model in models])
 
 
 def _camera_of(camera: Camera, model: CameraModel) -> Camera:
-    """The frozen scene's camera along rays; or, for other models than a pinhole, a camera in the middle of the scene.
-    That one has Gaussians all around it, at the poles and on the seam too."""
+    """A camera of this model. For a pinhole it is the frozen scene's camera along rays. For other models it is in the
+    middle of the scene, with Gaussians all around it, at the poles and on the seam too."""
     if model.is_pinhole:
         return camera.along_rays(by_rays=True)
     middle = np.array([0.25, -0.125, 4.0])
@@ -239,7 +243,7 @@ def _camera_of(camera: Camera, model: CameraModel) -> Camera:
 
 
 def _of_rays(bench: CaseBench, projection: str, camera: Camera) -> StageOutcome:
-    # a workspace of its own: later stages need the results in the bench's
+    # A separate rasterizer with its own workspace, because later stages need the results in the bench's workspace.
     rasterizer, gaussians = Rasterizer(bench.device), bench.frozen.gaussians
 
     def launch() -> tuple[ForwardPass, Channels]:
@@ -258,7 +262,8 @@ def _of_rays(bench: CaseBench, projection: str, camera: Camera) -> StageOutcome:
     parts = _tangent_parts(tangents, shown, splats)
     if bench.model.count <= MAX_GAUSSIANS_FOR_REFERENCE:
         picture = every_pixel.render(gaussians, camera, bench.frozen.background.astype(np.float64))
-        clear = picture.margin > 3 * MIN_DECISION_MARGIN  # float32 directions are off by 1e-7; a pixel is 0.1 wide
+        # The margin is larger here: float32 directions are off by 1e-7, at pixels 0.1 radians wide.
+        clear = picture.margin > 3 * MIN_DECISION_MARGIN
         solid = clear & (picture.alpha > 0.5)
         parts["image"] = (cropped(image, camera)[clear], picture.image[clear])
         parts["transmittance"] = (cropped(left, camera)[clear], 1 - picture.alpha[clear])
@@ -271,7 +276,7 @@ def _of_rays(bench: CaseBench, projection: str, camera: Camera) -> StageOutcome:
 
 
 def _tangent_parts(tangents: reference_rays.Tangents, shown: Any, splats: Array) -> dict[str, tuple[Array, Array]]:
-    """Columns of the visible Gaussians' splats on the device, each with the reference's values."""
+    """Splat columns of the visible Gaussians: the device's values paired with the reference's."""
 
     def column(*names: str) -> Array:
         return splats[:, [RAY.index(name) for name in names]]

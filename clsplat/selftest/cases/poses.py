@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-test of the pose and lens stages: the gradients with respect to a camera's pose and lens."""
+"""Case of the pose stage and self-test of the lens stage: the gradients with respect to a camera's pose and lens."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SYNTHETIC_GRADIENT_GROUPS = ("means", "quaternions", "sh_dc")
 
 
 def _random(rng: Generator, count: int) -> Inputs:
-    """Gradients of any magnitude. Those of Gaussians that are not visible are NaN."""
+    """Random gradients of any magnitude. The gradients of invisible Gaussians are NaN."""
     scene, seen = random_scene(rng, count), np.arange(count) % 3 != 1
     size, by = 10 ** rng.uniform(-6, 3), {}
     for group in SYNTHETIC_GRADIENT_GROUPS:
@@ -63,9 +63,10 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
     by["sh"] = by.pop("sh_dc")[:, None]
     degree = given.gaussians.sh_degree
     wanted = reference(means, quaternions, sh, given.camera, degree, by)
-    got |= {"turn": got["sums"][:3], "shift": got["sums"][3:]}
-    # terms have both signs: a sum of 4000 is about 60 times as large as one, with an error of roundings of partial sums
-    return {"turn": Expected(wanted[:3], 2e-6), "shift": Expected(wanted[3:], 2e-6)}
+    got |= {"by rotation": got["sums"][:3], "by translation": got["sums"][3:]}
+    # Terms have both signs, so a sum of 4000 terms is only about 60 times as large as one. The error is that of rounded
+    # partial sums.
+    return {"by rotation": Expected(wanted[:3], 2e-6), "by translation": Expected(wanted[3:], 2e-6)}
 
 
 POSE_CASE = Case(

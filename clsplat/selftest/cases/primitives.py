@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cases of the kernels' own elementary functions (shared/math.h, shared/lanes.h), both sorts, prefix sums, and lists
-by append."""
+"""Cases of elementary functions (shared/elementary.h, shared/lanes.h), of radix and bitonic sort, of prefix sums, and
+of tile lists by append."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ PROBED: dict[str, tuple[float, float, Callable[[Array], Array]]] = {
     "sigmoid": (-80.0, 80.0, lambda x: 1 / (1 + np.exp(-x))),
     "exp2": (-8.5, 0.0, np.exp2),
 }
-"""Functions in the order of the probe's rows, each with the range of its arguments."""
+"""Tested functions in the order of the rows of probe_elementary: least and greatest argument, and the exact
+function."""
 
 
 def _random_arguments(rng: Generator, count: int) -> Inputs:
@@ -47,10 +48,10 @@ def _launch_probe(device: Device, _: Workspace, given: Inputs) -> Read:
 def _twin_of_probe(given: Inputs, _: Arrays) -> dict[str, Expected]:
     exact = {name: function(given.x[name].astype(np.float64)) for name, (_, _, function) in PROBED.items()}
     return {
-        "exp": Expected(exact["exp"], 2.4e-7, exact["exp"]),  # 2 ulp: the polynomial and the range reduction
-        "log2": Expected(exact["log2"], 2.4e-7, np.maximum(np.abs(exact["log2"]), 1)),  # its values pass through 0
+        "exp": Expected(exact["exp"], 2.4e-7, exact["exp"]),  # 2 ulp, from the polynomial and the range reduction
+        "log2": Expected(exact["log2"], 2.4e-7, np.maximum(np.abs(exact["log2"]), 1)),  # errors near 0 are absolute
         "sigmoid": Expected(exact["sigmoid"], 3.6e-7, exact["sigmoid"]),  # 3 ulp
-        "exp2": Expected(exact["exp2"], 2.1e-7, exact["exp2"]),  # 0.8e-7 from the polynomial, the rest from rounding
+        "exp2": Expected(exact["exp2"], 2.1e-7, exact["exp2"]),  # 0.8e-7 of the polynomial, plus rounding
     }
 
 
@@ -69,7 +70,7 @@ SCAN_SIZES = (
 
 
 def _random_keys(rng: Generator, count: int) -> Inputs:
-    """Keys of few bits or of many, and a base that is not larger than any of them."""
+    """Random sort keys of few bits or of many, and a base that is at most the smallest key."""
     bits = int(rng.choice([1, 4, 5, 11, 12, 13, 22, 23, 24, 26, 27, 31, 32, 32]))
     base = int(rng.choice([0, 0, 2**32 - 2**bits, rng.integers(2**32 - 2**bits + 1)]))
     values = (base + rng.integers(0, 2**bits, count)).astype(np.uint32)
@@ -77,7 +78,8 @@ def _random_keys(rng: Generator, count: int) -> Inputs:
 
 
 def _frozen_keys(bench: CaseBench) -> list[Inputs]:
-    """Keys for both sorts, because a scene of another size may use the other sort."""
+    """Keys for the bitonic sort (base None) and for the radix sort. A scene's own keys would test only one of the
+    two."""
     sizes = ((400, 12), (3000, 20), (30_000 if bench.frozen.name == "crowd" else 5000, 32))
     found = [Inputs(keys=keys(51 + index, n, bits), bits=bits, base=0) for index, (n, bits) in enumerate(sizes)]
     found[0].base = None
@@ -135,16 +137,16 @@ SCAN_CASE = Case(
 
 
 _WHOLE_BOX = 16
-"""Largest number of tiles in a box all of whose tiles are listed, whatever the ellipse is (SMALL_BOX of tile.h)."""
+"""Largest number of tiles in a box of which all tiles are listed, whatever the ellipse is (SMALL_BOX of tile.h)."""
 _EVERYWHERE = 1e6
-"""Half an ellipse's width, in pixels, that reaches all tiles of its rows."""
+"""Half width in pixels of an ellipse that reaches all tiles of its rows."""
 _COUNTS = ("VISIBLE", "PAIRS", "LONGEST", "STOPPED")
 
 
 def splats_of_boxes(boxes: NDArray[np.int64], depths: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Splats (n, SPLAT) that reach the tiles [x0, x1) of the rows [y0, y1).
+    """Splats (n, len(SPLAT)) that reach the tiles [x0, x1) of the tile rows [y0, y1).
 
-    boxes: (n, 4), x0, x1, y0, y1. A box of more than 16 tiles must be as wide as the image.
+    boxes: (n, 4), with x0, x1, y0 and y1 of each box. A box of more than 16 tiles must be as wide as the image.
     """
     splats = np.zeros((len(boxes), len(SPLAT)), np.float32)
     low, high = TILE * boxes[:, ::2] + TILE / 2, TILE * (boxes[:, 1::2] - 1) + TILE / 2  # centres of the outer tiles
@@ -165,14 +167,15 @@ def splats_of_boxes(boxes: NDArray[np.int64], depths: NDArray[np.float32]) -> ND
 
 
 def tiles_of_boxes(boxes: NDArray[np.int64], tiles_x: int) -> list[NDArray[np.int64]]:
-    """Each box's tiles, ascending."""
+    """List the numbers of each box's tiles in ascending order."""
     return [
         (np.arange(y0, y1)[:, None] * tiles_x + np.arange(x0, x1)).ravel() for x0, x1, y0, y1 in boxes.astype(np.int64)
     ]
 
 
 def boxes_of(rng: Generator, count: int, tiles: tuple[int, int]) -> NDArray[np.int64]:
-    """Random boxes for `splats_of_boxes`: none, small ones, whole rows, and now and then all tiles."""
+    """Random boxes (count, 4) of tiles for `splats_of_boxes`: empty, small, of whole rows, and now and then of all
+    tiles."""
     begin = rng.integers(0, tiles, (count, 2))
     end = np.minimum(begin + rng.integers(1, 5, (count, 2)), tiles)
     kind = rng.choice(4, count, p=(0.1, 0.7, 0.17, 0.03))
@@ -184,7 +187,7 @@ def boxes_of(rng: Generator, count: int, tiles: tuple[int, int]) -> NDArray[np.i
 
 
 def depths_of(rng: Generator, count: int) -> NDArray[np.float32]:
-    """Random depths, in half of the draws with many equal ones."""
+    """Random depths (count,). In half of the calls many of them are equal."""
     depths = rng.uniform(0.1, 100, count) if rng.random() < 0.5 else rng.integers(1, 4, count)
     return depths.astype(np.float32)
 
@@ -204,7 +207,7 @@ def _random_boxes(rng: Generator, count: int) -> Inputs:
 
 
 def _frozen_boxes(bench: CaseBench) -> list[Inputs]:
-    """Depths that differ, and depths that are equal; among the boxes are wide ones."""
+    """Two inputs: with different depths, and with many equal depths. Some boxes are as wide as the image."""
     rng, tiles = np.random.default_rng(61), (13, 9)
     count = 4000 if bench.frozen.name == "crowd" else 400
     depths = rng.uniform(0.1, 100, count), rng.integers(1, 4, count)
@@ -237,7 +240,7 @@ def _launch_append(device: Device, work: Workspace, given: Inputs) -> Read:
 
 
 def _digits(lengths: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Numbers of binary digits."""
+    """The numbers of binary digits of the lengths."""
     return np.array([int(length).bit_length() for length in lengths], np.int64)
 
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cases of parts of a training step: Adam, the noise of MCMC on means, and penalties on opacity and scale."""
+"""Cases of parts of a training step: Adam, late Adam (settle), the noise of MCMC on means, and the penalties on opacity
+and scale."""
 
 from __future__ import annotations
 
@@ -31,16 +32,17 @@ from clsplat.stages.project import Screen, Slots, project, project_grad
 from clsplat.stages.settle import settle
 
 ADAM_ENDS = {"parameters": (-1.0, 1.0), "gradients": (-0.5, 0.5), "first": (-0.25, 0.25), "second": (0.0625, 0.5)}
-"""Arrays of a step, and the range of their values in the self-test."""
+"""Arrays of a step of Adam, with the least and greatest of their values in the self-test."""
 ADAM_RATES = {name: 2.0**-power for power, name in enumerate(PARAMETER_GROUPS, 3)}
 
 
 def _random_step(rng: Generator, count: int) -> Inputs:
-    """Gradients of 1e-15 to 1e6, with moments of any magnitude or zero. Adam updates all elements, only those with a
-    gradient (sparse), or only visible Gaussians (late)."""
+    """Random gradients of 1e-15 to 1e6, with moments of any magnitude or zero. rows: Adam updates all elements ("all"),
+    those with a gradient ("sparse"), or those of visible Gaussians ("late")."""
     step = int(rng.choice([1, 2, 10, 1000, 30_000, 10_000_000]))
     later, rows = step > 1, str(rng.choice(["all", "sparse", "late"]))
-    visible = (rng.random(count) < 0.5) | (np.arange(count) >= 2 * count // 3)  # some vectors are visible as a whole
+    # In some vectors all rows are visible, and in some none.
+    visible = (rng.random(count) < 0.5) | (np.arange(count) >= 2 * count // 3)
     visible[: count // 3] = False
     made: dict[str, Arrays] = {name: {} for name in ADAM_ENDS}
     for group, shape in group_shapes(count, int(rng.choice([4, 16]))).items():
@@ -72,13 +74,13 @@ def _frozen_steps(bench: CaseBench) -> list[Inputs]:
         }
         if rows == "sparse":
             for values in made["gradients"].values():
-                values[~bench.visible] = 0.0  # project_grad leaves zeros there
+                values[~bench.visible] = 0.0  # project_grad leaves zeros for invisible Gaussians
         found.append(Inputs(arrays=made, rows=rows, step=7, visible=bench.visible, rates=ADAM_RATES))
     return found
 
 
 def uploaded_groups(device: Device, arrays: Mapping[str, Arrays]) -> list[DeviceGaussians]:
-    """Arrays by group, uploaded to the device."""
+    """Upload sets of arrays by parameter group to the device."""
     found = []
     for groups in arrays.values():
         count, rest, _ = groups["sh_rest"].shape
@@ -115,15 +117,15 @@ def _twin_of_adam(given: Inputs, got: Arrays) -> dict[str, Expected]:
             found.append(values.ravel())
     parameters, first, second, steps, terms, rows = (np.concatenate(found) for found in made.values())
     wanted = {
-        # beta2 in float32 is off by 1e-8, which is 1e-5 of 1 - beta2 = 1e-3 and so of a step
+        # beta2 in float32 is off by 1e-8. This is 1e-5 of 1 - beta2 = 1e-3, and so 1e-5 of a step.
         "parameters": Expected(parameters, 1e-4, steps + 1e-2 * np.abs(parameters), rows),
         "first": Expected(first, 1e-6, terms, rows),  # a few roundings
         "second": Expected(second, 3e-5, second, rows),
         "gradients": exactly(np.zeros_like(got["gradients"])),
     }
     for name in ("parameters", "first", "second"):
-        got[f"{name} left alone"] = got[name][~rows]
-        wanted[f"{name} left alone"] = exactly(wanted[name].values[~rows])
+        got[f"{name} that must not change"] = got[name][~rows]
+        wanted[f"{name} that must not change"] = exactly(wanted[name].values[~rows])
     return wanted
 
 
@@ -138,11 +140,12 @@ ADAM_CASE = Case(
 
 
 def _random_missed(rng: Generator, count: int) -> Inputs:
-    """Rows that missed at most MOST_MISSED steps up to step `step`, with moments of any magnitude, some of them zero.
+    """Random inputs of late Adam: rows that missed 0 to MOST_MISSED steps up to step `step`, with moments of any
+    magnitude, some of them zero.
 
-    first_step: the last step that every row has taken.
-    rates: learning rates of each step after `first_step`, by group.
-    every: steps between updates of the higher SH bands.
+    first_step: the last step that all rows have taken.
+    rates: learning rates of each step after `first_step`, by parameter group.
+    every: number of steps between updates of the SH bands from degree 1 on.
     """
     span, every = int(rng.choice([1, 7, 40, MOST_MISSED])), int(rng.choice([1, 2]))
     first_step = int(rng.choice([0, 1, 100, 30_000]))
@@ -150,7 +153,7 @@ def _random_missed(rng: Generator, count: int) -> Inputs:
     last[0] = first_step
     made: dict[str, Arrays] = {name: {} for name in ("parameters", "first", "second")}
     for group, shape in group_shapes(count, int(rng.choice([1, 16]))).items():
-        size = 10 ** rng.uniform(-9, 6, shape)  # well over Adam's epsilon
+        size = 10 ** rng.uniform(-9, 6, shape)  # far above Adam's epsilon
         made["parameters"][group] = rng.standard_normal(shape).astype(np.float32)
         made["first"][group] = (rng.standard_normal(shape) * size * (rng.random(shape) < 0.9)).astype(np.float32)
         made["second"][group] = (rng.uniform(0.1, 1.0, shape) * size**2).astype(np.float32)
@@ -185,7 +188,7 @@ def _launch_settle(device: Device, _: Workspace, given: Inputs) -> Read:
     }
 
 
-def _twin_of_settle(given: Inputs, got: Arrays) -> dict[str, Expected]:  # noqa: ARG001  # as every twin
+def _twin_of_settle(given: Inputs, got: Arrays) -> dict[str, Expected]:  # noqa: ARG001  # all twins have these arguments
     taken = np.ones_like(given.visible) if given.all_rows else given.visible
     made: dict[str, list[Array]] = {name: [] for name in ("parameters", "first", "second", "moves")}
     for group, rates in given.rates.items():
@@ -203,8 +206,8 @@ def _twin_of_settle(given: Inputs, got: Arrays) -> dict[str, Expected]:  # noqa:
     parameters, first, second, moves = (np.concatenate(found) for found in made.values())
     mark = given.step + (not given.all_rows)
     return {
-        # A rounding of the sum and a few of the movement. The betas in float32 are off by 3e-8, which is 1e-6 of a sum
-        # of some 30 steps.
+        # The bound covers a rounding of the sum and a few of the movement. The betas in float32 are off by 3e-8, which
+        # is 1e-6 of a sum over some 30 steps.
         "parameters": Expected(parameters, 3e-6, moves),
         "first": Expected(first, 2e-5, np.abs(first)),  # beta1 is off by 2.6e-8: 7e-6 after 256 steps
         "second": Expected(second, 1e-5, second),  # beta2 is off by 1.3e-8: 3e-6 after 256 steps
@@ -225,10 +228,10 @@ GEOMETRY_ARRAYS = ("quaternions", "log_scales", "opacity_logits")
 
 
 def _random_noise(rng: Generator, count: int) -> Inputs:
-    """Gaussians of nearly any opacity and shape, including needles and discs."""
+    """Random Gaussians of nearly any opacity and shape, including needles and discs."""
     explore = Exploration(amount=10 ** rng.uniform(-3, 3), key=step_key(0, int(rng.integers(1 << 30))))
     logits = rng.uniform(-9, 0, count).astype(np.float32)
-    logits[0] = -7.0  # at least one Gaussian moves
+    logits[0] = -7.0  # so faint that at least one Gaussian moves
     return Inputs(
         explore=explore,
         quaternions=(rng.standard_normal((count, 4)) * 10 ** rng.uniform(-3, 3, (count, 1))).astype(np.float32),
@@ -252,7 +255,8 @@ def _frozen_noise(bench: CaseBench) -> list[Inputs]:
 
 def _launch_noise(device: Device, _: Workspace, given: Inputs) -> Read:
     count = len(given.opacity_logits)
-    means, sh = np.zeros((count, 3), np.float32), np.zeros((count, 1, 3), np.float32)  # no rounding in sums
+    # The means are 0, so that adding the noise rounds nothing.
+    means, sh = np.zeros((count, 3), np.float32), np.zeros((count, 1, 3), np.float32)
     arrays = {name: getattr(given, name) for name in GEOMETRY_ARRAYS}
     held = upload_gaussians(device, Gaussians(means=means, sh=sh, **arrays))
     noise(device, given.explore, held, 0, fresh_readback(device))
@@ -263,12 +267,12 @@ def _twin_of_noise(given: Inputs, got: Arrays) -> dict[str, Expected]:
     quaternions, log_scales, logits = given.wide(*GEOMETRY_ARRAYS)
     wanted = displacements(given.explore, quaternions, log_scales, logits)
     stays = given.opacity_logits >= highest_logit(given.explore.dead)
-    got |= {"moves": got["means"][~stays], "means of the opaque": got["means"][stays]}
+    got |= {"moved means": got["means"][~stays], "means that must not move": got["means"][stays]}
     size = np.abs(wanted) + 0.1 * np.abs(wanted).max(initial=0)
     return {
-        "means": Expected(wanted, 5e-6),  # 100 (o - dead), up to 16, changes by 1e-6 of itself with an ulp of o
-        "moves": Expected(wanted[~stays], 1e-4, size[~stays]),
-        "means of the opaque": exactly(np.zeros_like(got["means of the opaque"])),
+        "means": Expected(wanted, 5e-6),  # an ulp of the opacity o changes the noise by 1e-6 of itself
+        "moved means": Expected(wanted[~stays], 1e-4, size[~stays]),
+        "means that must not move": exactly(np.zeros_like(got["means that must not move"])),
         **{name: exactly(getattr(given, name)) for name in GEOMETRY_ARRAYS},
     }
 
@@ -284,7 +288,7 @@ NOISE_CASE = Case(
 
 
 def random_scene(rng: Generator, count: int) -> Inputs:
-    """Gaussians with SH of degree 1, in front of a camera and some behind it."""
+    """A random camera and Gaussians with SH of degree 1, most of them in front of it and some behind it."""
     rotation = Rotation.random(random_state=rng).as_matrix()
     camera = Camera(70, 50, 60.0, 65.0, 30.0, 27.0, rotation, rng.normal(size=3))
     depths = rng.uniform(1.0, 6.0, count) * np.where(np.arange(count) % 5 == 3, -1, 1)
@@ -299,7 +303,7 @@ def random_scene(rng: Generator, count: int) -> Inputs:
 
 
 def _launch_penalties(device: Device, work: Workspace, given: Inputs) -> Read:
-    """Compute the gradient of the penalties alone: the loss's gradient is zero."""
+    """Compute the gradient of the penalties alone, with slots of zeros as the loss's gradient."""
     model, camera_array = upload_gaussians(device, given.gaussians), upload(device, pack_camera(given.camera))
     projected = project(device, work, model, given.camera, camera_array)
     gradients = allocate_gaussians(device, model.count, model.coefficients, zero=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All cases by name, and all stages of the self-test."""
+"""Tables of all cases (CASES) and of all stages of the self-test (OUTCOMES_BY_STAGE), by name."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ CASES: dict[str, Case] = {
     "statistics": STATISTICS_CASE,
     "marks": MARKS_CASE,
 }
-"""Cases that do not need results of other stages. Those with inputs from a frozen scene are self-test stages."""
+"""Cases by name. Those with inputs from a frozen scene (`frozen`) are stages of the self-test."""
 
 OUTCOMES_BY_STAGE: dict[str, Callable[[CaseBench], StageOutcome]] = {
     **{name: case.outcome for name, case in CASES.items() if case.frozen is not None},

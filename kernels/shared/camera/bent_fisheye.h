@@ -1,11 +1,11 @@
-// For fisheye.h: the image radius as a function of the angle from the axis, for a fisheye with coefficients (Kannala
-// and Brandt), (18) of docs/cameras.md.
+// The Kannala-Brandt fisheye, a fisheye with coefficients: the radius on the image as a function of the angle from the
+// axis, (18) of docs/cameras.md. fisheye.h includes this file.
 #define FARTHEST_ANGLE(camera) (camera)[CAMERA_FOLD]
 #define IS_IN_PICTURE(radius, camera) ((radius) < (camera)[CAMERA_FOLD_RADIUS])
 #define SERIES(camera) (2.0f * (camera)[CAMERA_K1])
 
-// Radius on the image, in focal lengths, at the angle t from the axis; then its first derivative (slope_of) and its
-// second (bend_of).
+// radius_of: the radius on the image, in focal lengths, at the angle t from the axis; slope_of, bend_of: the first and
+// second derivatives of the radius.
 static inline floatL radius_of(floatL t, CAMERA_SPACE float *camera) {
   const floatL t2 = t * t;
   floatL p = fmaL(t2, (floatL)(camera[CAMERA_K4]), (floatL)(camera[CAMERA_K3]));
@@ -26,10 +26,11 @@ static inline float bend_of(float t, CAMERA_SPACE float *camera) {
   p = fma1(t2, p, 20.0f * camera[CAMERA_K2]);
   return t * fma1(t2, p, 6.0f * camera[CAMERA_K1]);
 }
-// The derivative of p = 1 / slope.
+// The derivative of p = 1 / slope_of with respect to the angle theta.
 #define SLOPE_OF_INVERSE(theta, p, camera) (-bend_of(theta, camera) * (p) * (p))
 
-// The angle whose image radius is `radius`, by Newton's method. The host has checked that this converges.
+// The angle from the axis whose radius on the image is `radius`, by Newton's method. The host has checked that the
+// iteration converges.
 static inline floatL angle_of(floatL radius, CAMERA_SPACE float *camera) {
   const floatL fold = (floatL)(FARTHEST_ANGLE(camera));
   floatL t = radius < fold ? radius : fold;
@@ -42,7 +43,7 @@ static inline floatL angle_of(floatL radius, CAMERA_SPACE float *camera) {
 }
 
 #ifdef NEEDS_TANGENTS
-// A lens shows nothing beyond the angle at which its image folds over.
+// True if the lens shows the direction f: nothing is shown beyond the angle at which the image folds over.
 static inline int is_shown(const float *f, __constant float *camera) {
   const float across = sqrt(fma1(f[0], f[0], f[1] * f[1]));
   return half_atan(across, f[2]) < FARTHEST_ANGLE(camera);

@@ -1,7 +1,8 @@
-// Functions that all camera models with RAYS share, included before their headers. Equation numbers refer to
-// docs/cameras.md.
+// Functions that all camera models along rays (RAYS) share; camera.h includes this file before the model's header.
+// Equation numbers refer to docs/cameras.md.
 
-// sin(x) for |x| up to slightly over 90 degrees, relative error 2e-8: minimax in x^2.
+// sin(x) for |x| up to slightly over a quarter turn, in radians, with a relative error of 2e-8: a minimax polynomial in
+// x^2.
 static inline floatL sinL(floatL x) {
   const floatL t = x * x;
   floatL p = fmaL(t, (floatL)(2.601887672e-06f), (floatL)(-1.980741217e-04f));
@@ -13,9 +14,9 @@ static inline floatL sinL(floatL x) {
 static inline floatL absL(floatL x) { return x < 0.0f ? -x : x; }
 
 #ifdef NEEDS_TANGENTS
-// (9), (10), (19), (30) for images whose radius depends only on the angle from the axis. f: the direction; across: its
-// distance from the axis; along / slope: radians that fx pixels cover away from the axis; around: radians that they
-// cover around it.
+// The tangent plane at a direction, for images whose radius depends only on the angle from the axis: fills *t, (9),
+// (10), (19) and (30). f: the unit direction; across: the distance of f from the axis; along / slope: the angle in
+// radians that fx pixels cover away from the axis; around: the angle that they cover around the axis.
 static inline void tangent_around_axis(const float *f, float across, float along, float slope, float around,
                                        __constant float *camera, Tangent *t) {
   const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];
@@ -32,8 +33,10 @@ static inline void tangent_around_axis(const float *f, float across, float along
   t->k[3] = c * around / fy;
 }
 
-// (27), (28) for such an image. r: the direction's distance from the axis; p, q: along / slope and around, as above;
-// dp, dq: their derivatives with respect to the angle.
+// The gradient `by` through the low-pass part of the covariance, with respect to a move of the mean's direction along
+// e1 and e2, for the images of tangent_around_axis: (27) and (28). r: the distance of the direction f from the axis; p,
+// q: along / slope and around of tangent_around_axis; dp, dq: the derivatives of p and q with respect to the angle from
+// the axis; g: the gradient with respect to the covariance's xx, xy (as one variable) and yy.
 static inline void low_pass_around_axis(const float *f, float r, float p, float q, float dp, float dq,
                                         __constant float *camera, const float *g, float *by) {
   const float wide = 1.0f / (camera[CAMERA_FX] * camera[CAMERA_FX]), z = f[2];
@@ -60,12 +63,13 @@ static inline InCamera in_camera(__constant float *camera, float x, float y, flo
   return p;
 }
 
-// A mean in the camera's axes before and after the motion, and the difference.
+// A mean in the camera's axes: p before the motion, q after the motion, and d, the difference q - p.
 typedef struct {
   float p[3], q[3], d[3];
 } Moved;
 
-// Fills *m. Returns 0 if the mean is nearer than the near plane of `after`. to: the mean after its motion.
+// Moves the mean (x, y, z), seen by `camera`, to the mean `to`, seen by `after`: fills *m. Returns 0 if the moved mean
+// is nearer than the near plane of `after`.
 static inline int move(__constant float *camera, __constant float *after, float x, float y, float z,
                        __global const float *to, Moved *m) {
   const InCamera here = in_camera(camera, x, y, z), there = in_camera(after, to[0], to[1], to[2]);
@@ -78,7 +82,7 @@ static inline int move(__constant float *camera, __constant float *after, float 
   return distance > after[CAMERA_NEAR] && distance < 1e15f;
 }
 
-// The change of a camera value from `camera` to `after`.
+// The change of the camera's value `name` from `camera` to `after`.
 #define GROWN(name)                                                                                                    \
   ((after[CAMERA_##name] - camera[CAMERA_##name]) + (after[CAMERA_##name##_LOW] - camera[CAMERA_##name##_LOW]))
 #endif

@@ -1,10 +1,11 @@
-// Equirectangular: a panorama of longitude and latitude. Equation numbers refer to docs/cameras.md.
+// The equirectangular camera model: x on the image is proportional to longitude, y to latitude. Equation numbers refer
+// to docs/cameras.md.
 #define WRAPS
 
-// (5): the unit direction (x, y, z) of pixels (px, py); 0 if there is none.
+// The unit direction (x, y, z) of the pixels (px, py), (5); (0, 0, 0) for pixels that have no direction.
 static inline void ray_of(floatL px, floatL py, CAMERA_SPACE float *camera, floatL *x, floatL *y, floatL *z) {
   const floatL a = (px - camera[CAMERA_CX]) / camera[CAMERA_FX], b = (py - camera[CAMERA_CY]) / camera[CAMERA_FY];
-  // longitude within 180 degrees of the axis
+  // The longitude, moved by whole turns to within half a turn of the axis.
   const floatL turns = floorL(fmaL(a, (floatL)(0.5f / HALF_TURN), (floatL)(0.5f)));
   const floatL longitude = fmaL(turns, (floatL)(-2.0f * HALF_TURN), a);
   const floatL away = absL(longitude), from_side = QUARTER_TURN - away;
@@ -20,7 +21,7 @@ static inline void ray_of(floatL px, floatL py, CAMERA_SPACE float *camera, floa
 #define NEAR_DEPTH(z, distance) (distance)
 #define is_shown(f, camera) 1
 
-// (9), (10); f: the direction.
+// The tangent plane at the unit direction f, (9) and (10): fills *t.
 static inline void tangent_of(const float *f, __constant float *camera, Tangent *t) {
   const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];
   const float level = sqrt(fma1(f[0], f[0], f[2] * f[2]));
@@ -31,14 +32,15 @@ static inline void tangent_of(const float *f, __constant float *camera, Tangent 
   t->e2[0] = -f[1] * s;
   t->e2[1] = level;
   t->e2[2] = -f[1] * c;
-  const float least = 0.5f / fy; // at least half a row from a pole, where a pixel is a point
+  // Pixels nearer than half a row to a pole count as half a row away, because at the pole their width is 0.
+  const float least = 0.5f / fy;
   t->k[0] = (level > least ? level : least) / fx;
   t->k[1] = t->k[2] = 0.0f;
   t->k[3] = 1.0f / fy;
 }
 
-// (26): the gradient through the low-pass part of the covariance, with respect to a move of the mean's direction along
-// e1 and e2. g: the gradient with respect to the covariance's xx, xy (as one variable) and yy.
+// The gradient `by` through the low-pass part of the covariance, (26), with respect to a move of the mean's direction f
+// along e1 and e2. g: the gradient with respect to the covariance's xx, xy (as one variable) and yy.
 static inline void low_pass_gradient(const float *f, __constant float *camera, const float *g, float *by) {
   const float wide = 1.0f / (camera[CAMERA_FX] * camera[CAMERA_FX]);
   const float level = sqrt(fma1(f[0], f[0], f[2] * f[2])), least = 0.5f / camera[CAMERA_FY];
@@ -50,7 +52,7 @@ static inline void low_pass_gradient(const float *f, __constant float *camera, c
 #endif
 
 #ifdef NEEDS_BOXES
-// The box of all directions within an angle of f; `reach` is the tangent of the angle.
+// The box *t of the pixels of all directions within an angle of the unit direction f. reach: the tangent of the angle.
 static inline void box_of(const float *f, float reach, __constant float *camera, Box *t) {
   const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];
   const float cx = camera[CAMERA_CX] - camera[CAMERA_WINDOW_X], cy = camera[CAMERA_CY] - camera[CAMERA_WINDOW_Y];
@@ -75,8 +77,8 @@ static inline void box_of(const float *f, float reach, __constant float *camera,
 #endif
 
 #ifdef NEEDS_MOTION
-// (74) of docs/channels.md: the change of the angles, computed from the change of the coordinates. A difference of two
-// angles would lose small motions by rounding.
+// The motion of a mean on the image, in pixels, (74) of docs/channels.md. The change of the angles is computed from the
+// change of the coordinates, because a difference of two angles would lose small motions by rounding.
 static inline void motion_of(__constant float *camera, __constant float *after, float x, float y, float z,
                              __global const float *to, __global const float *splat, __global float *motion) {
   Moved m;
@@ -88,7 +90,7 @@ static inline void motion_of(__constant float *camera, __constant float *after, 
   const float grown = sum > 0.0f ? fma1(d[0], p[0] + q[0], d[2] * (p[2] + q[2])) / sum : 0.0f;
   const float turned = signed_atan(fma1(d[0], p[2], -(d[2] * p[0])), fma1(p[0], q[0], p[2] * q[2]));
   const float risen = signed_atan(fma1(d[1], level, -(grown * p[1])), fma1(p[1], q[1], level * level_there));
-  // (6): the longitude nearest to the middle of the frame, at which the mean is drawn
+  // (6): the mean is drawn at the longitude nearest to the middle of the frame.
   const float middle = 0.5f * (camera[CAMERA_XMIN] + camera[CAMERA_XMAX]), longitude = signed_atan(p[0], p[2]);
   const float turns = floorL(fma1(longitude - middle, 0.5f / HALF_TURN, 0.5f));
   const float a = fma1(turns, -2.0f * HALF_TURN, longitude), b = signed_atan(p[1], level);
@@ -98,7 +100,8 @@ static inline void motion_of(__constant float *camera, __constant float *after, 
 #endif
 
 #ifdef NEEDS_PIXEL_WIDTH
-// The width of a pixel at a point in the camera's axes, in world units; 1e30 if the camera does not see the point.
+// The width of a pixel in world units at the point (x, y, z) in the camera's axes; 1e30 if the camera does not see the
+// point.
 static inline float pixel_width(float x, float y, float z, CAMERA_SPACE float *camera) {
   const float distance = sqrt(fma1(x, x, fma1(y, y, z * z)));
   return distance > camera[CAMERA_NEAR] ? distance / fmax(camera[CAMERA_FX], camera[CAMERA_FY]) : 1e30f;

@@ -1,8 +1,8 @@
-// Fisheye: the radius on the image depends on the angle from the axis, equidistant or with coefficients. Equation
-// numbers refer to docs/cameras.md.
+// The fisheye camera models: the radius on the image depends only on the angle from the axis. It is the angle itself
+// (equidistant), or with BENT_FISHEYE a polynomial of the angle. Equation numbers refer to docs/cameras.md.
 #ifdef BENT_FISHEYE
 #include "shared/camera/bent_fisheye.h"
-#else // the radius is the angle
+#else // equidistant: the radius, in focal lengths, is the angle in radians
 #define FARTHEST_ANGLE(camera) HALF_TURN
 #define IS_IN_PICTURE(radius, camera) ((radius) <= HALF_TURN)
 #define SERIES(camera) 0.0f
@@ -13,7 +13,7 @@
 #define is_shown(f, camera) 1
 #endif
 
-// (4): the unit direction (x, y, z) of pixels (px, py); 0 if there is none.
+// The unit direction (x, y, z) of the pixels (px, py), (4); (0, 0, 0) for pixels outside the lens's picture.
 static inline void ray_of(floatL px, floatL py, CAMERA_SPACE float *camera, floatL *x, floatL *y, floatL *z) {
   const floatL a = (px - camera[CAMERA_CX]) / camera[CAMERA_FX], b = (py - camera[CAMERA_CY]) / camera[CAMERA_FY];
   const floatL radius = sqrt(fmaL(a, a, b * b));
@@ -29,7 +29,7 @@ static inline void ray_of(floatL px, floatL py, CAMERA_SPACE float *camera, floa
 #ifdef NEEDS_TANGENTS
 #define NEAR_DEPTH(z, distance) (distance)
 
-// (9), (10), (19); f: the direction.
+// The tangent plane at the unit direction f, (9), (10) and (19): fills *t.
 static inline void tangent_of(const float *f, __constant float *camera, Tangent *t) {
   const float across = sqrt(fma1(f[0], f[0], f[1] * f[1]));
   const float theta = half_atan(across, f[2]), radius = radius_of(theta, camera);
@@ -39,15 +39,15 @@ static inline void tangent_of(const float *f, __constant float *camera, Tangent 
   tangent_around_axis(f, across, 1.0f, slope_of(theta, camera), around, camera, t);
 }
 
-// (27), (28): the gradient through the low-pass part of the covariance, with respect to a move of the mean's direction
-// along e1 and e2. g: the gradient with respect to the covariance's xx, xy (as one variable) and yy.
+// The gradient `by` through the low-pass part of the covariance, (27) and (28), with respect to a move of the mean's
+// direction f along e1 and e2. g: the gradient with respect to the covariance's xx, xy (as one variable) and yy.
 static inline void low_pass_gradient(const float *f, __constant float *camera, const float *g, float *by) {
   const float r = sqrt(fma1(f[0], f[0], f[1] * f[1])), z = f[2], theta = half_atan(r, z);
   const float radius = radius_of(theta, camera), slope = slope_of(theta, camera);
   const float p = 1.0f / slope, dp = SLOPE_OF_INVERSE(theta, p, camera);
   const float ratio = theta > 1e-6f ? r / radius : 1.0f, least = 0.5f / (HALF_TURN * camera[CAMERA_FX]);
   const float q = ratio > least ? ratio : least;
-  // near the axis by a series: sin(t) / D(t) is 1 - (1/6 + k1) t^2
+  // Near the axis dq is computed from a series: sin(t) / D(t) is 1 - (1/6 + k1) t^2, with D the radius at the angle t.
   const float near_axis = theta * (-1.0f / 3.0f - SERIES(camera));
   const float off_axis = fma1(-q, slope, z) / radius;
   const float dq = ratio > least ? (theta > 0.02f ? off_axis : near_axis) : 0.0f;
@@ -56,7 +56,7 @@ static inline void low_pass_gradient(const float *f, __constant float *camera, c
 #endif
 
 #ifdef NEEDS_BOXES
-// The box of all directions within an angle of f; `reach` is the tangent of the angle.
+// The box *t of the pixels of all directions within an angle of the unit direction f. reach: the tangent of the angle.
 static inline void box_of(const float *f, float reach, __constant float *camera, Box *t) {
   const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];
   const float cx = camera[CAMERA_CX] - camera[CAMERA_WINDOW_X], cy = camera[CAMERA_CY] - camera[CAMERA_WINDOW_Y];
@@ -69,7 +69,7 @@ static inline void box_of(const float *f, float reach, __constant float *camera,
   const float outer = radius_of(far, camera);
   float middle_x = 0.0f, middle_y = 0.0f, half_x = outer, half_y = outer;
   if (sine < 0.999f * across && theta > cap && theta + cap < FARTHEST_ANGLE(camera)) {
-    // a part of a ring around the axis, bounded by a rectangle along the mean's direction
+    // The directions lie in a part of a ring around the axis, which a rectangle along the mean's direction bounds.
     const float ratio = sine / across, cosine = sqrt(1.0f - ratio * ratio);
     const float c = f[0] / across, s = f[1] / across;
     const float near = radius_of(theta - cap, camera) * cosine;
@@ -87,8 +87,8 @@ static inline void box_of(const float *f, float reach, __constant float *camera,
 #endif
 
 #ifdef NEEDS_MOTION
-// (75) of docs/channels.md: the change of the angles, computed from the change of the coordinates. A difference of two
-// angles would lose small motions by rounding.
+// The motion of a mean on the image, in pixels, (75) of docs/channels.md. The change of the angles is computed from the
+// change of the coordinates, because a difference of two angles would lose small motions by rounding.
 static inline void motion_of(__constant float *camera, __constant float *after, float x, float y, float z,
                              __global const float *to, __global const float *splat, __global float *motion) {
   Moved m;
@@ -96,7 +96,8 @@ static inline void motion_of(__constant float *camera, __constant float *after, 
   if (!move(camera, after, x, y, z, to, &m)) return;
   const float *p = m.p, *q = m.q, *d = m.d;
   const float across = sqrt(fma1(p[0], p[0], p[1] * p[1])), across_there = sqrt(fma1(q[0], q[0], q[1] * q[1]));
-  if (!(across > 0.0f || p[2] > 0.0f) || !(across_there > 0.0f || q[2] > 0.0f)) return; // straight behind: no pixel
+  // A direction straight behind the camera has no pixel.
+  if (!(across > 0.0f || p[2] > 0.0f) || !(across_there > 0.0f || q[2] > 0.0f)) return;
   const float sum = across + across_there;
   const float grown = sum > 0.0f ? fma1(d[0], p[0] + q[0], d[1] * (p[1] + q[1])) / sum : 0.0f;
   const float turned = signed_atan(fma1(grown, p[2], -(d[2] * across)), fma1(across, across_there, p[2] * q[2]));
@@ -111,8 +112,8 @@ static inline void motion_of(__constant float *camera, __constant float *after, 
 #endif
 
 #ifdef NEEDS_PIXEL_WIDTH
-// The width of a pixel at a point in the camera's axes, in world units: along the radius or around the axis, whichever
-// is smaller. 1e30 if the camera does not see the point.
+// The width of a pixel in world units at the point (x, y, z) in the camera's axes: along the radius or around the axis,
+// whichever is smaller. 1e30 if the camera does not see the point.
 static inline float pixel_width(float x, float y, float z, CAMERA_SPACE float *camera) {
   const float distance = sqrt(fma1(x, x, fma1(y, y, z * z)));
   const float width = distance / fmax(camera[CAMERA_FX], camera[CAMERA_FY]);

@@ -1,8 +1,9 @@
-// Orthographic: the image is linear in x and y, (3) and (15) to (17). Equation numbers refer to docs/cameras.md.
+// The orthographic camera model: the image is linear in x and y, (3) and (15) to (17). Equation numbers refer to
+// docs/cameras.md.
 #define ON_PLANE
 #define PARALLEL_RAYS
 
-// RATIO: the number of which the image position is a linear function. ratio_rest: its rounding error.
+// RATIO: the number on which the image position depends linearly. ratio_rest: the low part of RATIO.
 #define RATIO(x, z) (x)
 #define ratio_rest(ratio, x, x_low, z, z_low) (x_low)
 
@@ -12,7 +13,7 @@ static inline floatL clamped_rest(floatL ratio, floatL x, floatL x_low, floatL z
   return (floatL)(0.0f);
 }
 
-// (16). Arguments as in perspective.h.
+// The Jacobian's row for x or y, (16). The arguments are those of perspective.h.
 static inline void jacobian_row(floatL x, floatL z, float focal, float low, float high, floatL *rx, floatL *jx) {
   *rx = (floatL)(0.0f);
   *jx = (floatL)(focal);
@@ -20,7 +21,7 @@ static inline void jacobian_row(floatL x, floatL z, float focal, float low, floa
 #endif
 
 #ifdef NEEDS_GRADIENT
-// (20). Arguments as in perspective.h.
+// The gradient with respect to the mean in the camera's axes, (20). The arguments are those of perspective.h.
 static inline void mean_gradient(const floatL *at, const floatL *limited, floatL jx, floatL jy, floatL d_mx,
                                  floatL d_my, floatL by_j02, floatL by_j12, floatL d_size, floatL *d, floatL *beyond) {
   d[0] = jx * d_mx;

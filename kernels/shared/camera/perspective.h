@@ -1,13 +1,13 @@
-// Perspective: the image is linear in x/z and y/z, (2) of docs/cameras.md. Other equation numbers refer to
-// docs/gradients.md.
+// The perspective camera model: the image is linear in x/z and y/z, (2) of docs/cameras.md. Other equation numbers
+// refer to docs/gradients.md.
 #define ON_PLANE
 
-// RATIO: the number of which the image position is a linear function. ratio_rest: its rounding error.
+// RATIO: the number on which the image position depends linearly. ratio_rest: the low part of RATIO.
 #define RATIO(x, z) ((x) / (z))
 #define ratio_rest slope_rest
 
 #ifdef NEEDS_PROJECTION
-// The low part of x/z as in the Jacobian: where x/z is clamped, the low part of the limit.
+// The low part of the Jacobian's clamped x/z. Where x/z is clamped, this is the low part of the limit.
 static inline floatL clamped_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low, float low,
                                   float low_rest, float high, float high_rest) {
   const floatL rest = ratio_rest(ratio, x, x_low, z, z_low);
@@ -15,7 +15,8 @@ static inline floatL clamped_rest(floatL ratio, floatL x, floatL x_low, floatL z
   return ratio == high ? (floatL)(high_rest) : above;
 }
 
-// (3), (4): the Jacobian's row for x is jx (1, 0, -rx), and for y jy (0, 1, -ry). low, high: limits of the ratio.
+// Computes rx and jx of the Jacobian's row for x, jx (1, 0, -rx), (3) and (4). For y the row is jy (0, 1, -ry). low,
+// high: limits of x/z.
 static inline void jacobian_row(floatL x, floatL z, float focal, float low, float high, floatL *rx, floatL *jx) {
   *rx = clampL(x / z, low, high);
   *jx = focal / z;
@@ -23,11 +24,11 @@ static inline void jacobian_row(floatL x, floatL z, float focal, float low, floa
 #endif
 
 #ifdef NEEDS_GRADIENT
-// (52): the gradient with respect to the mean in the camera's axes, through the image position and through J. Where
-// the ratio is clamped, J depends only on z. at: the mean; limited: rx, ry; jx, jy: as in (4); d_mx, d_my: the gradient
-// with respect to the image position; by_j02, by_j12: with respect to the Jacobian's last column, divided by -jx and
-// -jy; d_size: with respect to the log of the size. Fills d[3]; and beyond[2] of (145), for a clamped ratio, which is a
-// fixed image position.
+// The gradient d (3) with respect to the mean in the camera's axes, through the image position and through the Jacobian
+// J, (52). Where x/z or y/z is clamped, J depends only on z. at: the mean; limited: rx, ry; jx, jy: as in (4); d_mx,
+// d_my: the gradient with respect to the image position; by_j02, by_j12: the gradient with respect to J's last column,
+// divided by -jx and -jy; d_size: the gradient with respect to the log of the size. Also sets beyond (2), the part of
+// (145) for a clamped x/z or y/z, whose limit is a fixed image position.
 static inline void mean_gradient(const floatL *at, const floatL *limited, floatL jx, floatL jy, floatL d_mx,
                                  floatL d_my, floatL by_j02, floatL by_j12, floatL d_size, floatL *d, floatL *beyond) {
   const floatL z = at[2], rx = at[0] / z, ry = at[1] / z;

@@ -1,9 +1,9 @@
-// Functions that all camera models with an image plane share, included after their headers. Image positions are linear
-// functions of RATIO. Equation numbers refer to docs/gradients.md.
+// Functions that all camera models with an image plane share; camera.h includes this file after the model's header.
+// Image positions are linear functions of RATIO. Equation numbers refer to docs/gradients.md.
 
 #if defined(NEEDS_PROJECTION) || defined(NEEDS_MOTION)
-// (2): focal * (x / z) + centre, as whole pixels relative to the window and a fraction in [0, 1). The fraction has the
-// same bits in every window.
+// Computes a coordinate on the image, focal * RATIO + centre, (2), as whole pixels relative to the window and a
+// fraction (`rest`) in [0, 1). The fraction has the same bits in every window of a frame.
 static inline void image_position(floatL x, floatL x_low, floatL z, floatL z_low, float focal, float focal_low,
                                   float centre, float centre_low, float window, floatL *whole, floatL *rest) {
   const floatL ratio = RATIO(x, z);
@@ -17,7 +17,8 @@ static inline void image_position(floatL x, floatL x_low, floatL z, floatL z_low
 #endif
 
 #ifdef NEEDS_MOTION
-// A mean's position on the image, as whole pixels and a fraction. Returns 0 if it is not beyond the near plane.
+// Computes a mean's position on the image, as whole pixels and fractions. Returns 0 if the mean is not beyond the near
+// plane.
 static inline int place_of(__constant float *camera, float x, float y, float z, float *whole, float *rest) {
   const Double at_x = CAMERA_ROW(0), at_y = CAMERA_ROW(1), at_z = CAMERA_ROW(2);
   if (!(at_z.high > camera[CAMERA_NEAR])) return 0;
@@ -28,7 +29,8 @@ static inline int place_of(__constant float *camera, float x, float y, float z, 
   return 1;
 }
 
-// Whole pixels and fractions are subtracted separately, because their sum in float32 would lose digits.
+// The motion of a mean on the image, in pixels. Whole pixels and fractions are subtracted separately, because their sum
+// in float32 would lose digits.
 static inline void motion_of(__constant float *camera, __constant float *after, float x, float y, float z,
                              __global const float *to, __global const float *splat, __global float *motion) {
   float whole[2], rest[2];
@@ -46,8 +48,8 @@ static inline void motion_of(__constant float *camera, __constant float *after, 
 #endif
 
 #ifdef NEEDS_PIXEL_WIDTH
-// (88) for one view: the width of a pixel at a point in the camera's axes, in world units; 1e30 if the camera does not
-// see the point.
+// The width of a pixel in world units at the point (x, y, z) in the camera's axes, (88) for one view; 1e30 if the
+// camera does not see the point.
 static inline float pixel_width(float x, float y, float z, CAMERA_SPACE float *camera) {
   const int seen = z > camera[CAMERA_NEAR] && x > camera[CAMERA_XMIN] * z && x < camera[CAMERA_XMAX] * z &&
                    y > camera[CAMERA_YMIN] * z && y < camera[CAMERA_YMAX] * z;
