@@ -6,8 +6,8 @@ New rows stand behind the rows that they are copied from. So a new record needs 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -87,15 +87,36 @@ Reader = Callable[[NDArray[np.int64]], NDArray[Any]]
 """A function that returns the records of the chunks with these numbers."""
 
 
+@dataclass(frozen=True, eq=False)
+class NewValues:
+    """Values of fields where rows do not have those of the row that they come from.
+
+    fresh: by kind, the beginning of a field's name: the value of FRESH rows. Fields of other kinds are copied.
+    initial: values of new fields, and of those that begin anew; 0 if a field is not listed.
+    anew: fields that begin anew in every row.
+    """
+
+    fresh: Mapping[str, float] = field(default_factory=lambda: {"first": 0.0, "second": 0.0})
+    initial: Mapping[str, float] = field(default_factory=dict)
+    anew: frozenset[str] = frozenset()
+
+
+_MOVED_AS_THEY_ARE = NewValues()
+
+
 def gathered(
-    rows: NDArray[np.uint32], read: Reader, record: np.dtype[Any], passed: Callable[[int], None]
+    rows: NDArray[np.uint32],
+    read: Reader,
+    record: np.dtype[Any],
+    passed: Callable[[int], None],
+    values: NewValues = _MOVED_AS_THEY_ARE,
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
     """Yield numbers and records of the new chunks, some at a time. Row j of the model becomes the old row rows[j].
 
-    The moments of FRESH rows are zero. SH coefficients that the old records do not have are zero.
+    SH coefficients that the old records do not have are zero.
 
     read: of the old chunks.
-    record: type of the new records.
+    record: type of the new records. Other fields of the old ones are left out.
     passed: called with the number of the first old chunk that is still read, if the sources of `rows` rise.
     """
     size = CHUNK_ROWS * BLOCK_CHUNKS
@@ -103,13 +124,15 @@ def gathered(
         entries = rows[begin : begin + size]
         sources, first = (entries & ~FRESH).astype(np.int64), begin // CHUNK_ROWS
         records, chunks = np.zeros(chunks_of(len(entries)), record), sources // CHUNK_ROWS
+        for name in values.initial.keys() & set(record.names or ()):
+            records[name] = values.initial[name]
         wanted = np.unique(chunks)
         for start in range(0, len(wanted), BLOCK_CHUNKS):
             some = wanted[start : start + BLOCK_CHUNKS]
             mine = np.flatnonzero((chunks >= some[0]) & (chunks <= some[-1]))
             old = read(some)
             at = CHUNK_ROWS * np.searchsorted(some, chunks[mine]) + sources[mine] % CHUNK_ROWS
-            _copy(old, at, records, mine, entries[mine] >= FRESH)
+            _copy(old, at, records, mine, entries[mine] >= FRESH, values)
         yield np.arange(first, first + len(records)), records
         passed(int(chunks[-1]))
 
@@ -120,18 +143,19 @@ def _copy(
     records: NDArray[Any],
     places: NDArray[np.int64],
     fresh: NDArray[np.bool_],
+    values: NewValues,
 ) -> None:
     """Copy rows of old records to places in new ones, of both of which the rows count on from record to record."""
-    parts = list(_by_chunk(places))
-    for name in old.dtype.names or ():
-        values = old[name].reshape(-1, *old[name].shape[2:]).take(at, axis=0)
-        if not name.startswith("parameters/"):
-            values[fresh] = 0.0
+    parts, wanted = list(_by_chunk(places)), set(records.dtype.names or ()) - values.anew
+    for name in (name for name in old.dtype.names or () if name in wanted):
+        rows = old[name].reshape(-1, *old[name].shape[2:]).take(at, axis=0)
+        if (value := values.fresh.get(name.split("/")[0])) is not None:
+            rows[fresh] = value
         target = records[name]
-        if target.shape[2:] != values.shape[1:]:  # more SH coefficients
-            target = target[:, :, : values.shape[1]]
+        if target.shape[2:] != rows.shape[1:]:  # more SH coefficients
+            target = target[:, :, : rows.shape[1]]
         for number, theirs, ours in parts:
-            target[number, theirs] = values[ours]
+            target[number, theirs] = rows[ours]
 
 
 def _by_chunk(places: NDArray[np.int64]) -> Iterator[tuple[int, Any, slice]]:

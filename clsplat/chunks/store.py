@@ -3,7 +3,8 @@
 
 A record has all fields of CHUNK_ROWS rows, one field after the other, so that a chunk moves by one read or write. In a
 file each field of a record has a checksum, so that a file that was cut or changed never gives a wrong row. A chunk that
-a kept checkpoint names is not overwritten, but written to another slot (docs/decisions/0052-a-store-of-chunks.md).
+a kept checkpoint names is not overwritten, but written to another slot (docs/decisions/0052-a-store-of-chunks.md). A
+field that was filled with a constant is only noted as such.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.chunks.manifest import Manifest, chunks_of
+from clsplat.chunks.manifest import CONSTANTS, WRITTEN, ZERO, Manifest, chunks_of
 from clsplat.chunks.slots import NO_SLOT, SlotTable
 from clsplat.errors import InputError, WriteError, reason_of
 from clsplat.files.atomic import remove, require_room, sync_folder, write_error
@@ -70,15 +71,18 @@ class ChunkStore:
         self.release: Callable[[], KeptSlots | None] = lambda: None
         self.moved: Callable[[int, float], object] = lambda _nbytes, _seconds: None
         self._memory: list[NDArray[np.uint8] | None] = [None] * self.chunks if path is None else []
-        """The bytes of each chunk in main memory, None for zeros: an array each, to be given back alone."""
+        """The bytes of each chunk in main memory, None before it is written: an array each, to be given back alone."""
         self._given_back = 0
+        self._names = tuple(self.record.names or ())
+        self._constants = np.full((self.chunks, len(self._names)), ZERO)
+        """By chunk and field, ZERO or INFINITE if all elements are that, whatever the record has; else WRITTEN."""
         if path is None:
             return
-        self._names = tuple(self.record.names or ())
         if opened is not None:
             self._file, manifest = opened
             size = os.fstat(self._file.fileno()).st_size // self.record.itemsize
-            self._checksums, current = manifest.checksums.copy(), manifest.slots.copy()
+            self._checksums, self._constants = manifest.checksums.copy(), manifest.constants.copy()
+            current = manifest.slots.copy()
         else:
             self._file, size = _new_file(path, self.nbytes), self.chunks
             self._checksums = np.zeros((self.chunks, len(self._names)), np.uint32)
@@ -105,7 +109,8 @@ class ChunkStore:
         except OSError as error:
             raise write_error(str(self.path), error) from None
         sync_folder(self.path.parent)
-        return Manifest(self.path, self.count, self.fields, self.slots.current.copy(), self._checksums.copy())
+        arrays = self.slots.current.copy(), self._checksums.copy(), self._constants.copy()
+        return Manifest(self.path, self.count, self.fields, *arrays)
 
     @property
     def is_lost(self) -> bool:
@@ -149,15 +154,17 @@ class ChunkStore:
         records = np.empty(len(numbers), self.record)
         if self.path is None:
             for row, number in zip(_rows_of(records), numbers, strict=True):
-                held = self._memory[number]
-                row[:] = 0 if held is None else held
-            return records
-        slots = self.slots.current[numbers]
-        records[slots == NO_SLOT] = np.zeros((), self.record)
-        for begin, first, length in runs(slots):
-            self._read_at(first * self.record.itemsize, records[begin : begin + length])
-        for place in np.flatnonzero(slots != NO_SLOT):
-            self._check(int(numbers[place]), self._names, records[place])
+                if (held := self._memory[number]) is not None:
+                    row[:] = held
+        else:
+            for begin, first, length in runs(self.slots.current[numbers]):
+                self._read_at(first * self.record.itemsize, records[begin : begin + length])
+            for place, number in enumerate(numbers):
+                self._check(int(number), self._names, records[place])
+        constants = self._constants[numbers]
+        for index in np.flatnonzero(constants.any(axis=0)):
+            for constant, value in CONSTANTS.items():
+                records[self._names[index]][constants[:, index] == constant] = value
         return records
 
     def write(self, numbers: NDArray[np.integer[Any]], records: NDArray[Any]) -> None:
@@ -165,6 +172,7 @@ class ChunkStore:
         if self.path is None:
             for row, number in zip(_rows_of(records), numbers, strict=True):
                 self._in_memory(int(number))[:] = row
+            self._constants[numbers] = WRITTEN
             return
         self._make_room(numbers)
         slots = self.slots.targets(numbers)
@@ -173,6 +181,7 @@ class ChunkStore:
         self.slots.written(numbers, slots)
         for place, number in enumerate(numbers):
             self._checksums[number] = [zlib.crc32(records[place][name]) for name in self._names]
+        self._constants[numbers] = WRITTEN
 
     def get_rows(self, field: str, start: int, stop: int) -> NDArray[np.float32]:
         """A copy of the rows [start, stop) of a field. Raises ScratchError as `read`."""
@@ -236,6 +245,20 @@ class ChunkStore:
                 own[:] = changed
                 self._set_field(number, field, rows)
 
+    def fill(self, field: str, value: float) -> None:
+        """Set every element of a field. If the value is one of CONSTANTS, no chunk is read or written."""
+        constant = next((each for each, known in CONSTANTS.items() if known == value), None)
+        if constant is None:
+            self.change(field, lambda rows: np.full_like(rows, value))
+        elif field in self._names:
+            self._constants[:, self._names.index(field)] = constant
+
+    def rename(self, names: Mapping[str, str]) -> None:
+        """Give fields other names. names: the new names by the old ones."""
+        self.fields = {names.get(name, name): shape for name, shape in self.fields.items()}
+        self.record = record_type(self.fields)
+        self._names = tuple(self.record.names or ())
+
     def give_back(self, before: int) -> None:
         """Give back the memory of the chunks below number `before`, which nobody reads again."""
         for number in range(self._given_back, before) if self.path is None else ():
@@ -252,12 +275,18 @@ class ChunkStore:
     def _field(self, number: int, field: str) -> NDArray[np.float32]:
         """A field (CHUNK_ROWS, ...) of a chunk's record. In main memory it is the field itself."""
         kind, offset = self.record.fields[field][:2]  # type: ignore[index]  # it has fields
+        of_field = number, self._names.index(field)
+        constant = int(self._constants[of_field])
         if self.path is None:
             held = self._in_memory(number)[offset : offset + kind.itemsize]
-            return held.view(np.float32).reshape(kind.shape)
-        rows = np.zeros(kind.shape, np.float32)
-        if (slot := int(self.slots.current[number])) != NO_SLOT:
-            self._read_at(slot * self.record.itemsize + offset, rows)
+            rows = held.view(np.float32).reshape(kind.shape)
+            self._constants[of_field] = WRITTEN
+        else:
+            rows = np.empty(kind.shape, np.float32)
+        if constant != WRITTEN:
+            rows[:] = CONSTANTS[constant]
+        elif self.path is not None:
+            self._read_at(int(self.slots.current[number]) * self.record.itemsize + offset, rows)
             self._check(number, (field,), {field: rows})
         return rows
 
@@ -271,9 +300,9 @@ class ChunkStore:
             record[field][0] = rows
             self.write(numbers, record)
             return
-        slot = int(self.slots.current[number])
+        slot, of_field = int(self.slots.current[number]), (number, self._names.index(field))
         self._write_at(slot * self.record.itemsize + self.record.fields[field][1], rows)  # type: ignore[index]
-        self._checksums[number, self._names.index(field)] = zlib.crc32(rows.data)
+        self._checksums[of_field], self._constants[of_field] = zlib.crc32(rows.data), WRITTEN
 
     def _make_room(self, numbers: NDArray[np.integer[Any]]) -> None:
         """Let the file have free slots for these chunks. Raises WriteError."""
@@ -290,7 +319,8 @@ class ChunkStore:
     def _check(self, number: int, names: Sequence[str], record: Any) -> None:
         """Raise ScratchError if fields of a record differ from what was written."""
         for name in names:
-            if zlib.crc32(record[name]) != self._checksums[number, self._names.index(name)]:
+            of_field = number, self._names.index(name)
+            if self._constants[of_field] == WRITTEN and zlib.crc32(record[name]) != self._checksums[of_field]:
                 raise ScratchError(f"{self.path}: chunk {number} of the model has changed since it was written")
 
     def _read_at(self, offset: int, into: NDArray[Any]) -> None:

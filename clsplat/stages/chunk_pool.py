@@ -54,7 +54,8 @@ def copy_chunks(
 
 
 class ChunkPool:
-    """The chunks of a streamed model that are on the device: parameters and moments, with room for `rows` Gaussians.
+    """The chunks of a streamed model that are on the device: parameters, moments and statistics, with room for `rows`
+    Gaussians.
 
     store: records of all chunks. Those on the device may be newer there, until `write_back`.
     arrays: by field, the rows of the slots.
@@ -130,6 +131,16 @@ class ChunkPool:
         self._exchange_caught(*self._residency.held(), nothing, nothing.astype(np.uint32))
         self._residency.clear()
 
+    def fill(self, field: str, value: float) -> None:
+        """Set every element of a field, in the slots and in the store."""
+        self.arrays[field].fill(value)
+        self.store.fill(field, value)
+
+    def rename(self, names: Mapping[str, str]) -> None:
+        """Give fields other names, in the slots and in the store. names: the new names by the old ones."""
+        self.arrays = {names.get(name, name): array for name, array in self.arrays.items()}
+        self.store.rename(names)
+
     def slots_of(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
         """The slot of each chunk, -1 if it is not on the device."""
         return self._residency.slots_of(numbers)
@@ -195,6 +206,11 @@ class StoredArray:
     def shape(self) -> tuple[int, ...]:
         return self.pool.store.count, *self.pool.store.fields[self.field]
 
+    @property
+    def in_pool(self) -> DeviceArray:
+        """The rows of the pool's slots."""
+        return self.pool.arrays[self.field]
+
     def get(self) -> NDArray[np.float32]:
         """A copy of all rows."""
         return self.get_rows(0, self.pool.store.count)
@@ -230,4 +246,4 @@ class StoredArray:
 
     def fill(self, value: float) -> None:
         """Set every element."""
-        self.change(lambda rows: np.full_like(rows, value))
+        self.pool.fill(self.field, value)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calls import raising
 from numpy.typing import NDArray
 from wide import flip, full
 
@@ -81,6 +82,54 @@ def test_rows_of_some_chunks(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found["a"], np.concatenate([values[4096:5120], values[19 * CHUNK_ROWS :]]))
     assert found["none"].shape == (2 * CHUNK_ROWS - 5, 0, 3)
     store.close()
+
+
+@pytest.mark.parametrize("value", [0.0, np.inf])
+@pytest.mark.parametrize("in_file", [False, True])
+def test_a_constant_is_noted_and_not_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_file: bool, value: float
+) -> None:
+    """Also where a checkpoint names the chunks. A later change of some rows keeps it in the others."""
+    made = ChunkStore(COUNT, FIELDS, tmp_path / "x.chunks" if in_file else None)
+    records = written(made)
+    if in_file:
+        made.slots.hold([made.manifest().slots])
+    with monkeypatch.context() as patch:
+        for name in ("_read_at", "_write_at", "_in_memory"):
+            patch.setattr(made, name, raising(AssertionError(name)))
+        made.fill("b", value)
+        made.fill("none", value)
+    got = made.read(ALL)
+    assert (got["b"] == value).all()
+    assert got["a"].tobytes() == records["a"].tobytes()
+    made.set_at("b", np.array([5]), np.ones(1, np.float32))
+    assert made.get_rows("b", 4, 7).tolist() == [value, 1, value]
+    made.write(np.array([3]), records[3:4])
+    assert made.read(np.array([3, 4]))["b"].tolist() == [records["b"][3].tolist(), [value] * CHUNK_ROWS]
+    if in_file:
+        again = ChunkStore.opened(made.manifest(), writable=False)
+        again.verify()
+        assert again.read(ALL).tobytes() == made.read(ALL).tobytes()
+        again.close()
+    made.fill("b", 3.0)
+    assert (made.get_rows("b", 0, COUNT) == 3).all()
+    made.close()
+
+
+@pytest.mark.parametrize("in_file", [False, True])
+def test_fields_may_change_their_names(tmp_path: Path, in_file: bool) -> None:
+    made = ChunkStore(COUNT, {"now": (), "then": ()}, tmp_path / "x.chunks" if in_file else None)
+    now, then = np.arange(COUNT, dtype=np.float32), -np.arange(COUNT, dtype=np.float32)
+    made.set_rows("now", 0, now)
+    made.set_rows("then", 0, then)
+    made.rename({"now": "then", "then": "now"})
+    made.set_rows("now", 7, np.full(1, 0.5, np.float32))
+    then[7] = 0.5
+    stores = [made, ChunkStore.opened(made.manifest(), writable=False)] if in_file else [made]
+    for each in stores:
+        np.testing.assert_array_equal(each.get_rows("now", 0, COUNT), then)
+        np.testing.assert_array_equal(each.get_rows("then", 0, COUNT), now)
+        each.close()
 
 
 def test_what_a_checkpoint_names_is_not_overwritten(store: ChunkStore) -> None:
@@ -244,6 +293,9 @@ WRONG: dict[str, Callable[[Manifest], Manifest]] = {
     "another type": lambda m: replace(m, slots=m.slots.astype(np.int32)),  # type: ignore[arg-type]
     "more Gaussians": lambda m: replace(m, count=m.count + CHUNK_ROWS),
     "no Gaussians": lambda m: replace(m, count=0),
+    "fewer constants": lambda m: replace(m, constants=m.constants[:-1]),
+    "an unknown constant": lambda m: replace(m, constants=m.constants + np.uint8(3)),
+    "a chunk that is nowhere": lambda m: replace(m, slots=np.where(m.slots == 3, -1, m.slots)),
     "fewer checksums": lambda m: replace(m, checksums=m.checksums[:, :1]),
     "a huge field": lambda m: replace(m, fields={**m.fields, "b": (1 << 40,)}),
     "many fields": lambda m: replace(m, fields={str(k): () for k in range(99)}),

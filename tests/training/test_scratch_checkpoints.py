@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny import short
+from tiny import run_steps, short
 from wide import flip, full, let_small_models_have_chunks, start_training, start_wide
 
 from clsplat.api import train
 from clsplat.chunks import store as store_module
-from clsplat.chunks.manifest import Manifest
+from clsplat.chunks.manifest import Manifest, manifest_of
 from clsplat.chunks.slots import MAX_TENTHS
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
@@ -27,11 +27,12 @@ from clsplat.errors import CapacityError, InputError, WriteError
 from clsplat.files import atomic, mounts
 from clsplat.gaussians import GaussiansOfFile
 from clsplat.layouts.columns import CHUNK_ROWS
-from clsplat.runs.checkpoints import read_manifest
+from clsplat.runs.checkpoints import Checkpoint, read_manifest
 from clsplat.runs.run import Run, owned_files
 from clsplat.runs.scratch import owner_of
 from clsplat.scenes.scene import Scene
 from clsplat.stages import chunk_pool
+from clsplat.training.memory import HostMemory
 from clsplat.training.trainer import Trainer
 
 LIMIT = 4 << 20
@@ -148,6 +149,34 @@ def test_resumed_under_another_limit(
     manifests = [manifest.path for _, manifest in run.manifests()]
     assert set(files_of(run)) == set(manifests), "files that no checkpoint names any longer are removed"
     assert bool(manifests) == (second in (LIMIT, 5 << 20))
+
+
+@pytest.mark.parametrize("scratch", ["same", "other"])
+def test_statistics_that_the_settings_did_not_need_before(
+    scene: Scene, default_device: Device, tmp_path: Path, scratch: str
+) -> None:
+    """They stay unknown, and the others go on. The chunks then have other fields, so they take a new file."""
+    run = Run.create(tmp_path / "run", STEADY)
+    more = replace(STEADY, density=replace(STEADY.density, every=100, min_contribution=1e-3))
+    memory = HostMemory.chosen(LIMIT, "none", run)
+    trainer = Trainer(scene, STEADY, default_device, memory=memory)
+    run_steps(5, trainer)
+    arrays, state = trainer.checkpoint()
+    checkpoint = Checkpoint(trainer.step, arrays, state, manifest_of(arrays, state))
+    if scratch == "other":
+        memory = replace(memory, scratch=tmp_path / "other")
+    other = Trainer(scene, more, default_device, memory=memory)
+    other.restore(checkpoint)
+    named = other.statistics.named()
+    assert len(named) == 7
+    for name, array in named.items():
+        if name in trainer.statistics.named():
+            assert np.array_equal(array.get(), trainer.statistics.named()[name].get())
+        else:
+            assert np.isinf(array.get()).all()
+    assert other.model.store is not None
+    for each in (other, trainer):
+        each.close()
 
 
 def test_a_finished_training_can_go_on(go: Train, whole: Callable[[TrainConfig], bytes]) -> None:

@@ -34,7 +34,7 @@ from clsplat.images.writing import write_image
 from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
-from clsplat.stages.device_gaussians import HostGaussians
+from clsplat.stages.device_gaussians import HostArray, HostGaussians
 from clsplat.training.memory import UNLIMITED, HostMemory
 from clsplat.training.trainer import Trainer
 
@@ -141,7 +141,7 @@ def large_trainer(scene: Scene, config: TrainConfig, arguments: Any, count: int,
     model.plan = trainer.planner.plan(count, trainer.strategy.needs(), trainer.components, trainer.pending.turns)
     model.set(HostGaussians(count, (config.sh_degree + 1) ** 2, arrays, count))
     for component in trainer.components:
-        component.rows_moved(trainer.statistics.seen)
+        component.rows_moved(HostArray(np.broadcast_to(np.uint32(0), count)))
     return trainer
 
 

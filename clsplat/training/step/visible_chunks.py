@@ -268,12 +268,11 @@ class VisibleChunks(Component):
         if chunks.whole and pool is None:
             return None
         if pool is not None and len(chunks.numbers) > pool.slots:
-            return PlacedChunks(model, ChunkNumbers(chunks.numbers), None)
-        listed = send_chunks(work, "chunks", chunks.numbers, model[0].count)
+            return PlacedChunks(model, ChunkNumbers(chunks.numbers))
         if pool is None:
-            return PlacedChunks(model, listed, listed)
+            return PlacedChunks(model, send_chunks(work, "chunks", chunks.numbers, model[0].count))
         slots = send_chunks(work, "chunk_slots", pool.place(chunks.numbers, changes=True), pool.rows)
-        return PlacedChunks(_in_pool(model), slots, listed)
+        return PlacedChunks(_in_pool(model), slots)
 
     def _note(self, step: AdamStep) -> None:
         """Put a step into the table, from which steps go that all chunks have taken."""
