@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.chunks.manifest import chunks_of
+from clsplat.chunks.division import NEW, Division, chunk_of
 from clsplat.chunks.order import beside_parents
-from clsplat.chunks.store import BLOCK_CHUNKS
 from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.optimisation.density_rules import FRESH
 
+BLOCK_CHUNKS = 16
+"""Chunks that are read or written at once where many of them are."""
 _KEPT, _CLONE, _FIRST_HALF, _SECOND_HALF = range(4)
 """Kinds of rows, in the order of a list by kind."""
 
@@ -104,37 +105,64 @@ class NewValues:
 _MOVED_AS_THEY_ARE = NewValues()
 
 
+@dataclass(frozen=True, eq=False)
+class OldChunks:
+    """Chunks whose rows move.
+
+    starts: as in `Division`.
+    read: function that returns the records of some of them.
+    """
+
+    starts: NDArray[np.int64]
+    read: Reader
+
+
 def gathered(
-    rows: NDArray[np.uint32],
-    read: Reader,
+    rows: NDArray[np.uint32] | None,
+    old: OldChunks,
+    to: Division,
     record: np.dtype[Any],
-    passed: Callable[[int], None],
+    passed: Callable[[int], None] = lambda _: None,
     values: NewValues = _MOVED_AS_THEY_ARE,
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
-    """Yield numbers and records of the new chunks, some at a time. Row j of the model becomes the old row rows[j].
+    """Yield numbers and records of the chunks that are new, some at a time. Row j of the model becomes the old row
+    rows[j]; with None all rows stay.
 
     SH coefficients that the old records do not have are zero.
 
-    read: of the old chunks.
     record: type of the new records. Other fields of the old ones are left out.
     passed: called with the number of the first old chunk that is still read, if the sources of `rows` rise.
     """
-    size = CHUNK_ROWS * BLOCK_CHUNKS
-    for begin in range(0, len(rows), size):
-        entries = rows[begin : begin + size]
-        sources, first = (entries & ~FRESH).astype(np.int64), begin // CHUNK_ROWS
-        records, chunks = np.zeros(chunks_of(len(entries)), record), sources // CHUNK_ROWS
+    new = np.flatnonzero(to.kept == NEW)
+    for begin in range(0, len(new), BLOCK_CHUNKS):
+        numbers = new[begin : begin + BLOCK_CHUNKS]
+        entries, places = _entries(rows, to.starts, numbers)
+        sources, records = (entries & ~FRESH).astype(np.int64), np.zeros(len(numbers), record)
         for name in values.initial.keys() & set(record.names or ()):
             records[name] = values.initial[name]
+        chunks = chunk_of(old.starts, sources)
         wanted = np.unique(chunks)
         for start in range(0, len(wanted), BLOCK_CHUNKS):
             some = wanted[start : start + BLOCK_CHUNKS]
             mine = np.flatnonzero((chunks >= some[0]) & (chunks <= some[-1]))
-            old = read(some)
-            at = CHUNK_ROWS * np.searchsorted(some, chunks[mine]) + sources[mine] % CHUNK_ROWS
-            _copy(old, at, records, mine, entries[mine] >= FRESH, values)
-        yield np.arange(first, first + len(records)), records
+            of_mine, old_records = chunks[mine], old.read(some)
+            at = CHUNK_ROWS * np.searchsorted(some, of_mine) + sources[mine] - old.starts[of_mine]
+            _copy(old_records, at, records, places[mine], entries[mine] >= FRESH, values)
+            del old_records
+        yield numbers, records
         passed(int(chunks[-1]))
+
+
+def _entries(
+    rows: NDArray[np.uint32] | None, starts: NDArray[np.int64], numbers: NDArray[np.int64]
+) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
+    """Entries of the rows of some chunks, and their places in the chunks' records, which have CHUNK_ROWS each."""
+    entries, places = [], []
+    for place, number in enumerate(numbers.tolist()):
+        begin, end = int(starts[number]), int(starts[number + 1])
+        entries.append(np.arange(begin, end, dtype=np.uint32) if rows is None else rows[begin:end])
+        places.append(np.arange(CHUNK_ROWS * place, CHUNK_ROWS * place + end - begin))
+    return np.concatenate(entries), np.concatenate(places)
 
 
 def _copy(

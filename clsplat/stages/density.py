@@ -32,7 +32,7 @@ LISTED_ROWS = 1 << 16
 CONTRIBUTION_STATISTICS = ("current_totals", "current_largest", "whole_totals", "whole_largest")
 NEXT_EPOCH = {"whole_totals": "current_totals", "whole_largest": "current_largest"}
 NEXT_EPOCH |= {current: whole for whole, current in NEXT_EPOCH.items()}
-"""What each contribution is called in the next epoch. Those that become current begin at 0."""
+"""Names of contributions in the next epoch. Those that become current begin at 0."""
 KIND = "statistics"
 """Beginning of the names of statistics in a checkpoint and a store of chunks."""
 

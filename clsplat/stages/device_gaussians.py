@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from clsplat.chunks.gathering import NewValues, gathered
-from clsplat.chunks.manifest import chunks_of
-from clsplat.chunks.store import ChunkStore, record_type, runs
+from clsplat.chunks.division import NEW, Division, even_starts
+from clsplat.chunks.gathering import NewValues, OldChunks, gathered
+from clsplat.chunks.slot_file import runs
+from clsplat.chunks.store import ChunkStore, record_type
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, floats_of, group_shapes
@@ -171,8 +172,8 @@ def parts(
     Models on the device have a single part. Each part of another model is valid until the next part is requested.
 
     models: all on the device, or none: the first ones in one pool, if there is a pool, and the others in main memory. A
-        part of a pool has at most as many chunks as the pool has slots.
-    keep: True keeps changes of the parts: they are copied back to the host, or noted in the pool.
+        part of a pool has as many rows as the pool's slots have room for.
+    keep: True keeps changes of the parts: they are copied back to the host, or to the pool's store.
     """
     on_device = tuple(model for model in models if isinstance(model, DeviceGaussians))
     if len(on_device) == len(models):
@@ -184,12 +185,14 @@ def parts(
     for start in range(0, count, rows):
         stop = min(start + rows, count)
         if pool is not None:
-            pool.place_run(start // CHUNK_ROWS, chunks_of(stop - start), changes=keep)
+            pool.place_rows(start, stop)
         there = [
             model.first_in_pool(stop - start) if model.pool is not None else _uploaded(work, index, model, start, stop)
             for index, model in enumerate(streamed)
         ]
         yield start, stop, tuple(there)
+        if keep and pool is not None:
+            pool.keep_rows(start, stop)
         for model, part in zip(streamed, there, strict=True) if keep else ():
             for name, array in part.arrays.items() if model.pool is None else ():
                 array.read_into(model[name].values[start:stop])
@@ -256,16 +259,16 @@ class CopiedRows:
     rows: NDArray[np.uint32] | None = None
     values: NewValues = field(default_factory=NewValues)
 
-    def to_store(self, store: ChunkStore, passed: Callable[[int], None] = lambda _: None) -> None:
-        """Copy to a store. passed: as in `chunks.gathering.gathered`. Raises WriteError and ScratchError."""
-        for numbers, records in self._records(store.record, passed):
+    def to_store(self, store: ChunkStore) -> None:
+        """Copy to a store. Raises WriteError and ScratchError."""
+        for numbers, records in self._records(store.record, store.starts):
             store.write(numbers, records)
 
     def to_arrays(self, arrays: Mapping[str, AnyArray]) -> None:
         """Copy to arrays by field, on the device or in main memory. Raises ScratchError."""
         record = record_type({name: array.shape[1:] for name, array in arrays.items()})
         count = arrays["parameters/means"].shape[0]
-        for numbers, records in self._records(record, lambda _: None):
+        for numbers, records in self._records(record, even_starts(count)):
             begin = CHUNK_ROWS * int(numbers[0])
             end = min(begin + CHUNK_ROWS * len(numbers), count)
             for name in record.names or ():
@@ -273,16 +276,17 @@ class CopiedRows:
                 array.set_rows(begin, records[name].reshape(-1, *array.shape[1:])[: end - begin])
 
     def _records(
-        self, record: np.dtype[Any], passed: Callable[[int], None]
+        self, record: np.dtype[Any], starts: NDArray[np.int64]
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
         means = self.arrays["parameters/means"]
-        rows = np.arange(means.shape[0], dtype=np.uint32) if self.rows is None else self.rows
         if isinstance(means, StoredArray):
             means.pool.write_back()
-            read = means.pool.store.read
+            old = OldChunks(means.pool.store.starts, means.pool.store.read)
         else:
-            read = partial(_records, means.shape[0], self.arrays)
-        return gathered(rows, read, record, passed, self.values)
+            count = means.shape[0]
+            old = OldChunks(even_starts(count), partial(_records, count, self.arrays))
+        to = Division(starts, np.full(len(starts) - 1, NEW))
+        return gathered(self.rows, old, to, record, values=self.values)
 
 
 def _records(count: int, arrays: Mapping[str, ReadableArray], numbers: NDArray[np.int64]) -> NDArray[Any]:

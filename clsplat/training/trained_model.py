@@ -19,7 +19,7 @@ from clsplat.arrays import Float32
 from clsplat.chunks.gathering import NewValues
 from clsplat.chunks.manifest import Manifest
 from clsplat.chunks.order import ORDERED_ROWS, space_order
-from clsplat.chunks.store import ChunkStore
+from clsplat.chunks.store import ChunkStore, record_type
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
@@ -74,6 +74,7 @@ from clsplat.training.density import RowPlan
 from clsplat.training.moved_rows import MovedRows, both, ordered, some_of
 from clsplat.training.stability.health import examine
 
+_ALL_ROWS = new_values()
 EXAMINED_CHUNKS = 64
 """Chunks whose numbers are examined at once."""
 HALVED_ROWS = 1 << 15
@@ -204,7 +205,7 @@ class TrainedModel:
         """Arrays and state of a checkpoint: a manifest if there is a scratch file."""
         if (store := self.store) is None or self._pool is None:
             return self.arrays(), {}
-        if store.is_lost:
+        if store.file.is_lost:
             warn(f"{store.path}: has been removed while it was in use; the Gaussians go to a new file")
             self._place()
             return self.record()
@@ -238,7 +239,7 @@ class TrainedModel:
     def widen(self, coefficients: int) -> None:
         """Make room for more SH coefficients, which start from zero."""
         if self._pool is not None:
-            self._place(coefficients=coefficients)
+            self._move_chunks(None, lambda: None, new_values(), coefficients)
             return
         if not self.plan.gathers:
             self._take_down()
@@ -282,7 +283,7 @@ class TrainedModel:
         rows: NDArray[np.uint32] | None = None,
         coefficients: int = 0,
         changes: Callable[[], None] = lambda: None,
-        values: NewValues | None = None,
+        values: NewValues = _ALL_ROWS,
     ) -> None:
         """Put Gaussians where the plan assigns them. The rows of a large streamed model are in a store of chunks.
 
@@ -293,7 +294,6 @@ class TrainedModel:
         changes: called before the first change of this model.
         values: of moved rows.
         """
-        values = values or new_values()
         parameters = self.parameters if models is None else models[0]
         assert parameters is not None
         count, coefficients = parameters.count if rows is None else len(rows), coefficients or parameters.coefficients
@@ -326,15 +326,13 @@ class TrainedModel:
         source, old = self.with_moments if models is None else models, self._pool if models is None else None
         named = self.statistics.named() if statistics is None else statistics
         copied = CopiedRows(by_field(source) | {f"{KIND}/{name}": each for name, each in named.items()}, rows, values)
-        store = ChunkStore(count, self._fields(coefficients), self._scratch(self._record_bytes(coefficients) * count))
+        path, widest = self._scratch(self._record_bytes(coefficients) * count), self._fields((self._sh_degree + 1) ** 2)
+        starts = old.store.starts if old is not None and rows is None else None
+        store = ChunkStore(count, self._fields(coefficients), path, widest=widest, starts=starts)
         make = partial(ChunkPool, self._device, self._work, store, self.plan.rows)
         try:
             pool = make() if isinstance(source[0], HostGaussians) and old is None else None
-            if old is not None and old.store.path is None and store.path is None:
-                changes()  # no memory for a second copy is needed: each chunk is given back when it has been copied
-                copied.to_store(store, old.store.give_back)
-            else:
-                copied.to_store(store)
+            copied.to_store(store)
         except BaseException:
             store.close()
             raise
@@ -343,6 +341,24 @@ class TrainedModel:
         vars(self).pop("statistics", None)
         self._free_models()
         self._use(pool or make(), coefficients)
+
+    def _move_chunks(
+        self, rows: NDArray[np.uint32] | None, changes: Callable[[], None], values: NewValues, coefficients: int
+    ) -> None:
+        """Move the rows of a model in a store, which stays where it is unless main memory has no room for it any
+        longer. Arguments as those of `_place`."""
+        assert self._pool is not None
+        count, store = self.parameters.count if rows is None else len(rows), self._pool.store
+        to_file = store.path is None and self._scratch(self._record_bytes(coefficients) * count) is not None
+        if to_file or not self.plan.streamed or count <= ORDERED_ROWS:
+            self._place(rows=rows, coefficients=coefficients, changes=changes, values=values)
+            return
+        self._pool.release()
+        store.move(rows, values, changes, self._fields(coefficients) if rows is None else None)
+        self._pool.free()
+        self._pool = None
+        self._free_models()
+        self._use(ChunkPool(self._device, self._work, store, self.plan.rows), coefficients)
 
     def _fields(self, coefficients: int) -> dict[str, tuple[int, ...]]:
         """Fields of a store of this model."""
@@ -390,12 +406,13 @@ class TrainedModel:
         if (
             manifest is None
             or dict(manifest.fields) != self._fields(coefficients)
+            or manifest.slot_bytes != record_type(self._fields((self._sh_degree + 1) ** 2)).itemsize
             or not self.plan.streamed
             or self._files is None
             or not self._files.may_write(manifest.path)
         ):
             return False
-        if self._scratch(self._record_bytes(coefficients) * manifest.count) is None:
+        if self._scratch(self._record_bytes(coefficients) * int(manifest.lengths.sum())) is None:
             return False
         self.close()
         store = ChunkStore.opened(manifest, writable=True)
@@ -475,8 +492,12 @@ class TrainedModel:
             try_gather(self._device, count, self.parameters)
         try:
             self.plan = self._make_plan(count)
-            if self._pool is not None or (self.plan.streamed and count > ORDERED_ROWS):
-                self._place(rows=_on_host(rows), changes=changes, values=new_values(densified=new_statistics))
+            values = new_values(densified=new_statistics)
+            if self._pool is not None:
+                self._move_chunks(_on_host(rows), changes, values, self.parameters.coefficients)
+                return
+            if self.plan.streamed and count > ORDERED_ROWS:
+                self._place(rows=_on_host(rows), changes=changes, values=values)
                 return
             rows = self._gather(rows, on_device=gathers and self.plan.gathers, changes=changes)
         except CapacityError as error:
