@@ -6,19 +6,20 @@ New rows stand behind the rows that they are copied from. So a new record needs 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.chunks.manifest import chunks_of
+from clsplat.chunks.division import NEW, Division, chunk_of
 from clsplat.chunks.order import beside_parents
-from clsplat.chunks.store import BLOCK_CHUNKS
 from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.optimisation.density_rules import FRESH
 
+BLOCK_CHUNKS = 16
+"""Chunks that are read or written at once where many of them are."""
 _KEPT, _CLONE, _FIRST_HALF, _SECOND_HALF = range(4)
 """Kinds of rows, in the order of a list by kind."""
 
@@ -87,31 +88,81 @@ Reader = Callable[[NDArray[np.int64]], NDArray[Any]]
 """A function that returns the records of the chunks with these numbers."""
 
 
+@dataclass(frozen=True, eq=False)
+class NewValues:
+    """Values of fields where rows do not have those of the row that they come from.
+
+    fresh: by kind, the beginning of a field's name: the value of FRESH rows. Fields of other kinds are copied.
+    initial: values of new fields, and of those that begin anew; 0 if a field is not listed.
+    anew: fields that begin anew in every row.
+    """
+
+    fresh: Mapping[str, float] = field(default_factory=lambda: {"first": 0.0, "second": 0.0})
+    initial: Mapping[str, float] = field(default_factory=dict)
+    anew: frozenset[str] = frozenset()
+
+
+_MOVED_AS_THEY_ARE = NewValues()
+
+
+@dataclass(frozen=True, eq=False)
+class OldChunks:
+    """Chunks whose rows move.
+
+    starts: as in `Division`.
+    read: function that returns the records of some of them.
+    """
+
+    starts: NDArray[np.int64]
+    read: Reader
+
+
 def gathered(
-    rows: NDArray[np.uint32], read: Reader, record: np.dtype[Any], passed: Callable[[int], None]
+    rows: NDArray[np.uint32] | None,
+    old: OldChunks,
+    to: Division,
+    record: np.dtype[Any],
+    passed: Callable[[int], None] = lambda _: None,
+    values: NewValues = _MOVED_AS_THEY_ARE,
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
-    """Yield numbers and records of the new chunks, some at a time. Row j of the model becomes the old row rows[j].
+    """Yield numbers and records of the chunks that are new, some at a time. Row j of the model becomes the old row
+    rows[j]; with None all rows stay.
 
-    The moments of FRESH rows are zero. SH coefficients that the old records do not have are zero.
+    SH coefficients that the old records do not have are zero.
 
-    read: of the old chunks.
-    record: type of the new records.
+    record: type of the new records. Other fields of the old ones are left out.
     passed: called with the number of the first old chunk that is still read, if the sources of `rows` rise.
     """
-    size = CHUNK_ROWS * BLOCK_CHUNKS
-    for begin in range(0, len(rows), size):
-        entries = rows[begin : begin + size]
-        sources, first = (entries & ~FRESH).astype(np.int64), begin // CHUNK_ROWS
-        records, chunks = np.zeros(chunks_of(len(entries)), record), sources // CHUNK_ROWS
+    new = np.flatnonzero(to.kept == NEW)
+    for begin in range(0, len(new), BLOCK_CHUNKS):
+        numbers = new[begin : begin + BLOCK_CHUNKS]
+        entries, places = _entries(rows, to.starts, numbers)
+        sources, records = (entries & ~FRESH).astype(np.int64), np.zeros(len(numbers), record)
+        for name in values.initial.keys() & set(record.names or ()):
+            records[name] = values.initial[name]
+        chunks = chunk_of(old.starts, sources)
         wanted = np.unique(chunks)
         for start in range(0, len(wanted), BLOCK_CHUNKS):
             some = wanted[start : start + BLOCK_CHUNKS]
             mine = np.flatnonzero((chunks >= some[0]) & (chunks <= some[-1]))
-            old = read(some)
-            at = CHUNK_ROWS * np.searchsorted(some, chunks[mine]) + sources[mine] % CHUNK_ROWS
-            _copy(old, at, records, mine, entries[mine] >= FRESH)
-        yield np.arange(first, first + len(records)), records
+            of_mine, old_records = chunks[mine], old.read(some)
+            at = CHUNK_ROWS * np.searchsorted(some, of_mine) + sources[mine] - old.starts[of_mine]
+            _copy(old_records, at, records, places[mine], entries[mine] >= FRESH, values)
+            del old_records
+        yield numbers, records
         passed(int(chunks[-1]))
+
+
+def _entries(
+    rows: NDArray[np.uint32] | None, starts: NDArray[np.int64], numbers: NDArray[np.int64]
+) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
+    """Entries of the rows of some chunks, and their places in the chunks' records, which have CHUNK_ROWS each."""
+    entries, places = [], []
+    for place, number in enumerate(numbers.tolist()):
+        begin, end = int(starts[number]), int(starts[number + 1])
+        entries.append(np.arange(begin, end, dtype=np.uint32) if rows is None else rows[begin:end])
+        places.append(np.arange(CHUNK_ROWS * place, CHUNK_ROWS * place + end - begin))
+    return np.concatenate(entries), np.concatenate(places)
 
 
 def _copy(
@@ -120,18 +171,19 @@ def _copy(
     records: NDArray[Any],
     places: NDArray[np.int64],
     fresh: NDArray[np.bool_],
+    values: NewValues,
 ) -> None:
     """Copy rows of old records to places in new ones, of both of which the rows count on from record to record."""
-    parts = list(_by_chunk(places))
-    for name in old.dtype.names or ():
-        values = old[name].reshape(-1, *old[name].shape[2:]).take(at, axis=0)
-        if not name.startswith("parameters/"):
-            values[fresh] = 0.0
+    parts, wanted = list(_by_chunk(places)), set(records.dtype.names or ()) - values.anew
+    for name in (name for name in old.dtype.names or () if name in wanted):
+        rows = old[name].reshape(-1, *old[name].shape[2:]).take(at, axis=0)
+        if (value := values.fresh.get(name.split("/")[0])) is not None:
+            rows[fresh] = value
         target = records[name]
-        if target.shape[2:] != values.shape[1:]:  # more SH coefficients
-            target = target[:, :, : values.shape[1]]
+        if target.shape[2:] != rows.shape[1:]:  # more SH coefficients
+            target = target[:, :, : rows.shape[1]]
         for number, theirs, ours in parts:
-            target[number, theirs] = values[ours]
+            target[number, theirs] = rows[ours]
 
 
 def _by_chunk(places: NDArray[np.int64]) -> Iterator[tuple[int, Any, slice]]:

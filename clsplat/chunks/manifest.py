@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The manifest of a checkpoint whose Gaussians are in a scratch file: the slot and the checksums of each chunk."""
+"""The manifest of a checkpoint whose Gaussians are in a scratch file: slot and checksums of each chunk."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 from clsplat.layouts.columns import CHUNK_ROWS
 
 MANIFEST_KEY = "chunks"
-SLOTS_KEY, CHECKSUMS_KEY = "chunks/slots", "chunks/checksums"
+MANIFEST_ARRAYS = ("chunks/lengths", "chunks/slots", "chunks/checksums", "chunks/constants")
+"""Names of its arrays in a checkpoint."""
+WRITTEN, ZERO, INFINITE = np.arange(3, dtype=np.uint8)
+CONSTANTS = {int(ZERO): 0.0, int(INFINITE): np.inf}
+"""Values that a field of a chunk may be known to have everywhere. A field that is WRITTEN has those in its slot."""
 _MOST_FIELDS, _MOST_FLOATS = 64, 64
 """Limits of what a damaged file can ask for: fields of a record, and elements of a row of one."""
-
-
-def chunks_of(rows: int) -> int:
-    """Number of chunks of a model of `rows` Gaussians."""
-    return -(-rows // CHUNK_ROWS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,50 +29,71 @@ class Manifest:
     """List of a checkpoint's chunks.
 
     path: the scratch file.
-    count: number of Gaussians.
+    slot_bytes: bytes of a slot, of which a record takes the first.
     fields: shape of a row of each field, float32, by name.
+    lengths: (chunks,) int64, the number of rows of each chunk.
     slots: (chunks,) int64, the slot of each chunk.
     checksums: (chunks, fields with elements) uint32, the crc32 of each field of each chunk.
+    constants: of the same shape, uint8: WRITTEN, or the constant that all elements of the field are.
     """
 
     path: Path
-    count: int
+    slot_bytes: int
     fields: Mapping[str, tuple[int, ...]]
+    lengths: NDArray[np.int64]
     slots: NDArray[np.int64]
     checksums: NDArray[np.uint32]
+    constants: NDArray[np.uint8]
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Its arrays in a checkpoint."""
-        return {SLOTS_KEY: self.slots, CHECKSUMS_KEY: self.checksums}
+        return dict(zip(MANIFEST_ARRAYS, (self.lengths, self.slots, self.checksums, self.constants), strict=True))
 
     def state(self) -> dict[str, Any]:
         """Its part of a checkpoint's state."""
         fields = {name: list(shape) for name, shape in self.fields.items()}
-        return {MANIFEST_KEY: {"file": str(self.path), "count": self.count, "rows": CHUNK_ROWS, "fields": fields}}
+        sizes = {"rows": CHUNK_ROWS, "slot_bytes": self.slot_bytes}
+        return {MANIFEST_KEY: {"file": str(self.path), **sizes, "fields": fields}}
 
 
 def manifest_of(arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) -> Manifest | None:
     """The manifest of a checkpoint; None if its Gaussians are arrays. Raises ValueError for a wrong one."""
     if (record := state.get(MANIFEST_KEY)) is None:
         return None
-    slots, checksums = arrays.get(SLOTS_KEY), arrays.get(CHECKSUMS_KEY)
-    if not isinstance(record, dict) or slots is None or checksums is None:
+    if not isinstance(record, dict) or not set(MANIFEST_ARRAYS) <= arrays.keys():
         raise ValueError("its list of chunks is incomplete")
-    file, count, fields = record.get("file"), record.get("count"), record.get("fields")
-    if not isinstance(file, str) or type(count) is not int or count < 1 or record.get("rows") != CHUNK_ROWS:
+    lengths, slots, checksums, constants = (arrays[key] for key in MANIFEST_ARRAYS)
+    file, slot_bytes, fields = record.get("file"), record.get("slot_bytes"), record.get("fields")
+    if not isinstance(file, str) or type(slot_bytes) is not int or record.get("rows") != CHUNK_ROWS:
         raise ValueError(f"its chunks are not as this version writes them ({CHUNK_ROWS} rows each)")
     if not isinstance(fields, dict) or len(fields) > _MOST_FIELDS or not all(map(_is_shape, fields.values())):
         raise ValueError("the fields of its chunks are not as this version writes them")
     shapes = {name: tuple(shape) for name, shape in fields.items()}
     filled = sum(0 not in shape for shape in shapes.values())
-    chunks = chunks_of(count)
-    for array, shape, kind in ((slots, (chunks,), np.int64), (checksums, (chunks, filled), np.uint32)):
+    if not _record_bytes(shapes) <= slot_bytes <= _MOST_FIELDS * _MOST_FLOATS * 4 * CHUNK_ROWS:
+        raise ValueError(f"its chunks are not as this version writes them (in slots of {slot_bytes} bytes)")
+    by_chunk, by_field = lengths.shape[:1], (*lengths.shape[:1], filled)
+    wanted = (
+        (lengths, by_chunk, np.int64),
+        (slots, by_chunk, np.int64),
+        (checksums, by_field, np.uint32),
+        (constants, by_field, np.uint8),
+    )
+    for array, shape, kind in wanted:
         if array.shape != shape or array.dtype != kind:
             raise ValueError(f"its list of chunks has shape {array.shape} of {array.dtype}, expected {shape}")
+    if not 1 <= lengths.min(initial=CHUNK_ROWS + 1) <= lengths.max(initial=1) <= CHUNK_ROWS:
+        raise ValueError(f"its chunks have lengths that are not from 1 to {CHUNK_ROWS}")
     written = slots[slots >= 0]
     if slots.min() < -1 or len(np.unique(written)) < len(written):
         raise ValueError("two of its chunks have one slot")
-    return Manifest(Path(file), count, shapes, slots, checksums)
+    if constants.max(initial=WRITTEN) > INFINITE or (constants[slots < 0] == WRITTEN).any():
+        raise ValueError("its list of chunks has constants that are not as this version writes them")
+    return Manifest(Path(file), slot_bytes, shapes, lengths, slots, checksums, constants)
+
+
+def _record_bytes(fields: Mapping[str, tuple[int, ...]]) -> int:
+    return 4 * CHUNK_ROWS * sum(map(prod, fields.values()))
 
 
 def _is_shape(value: object) -> bool:

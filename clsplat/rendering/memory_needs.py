@@ -108,7 +108,8 @@ def plan_step(
         photographs=0
         if device.shares_memory
         else (target.SOURCE_PIXEL_BYTES + step.masks * target.MASK_PIXEL_BYTES) * step.photographs,
-        held=statistics + step.row_bytes if step.by_chunk else None,
+        statistics=statistics,
+        held=step.row_bytes if step.by_chunk else None,
         pool=step.pool,
     )
     return _plan(device, need)

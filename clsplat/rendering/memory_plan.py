@@ -29,8 +29,9 @@ class Need:
     planes: bytes of all arrays that are as large as the image.
     scratch: bytes of all other arrays.
     photographs: bytes of the photographs, which the device keeps between steps if it has room.
+    statistics: those of `row` that come and go with the parameters, if chunks do.
     held: those of `row` that a step over the chunks in view needs of all Gaussians too; None if steps cannot run so.
-    pool: bytes for parameters and moments of the Gaussians on the device; None leaves it to the plan.
+    pool: bytes for parameters, moments and statistics of the Gaussians on the device; None leaves it to the plan.
     """
 
     gaussians: int
@@ -43,6 +44,7 @@ class Need:
     planes: int
     scratch: int
     photographs: int = 0
+    statistics: int = 0
     held: int | None = None
     pool: int | None = None
 
@@ -55,6 +57,11 @@ class Need:
     def total(self) -> int:
         """Bytes needed if everything except photographs is on the device at once."""
         return self.planes + self.scratch + self.gaussians * (self.row + self.model) + self.pairs * self.pair
+
+    @property
+    def record(self) -> int:
+        """Bytes of a Gaussian in a chunk."""
+        return self.model + self.statistics
 
     @property
     def moving(self) -> int:
@@ -161,11 +168,11 @@ def _plan_by_chunk(need: Need, held: int, budget: int, max_allocation: int) -> P
 
     Raises CapacityError if not even one chunk fits.
     """
-    room = budget - need.planes - need.scratch - need.gaussians * held - CHUNK_ROWS * need.model
-    in_view = need.model + need.model // CROSSING_SHARE + need.row - held + need.banded
+    room = budget - need.planes - need.scratch - need.gaussians * held - CHUNK_ROWS * need.record
+    in_view = need.record + need.record // CROSSING_SHARE + need.row - need.statistics - held + need.banded
     rows = room // (in_view + PAIRS_IN_VIEW * need.pair)
     if need.pool is not None:
-        rows = min(rows, need.pool // need.model)
+        rows = min(rows, need.pool // need.record)
     rows = min(rows, max_allocation // need.widest, need.gaussians + CHUNK_ROWS - 1) // CHUNK_ROWS * CHUNK_ROWS
     if rows < CHUNK_ROWS:
         least = budget - room + CHUNK_ROWS * (in_view + PAIRS_IN_VIEW * need.pair)

@@ -20,7 +20,7 @@ from zipfile import ZIP_STORED, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.chunks.manifest import CHECKSUMS_KEY, SLOTS_KEY, Manifest, manifest_of
+from clsplat.chunks.manifest import MANIFEST_ARRAYS, Manifest, manifest_of
 from clsplat.errors import InputError, examples
 from clsplat.files.atomic import atomic_writer
 from clsplat.files.documents import open_input, parse_json
@@ -141,7 +141,7 @@ def scene_of(path: Path) -> str | None:
 def read_manifest(path: Path) -> Manifest | None:
     """The manifest of a checkpoint; None if it has none or the file is damaged."""
     try:
-        return manifest_of(*_part(path, SLOTS_KEY, CHECKSUMS_KEY))
+        return manifest_of(*_part(path, *MANIFEST_ARRAYS))
     except Exception:  # noqa: BLE001  # as in load_latest_checkpoint, which reports the damage
         return None
 

@@ -10,7 +10,6 @@ from contextlib import suppress
 from pathlib import Path
 
 from clsplat.chunks.manifest import Manifest
-from clsplat.chunks.slots import MAX_TENTHS
 from clsplat.chunks.store import ChunkStore, KeptSlots
 from clsplat.errors import warn
 from clsplat.files.atomic import machine_mark, remove
@@ -58,16 +57,14 @@ class ScratchFiles:
         """Keep the slots of a file that checkpoints name, from now on. Tell the rate of a network disk."""
         assert store.path is not None
         path = store.path
-        store.release, store.moved = lambda: self._release(path), self._count
+        store.release, store.file.moved = lambda: self._release(path), self._count
         store.slots.hold(self._kept(path))
 
     def saved(self, store: ChunkStore | None) -> None:
         """Note that a checkpoint has been written, of the chunks in a file or of others."""
         current = None if store is None else store.path
         if store is not None and current is not None:
-            while self._needs() * 10 > MAX_TENTHS * store.nbytes and self._others(current) and self._give_up():
-                self.remove_unnamed(current)
-            store.slots.hold(self._kept(current))
+            store.hold(self._kept(current))
         self.remove_unnamed(current)
 
     def remove_unnamed(self, current: Path | None = None) -> None:
@@ -92,23 +89,8 @@ class ScratchFiles:
     def _kept(self, path: Path) -> KeptSlots:
         return [manifest.slots for _, manifest in self._manifests() if manifest.path == path]
 
-    def _others(self, current: Path) -> bool:
-        """True if a checkpoint names another file."""
-        return any(manifest.path != current for _, manifest in self._manifests())
-
-    def _needs(self) -> int:
-        """Bytes of the files that checkpoints name."""
-        sizes = 0
-        for path in {manifest.path for _, manifest in self._manifests()}:
-            with suppress(OSError):
-                sizes += path.stat().st_size
-        return sizes
-
-    def _give_up(self) -> bool:
-        return self._run is not None and self._run.give_up_checkpoint()
-
     def _release(self, path: Path) -> KeptSlots | None:
-        return self._kept(path) if self._give_up() else None
+        return self._kept(path) if self._run is not None and self._run.give_up_checkpoint() else None
 
     def _count(self, nbytes: int, seconds: float) -> None:
         if note := self._rate.count(nbytes, seconds):

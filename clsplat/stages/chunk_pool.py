@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from math import prod
 from typing import Any
@@ -54,7 +54,8 @@ def copy_chunks(
 
 
 class ChunkPool:
-    """The chunks of a streamed model that are on the device: parameters and moments, with room for `rows` Gaussians.
+    """The chunks of a streamed model that are on the device: parameters, moments and statistics, with room for `rows`
+    Gaussians.
 
     store: records of all chunks. Those on the device may be newer there, until `write_back`.
     arrays: by field, the rows of the slots.
@@ -79,9 +80,13 @@ class ChunkPool:
         self.moved_bytes = 0
         """Bytes of the records that have been fetched or written back."""
 
+    def free(self) -> None:
+        """Free the device's memory. The pool cannot be used any longer."""
+        self.arrays.clear()
+
     def close(self) -> None:
         """Free the device's memory, and close the store."""
-        self.arrays.clear()
+        self.free()
         self.store.close()
 
     @property
@@ -109,12 +114,24 @@ class ChunkPool:
             self._changed[moves.slots] = True
         return moves.slots
 
-    def place_run(self, first: int, count: int, *, changes: bool) -> None:
-        """Bring chunks that follow each other to the first slots, in order."""
-        numbers = np.arange(first, first + count)
-        if (self._residency.slots_of(numbers) != np.arange(count)).any():
-            self.release()
-        self.place(numbers, changes=changes)
+    def place_rows(self, start: int, stop: int) -> None:
+        """Bring the rows [start, stop) to the first rows of the slots, whatever chunks they are of. No chunk is on the
+        device then, so `keep_rows` has to write changes back. Raises WriteError and ScratchError."""
+        self.release()
+        for begin, end, slots in self._row_groups(start, stop):
+            self._to_slots(slots, self.store.get_records(begin, end))
+
+    def keep_rows(self, start: int, stop: int) -> None:
+        """Write rows that `place_rows` has brought back to the store. Raises WriteError and ScratchError."""
+        for begin, end, slots in self._row_groups(start, stop):
+            self.store.set_records(begin, end, self._from_slots(slots))
+
+    def _row_groups(self, start: int, stop: int) -> Iterator[tuple[int, int, NDArray[np.uint32]]]:
+        """Yield rows [begin, end) that cross at once, and their slots."""
+        slots = np.arange(-(-(stop - start) // CHUNK_ROWS), dtype=np.uint32)
+        for some in self._groups(len(slots)):
+            begin = start + CHUNK_ROWS * some.start
+            yield begin, min(begin + CHUNK_ROWS * len(slots[some]), stop), slots[some]
 
     def write_back(self) -> None:
         """Write the chunks that the device has changed to the store. Raises WriteError."""
@@ -126,9 +143,20 @@ class ChunkPool:
     def release(self) -> None:
         """Write back, and forget what is on the device: the store is going to change, or other chunks are wanted."""
         self.write_back()
-        nothing = np.zeros(0, np.int64)
-        self._exchange_caught(*self._residency.held(), nothing, nothing.astype(np.uint32))
-        self._residency.clear()
+        nothing, (numbers, slots) = np.zeros(0, np.int64), self._residency.held()
+        if len(numbers):
+            self._exchange_caught(numbers, slots, nothing, nothing.astype(np.uint32))
+            self._residency.clear()
+
+    def fill(self, field: str, value: float) -> None:
+        """Set every element of a field, in the slots and in the store."""
+        self.arrays[field].fill(value)
+        self.store.fill(field, value)
+
+    def rename(self, names: Mapping[str, str]) -> None:
+        """Give fields other names, in the slots and in the store. names: the new names by the old ones."""
+        self.arrays = {names.get(name, name): array for name, array in self.arrays.items()}
+        self.store.rename(names)
 
     def slots_of(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
         """The slot of each chunk, -1 if it is not on the device."""
@@ -148,17 +176,15 @@ class ChunkPool:
 
     def _fetch(self, numbers: NDArray[np.int64], slots: NDArray[np.uint32]) -> None:
         for some in self._groups(len(numbers)):
-            on_device, records = self._crossing(slots[some])
-            values = np.ascontiguousarray(self.store.read(numbers[some]))
-            self._close_last(numbers[some], values)
-            records.set(values.view(np.uint32).reshape(records.shape))
-            copy_chunks(self._device, on_device, records, self.store.record, self.arrays, to_records=False)
-            self.moved_bytes += values.nbytes
+            values = self.store.read(numbers[some])
+            self._close(numbers[some], values)
+            self._to_slots(slots[some], values)
 
-    def _close_last(self, numbers: NDArray[np.int64], records: NDArray[Any]) -> None:
-        """Let the rows behind the model's last one be copies of it that no view shows and no step moves."""
-        rows = self.store.count % CHUNK_ROWS
-        for place in np.flatnonzero(numbers == self.store.chunks - 1) if rows else ():
+    def _close(self, numbers: NDArray[np.int64], records: NDArray[Any]) -> None:
+        """Let the rows behind each chunk's last one be copies of it that no view shows and no step moves."""
+        lengths = self.store.lengths(numbers)
+        for place in np.flatnonzero(lengths < CHUNK_ROWS).tolist():
+            rows = int(lengths[place])
             for name in self.store.record.names or ():
                 values = records[name][place]
                 values[rows:] = values[rows - 1] if name.startswith("parameters/") else 0.0
@@ -166,11 +192,20 @@ class ChunkPool:
 
     def _write(self, numbers: NDArray[np.int64], slots: NDArray[np.uint32]) -> None:
         for some in self._groups(len(numbers)):
-            on_device, records = self._crossing(slots[some])
-            copy_chunks(self._device, on_device, records, self.store.record, self.arrays, to_records=True)
-            values = records.get()
-            self.store.write(numbers[some], values.view(self.store.record).reshape(-1))
-            self.moved_bytes += values.nbytes
+            self.store.write(numbers[some], self._from_slots(slots[some]))
+
+    def _to_slots(self, slots: NDArray[np.uint32], values: NDArray[Any]) -> None:
+        on_device, records = self._crossing(slots)
+        records.set(np.ascontiguousarray(values).view(np.uint32).reshape(records.shape))
+        copy_chunks(self._device, on_device, records, self.store.record, self.arrays, to_records=False)
+        self.moved_bytes += values.nbytes
+
+    def _from_slots(self, slots: NDArray[np.uint32]) -> NDArray[Any]:
+        on_device, records = self._crossing(slots)
+        copy_chunks(self._device, on_device, records, self.store.record, self.arrays, to_records=True)
+        values: NDArray[Any] = records.get()
+        self.moved_bytes += values.nbytes
+        return values.view(self.store.record).reshape(-1)
 
     def _groups(self, count: int) -> list[slice]:
         """Parts of `count` chunks that cross one after the other."""
@@ -194,6 +229,11 @@ class StoredArray:
     @property
     def shape(self) -> tuple[int, ...]:
         return self.pool.store.count, *self.pool.store.fields[self.field]
+
+    @property
+    def in_pool(self) -> DeviceArray:
+        """The rows of the pool's slots."""
+        return self.pool.arrays[self.field]
 
     def get(self) -> NDArray[np.float32]:
         """A copy of all rows."""
@@ -230,4 +270,4 @@ class StoredArray:
 
     def fill(self, value: float) -> None:
         """Set every element."""
-        self.change(lambda rows: np.full_like(rows, value))
+        self.pool.fill(self.field, value)

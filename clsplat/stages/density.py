@@ -5,40 +5,72 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
-from clsplat.chunks.gathering import SourceList, in_source_order
+from clsplat.chunks.gathering import NewValues, SourceList, in_source_order
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.command_buffer import LaunchParameter
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
 from clsplat.gaussians import group_shapes
-from clsplat.layouts.columns import SPLAT
+from clsplat.layouts.columns import CHUNK_ROWS, SPLAT
 from clsplat.optimisation.density_rules import FRESH, MarkRules
-from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostArray, HostGaussians
+from clsplat.stages.chunk_pool import ChunkPool, StoredArray
+from clsplat.stages.device_gaussians import AnyArray, AnyGaussians, DeviceGaussians, HostArray, HostGaussians
 from clsplat.stages.project import Projected, Screen
 from clsplat.stages.scan import scan
-
-
-def gaussian_bytes(*, contributions: bool) -> int:
-    """Bytes of each Gaussian's statistics: sum, views, radius; with contributions, two values in each of two epochs."""
-    return 4 * (3 + 4 * contributions)
-
 
 SCORED_STATISTICS = ("whole_largest", "current_largest")
 LISTED_ROWS = 1 << 16
 """Rows of a list on the host that are uploaded at a time."""
 CONTRIBUTION_STATISTICS = ("current_totals", "current_largest", "whole_totals", "whole_largest")
+NEXT_EPOCH = {"whole_totals": "current_totals", "whole_largest": "current_largest"}
+NEXT_EPOCH |= {current: whole for whole, current in NEXT_EPOCH.items()}
+"""Names of contributions in the next epoch. Those that become current begin at 0."""
+KIND = "statistics"
+"""Beginning of the names of statistics in a checkpoint and a store of chunks."""
+
+
+def statistics_names(*, contributions: bool) -> tuple[str, ...]:
+    """Names of the statistics: sum, views, radius; with contributions, two values in each of two epochs."""
+    return ("gradient_sums", "seen", "radii", *(CONTRIBUTION_STATISTICS if contributions else ()))
+
+
+def gaussian_bytes(*, contributions: bool) -> int:
+    """Bytes of each Gaussian's statistics."""
+    return 4 * len(statistics_names(contributions=contributions))
+
+
+def initial_value(name: str) -> float:
+    """Value of a statistic at first."""
+    return np.inf if name in CONTRIBUTION_STATISTICS else 0.0
+
+
+def statistics_fields(*, contributions: bool) -> dict[str, tuple[int, ...]]:
+    """Fields of a store of chunks for the statistics."""
+    return {f"{KIND}/{name}": () for name in statistics_names(contributions=contributions)}
+
+
+def new_values(*, densified: bool = False) -> NewValues:
+    """Values of moved rows in a store. FRESH rows have moments of zero, and statistics that are infinite.
+
+    densified: True if all statistics except contributions begin anew.
+    """
+    names = statistics_names(contributions=True)
+    anew = frozenset(f"{KIND}/{name}" for name in names if densified and name not in CONTRIBUTION_STATISTICS)
+    initial = {f"{KIND}/{name}": initial_value(name) for name in CONTRIBUTION_STATISTICS}
+    return NewValues({"first": 0.0, "second": 0.0, KIND: np.inf}, initial, anew)
 
 
 @dataclass(frozen=True, eq=False)
 class DensityStatistics:
-    """Statistics per Gaussian, (n,) each.
+    """Statistics per Gaussian, (n,) each: on the device, or fields of a streamed model's chunks.
 
     These count since the last densification:
 
@@ -50,28 +82,45 @@ class DensityStatistics:
     epoch, whether or not Gaussians are densified. `totals` is the sum over the views, `largest` the maximum of one
     view; `current` is the current epoch, `whole` the last complete epoch. They are infinite for a Gaussian that was
     not measured in some view of the epoch, for example a new one. They are None if no rule uses them.
+
+    of_slots: True if the arrays are those of a pool's slots.
     """
 
-    gradient_sums: DeviceArray
-    seen: DeviceArray
-    radii: DeviceArray
-    current_totals: DeviceArray | None = None
-    current_largest: DeviceArray | None = None
-    whole_totals: DeviceArray | None = None
-    whole_largest: DeviceArray | None = None
+    gradient_sums: DeviceArray | StoredArray
+    seen: DeviceArray | StoredArray
+    radii: DeviceArray | StoredArray
+    current_totals: DeviceArray | StoredArray | None = None
+    current_largest: DeviceArray | StoredArray | None = None
+    whole_totals: DeviceArray | StoredArray | None = None
+    whole_largest: DeviceArray | StoredArray | None = None
+    of_slots: bool = False
+
+    @property
+    def on_device(self) -> DensityStatistics:
+        """The arrays that kernels get: of a streamed model, those of the pool's slots."""
+        if not isinstance(self.seen, StoredArray):
+            return self
+        return DensityStatistics(**{name: array.in_pool for name, array in self.named().items()}, of_slots=True)
 
     def rows(self, start: int, stop: int) -> DensityStatistics:
-        """The statistics of the Gaussians [start, stop)."""
+        """The statistics `on_device` of the Gaussians [start, stop). A pool has them in its first slots."""
+        start, stop = (0, stop - start) if self.of_slots else (start, stop)
         if (start, stop) == (0, self.seen.shape[0]):
             return self
-        return DensityStatistics(**{name: array.rows(start, stop) for name, array in self.named().items()})
+        arrays = {name: array.rows(start, stop) for name, array in self.named().items()}
+        return DensityStatistics(**arrays, of_slots=self.of_slots)
 
-    def named(self) -> dict[str, DeviceArray]:
-        """The arrays by name; a checkpoint uses the same names."""
-        return {name: array for name, array in vars(self).items() if array is not None}
+    def named(self) -> dict[str, Any]:
+        """The arrays by name."""
+        names = statistics_names(contributions=True)
+        return {name: array for name in names if (array := getattr(self, name)) is not None}
+
+    def by_field(self) -> dict[str, Any]:
+        """The arrays by the names that they have in a checkpoint and in a store of chunks."""
+        return {f"{KIND}/{name}": array for name, array in self.named().items()}
 
     def load(self, values: Mapping[str, Float32]) -> None:
-        """Upload the arrays that `values` contains, by name."""
+        """Set the arrays that `values` contains, by name."""
         for name, array in self.named().items():
             if name in values:
                 array.set(values[name])
@@ -88,21 +137,25 @@ class DensityStatistics:
             return self
         self.whole_totals.fill(0.0)
         self.whole_largest.fill(0.0)
-        return replace(
-            self,
-            current_totals=self.whole_totals,
-            current_largest=self.whole_largest,
-            whole_totals=self.current_totals,
-            whole_largest=self.current_largest,
-        )
+        if isinstance(self.whole_totals, StoredArray):
+            self.whole_totals.pool.rename({f"{KIND}/{old}": f"{KIND}/{new}" for old, new in NEXT_EPOCH.items()})
+            return self
+        return replace(self, **{new: getattr(self, old) for old, new in NEXT_EPOCH.items()})
 
 
 def new_statistics(device: Device, count: int, *, contributions: bool = False) -> DensityStatistics:
     """Initial statistics of `count` Gaussians: zero, with infinite contributions."""
-    names = ("gradient_sums", "seen", "radii", *(CONTRIBUTION_STATISTICS if contributions else ()))
-    arrays = {name: allocate(device, (count,), np.float32) for name in names}
+    names = statistics_names(contributions=contributions)
+    arrays: dict[str, Any] = {name: allocate(device, (count,), np.float32) for name in names}
     for name, array in arrays.items():
-        array.fill(np.inf if name in CONTRIBUTION_STATISTICS else 0.0)
+        array.fill(initial_value(name))
+    return DensityStatistics(**arrays)
+
+
+def pooled_statistics(pool: ChunkPool) -> DensityStatistics:
+    """The statistics in the store of a pool."""
+    names = [name for name in statistics_names(contributions=True) if f"{KIND}/{name}" in pool.store.fields]
+    arrays: dict[str, Any] = {name: StoredArray(pool, f"{KIND}/{name}") for name in names}
     return DensityStatistics(**arrays)
 
 
@@ -198,37 +251,53 @@ class DeviceMarker:
         return in_source_order(piece.entries() for piece in pieces)
 
     def _pieces(self) -> Iterator[tuple[int, int]]:
-        """Rows that are marked together: as many as the plan brings to the device."""
+        """Rows that are marked together: as many as the plan brings to the device, or of a pool about half as many,
+        which with their statistics take no more memory than the splats of all."""
         model = self.parameters
         rows = model.rows if isinstance(model, HostGaussians) else max(model.count, 1)
+        if isinstance(self.statistics.seen, StoredArray):
+            rows = CHUNK_ROWS * max(self.statistics.seen.pool.slots // 2, 1)
         for start in range(0, model.count, rows):
             yield start, min(start + rows, model.count)
 
 
-@dataclass(frozen=True, eq=False)
 class _Scratch:
-    """Scratch memory for n rows: scores (n), log scales (n, 3) and opacity logits (n), float32; marks (3n), places (3n)
-    and rows (2n), uint32."""
+    """Scratch memory for `n` rows.
 
-    scores: DeviceArray
-    log_scales: DeviceArray
-    opacity_logits: DeviceArray
-    marks: DeviceArray
-    places: DeviceArray
-    rows: DeviceArray
+    scores (n), float32; marks (3n), places (3n) and rows (2n), uint32.
+    """
+
+    def __init__(self, marker: DeviceMarker, n: int) -> None:
+        self._n, unit = n, marker.device.row_alignment
+        sizes = (n, 3 * n, 3 * n, 2 * n, *(_COLUMN_WIDTHS.get(name, 1) * n for name in _COLUMNS))
+        begins = [0, *np.cumsum([-(-size // unit) * unit for size in sizes]).tolist()]
+        space = marker.work.array("splats", (max(begins[-1], len(SPLAT) * n),), np.uint32)
+        words = [space.rows(begin, begin + size) for begin, size in zip(begins, sizes, strict=False)]
+        self.scores = replace(words[0], dtype=np.dtype(np.float32))
+        self.marks, self.places, self.rows = words[1:4]
+        self._columns = dict(zip(_COLUMNS, words[4:], strict=True))
+
+    def column(self, name: str, array: AnyArray, start: int) -> DeviceArray:
+        """The rows of an array from `start` on: its own if it is on the device, else a copy, which the next one of this
+        name overwrites."""
+        if isinstance(array, DeviceArray):
+            return array.rows(start, start + self._n)
+        shape = (self._n, *array.shape[1:])
+        column = replace(self._columns[name], dtype=np.dtype(np.float32)).reshaped(*shape)
+        column.set(array.get_rows(start, start + self._n))
+        return column
+
+
+_COLUMNS = ("log_scales", "opacity_logits", "gradient_sums", "seen", *SCORED_STATISTICS)
+_COLUMN_WIDTHS = {"log_scales": 3}
 
 
 @stage("density")
 def _scored(device: Device, marker: DeviceMarker, rules: MarkRules, start: int, stop: int) -> _Scratch:
-    n, statistics, unit = stop - start, marker.statistics.rows(start, stop), device.row_alignment
-    sizes = (n, 3 * n, n, 3 * n, 3 * n, 2 * n)
-    begins = [0, *np.cumsum([-(-size // unit) * unit for size in sizes]).tolist()]
-    space = marker.work.array("splats", (max(begins[-1], len(SPLAT) * n),), np.uint32)
-    words = [space.rows(begin, begin + size) for begin, size in zip(begins, sizes, strict=False)]
-    floats = [replace(array, dtype=np.dtype(np.float32)) for array in words[:3]]
-    scratch = _Scratch(floats[0], floats[1].reshaped(n, 3), floats[2], *words[3:])
-    views = (statistics.gradient_sums, statistics.seen)
-    known = [getattr(statistics, name) or statistics.seen for name in SCORED_STATISTICS]
+    n, arrays, scratch = stop - start, marker.statistics.named(), _Scratch(marker, stop - start)
+    columns = {name: scratch.column(name, arrays[name], start) for name in _COLUMNS if name in arrays}
+    views = (columns["gradient_sums"], columns["seen"])
+    known = [columns.get(name, columns["seen"]) for name in SCORED_STATISTICS]
     edges = (rules.gradient, rules.contribution)
     launch_items(device, device.kernels("density").density_scores, n, n, *edges, *views, *known, scratch.scores)
     return scratch
@@ -239,15 +308,10 @@ def _listed(device: Device, marker: DeviceMarker, rules: MarkRules, start: int, 
     """The list of the rows [start, stop), which the next one overwrites."""
     n, model, kernels = stop - start, marker.parameters, device.kernels("density")
     scratch, counts = _scored(device, marker, rules, start, stop), allocate(device, (2,), np.uint32)
-    columns = {name: getattr(scratch, name) for name in ("log_scales", "opacity_logits")}
-    for name, column in columns.items():
-        array = model[name]
-        if isinstance(array, DeviceArray):
-            columns[name] = array
-        else:
-            column.set(array.get_rows(start, stop))
+    columns = [scratch.column(name, model[name], start) for name in ("log_scales", "opacity_logits")]
+    radii = scratch.column("seen", marker.statistics.radii, start)  # the scores are made
     edges = (rules.large, rules.transparent, rules.oversized, rules.oversized_half, rules.radius)
-    arrays = (scratch.scores, marker.statistics.rows(start, stop).radii, *columns.values(), scratch.marks)
+    arrays = (scratch.scores, radii, *columns, scratch.marks)
     launch_items(device, kernels.density_marks, n, n, start, *rules.cut_off, *edges, *arrays)
     scan(device, marker.work, scratch.marks, scratch.places, counts)
     launch_items(device, kernels.density_rows, n, n, start, scratch.marks, scratch.places, scratch.rows, counts)
@@ -303,7 +367,7 @@ def carried(
     source: arrays by name (`DensityStatistics.named`). Each is removed as soon as it is copied, so that the memory for
     one of them is enough.
     """
-    arrays: dict[str, DeviceArray] = {}
+    arrays: dict[str, Any] = {}
     for name in tuple(source):
         old = source.pop(name)
         copies = name in CONTRIBUTION_STATISTICS or not densified

@@ -4,18 +4,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from clsplat.chunks.gathering import gathered
-from clsplat.chunks.manifest import chunks_of
-from clsplat.chunks.store import ChunkStore, record_type, runs
+from clsplat.chunks.division import NEW, Division, even_starts
+from clsplat.chunks.gathering import NewValues, OldChunks, gathered
+from clsplat.chunks.slot_file import runs
+from clsplat.chunks.store import ChunkStore, record_type
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, floats_of, group_shapes
@@ -159,6 +159,7 @@ class HostGaussians(_ByGroup[Any]):
 
 AnyGaussians = DeviceGaussians | HostGaussians
 AnyArray = DeviceArray | HostArray | StoredArray
+ReadableArray = AnyArray | SavedArray
 KINDS = ("parameters", "first", "second")
 """Kinds of arrays of a model in training, as a checkpoint and a store of chunks name them."""
 
@@ -171,8 +172,8 @@ def parts(
     Models on the device have a single part. Each part of another model is valid until the next part is requested.
 
     models: all on the device, or none: the first ones in one pool, if there is a pool, and the others in main memory. A
-        part of a pool has at most as many chunks as the pool has slots.
-    keep: True keeps changes of the parts: they are copied back to the host, or noted in the pool.
+        part of a pool has as many rows as the pool's slots have room for.
+    keep: True keeps changes of the parts: they are copied back to the host, or to the pool's store.
     """
     on_device = tuple(model for model in models if isinstance(model, DeviceGaussians))
     if len(on_device) == len(models):
@@ -184,12 +185,14 @@ def parts(
     for start in range(0, count, rows):
         stop = min(start + rows, count)
         if pool is not None:
-            pool.place_run(start // CHUNK_ROWS, chunks_of(stop - start), changes=keep)
+            pool.place_rows(start, stop)
         there = [
             model.first_in_pool(stop - start) if model.pool is not None else _uploaded(work, index, model, start, stop)
             for index, model in enumerate(streamed)
         ]
         yield start, stop, tuple(there)
+        if keep and pool is not None:
+            pool.keep_rows(start, stop)
         for model, part in zip(streamed, there, strict=True) if keep else ():
             for name, array in part.arrays.items() if model.pool is None else ():
                 array.read_into(model[name].values[start:stop])
@@ -213,9 +216,9 @@ def fields_of(coefficients: int) -> dict[str, tuple[int, ...]]:
 
 def chunk_parts(
     work: Workspace, chunks: ChunkNumbers, *models: AnyGaussians, changes: bool = False
-) -> Iterator[tuple[int, int, tuple[DeviceGaussians, ...], ChunkList, NDArray[np.integer[Any]]]]:
+) -> Iterator[tuple[int, int, tuple[DeviceGaussians, ...], ChunkList]]:
     """Yield chunks of the models in a pool, as many at a time as it has slots: which rows [start, stop) they are of a
-    launch over all of `chunks`; the rows of the pool's slots, of each model; the list of their slots; their numbers.
+    launch over all of `chunks`; the rows of the pool's slots, of each model; the list of their slots.
 
     Each part is valid until the next part is requested.
 
@@ -230,63 +233,63 @@ def chunk_parts(
         numbers = chunks.numbers[begin : begin + pool.slots]
         slots = exact_chunks(work, "chunk_slots", pool.place(numbers, changes=changes), pool.rows)
         start = CHUNK_ROWS * begin
-        yield start, start + CHUNK_ROWS * len(numbers), tuple(model.in_pool for model in streamed), slots, numbers
+        yield start, start + CHUNK_ROWS * len(numbers), tuple(model.in_pool for model in streamed), slots
 
 
 Models = Sequence["AnyGaussians | None"]
 """Parameters, first and second moments. Moments that are None are zero."""
 
 
-def new_store(count: int, coefficients: int, path: Path | None) -> ChunkStore:
-    """A store for parameters, first and second moments of `count` Gaussians. Raises WriteError."""
-    return ChunkStore(count, fields_of(coefficients), path)
-
-
-def copy_to_store(
-    models: Models, rows: NDArray[np.uint32] | None, to: ChunkStore, passed: Callable[[int], None] | None = None
-) -> None:
-    """Copy Gaussians to a store, chunk by chunk, so that row j is row rows[j]; None copies all rows.
-
-    passed: as in `chunks.gathering.gathered`.
-    Raises WriteError and ScratchError.
-    """
-    for numbers, records in _gathered(models, rows, to.record, passed or (lambda _: None)):
-        to.write(numbers, records)
-
-
-def copy_to_models(models: Models, rows: NDArray[np.uint32] | None, to: Sequence[AnyGaussians]) -> None:
-    """Copy Gaussians of a store to models on the device or in main memory, chunk by chunk, as `copy_to_store` does.
-
-    Raises ScratchError.
-    """
-    fields = {
-        f"{kind}/{name}": to_model[name] for kind, to_model in zip(KINDS, to, strict=True) for name in PARAMETER_GROUPS
-    }
-    record = record_type({name: array.shape[1:] for name, array in fields.items()})
-    for numbers, records in _gathered(models, rows, record, lambda _: None):
-        begin = CHUNK_ROWS * int(numbers[0])
-        count = min(CHUNK_ROWS * len(numbers), to[0].count - begin)
-        for name in record.names or ():
-            array = fields[name]
-            array.set_rows(begin, records[name].reshape(-1, *array.shape[1:])[:count])
-
-
-def _gathered(
-    models: Models, rows: NDArray[np.uint32] | None, record: np.dtype[Any], passed: Callable[[int], None]
-) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
-    parameters = models[0]
-    assert parameters is not None
-    if rows is None:
-        rows = np.arange(parameters.count, dtype=np.uint32)
-    if isinstance(parameters, HostGaussians) and parameters.pool is not None:
-        parameters.pool.write_back()
-        return gathered(rows, parameters.pool.store.read, record, passed)
+def by_field(models: Models) -> dict[str, AnyArray]:
+    """The arrays of parameters and moments by the names of a store's fields. Moments that are None are left out."""
     given = {kind: model for kind, model in zip(KINDS, models, strict=True) if model is not None}
-    arrays = {f"{kind}/{name}": model[name] for kind, model in given.items() for name in PARAMETER_GROUPS}
-    return gathered(rows, partial(_records, parameters.count, arrays), record, passed)
+    return {f"{kind}/{name}": model[name] for kind, model in given.items() for name in PARAMETER_GROUPS}
 
 
-def _records(count: int, arrays: Mapping[str, AnyArray], numbers: NDArray[np.int64]) -> NDArray[Any]:
+@dataclass(frozen=True, eq=False)
+class CopiedRows:
+    """Gaussians that are copied, chunk by chunk.
+
+    arrays: all by field: those of a pool's store, or others.
+    rows: row j of the copy is row rows[j]; None copies all rows.
+    values: of rows that are new, and of fields that are not among `arrays`.
+    """
+
+    arrays: Mapping[str, ReadableArray]
+    rows: NDArray[np.uint32] | None = None
+    values: NewValues = field(default_factory=NewValues)
+
+    def to_store(self, store: ChunkStore) -> None:
+        """Copy to a store. Raises WriteError and ScratchError."""
+        for numbers, records in self._records(store.record, store.starts):
+            store.write(numbers, records)
+
+    def to_arrays(self, arrays: Mapping[str, AnyArray]) -> None:
+        """Copy to arrays by field, on the device or in main memory. Raises ScratchError."""
+        record = record_type({name: array.shape[1:] for name, array in arrays.items()})
+        count = arrays["parameters/means"].shape[0]
+        for numbers, records in self._records(record, even_starts(count)):
+            begin = CHUNK_ROWS * int(numbers[0])
+            end = min(begin + CHUNK_ROWS * len(numbers), count)
+            for name in record.names or ():
+                array = arrays[name]
+                array.set_rows(begin, records[name].reshape(-1, *array.shape[1:])[: end - begin])
+
+    def _records(
+        self, record: np.dtype[Any], starts: NDArray[np.int64]
+    ) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
+        means = self.arrays["parameters/means"]
+        if isinstance(means, StoredArray):
+            means.pool.write_back()
+            old = OldChunks(means.pool.store.starts, means.pool.store.read)
+        else:
+            count = means.shape[0]
+            old = OldChunks(even_starts(count), partial(_records, count, self.arrays))
+        to = Division(starts, np.full(len(starts) - 1, NEW))
+        return gathered(self.rows, old, to, record, values=self.values)
+
+
+def _records(count: int, arrays: Mapping[str, ReadableArray], numbers: NDArray[np.int64]) -> NDArray[Any]:
     """Records of chunks of `count` Gaussians, from arrays by field."""
     records = np.empty(len(numbers), record_type({name: array.shape[1:] for name, array in arrays.items()}))
     for place, first, length in runs(numbers):
@@ -312,7 +315,7 @@ def pooled(pool: ChunkPool, coefficients: int) -> tuple[HostGaussians, HostGauss
 def saved_models(store: ChunkStore) -> list[HostGaussians]:
     """Parameters, first and second moments of the chunks of a checkpoint. Raises ValueError for other fields."""
     coefficients = store.fields.get("parameters/sh_rest", (0,))[0] + 1
-    if store.fields != fields_of(coefficients):
+    if {name: shape for name, shape in store.fields.items() if name.split("/")[0] in KINDS} != fields_of(coefficients):
         raise ValueError("its chunks have other fields than this version's")
     return [
         HostGaussians(
@@ -324,11 +327,6 @@ def saved_models(store: ChunkStore) -> list[HostGaussians]:
         )
         for kind in KINDS
     ]
-
-
-def saved_arrays(models: Sequence[HostGaussians]) -> dict[str, Any]:
-    """The arrays of `saved_models` by their names in a checkpoint; none of models in main memory."""
-    return {array.field: array for model in models for array in model.arrays.values() if isinstance(array, SavedArray)}
 
 
 def rows_at(array: AnyArray, places: NDArray[np.integer[Any]] | slice) -> NDArray[np.float32]:

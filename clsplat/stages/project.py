@@ -90,7 +90,7 @@ def _projected_parts(
 ) -> Iterator[tuple[int, DeviceGaussians, Projected]]:
     """Yield, for each part of the model that is on the device at once, its first row, the part, and its projection."""
     if isinstance(chunks, ChunkNumbers):
-        for start, stop, (part,), slots, _ in chunk_parts(work, chunks, gaussians):
+        for start, stop, (part,), slots in chunk_parts(work, chunks, gaussians):
             yield start, part, replace(projected.rows(start, stop), chunks=slots)
         return
     for start, stop, (part,) in parts(work, gaussians):

@@ -314,7 +314,7 @@ class Batch:
                 transfer.result()
             for index, future in pending:
                 outcome = future.result()
-                losses.append(self._take(sums, outcome, step_of_view, probes(views[index], step_of_view)))
+                losses.append(self._take(model[0], sums, outcome, step_of_view, probes(views[index], step_of_view)))
                 own[index] = [None if each is None else upload(device, each) for each in outcome.own]
         finally:  # no thread may continue after an error
             under_way: list[Future[Any]] = [*transfers, *(future for _, future in pending)]
@@ -376,11 +376,16 @@ class Batch:
         inputs = replace(inputs, photograph=self.photographs.bring(inputs.view, factor))
         return step.run(model, inputs, probes(inputs, step), gradients, reads_loss=True)
 
-    def _take(self, sums: AnyGaussians, outcome: ViewOutcome, step: _AddedView, probe: StepProbe) -> Loss:
-        """Add the results of a view that another device computed. Uses the scratch memory of a view on this device."""
+    def _take(
+        self, parameters: AnyGaussians, sums: AnyGaussians, outcome: ViewOutcome, step: _AddedView, probe: StepProbe
+    ) -> Loss:
+        """Add the results of a view that another device computed. Uses the scratch memory of a view on this device.
+
+        parameters: those of the model. A pool has their statistics on the device with them.
+        """
         device, work = step.device, self.rasterizer.work
         probe.loss(outcome.loss)
-        for start, stop, (part,) in parts(work, sums, keep=True):
+        for start, stop, (_, part) in parts(work, parameters, sums, keep=True):
             rows = {name: _brought(work, device, name, values[start:stop]) for name, values in outcome.arrays.items()}
             arrays = {
                 group: _brought(work, device, f"view_{group}", values[start:stop])

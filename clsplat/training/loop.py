@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.chunks.store import ScratchError
+from clsplat.chunks.slot_file import ScratchError
 from clsplat.device.drivers.worker_process import TrialInterrupted
 from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError
 from clsplat.evaluation.depths import keep_depths

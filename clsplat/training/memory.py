@@ -112,25 +112,23 @@ class HostMemory:
             count = len(scene.points) or config.random_points
             taken = count * model_bytes(config)
             if streams_by_chunk(config, device, count):
-                model = MODELS * 4 * floats_of((config.sh_degree + 1) ** 2)
-                taken = _least_pool(model) + count * gaussian_bytes(contributions=False)
+                taken = _least_pool(record_bytes(config, contributions=False))
             taken *= device.shares_memory
             photographs = replace(self, cache=None).photographs(scene, config)  # the cache would make its folder
             self.share(photographs, count, taken, begins=True)
 
-    def pool(self, photographs: HostPhotographs, count: int, model: int, held: int, *, begins: bool) -> int | None:
+    def pool(self, photographs: HostPhotographs, count: int, record: int, *, begins: bool) -> int | None:
         """Bytes of main memory for the chunks that are on a device which shares it; None if all chunks fit.
 
-        model: bytes per Gaussian of parameters and moments.
-        held: other bytes per Gaussian.
+        record: bytes of a Gaussian in a chunk.
         begins: as in `share`.
         """
-        if self.limit is None or self.limit >= count * (model + held) + photographs.least:
+        if self.limit is None or self.limit >= count * record + photographs.least:
             return None
-        pool = (self.limit - photographs.least - count * held) * POOL_QUARTERS // 4
-        if begins and pool < CHUNK_ROWS * model:
-            raise self._too_little(photographs, count, _least_pool(model) + count * held)
-        return max(pool, CHUNK_ROWS * model)
+        pool = (self.limit - photographs.least) * POOL_QUARTERS // 4
+        if begins and pool < CHUNK_ROWS * record:
+            raise self._too_little(photographs, count, _least_pool(record))
+        return max(pool, CHUNK_ROWS * record)
 
     def scratch_file(self, nbytes: int, photographs: HostPhotographs) -> Path | None:
         """A new file for so many bytes of chunks; None if main memory has room for them. Raises InputError if there is
@@ -181,9 +179,14 @@ class HostMemory:
             remove_decoded(run.cache_path)
 
 
-def _least_pool(model: int) -> int:
-    """Bytes beside photographs and statistics with which the pool has room for one chunk. model: bytes per Gaussian."""
-    return -(-CHUNK_ROWS * model * 4 // POOL_QUARTERS)
+def record_bytes(config: TrainConfig, *, contributions: bool) -> int:
+    """Bytes of a Gaussian in a chunk: parameters, moments and statistics."""
+    return MODELS * 4 * floats_of((config.sh_degree + 1) ** 2) + gaussian_bytes(contributions=contributions)
+
+
+def _least_pool(record: int) -> int:
+    """Bytes beside photographs with which the pool has room for one chunk. record: bytes of a Gaussian in it."""
+    return -(-CHUNK_ROWS * record * 4 // POOL_QUARTERS)
 
 
 UNLIMITED = HostMemory()
@@ -216,8 +219,10 @@ class MemoryPlanner:
         Raises CapacityError, or InputError for too little main memory.
         """
         by_chunk = streams_by_chunk(self._config, self._rasterizer.device, count)
-        on_host, held = self._rasterizer.device.shares_memory, gaussian_bytes(contributions=needs.contributions)
-        model = MODELS * 4 * floats_of((self._config.sh_degree + 1) ** 2)
+        on_host, record = (
+            self._rasterizer.device.shares_memory,
+            record_bytes(self._config, contributions=needs.contributions),
+        )
         memory = StepMemory(
             fields=slot_fields(needs, nearness=bool(self._config.depth_use)),
             photographs=sum(view.camera.width * view.camera.height for view in self._scene.train_views),
@@ -226,7 +231,7 @@ class MemoryPlanner:
             row_bytes=sum(component.row_bytes for component in components),
             pixel_bytes=sum(component.pixel_bytes for component in components),
             by_chunk=by_chunk,
-            pool=self._memory.pool(self._photographs.host, count, model, held, begins=self.begins)
+            pool=self._memory.pool(self._photographs.host, count, record, begins=self.begins)
             if by_chunk and on_host
             else None,
         )
@@ -235,7 +240,7 @@ class MemoryPlanner:
         made = self._plan(self._rasterizer.device, count, memory, models or usual)
         self._rasterizer.follow(made)
         self._photographs.follow(made.photographs)
-        self._share_host(made, count, held)
+        self._share_host(made, count)
         if self._batch is not None:
             replicas = [replica.device for replica in self._batch.replicas]
             self._batch.follow([self._plan(each, count, memory, REPLICA_ARRAYS_PER_PARAMETER) for each in replicas])
@@ -262,14 +267,10 @@ class MemoryPlanner:
                 f"{error}; without {', '.join(whole)} steps need memory for the Gaussians in view alone"
             ) from None
 
-    def _share_host(self, plan: Plan, count: int, statistics: int) -> None:
-        """Give the photographs the main memory that the Gaussians leave.
-
-        statistics: bytes of statistics per Gaussian.
-        """
-        model = plan.need.model * (plan.rows if plan.need.pool is not None else count)
+    def _share_host(self, plan: Plan, count: int) -> None:
+        """Give the photographs the main memory that the Gaussians leave."""
         on_host = self._rasterizer.device.shares_memory or plan.streamed
-        taken = model + count * statistics if on_host else 0
+        taken = plan.need.record * (plan.rows if plan.need.pool is not None else count) if on_host else 0
         enough = self._memory.share(self._photographs.host, count, taken, begins=self.begins)
         if not enough and not self._warned:
             self._warned = True

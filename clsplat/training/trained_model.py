@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
+from clsplat.chunks.gathering import NewValues
 from clsplat.chunks.manifest import Manifest
 from clsplat.chunks.order import ORDERED_ROWS, space_order
-from clsplat.chunks.store import ChunkStore
+from clsplat.chunks.store import ChunkStore, record_type
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
@@ -29,13 +30,18 @@ from clsplat.rendering.memory_needs import MODELS
 from clsplat.rendering.memory_plan import Plan
 from clsplat.runs.checkpoints import Checkpoint, unusable
 from clsplat.runs.scratch import ScratchFiles
-from clsplat.stages.chunk_pool import ChunkPool
+from clsplat.stages.chunk_pool import ChunkPool, StoredArray
 from clsplat.stages.density import (
+    KIND,
     DensityStatistics,
     DeviceMarker,
     carried,
     gather,
+    gaussian_bytes,
     new_statistics,
+    new_values,
+    pooled_statistics,
+    statistics_fields,
     try_gather,
     widen,
 )
@@ -43,20 +49,21 @@ from clsplat.stages.device_gaussians import (
     KINDS,
     AnyArray,
     AnyGaussians,
+    CopiedRows,
     HostArray,
     HostGaussians,
     Models,
+    ReadableArray,
+    SavedArray,
     allocate_gaussians,
+    by_field,
     change_rows,
-    copy_to_models,
-    copy_to_store,
+    fields_of,
     host_gaussians,
     host_model,
     host_zeros,
-    new_store,
     pooled,
     rows_at,
-    saved_arrays,
     saved_models,
     set_rows_at,
     to_device,
@@ -67,6 +74,7 @@ from clsplat.training.density import RowPlan
 from clsplat.training.moved_rows import MovedRows, both, ordered, some_of
 from clsplat.training.stability.health import examine
 
+_ALL_ROWS = new_values()
 EXAMINED_CHUNKS = 64
 """Chunks whose numbers are examined at once."""
 HALVED_ROWS = 1 << 15
@@ -117,15 +125,17 @@ class TrainedModel:
 
     @contextmanager
     def saved(self, checkpoint: Checkpoint) -> Iterator[tuple[list[HostGaussians], Checkpoint]]:
-        """Context with parameters, first and second moments of a checkpoint, and the checkpoint with their arrays.
+        """Context with parameters, first and second moments of a checkpoint, and the checkpoint with all its arrays.
 
-        A scratch file that has them is open in the context. Raises InputError for arrays of another model.
+        A scratch file that has some of them is open in the context. Raises InputError for arrays of another model.
         """
+        arrays: dict[str, Any] = dict(checkpoint.arrays)
         with ExitStack() as reading:
             try:
                 if checkpoint.manifest is not None:
                     store = reading.enter_context(closing(ChunkStore.opened(checkpoint.manifest, writable=False)))
                     models = saved_models(store)
+                    arrays |= {name: SavedArray(store, name) for name in store.fields}
                 else:
                     models = [host_model(checkpoint.arrays, kind) for kind in KINDS]
                 n, most = max(model.coefficients for model in models), (self._sh_degree + 1) ** 2
@@ -133,24 +143,23 @@ class TrainedModel:
                     raise ValueError(f"has {n} SH coefficients, more than the {most} of --sh-degree {self._sh_degree}")
             except ValueError as error:
                 raise unusable(checkpoint, str(error)) from None
-            yield models, replace(checkpoint, arrays={**checkpoint.arrays, **saved_arrays(models)})
+            yield models, replace(checkpoint, arrays=arrays)
 
     def load(self, models: Sequence[HostGaussians], checkpoint: Checkpoint) -> None:
-        """Continue with the models (`saved`) and the statistics of a checkpoint.
+        """Continue with the models and the statistics of a checkpoint (`saved`).
 
         Statistics that the settings did not need before the checkpoint stay unknown.
         Raises InputError for statistics of another model.
         """
         self.free()
-        self.plan = self._make_plan(models[0].count)
+        count, arrays = models[0].count, checkpoint.named(f"{KIND}/")
+        self.plan = self._make_plan(count)
+        for name, array in arrays.items():
+            if array.shape != (count,) or (isinstance(array, np.ndarray) and array.dtype != np.float32):
+                raise unusable(checkpoint, f"{KIND}/{name} has shape {array.shape}")
         if not self._go_on_in(checkpoint.manifest, models[0].coefficients):
-            self._place(models)
-        self.statistics = new_statistics(self._device, models[0].count, contributions=self._counts_contributions)
-        statistics = checkpoint.named("statistics/")
-        for name, array in self.statistics.named().items():
-            if name in statistics and (statistics[name].shape, statistics[name].dtype) != (array.shape, array.dtype):
-                raise unusable(checkpoint, f"statistics/{name} has shape {statistics[name].shape}")
-        self.statistics.load(statistics)
+            held = {name: HostArray(each) if isinstance(each, np.ndarray) else each for name, each in arrays.items()}
+            self._place(models, held)
 
     def free(self) -> None:
         """Free all arrays, and close the file of chunks."""
@@ -162,8 +171,7 @@ class TrainedModel:
     ) -> None:
         """Set the arrays, where the plan assigns them, with new statistics. Moments that are not given start from
         zero."""
-        self._place((parameters, first, second))
-        self.statistics = new_statistics(self._device, parameters.count, contributions=self._counts_contributions)
+        self._place((parameters, first, second), {})
 
     def kinds(self) -> dict[str, AnyGaussians]:
         """Parameters, first and second moments, by their names in a checkpoint."""
@@ -175,10 +183,11 @@ class TrainedModel:
         return self.parameters, self.first, self.second
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a checkpoint, without the statistics."""
-        return {
-            f"{kind}/{group}": model[group].get() for kind, model in self.kinds().items() for group in PARAMETER_GROUPS
-        }
+        """Parameters, moments and statistics by their names in a checkpoint."""
+        return {name: array.get() for name, array in self._by_field().items()}
+
+    def _by_field(self) -> dict[str, AnyArray]:
+        return by_field(self.with_moments) | self.statistics.by_field()
 
     def by_kind(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Mapping[str, AnyArray]]:
         """Parameters and moments by kind and group: those of a checkpoint, or of the scratch file, of which a
@@ -193,10 +202,10 @@ class TrainedModel:
         return self._pool.store if self._pool is not None and self._pool.store.path is not None else None
 
     def record(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        """Arrays and state of a checkpoint, without the statistics: a manifest if there is a scratch file."""
+        """Arrays and state of a checkpoint: a manifest if there is a scratch file."""
         if (store := self.store) is None or self._pool is None:
             return self.arrays(), {}
-        if store.is_lost:
+        if store.file.is_lost:
             warn(f"{store.path}: has been removed while it was in use; the Gaussians go to a new file")
             self._place()
             return self.record()
@@ -230,7 +239,7 @@ class TrainedModel:
     def widen(self, coefficients: int) -> None:
         """Make room for more SH coefficients, which start from zero."""
         if self._pool is not None:
-            self._place(coefficients=coefficients)
+            self._move_chunks(None, lambda: None, new_values(), coefficients)
             return
         if not self.plan.gathers:
             self._take_down()
@@ -270,61 +279,102 @@ class TrainedModel:
     def _place(
         self,
         models: Models | None = None,
+        statistics: Mapping[str, ReadableArray] | None = None,
         rows: NDArray[np.uint32] | None = None,
         coefficients: int = 0,
         changes: Callable[[], None] = lambda: None,
+        values: NewValues = _ALL_ROWS,
     ) -> None:
         """Put Gaussians where the plan assigns them. The rows of a large streamed model are in a store of chunks.
 
         models: new parameters and moments, not in a store. None keeps this model's, which are or will be in a store.
+        statistics: those of new models by name, of which others begin anew; None keeps this model's.
         rows: for each new row, the old row that it copies. None keeps all rows.
         coefficients: number of SH coefficients; 0 for as many as there are.
         changes: called before the first change of this model.
+        values: of moved rows.
         """
         parameters = self.parameters if models is None else models[0]
         assert parameters is not None
         count, coefficients = parameters.count if rows is None else len(rows), coefficients or parameters.coefficients
         if self.plan.streamed and count > ORDERED_ROWS:
             del parameters
-            self._to_store(models, count, rows, coefficients, changes)
+            self._to_store(models, statistics, count, rows, coefficients, changes, values)
         elif models is None:
             del parameters
-            self._from_store(count, rows, coefficients, changes)
+            self._from_store(count, rows, coefficients, changes, values)
         else:
             placed = [self._placed(model) for model in models if model is not None]
             self.close()
             self.parameters, *moments = placed
             self.first, self.second = moments or (self._zeros(count, coefficients), self._zeros(count, coefficients))
+            if statistics is not None:
+                self.statistics = new_statistics(self._device, count, contributions=self._counts_contributions)
+                self.statistics.load({name: array.get() for name, array in statistics.items()})
 
     def _to_store(
         self,
         models: Models | None,
+        statistics: Mapping[str, ReadableArray] | None,
         count: int,
         rows: NDArray[np.uint32] | None,
         coefficients: int,
         changes: Callable[[], None],
+        values: NewValues,
     ) -> None:
         """Put Gaussians into a new store, and make its pool. Arguments as those of `_place`."""
         source, old = self.with_moments if models is None else models, self._pool if models is None else None
-        store = new_store(count, coefficients, self._scratch(MODELS * 4 * floats_of(coefficients) * count))
+        named = self.statistics.named() if statistics is None else statistics
+        copied = CopiedRows(by_field(source) | {f"{KIND}/{name}": each for name, each in named.items()}, rows, values)
+        path, widest = self._scratch(self._record_bytes(coefficients) * count), self._fields((self._sh_degree + 1) ** 2)
+        starts = old.store.starts if old is not None and rows is None else None
+        store = ChunkStore(count, self._fields(coefficients), path, widest=widest, starts=starts)
         make = partial(ChunkPool, self._device, self._work, store, self.plan.rows)
         try:
             pool = make() if isinstance(source[0], HostGaussians) and old is None else None
-            if old is not None and old.store.path is None and store.path is None:
-                changes()  # no memory for a second copy is needed: each chunk is given back when it has been copied
-                copy_to_store(source, rows, store, old.store.give_back)
-            else:
-                copy_to_store(source, rows, store)
+            copied.to_store(store)
         except BaseException:
             store.close()
             raise
         changes()
-        del source, old  # the old pool makes room for the new one
+        del source, old, named, copied  # the old arrays make room for the new pool
+        vars(self).pop("statistics", None)
         self._free_models()
         self._use(pool or make(), coefficients)
 
+    def _move_chunks(
+        self, rows: NDArray[np.uint32] | None, changes: Callable[[], None], values: NewValues, coefficients: int
+    ) -> None:
+        """Move the rows of a model in a store, which stays where it is unless main memory has no room for it any
+        longer. Arguments as those of `_place`."""
+        assert self._pool is not None
+        count, store = self.parameters.count if rows is None else len(rows), self._pool.store
+        to_file = store.path is None and self._scratch(self._record_bytes(coefficients) * count) is not None
+        if to_file or not self.plan.streamed or count <= ORDERED_ROWS:
+            self._place(rows=rows, coefficients=coefficients, changes=changes, values=values)
+            return
+        self._pool.release()
+        store.move(rows, values, changes, self._fields(coefficients) if rows is None else None)
+        self._pool.free()
+        self._pool = None
+        self._free_models()
+        self._use(ChunkPool(self._device, self._work, store, self.plan.rows), coefficients)
+
+    def _fields(self, coefficients: int) -> dict[str, tuple[int, ...]]:
+        """Fields of a store of this model."""
+        return fields_of(coefficients) | statistics_fields(contributions=self._counts_contributions)
+
+    def _record_bytes(self, coefficients: int) -> int:
+        """Bytes of a Gaussian in a store."""
+        return MODELS * 4 * floats_of(coefficients) + gaussian_bytes(contributions=self._counts_contributions)
+
     def _from_store(
-        self, count: int, rows: NDArray[np.uint32] | None, coefficients: int, changes: Callable[[], None]
+        self,
+        count: int,
+        rows: NDArray[np.uint32] | None,
+        coefficients: int,
+        changes: Callable[[], None],
+        values: NewValues,
     ) -> None:
         """Take this model's Gaussians from its store to arrays. Arguments as those of `_place`."""
         old, self._pool = self._pool, None
@@ -339,7 +389,10 @@ class TrainedModel:
         else:
             on_device = [allocate_gaussians(self._device, count, coefficients) for _ in KINDS]
             self.parameters, self.first, self.second = on_device
-        copy_to_models(pooled(old, coefficients), rows, self.with_moments)
+        self.statistics = new_statistics(self._device, count, contributions=self._counts_contributions)
+        arrays = self._by_field()
+        stored = {name: StoredArray(old, name) for name in old.store.fields}
+        CopiedRows(stored, rows, values).to_arrays(arrays)
         old.close()
 
     def _free_models(self) -> None:
@@ -352,12 +405,14 @@ class TrainedModel:
         """Go on in the scratch file of a checkpoint. Returns False if the Gaussians belong elsewhere."""
         if (
             manifest is None
+            or dict(manifest.fields) != self._fields(coefficients)
+            or manifest.slot_bytes != record_type(self._fields((self._sh_degree + 1) ** 2)).itemsize
             or not self.plan.streamed
             or self._files is None
             or not self._files.may_write(manifest.path)
         ):
             return False
-        if self._scratch(MODELS * 4 * floats_of(coefficients) * manifest.count) is None:
+        if self._scratch(self._record_bytes(coefficients) * int(manifest.lengths.sum())) is None:
             return False
         self.close()
         store = ChunkStore.opened(manifest, writable=True)
@@ -370,6 +425,7 @@ class TrainedModel:
             self._files.follow(pool.store)
         self._pool = pool
         self.parameters, self.first, self.second = pooled(pool, coefficients)
+        self.statistics = pooled_statistics(pool)
 
     @property
     def in_file(self) -> bool:
@@ -436,10 +492,14 @@ class TrainedModel:
             try_gather(self._device, count, self.parameters)
         try:
             self.plan = self._make_plan(count)
-            if self._pool is not None or (self.plan.streamed and count > ORDERED_ROWS):
-                self._place(rows=_on_host(rows), changes=changes)
-            else:
-                rows = self._gather(rows, on_device=gathers and self.plan.gathers, changes=changes)
+            values = new_values(densified=new_statistics)
+            if self._pool is not None:
+                self._move_chunks(_on_host(rows), changes, values, self.parameters.coefficients)
+                return
+            if self.plan.streamed and count > ORDERED_ROWS:
+                self._place(rows=_on_host(rows), changes=changes, values=values)
+                return
+            rows = self._gather(rows, on_device=gathers and self.plan.gathers, changes=changes)
         except CapacityError as error:
             raise CapacityError(f"{error}; with --density.max-gaussians {before} the model grows no further") from None
         statistics = self.statistics.named()

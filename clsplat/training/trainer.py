@@ -295,7 +295,7 @@ class Trainer:
     def _watched(self, needs: StatisticsNeeds, inputs: ViewInputs, step: GradientStep, number: int) -> StepMonitor:
         """The probe that watches a view's step. number: number of views so far, this one included."""
         return StepMonitor(
-            step, number, inputs, needs, self.statistics, self.monitor, self.pending, self.tried, self._unmark
+            step, number, inputs, needs, self.statistics.on_device, self.monitor, self.pending, self.tried, self._unmark
         )
 
     def _unmark(self) -> None:
@@ -470,10 +470,8 @@ class Trainer:
         return arrays, self.position.state(self.monitor.retries) | state
 
     def _arrays(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        model, state = self.model.record()
-        arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
+        arrays, state = self.model.record()
         arrays.update({f"strategy/{name}": array for name, array in self.strategy.arrays().items()})
-        arrays |= model
         for component in self.components:
             arrays |= component.arrays()
         return arrays, state
@@ -487,14 +485,14 @@ class Trainer:
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continue from a checkpoint."""
-        with self.model.saved(checkpoint) as (models, arrays):
+        with self.model.saved(checkpoint) as (models, saved):
             self.monitor.retries, self.mark = self.position.load(checkpoint, len(self.views)), None
             self.monitor.forget()
             self.pending.forget()
-            self.model.load(models, checkpoint)
+            self.model.load(models, saved)
             self.strategy.load(checkpoint.named("strategy/"))
             try:
                 for component in self.components:
-                    component.load(arrays.named, self.step, self.parameters.count)
+                    component.load(saved.named, self.step, self.parameters.count)
             except ValueError as error:
                 raise unusable(checkpoint, str(error)) from None

@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calls import raising
 from numpy.typing import NDArray
 from wide import flip, full
 
-from clsplat.chunks import store as store_module
 from clsplat.chunks.manifest import Manifest, manifest_of
+from clsplat.chunks.slot_file import ScratchError, SlotFile, runs
 from clsplat.chunks.slots import MAX_TENTHS, NO_SLOT, SlotTable
-from clsplat.chunks.store import ChunkStore, ScratchError, runs
+from clsplat.chunks.store import ChunkStore
 from clsplat.errors import WriteError
 from clsplat.layouts.columns import CHUNK_ROWS
 
@@ -81,6 +82,55 @@ def test_rows_of_some_chunks(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found["a"], np.concatenate([values[4096:5120], values[19 * CHUNK_ROWS :]]))
     assert found["none"].shape == (2 * CHUNK_ROWS - 5, 0, 3)
     store.close()
+
+
+@pytest.mark.parametrize("value", [0.0, np.inf])
+@pytest.mark.parametrize("in_file", [False, True])
+def test_a_constant_is_noted_and_not_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_file: bool, value: float
+) -> None:
+    """Also where a checkpoint names the chunks. A later change of some rows keeps it in the others."""
+    made = ChunkStore(COUNT, FIELDS, tmp_path / "x.chunks" if in_file else None)
+    records = written(made)
+    if in_file:
+        made.slots.hold([made.manifest().slots])
+    with monkeypatch.context() as patch:
+        patch.setattr(made, "_in_memory", raising(AssertionError("in memory")))
+        for name in ("read_at", "write_at"):
+            patch.setattr(SlotFile, name, raising(AssertionError(name)))
+        made.fill("b", value)
+        made.fill("none", value)
+    got = made.read(ALL)
+    assert (got["b"] == value).all()
+    assert got["a"].tobytes() == records["a"].tobytes()
+    made.set_at("b", np.array([5]), np.ones(1, np.float32))
+    assert made.get_rows("b", 4, 7).tolist() == [value, 1, value]
+    made.write(np.array([3]), records[3:4])
+    assert made.read(np.array([3, 4]))["b"].tolist() == [records["b"][3].tolist(), [value] * CHUNK_ROWS]
+    if in_file:
+        again = ChunkStore.opened(made.manifest(), writable=False)
+        again.verify()
+        assert again.read(ALL).tobytes() == made.read(ALL).tobytes()
+        again.close()
+    made.fill("b", 3.0)
+    assert (made.get_rows("b", 0, COUNT) == 3).all()
+    made.close()
+
+
+@pytest.mark.parametrize("in_file", [False, True])
+def test_fields_may_change_their_names(tmp_path: Path, in_file: bool) -> None:
+    made = ChunkStore(COUNT, {"now": (), "then": ()}, tmp_path / "x.chunks" if in_file else None)
+    now, then = np.arange(COUNT, dtype=np.float32), -np.arange(COUNT, dtype=np.float32)
+    made.set_rows("now", 0, now)
+    made.set_rows("then", 0, then)
+    made.rename({"now": "then", "then": "now"})
+    made.set_rows("now", 7, np.full(1, 0.5, np.float32))
+    then[7] = 0.5
+    stores = [made, ChunkStore.opened(made.manifest(), writable=False)] if in_file else [made]
+    for each in stores:
+        np.testing.assert_array_equal(each.get_rows("now", 0, COUNT), then)
+        np.testing.assert_array_equal(each.get_rows("then", 0, COUNT), now)
+        each.close()
 
 
 def test_what_a_checkpoint_names_is_not_overwritten(store: ChunkStore) -> None:
@@ -205,14 +255,14 @@ def test_a_write_that_fails_gives_no_wrong_row(store: ChunkStore, monkeypatch: p
     """In a slot of its own the chunk stays what it was; in place half of it is new, and reading says so."""
     records = written(store)
     store.slots.hold([store.manifest().slots[:10]])
-    real = ChunkStore._write_at
+    real = SlotFile.write_at
 
-    def half(self: ChunkStore, offset: int, values: NDArray[Any]) -> None:
-        real(self, offset, np.ascontiguousarray(values).view(np.uint8).reshape(-1)[:10_000])
+    def half(self: SlotFile, slot: int, offset: int, values: NDArray[Any]) -> None:
+        real(self, slot, offset, np.ascontiguousarray(values).view(np.uint8).reshape(-1)[:10_000])
         full()
 
     with monkeypatch.context() as patch:
-        patch.setattr(store_module.ChunkStore, "_write_at", half)
+        patch.setattr(SlotFile, "write_at", half)
         for number in (3, 15):
             with pytest.raises(OSError, match="space"):
                 written(store, 1.0, np.array([number]))
@@ -232,8 +282,9 @@ def test_a_manifest_comes_back_from_a_checkpoint(store: ChunkStore) -> None:
     manifest = store.manifest()
     again = manifest_of(manifest.arrays(), {"step": 1, **manifest.state()})
     assert again is not None
-    assert (again.path, again.count, dict(again.fields)) == (manifest.path, manifest.count, FIELDS)
-    np.testing.assert_array_equal(again.slots, manifest.slots)
+    assert (again.path, again.slot_bytes, dict(again.fields)) == (manifest.path, manifest.slot_bytes, FIELDS)
+    for name, array in manifest.arrays().items():
+        np.testing.assert_array_equal(again.arrays()[name], array)
     assert manifest_of({}, {}) is None
 
 
@@ -242,8 +293,16 @@ WRONG: dict[str, Callable[[Manifest], Manifest]] = {
     "fewer slots": lambda m: replace(m, slots=m.slots[:-1]),
     "negative slots": lambda m: replace(m, slots=m.slots - 5),
     "another type": lambda m: replace(m, slots=m.slots.astype(np.int32)),  # type: ignore[arg-type]
-    "more Gaussians": lambda m: replace(m, count=m.count + CHUNK_ROWS),
-    "no Gaussians": lambda m: replace(m, count=0),
+    "more lengths": lambda m: replace(m, lengths=np.append(m.lengths, 1)),
+    "an empty chunk": lambda m: replace(m, lengths=m.lengths * (m.slots != 3)),
+    "a chunk that is too long": lambda m: replace(m, lengths=m.lengths + 1),
+    "no chunks": lambda m: replace(m, **{name.split("/")[1]: array[:0] for name, array in m.arrays().items()}),
+    "a single length": lambda m: replace(m, lengths=m.lengths[0]),
+    "slots that are too small": lambda m: replace(m, slot_bytes=m.slot_bytes - 1),
+    "huge slots": lambda m: replace(m, slot_bytes=1 << 60),
+    "fewer constants": lambda m: replace(m, constants=m.constants[:-1]),
+    "an unknown constant": lambda m: replace(m, constants=m.constants + np.uint8(3)),
+    "a chunk that is nowhere": lambda m: replace(m, slots=np.where(m.slots == 3, -1, m.slots)),
     "fewer checksums": lambda m: replace(m, checksums=m.checksums[:, :1]),
     "a huge field": lambda m: replace(m, fields={**m.fields, "b": (1 << 40,)}),
     "many fields": lambda m: replace(m, fields={str(k): () for k in range(99)}),
@@ -269,7 +328,7 @@ def test_low_slots_are_taken_first() -> None:
     table.hold([np.array([0, 1, NO_SLOT, NO_SLOT])])
     assert table.targets(np.array([2])) == [2], "no checkpoint names it"
     assert table.targets(np.array([1])) == [3]
-    assert table.lacking(np.array([0, 1, 3])) == 2
+    assert table.needed(np.array([0, 1, 3])) - table.free == 2
     assert table.end_of_held == 2
     table.grow(table.growth(2))
     np.testing.assert_array_equal(table.targets(np.array([3, 0])), [3, 4])

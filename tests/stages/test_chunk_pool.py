@@ -11,11 +11,14 @@ from calls import raising, refuses
 from compare import assert_same_bits
 from numpy.typing import NDArray
 
-from clsplat.chunks.store import ChunkStore, ScratchError
+from clsplat.chunks.gathering import NewValues
+from clsplat.chunks.slot_file import ScratchError
+from clsplat.chunks.store import ChunkStore
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.errors import WriteError
 from clsplat.layouts.columns import CHUNK_ROWS
+from clsplat.optimisation.density_rules import FRESH
 from clsplat.stages.chunk_pool import INVISIBLE_LOGIT, ChunkPool, StoredArray
 
 FIELDS: dict[str, tuple[int, ...]] = {
@@ -79,21 +82,31 @@ def check(pool: ChunkPool, model: Model) -> None:
         assert_same_bits(StoredArray(pool, name).get(), values, name)
 
 
+def change_rows(pool: ChunkPool, model: Model, start: int, by: float) -> None:
+    """Change as many rows as there is room for, from any row on."""
+    stop = min(start + pool.rows, COUNT)
+    pool.place_rows(start, stop)
+    assert (pool.slots_of(np.arange(CHUNKS)) < 0).all()
+    for name in model:
+        array = pool.arrays[name].rows(0, stop - start)
+        assert_same_bits(array.get(), model[name][start:stop], name)
+        model[name][start:stop] += np.float32(by)
+        array.set(model[name][start:stop])
+    pool.keep_rows(start, stop)
+
+
 @pytest.mark.parametrize("slots", [1, SLOTS, CHUNKS])
 def test_steps_over_some_chunks(device: Device, path: Path | None, slots: int) -> None:
-    """Random chunks come, are changed, and come back; now and then all of them come in order, or leave."""
+    """Random chunks come, are changed, and come back; now and then consecutive rows come, or all leave."""
     rng, model = np.random.default_rng(slots), model_of()
     pool = pool_of(device, model, path, slots)
     for call in range(24):
         numbers, changes = np.sort(rng.permutation(CHUNKS)[: rng.integers(1, slots + 1)]), bool(rng.random() < 0.6)
         if call % 6 == 5:
-            first, count = int(rng.integers(CHUNKS - len(numbers) + 1)), len(numbers)
-            pool.place_run(first, count, changes=changes)
-            numbers, placed = np.arange(first, first + count), np.arange(count)
-            assert pool.slots_of(numbers).tolist() == placed.tolist()
-        else:
-            placed = pool.place(numbers, changes=changes)
-            assert len(set(placed.tolist())) == len(numbers)
+            change_rows(pool, model, int(rng.integers(COUNT - 1)), call)
+            continue
+        placed = pool.place(numbers, changes=changes)
+        assert len(set(placed.tolist())) == len(numbers)
         for chunk, slot in zip(numbers.tolist(), placed.tolist(), strict=True) if changes else ():
             change(pool, model, chunk, slot, 1 + call)
         if call % 9 == 8:
@@ -197,6 +210,28 @@ def test_rows_behind_the_last_one(device: Device, path: Path | None) -> None:
         pool.arrays["parameters/opacity_logits"].set_rows(CHUNK_ROWS * int(slot) + 77, np.full(9, 5.0, np.float32))
         pool.release()
     check(pool, model)
+
+
+def test_rows_behind_each_chunks_last_one(device: Device, path: Path | None) -> None:
+    """Of chunks that have lost rows, or were split."""
+    model = model_of()
+    pool = pool_of(device, model, path)
+    rows = np.arange(COUNT, dtype=np.uint32)
+    rows = np.delete(np.insert(rows, CHUNK_ROWS + 3, CHUNK_ROWS + 2 | FRESH), slice(3 * CHUNK_ROWS + 9, 4 * CHUNK_ROWS))
+    pool.release()
+    pool.store.move(rows, NewValues(), lambda: None)
+    pool = ChunkPool(device, Workspace(device), pool.store, CHUNK_ROWS * (CHUNKS + 1))
+    numbers = np.arange(pool.store.chunks)
+    lengths = pool.store.lengths(numbers).tolist()
+    assert lengths == [1024, 512, 513, 1024, 9, 1024, 77]
+    for number, slot in enumerate(pool.place(numbers, changes=False).tolist()):
+        first, length = int(pool.store.starts[number]), lengths[number]
+        means = in_slot(pool, "parameters/means", slot)
+        wanted = model["parameters/means"][rows[first : first + length] & ~FRESH]
+        assert_same_bits(means[:length], wanted)
+        assert (means[length:] == wanted[-1]).all()
+        assert (in_slot(pool, "parameters/opacity_logits", slot)[length:] == np.float32(INVISIBLE_LOGIT)).all()
+        assert not in_slot(pool, "second/means", slot)[length:].any()
 
 
 def test_the_last_chunk_may_be_full(device: Device) -> None:

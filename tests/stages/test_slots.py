@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from quick import quick
 
 from clsplat.camera import Camera
+from clsplat.chunks.store import ChunkStore
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
@@ -25,15 +26,22 @@ from clsplat.stages.bounds import bounds
 from clsplat.stages.catch_up import StepTable, catch_up, step_table
 from clsplat.stages.chunk_lists import ChunkList, ChunkNumbers, send_chunks
 from clsplat.stages.chunk_pool import ChunkPool
-from clsplat.stages.density import add_statistics, new_statistics
+from clsplat.stages.density import (
+    add_statistics,
+    new_statistics,
+    new_values,
+    pooled_statistics,
+    statistics_fields,
+)
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import (
+    CopiedRows,
     DeviceGaussians,
     HostGaussians,
+    by_field,
     chunk_parts,
-    copy_to_store,
+    fields_of,
     host_gaussians,
-    new_store,
     parts,
     pooled,
     to_device,
@@ -62,8 +70,8 @@ class Model:
             moments.append(Gaussians(*(made[group].astype(np.float32) for group in groups), sh.astype(np.float32)))
         host = [host_gaussians(each, COUNT) for each in (gaussians, *moments)]
         self.whole: Models = tuple(to_device(device, each) for each in host)
-        store = new_store(COUNT, 9, None)
-        copy_to_store(host, None, store)
+        store = ChunkStore(COUNT, fields_of(9) | statistics_fields(contributions=True))
+        CopiedRows(by_field(host), values=new_values()).to_store(store)
         self.pool = ChunkPool(device, self.work, store, slots * CHUNK_ROWS)
         self.streamed: tuple[HostGaussians, ...] = pooled(self.pool, 9)
         self.chunks = send_chunks(self.work, "chunks", LISTED, COUNT)
@@ -122,22 +130,25 @@ def test_projection(shaped_device: Device, projection: str) -> None:
 @pytest.mark.slow_in_groups
 @pytest.mark.parametrize("sparse", quick([False, True], False))
 def test_a_step_of_adam(shaped_device: Device, *, sparse: bool) -> None:
-    """And statistics by the numbers of the chunks, of rows that are projected by slots."""
+    """And its statistics."""
     model, results = Model(shaped_device), []
+    whole = new_statistics(shaped_device, COUNT, contributions=True)
+    streamed = pooled_statistics(model.pool)
     before = model.whole[0]["means"].get()
     step = AdamStep(OptimiserConfig(sparse=sparse), 6, RATES)
-    for models, chunks in model.both():
+    for (models, chunks), statistics in zip(model.both(), (whole, streamed.on_device), strict=True):
         camera_array, projected = seen(shaped_device, models[0], chunks, model.camera)
         screen = Screen(upload(shaped_device, np.zeros((chunks.rows, 2), np.float32)))
         slots, readback = made_slots(shaped_device, projected.tile_counts.get()), fresh_readback(shaped_device)
         project_step(shaped_device, step, models, camera_array, projected, slots, screen, readback)
-        statistics = new_statistics(shaped_device, COUNT, contributions=False)
-        add_statistics(shaped_device, statistics, model.camera, replace(projected, chunks=model.chunks), screen)
-        arrays = {name: array.get() for name, array in statistics.named().items()}
-        results.append({**arrays, "screen": screen.gradients.get(), "readback": readback.get()})
+        add_statistics(shaped_device, statistics, model.camera, projected, screen)
+        results.append({"screen": screen.gradients.get(), "readback": readback.get()})
     moved = np.flatnonzero((model.whole[0]["means"].get() != before).any(axis=1))
     assert set((moved // CHUNK_ROWS).tolist()) == set(LISTED.tolist())
+    for result, statistics in zip(results, (whole, streamed), strict=True):
+        result |= {name: array.get() for name, array in statistics.named().items()}
     assert results[0]["seen"].sum() > 100
+    assert np.isinf(results[0]["whole_totals"]).all()
     for name, values in results[0].items():
         assert_same_bits(results[1][name], values, name)
     model.check()
@@ -179,8 +190,9 @@ def test_more_chunks_than_slots(shaped_device: Device, slots: int) -> None:
     screen = Screen(upload(shaped_device, np.zeros((len(counts), 2), np.float32)))
     project_step(shaped_device, step, model.whole, camera_array, whole, pairs, screen, readback)
     listed = []
-    for start, stop, part, chunks, of_part in chunk_parts(model.work, numbers, *model.streamed, changes=True):
-        assert (LISTED[start // CHUNK_ROWS : stop // CHUNK_ROWS] == of_part).all()
+    for start, stop, part, chunks in chunk_parts(model.work, numbers, *model.streamed, changes=True):
+        of_part = LISTED[start // CHUNK_ROWS : stop // CHUNK_ROWS]
+        assert (model.pool.slots_of(of_part) == chunks.numbers.get()).all()
         listed += of_part.tolist()
         projected, of_screen = (
             replace(some.rows(start, stop), chunks=chunks),

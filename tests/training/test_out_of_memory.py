@@ -22,7 +22,7 @@ from clsplat.errors import CapacityError
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.stages.density import gather
-from clsplat.stages.device_gaussians import copy_to_store
+from clsplat.stages.device_gaussians import CopiedRows
 from clsplat.training import moved_rows, trained_model
 from clsplat.training.step.monitor import StepMonitor
 
@@ -115,15 +115,15 @@ def test_a_buffer_that_the_driver_refuses_while_rows_move(
     def copied(*arguments: Any) -> None:
         for _ in range(3):
             allocate(device, (1,), np.float32)
-        copy_to_store(*arguments)
+        to_store(*arguments)
 
-    made = buffers._Buffer
+    made, to_store = buffers._Buffer, CopiedRows.to_store
     device = default_device.with_memory_limit(600 * 1024 if on_host else None)
     with monkeypatch.context() as patch:
         noted(patch, trained_model, "try_gather", moves)
         patch.setattr(buffers, "_Buffer", buffer)
         patch.setattr(trained_model, "gather", gathered)
-        patch.setattr(trained_model, "copy_to_store", copied)
+        patch.setattr(CopiedRows, "to_store", copied)
         with pytest.raises(CapacityError) as raised:
             train_on(load_scene(folder), GROWING, device=device, run=run)
     (step,) = saved_steps(run.path)

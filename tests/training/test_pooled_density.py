@@ -20,6 +20,8 @@ from tiny import run_steps, short
 
 from clsplat.chunks import gathering
 from clsplat.chunks.order import beside_parents
+from clsplat.chunks.slot_file import SlotFile
+from clsplat.chunks.store import ChunkStore
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.device.selection import open_device
@@ -102,17 +104,16 @@ def test_the_bytes_of_a_model_on_the_device(
 ) -> None:
     """With clones, halves in several parts, pruned rows, resets, and SH degrees from step 12 and 24 on."""
     wanted = after(32, trainer_of(scene, SETTINGS[name], default_device))
-    stores: list[tuple[int, int, Path | None]] = []
-    noted(monkeypatch, trained_model, "new_store", lambda *made: stores.append(made))
+    moves: list[tuple[int, int]] = []
+    noted(monkeypatch, ChunkStore, "move", lambda store, rows, *_: moves.append((store.count, rows is None)))
     trainer = trainer_of(scene, SETTINGS[name], limits)
     run_steps(32, trainer)
-    left = trainer.model._pool is None
+    left, path = trainer.model._pool is None, None if (store := trainer.model.store) is None else store.path
     assert_same(after(0, trainer), wanted)
-    counts, coefficients, paths = (set(each) for each in zip(*stores, strict=True))
-    assert len(counts) > 1 or left, "rows move within a store, or leave it"
-    assert {1, 4} <= coefficients
-    assert any(paths) == (limits()[1] is not UNLIMITED)
-    assert not any(path and path.exists() for path in paths)
+    assert len({count for count, _ in moves}) > 1 or left, "rows move within a store, or leave it"
+    assert any(widened for _, widened in moves)
+    assert (path is not None) == (limits()[1] is not UNLIMITED) or left
+    assert path is None or not path.exists()
 
 
 @pytest.mark.parametrize("room", [1, 2, 5, 7, 8, 11])
@@ -133,8 +134,8 @@ def traced(trainer: Trainer) -> tuple[int, int]:
 
 
 def test_no_second_copy_of_the_model(scene: Scene, limits: Limits) -> None:
-    """While rows move, main memory has the new rows, a few chunks, and lists. The device has a statistic more, and
-    scratch memory as of a frame of the rows that it has room for."""
+    """While rows move, main memory has the new rows, a few chunks, and lists. The device has scratch memory as of a
+    frame of the rows that it has room for."""
     config = replace(CONFIG, sh_degree=3, sh_degree_every=0)
     tracemalloc.start()
     try:
@@ -151,7 +152,7 @@ def test_no_second_copy_of_the_model(scene: Scene, limits: Limits) -> None:
     # 40 and 24 bytes a half are in one part here, 4 in a list; a chunk is read, one written, with their fields
     assert host < each * (grown + 6 * CHUNK_ROWS) + 100 * count
     assert rows < count / 2
-    assert device < 4 * (len(SPLAT) * rows + count + grown)
+    assert device < 4 * len(SPLAT) * rows
 
 
 class Shuffles(Adaptive):
@@ -247,7 +248,7 @@ def test_a_full_disk_leaves_the_state_before_it(
         raise write_error(str(tmp_path), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), needs=1)
 
     with monkeypatch.context() as patch:
-        patch.setattr(trained_model, "copy_to_store", full)
+        patch.setattr(SlotFile, "write", full)
         with pytest.raises(WriteError):
             trainer.train_step()
     assert trainer.step_back()

@@ -14,24 +14,25 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny import short
+from tiny import run_steps, short
 from wide import flip, full, let_small_models_have_chunks, start_training, start_wide
 
 from clsplat.api import train
-from clsplat.chunks import store as store_module
-from clsplat.chunks.manifest import Manifest
-from clsplat.chunks.slots import MAX_TENTHS
+from clsplat.chunks import gathering, slot_file
+from clsplat.chunks.manifest import Manifest, manifest_of
+from clsplat.chunks.slots import MAX_TENTHS, SlotTable
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError, WriteError
 from clsplat.files import atomic, mounts
 from clsplat.gaussians import GaussiansOfFile
 from clsplat.layouts.columns import CHUNK_ROWS
-from clsplat.runs.checkpoints import read_manifest
+from clsplat.runs.checkpoints import Checkpoint, read_manifest
 from clsplat.runs.run import Run, owned_files
 from clsplat.runs.scratch import owner_of
 from clsplat.scenes.scene import Scene
 from clsplat.stages import chunk_pool
+from clsplat.training.memory import HostMemory
 from clsplat.training.trainer import Trainer
 
 LIMIT = 4 << 20
@@ -150,6 +151,34 @@ def test_resumed_under_another_limit(
     assert bool(manifests) == (second in (LIMIT, 5 << 20))
 
 
+@pytest.mark.parametrize("scratch", ["same", "other"])
+def test_statistics_that_the_settings_did_not_need_before(
+    scene: Scene, default_device: Device, tmp_path: Path, scratch: str
+) -> None:
+    """They stay unknown, and the others go on. The chunks then have other fields, so they take a new file."""
+    run = Run.create(tmp_path / "run", STEADY)
+    more = replace(STEADY, density=replace(STEADY.density, every=100, min_contribution=1e-3))
+    memory = HostMemory.chosen(LIMIT, "none", run)
+    trainer = Trainer(scene, STEADY, default_device, memory=memory)
+    run_steps(5, trainer)
+    arrays, state = trainer.checkpoint()
+    checkpoint = Checkpoint(trainer.step, arrays, state, manifest_of(arrays, state))
+    if scratch == "other":
+        memory = replace(memory, scratch=tmp_path / "other")
+    other = Trainer(scene, more, default_device, memory=memory)
+    other.restore(checkpoint)
+    named = other.statistics.named()
+    assert len(named) == 7
+    for name, array in named.items():
+        if name in trainer.statistics.named():
+            assert np.array_equal(array.get(), trainer.statistics.named()[name].get())
+        else:
+            assert np.isinf(array.get()).all()
+    assert other.model.store is not None
+    for each in (other, trainer):
+        each.close()
+
+
 def test_a_finished_training_can_go_on(go: Train, whole: Callable[[TrainConfig], bytes]) -> None:
     more = replace(STEADY, iterations=33)
     wanted = whole(more)
@@ -169,13 +198,13 @@ def test_bytes_on_the_disk(go: Train, monkeypatch: pytest.MonkeyPatch, name: str
             sizes.append(store.path.stat().st_size / store.nbytes)
 
     written: list[int] = []
-    real = store_module.ChunkStore._write_at
+    real = slot_file.SlotFile.write_at
 
-    def write(store: store_module.ChunkStore, offset: int, values: Any) -> None:
+    def write(file: slot_file.SlotFile, slot: int, offset: int, values: Any) -> None:
         written.append(values.nbytes)
-        real(store, offset, values)
+        real(file, slot, offset, values)
 
-    monkeypatch.setattr(store_module.ChunkStore, "_write_at", write)
+    monkeypatch.setattr(slot_file.SlotFile, "write_at", write)
     config = SETTINGS[name]
     run = go(config, each=measure)
     assert len(sizes) > config.iterations - 4, "from the second step on, when the model has all SH bands"
@@ -191,7 +220,7 @@ def test_chunks_are_on_the_disk_before_the_manifest_names_them(
 ) -> None:
     order: list[str] = []
     scratch = tmp_path / "run" / "scratch"
-    flush, rename, write = os.fsync, atomic.replace, store_module.ChunkStore._write_at
+    flush, rename, write = os.fsync, atomic.replace, slot_file.SlotFile.write_at
 
     def fsync(descriptor: int) -> None:
         if any(os.path.samestat(os.fstat(descriptor), path.stat()) for path in scratch.glob("*.chunks")):
@@ -202,32 +231,38 @@ def test_chunks_are_on_the_disk_before_the_manifest_names_them(
         order.extend(["named"] * (target.suffix == ".npz"))
         rename(source, target)
 
-    def write_at(store: store_module.ChunkStore, *arguments: Any) -> None:
+    def write_at(file: slot_file.SlotFile, *arguments: Any) -> None:
         order.append("written")
-        write(store, *arguments)
+        write(file, *arguments)
 
     monkeypatch.setattr(os, "fsync", fsync)
     monkeypatch.setattr(atomic, "replace", replace_file)
-    monkeypatch.setattr(store_module.ChunkStore, "_write_at", write_at)
+    monkeypatch.setattr(slot_file.SlotFile, "write_at", write_at)
     go(STEADY)
     assert order.count("named") == 7
     for place in (place for place, event in enumerate(order) if event == "named"):
         assert order[place - 1] == "flushed", "nothing is written between"
 
 
-def test_density_control_takes_a_new_file(go: Train) -> None:
-    """The file before stays as long as a checkpoint names it."""
+def test_rows_move_in_the_same_file(go: Train) -> None:
+    """By density control, and by a higher SH degree. It has room for what the checkpoints name and for what changes."""
     seen: list[set[str]] = []
 
     def look(trainer: Trainer) -> None:
         if (store := trainer.model.store) is not None:
             assert store.path is not None
             seen.append({path.name for path in store.path.parent.iterdir()})
+            counts.add(store.count)
+            shares.append(store.path.stat().st_size / store.nbytes)
 
+    counts: set[int] = set()
+    shares: list[float] = []
     run = go(DENSE, each=look)
-    assert len(set().union(*seen)) > 1
-    assert max(map(len, seen)) == 2
+    assert len(counts) > 2
+    assert len(set().union(*seen)) == 1
     assert {path.name for path in files_of(run)} == {manifest.path.name for _, manifest in run.manifests()}
+    # all chunks change here, in steps and in density control: the latest checkpoint's, today's, and tomorrow's
+    assert max(shares) <= 3.0
 
 
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
@@ -356,6 +391,43 @@ def test_a_full_disk(go: Train, whole: Callable[[TrainConfig], bytes], monkeypat
     assert go().model_path.read_bytes() == wanted
 
 
+@pytest.mark.parametrize("ends", ["full", "killed"])
+def test_density_control_that_does_not_end(
+    go: Train, whole: Callable[[TrainConfig], bytes], monkeypatch: pytest.MonkeyPatch, ends: str
+) -> None:
+    """The disk is full, or the process is killed, when some of the new chunks are written: the checkpoint before is as
+    it was."""
+    wanted, taken = whole(DENSE), 0
+    real = SlotTable.take
+
+    def take(slots: SlotTable, count: int) -> Any:
+        nonlocal taken
+        taken += 1
+        if ends == "killed" and taken == 2:
+            raise _KilledError
+        if ends == "full" and taken == 1:
+            monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
+        return real(slots, count)
+
+    def begin(trainer: Trainer) -> None:
+        if trainer.step == 14:
+            monkeypatch.setattr(SlotTable, "take", take)
+            monkeypatch.setattr(gathering, "BLOCK_CHUNKS", 2)
+            if ends == "killed":
+                monkeypatch.setattr(trainer.model, "close", lambda: None)
+
+    allocate = getattr(os, "posix_fallocate", None)
+    if ends == "full":
+        with pytest.raises(WriteError, match=r"\.chunks: cannot be written: the disk is full"):
+            go(DENSE, each=begin)
+    else:
+        go(DENSE, until=20, each=begin)
+    assert taken == (1 if ends == "full" else 2)
+    monkeypatch.setattr(SlotTable, "take", real)
+    monkeypatch.setattr(os, "posix_fallocate", allocate, raising=False)
+    assert go(DENSE).model_path.read_bytes() == wanted
+
+
 def test_a_disk_that_is_full_at_the_start(go: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
     with pytest.raises(WriteError, match=r"the disk is full.*are needed"):
@@ -367,7 +439,7 @@ def test_a_read_only_folder(go: Train, tmp_path: Path, monkeypatch: pytest.Monke
     def refused(*_: object) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    monkeypatch.setattr(store_module, "FileIO", refused)
+    monkeypatch.setattr(slot_file, "FileIO", refused)
     with pytest.raises(WriteError, match=r"\.chunks: cannot be written: the disk is read-only"):
         go(scratch=tmp_path / "scratch")
 

@@ -2,11 +2,13 @@
 """Train a model that is larger than the memory it may have, and say what its steps take.
 
     tools/stress/run large [--gaussians 20e6] [--degree 3] [--steps 300] [--max-host-mem 4GiB] [--max-device-mem SIZE]
-        [--scratch DIR] [--dense] [--near] [--views 60] [--device DEVICE]
+        [--scratch DIR] [--dense] [--near] [--views 60] [--device DEVICE] [--control SHARE]
 
 The model is a plain of cells, a chunk of Gaussians each, made by a seed block by block; each camera looks at a small
 part of it. Prints the time of a step, the bytes that a step moves, the peak of anonymous and shared memory, and a
-digest of parameters and moments after the last step, which is the same at every limit.
+digest of parameters and moments after the last step, which is the same at every limit. With --control, density control
+follows, which clones some Gaussians of a share of the chunks and removes others: its time, the bytes that this process
+reads and writes for it (Linux), and its peak.
 """
 
 from __future__ import annotations
@@ -23,18 +25,22 @@ from typing import Any
 
 import numpy as np
 from measuring import plain_parser
+from numpy.typing import NDArray
 from typing_extensions import Self
 
 from clsplat.arrays import Float32
+from clsplat.chunks.gathering import SourceList
 from clsplat.config.checks import parse_bytes
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.selection import open_device
 from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
 from clsplat.images.writing import write_image
 from clsplat.layouts.columns import CHUNK_ROWS
+from clsplat.optimisation.density_rules import FRESH
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
-from clsplat.stages.device_gaussians import HostGaussians
+from clsplat.stages.device_gaussians import HostArray, HostGaussians
+from clsplat.training.density import RowPlan
 from clsplat.training.memory import UNLIMITED, HostMemory
 from clsplat.training.trainer import Trainer
 
@@ -45,6 +51,8 @@ CAMERA_HEIGHT = 9.0
 """World units above the plain. A camera sees some 11 x 8 cells."""
 DIGEST_ROWS = 1 << 18
 SECONDS_BETWEEN_LOOKS = 0.02
+REMOVED_EVERY, CLONED_EVERY = 50, 20
+"""Density control removes one in this many Gaussians of a chunk, and clones one in this many."""
 
 
 @dataclass(frozen=True)
@@ -141,8 +149,45 @@ def large_trainer(scene: Scene, config: TrainConfig, arguments: Any, count: int,
     model.plan = trainer.planner.plan(count, trainer.strategy.needs(), trainer.components, trainer.pending.turns)
     model.set(HostGaussians(count, (config.sh_degree + 1) ** 2, arrays, count))
     for component in trainer.components:
-        component.rows_moved(trainer.statistics.seen)
+        component.rows_moved(HostArray(np.broadcast_to(np.uint32(0), count)))
     return trainer
+
+
+def changed_rows(count: int, share: float) -> NDArray[np.uint32]:
+    """Rows of the plain after density control: in every chunk of a share of them some are cloned, others removed."""
+    rng, parts = np.random.default_rng(2), []
+    for first in range(0, count, CHUNK_ROWS):
+        rows = np.arange(first, min(first + CHUNK_ROWS, count), dtype=np.uint32)
+        if rng.random() < share:
+            rows = rows[np.arange(len(rows)) % REMOVED_EVERY > 0]
+            fresh = rows[::CLONED_EVERY]
+            rows = np.insert(rows, np.arange(0, len(rows), CLONED_EVERY) + 1, fresh | FRESH)
+        parts.append(rows)
+    return np.concatenate(parts)
+
+
+def moved_by_process() -> tuple[int, int]:
+    """Bytes that this process has read and written so far, by whatever call."""
+    lines = Path("/proc/self/io").read_text().splitlines()
+    counts = dict(line.split(": ") for line in lines)
+    return int(counts["rchar"]), int(counts["wchar"])
+
+
+def control(trainer: Trainer, share: float) -> str:
+    """Run density control, and say what it took."""
+    count = trainer.parameters.count
+    rows = changed_rows(count, share)
+    plan = RowPlan(listed=SourceList(rows, np.zeros(0, np.uint32)), new_statistics=True)
+    begin = time.perf_counter()
+    with MemoryPeak() as peak:
+        before = moved_by_process()
+        trainer.model.rearrange(plan, lambda: None)
+        read, written = (after - start for after, start in zip(moved_by_process(), before, strict=True))
+    seconds = time.perf_counter() - begin
+    return (
+        f"density control of {share:.2f} of the chunks, {count:,} to {len(rows):,} Gaussians: {seconds:.1f} s, "
+        f"{read / 2**20:,.0f} MiB read, {written / 2**20:,.0f} MiB written, peak {peak.bytes / 2**20:,.0f} MiB"
+    )
 
 
 def digest(trainer: Trainer) -> str:
@@ -169,6 +214,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--dense", action="store_true")
     parser.add_argument("--near", action="store_true")
     parser.add_argument("--device")
+    parser.add_argument("--control", type=float, metavar="SHARE")
     arguments = parser.parse_args(argv)
     count = int(arguments.gaussians)
     optimiser, density = OptimiserConfig(sparse=not arguments.dense), DensityConfig(every=0)
@@ -196,6 +242,8 @@ def main(argv: Sequence[str]) -> int:
         trainer.catch_up()
         caught, moved = time.perf_counter() - begin, trainer.model.moved_bytes
         text = digest(trainer)
+        controlled = control(trainer, arguments.control) if arguments.control is not None else ""
+        text += f", {digest(trainer)} after density control" if controlled else ""
         trainer.close()
     print(
         f"{count:,} Gaussians of degree {arguments.degree}, {'dense' if arguments.dense else 'sparse'} Adam, "
@@ -203,6 +251,8 @@ def main(argv: Sequence[str]) -> int:
         f"{moved / arguments.steps / 2**20:.0f} MiB moved a step, {made:.0f} s to begin, {caught:.0f} s to catch up, "
         f"peak {peak.bytes / 2**20:,.0f} MiB, digest {text}"
     )
+    if controlled:
+        print(controlled)
     return 0
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from clsplat.chunks.manifest import chunks_of
+from clsplat.chunks.division import chunks_of
 from clsplat.chunks.store import record_type
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, Workspace, upload

@@ -18,7 +18,7 @@ from clsplat.optimisation.dropout import Thinning, thinning_of
 from clsplat.optimisation.step_noise import NO_EXPLORATION, Exploration
 from clsplat.rendering.rasterizer import ForwardPass, PairCapacity, Rasterizer
 from clsplat.stages.adam import AdamStep, adam
-from clsplat.stages.chunk_lists import ChunkList, ChunkNumbers, exact_chunks
+from clsplat.stages.chunk_lists import ChunkList, ChunkNumbers
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians, chunk_parts, parts
 from clsplat.stages.loss import Loss, loss
 from clsplat.stages.loss_terms import LossTerm
@@ -241,17 +241,18 @@ class GradientStep:
         placed: PlacedChunks | None,
     ) -> None:
         """Take Adam's step for the model, part by part, or for some of its chunks."""
-        chunks = None if placed is None else placed.listed
+        chunks = None if placed is None else placed.in_model
 
         def change() -> None:
-            for start, part, projected, listed in self._parts(model, frame.projected, placed):
-                rows = self._rows(start, part, inputs, frame.camera_array, projected, slots, gradients, listed)
+            for start, part, projected in self._parts(model, frame.projected, chunks):
+                rows = self._rows(start, part, inputs, frame.camera_array, projected, slots, gradients)
                 self._change_rows(rows, inputs, probe)
 
         if self.room is None or gradients is not None or any(part.changes_rows for part in inputs.parts):
             change()
             return
         step, explore = self.adam_step, self.explore
+        assert not isinstance(chunks, ChunkNumbers), "such a step has exact counts"
         rows = None if chunks is None else chunks.key
         key = (slots, *map(ref, model[1:]), step.updates_sh_rest, bool(explore.weights), explore.amount != 0, rows)
         numbers = (*step_numbers(step, explore), *noise_numbers(explore), *probe.numbers)
@@ -259,18 +260,17 @@ class GradientStep:
         self.replayed(model[0], (*key, *probe.key), change, numbers, given, probe.before_replay)
 
     def _parts(
-        self, model: tuple[AnyGaussians, ...], projected: Projected, placed: PlacedChunks | None
-    ) -> Iterator[tuple[int, tuple[DeviceGaussians, ...], Projected, ChunkList | None]]:
-        """Yield, for each part of the model that is on the device at once, its first row, the part, its projection, and
-        the list of its chunks, if the step has chunks."""
+        self, model: tuple[AnyGaussians, ...], projected: Projected, chunks: ChunkList | ChunkNumbers | None
+    ) -> Iterator[tuple[int, tuple[DeviceGaussians, ...], Projected]]:
+        """Yield, for each part of the model that is on the device at once, its first row, the part, and its
+        projection."""
         work = self.rasterizer.work
-        if placed is not None and isinstance(placed.in_model, ChunkNumbers):
-            for start, stop, part, slots, numbers in chunk_parts(work, placed.in_model, *model, changes=True):
-                listed = exact_chunks(work, "chunks", numbers, model[0].count)
-                yield start, part, replace(projected.rows(start, stop), chunks=slots), listed
+        if isinstance(chunks, ChunkNumbers):
+            for start, stop, part, slots in chunk_parts(work, chunks, *model, changes=True):
+                yield start, part, replace(projected.rows(start, stop), chunks=slots)
             return
         for start, stop, part in parts(work, *model, keep=True):
-            yield start, part, *((projected.rows(start, stop), None) if placed is None else (projected, placed.listed))
+            yield start, part, projected.rows(start, stop) if chunks is None else projected
 
     def _rows(
         self,
@@ -281,9 +281,8 @@ class GradientStep:
         projected: Projected,
         slots: Slots,
         gradients: DeviceGaussians | None,
-        chunks: ChunkList | None,
     ) -> StepRows:
-        """Rows of the model or of `chunks` from `start` on, with arrays for their gradients."""
+        """Rows of the model, or of the chunks in `projected`, from `start` on, with arrays for their gradients."""
         count = projected.tile_counts.shape[0]
         by_lens = (part.lens_gradients(count) for part in inputs.parts)
         return StepRows(
@@ -297,7 +296,6 @@ class GradientStep:
             slots.rows(start, start + count),
             gradients,
             next((room for room in by_lens if room is not None), None),
-            chunks=chunks,
         )
 
     def _change_rows(self, rows: StepRows, inputs: ViewInputs, probe: StepProbe) -> None:

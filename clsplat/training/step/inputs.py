@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -26,12 +26,10 @@ class PlacedChunks:
     model: the model that the kernels get: the whole model, or, if it is streamed, the rows of the pool's slots.
     in_model: the chunks for kernels that read `model`. ChunkNumbers come to the pool one after the other; `model` is
         the streamed model then.
-    listed: the numbers of the chunks in the model; None with ChunkNumbers.
     """
 
     model: tuple[AnyGaussians, ...]
     in_model: ChunkList | ChunkNumbers
-    listed: ChunkList | None
 
 
 class ChunksInView(Protocol):
@@ -79,19 +77,17 @@ class ViewInputs:
 
 @dataclass(frozen=True, eq=False)
 class ViewRows:
-    """Rows [start, stop) of the model that are on the device at once: all rows if the model fits.
+    """Rows [start, stop) of the model, or of the chunks that were projected, that are on the device at once.
 
     projected: projection of these rows in the step's view.
     screen: their screen-space gradients. The kernel that changes the rows may write them, so that they are undefined
         before it.
-    chunks: the model's chunks that were projected. Then [start, stop) are rows of these.
     """
 
     start: int
     stop: int
     projected: Projected
     screen: Screen
-    chunks: ChunkList | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from clsplat.device.launch import only_tried
 from clsplat.rendering.rasterizer import ForwardPass
@@ -52,7 +52,7 @@ class StepMonitor(StepProbe):
     def key(self) -> tuple[object, ...]:
         """Everything that the launches of `add_statistics` depend on, except `numbers`."""
         camera = self.inputs.camera
-        return (*vars(self.statistics).values(), self.needs.gradients, camera.width, camera.height)
+        return (*self.statistics.named().values(), self.needs.gradients, camera.width, camera.height)
 
     @property
     def numbers(self) -> tuple[float, ...]:
@@ -87,10 +87,8 @@ class StepMonitor(StepProbe):
         """Add the view to the statistics that density control needs of these rows."""
         device, camera, screen = self.step.device, self.inputs.camera, rows.screen
         statistics, projected = self.statistics, rows.projected
-        if rows.chunks is None:
+        if projected.chunks is None:
             statistics = statistics.rows(rows.start, rows.stop)
-        else:  # of a streamed model only these chunks were projected, but statistics are of the whole model
-            projected = replace(projected, chunks=rows.chunks)
         if self.needs.gradients:
             add_statistics(device, statistics, camera, projected, screen)
         if screen.contributions is not None and statistics.current_totals is not None:

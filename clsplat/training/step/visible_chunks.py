@@ -16,13 +16,13 @@ from clsplat.camera import Camera
 from clsplat.chunks.bounds import ChunkBounds, hidden_path, largest_resumed_step, largest_step
 from clsplat.chunks.bounds_table import BoundsTable, Movement
 from clsplat.chunks.culling import PictureBorders, visible
+from clsplat.chunks.division import chunks_of
 from clsplat.chunks.order import ORDERED_ROWS
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import DEFAULT_GROUP_ITEMS
 from clsplat.gaussians import PARAMETER_GROUPS
-from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.optimisation.dropout import thinning_of
 from clsplat.rendering.rasterizer import MAX_COUNTED_PASSES, Rasterizer
 from clsplat.stages.adam import AdamStep
@@ -114,9 +114,12 @@ class VisibleChunks(Component):
         self._step_limit = step
         self._hidden_limit = 0.0 if self._config.optimiser.sparse else hidden_path(self._config.optimiser, step)
 
-    def _begin(self, count: int, step: int) -> None:
-        """Forget all bounds, of a model of `count` Gaussians that have all taken step number `step`."""
-        chunks = -(-count // CHUNK_ROWS)
+    def _begin(self, count: int, step: int, chunks: int = 0) -> None:
+        """Forget all bounds, of a model of `count` Gaussians that have all taken step number `step`.
+
+        chunks: number of its chunks; 0 if they are full.
+        """
+        chunks = chunks or chunks_of(count)
         self._count = count
         self._found = BoundsTable(chunks)
         self._unmeasured = np.ones(chunks, np.bool_)
@@ -129,6 +132,12 @@ class VisibleChunks(Component):
         self._before: dict[int, NDArray[np.uint32]] = {}
         """By number, `_last` as it was before the latest steps, which may be repeated."""
         self._caught: DeviceArray | None = None
+
+    def _divide(self, pool: ChunkPool | None) -> None:
+        """Follow the number of chunks of a model whose rows have moved."""
+        chunks = chunks_of(self._count) if pool is None else pool.store.chunks
+        if chunks != len(self._last):
+            self._begin(self._count, self.step, chunks)
 
     def _begin_table(self, step: int, chunks: int) -> None:
         """Begin with the next step, as all chunks have taken step number `step`."""
@@ -154,6 +163,7 @@ class VisibleChunks(Component):
         pool = gaussians.pool if isinstance(gaussians, HostGaussians) else None
         if isinstance(gaussians, HostGaussians) and (pool is None or self._config.thinning > 0):
             return  # thinning draws its random numbers by the row of the launch
+        self._divide(pool)
         self._streamed, self._slots = pool is not None, len(self._last) if pool is None else pool.slots
         if pool is not None:
             pool.cull = self.in_view
@@ -174,8 +184,7 @@ class VisibleChunks(Component):
         if there.any():
             found[there] = self._measured_on_device(gaussians.in_pool, slots[there].astype(np.uint32))
         for place in np.flatnonzero(~there):
-            begin = CHUNK_ROWS * int(numbers[place])
-            rows = (begin, min(begin + CHUNK_ROWS, gaussians.count))
+            rows = gaussians.pool.store.starts[numbers[place] : numbers[place] + 2].tolist()
             one = ChunkBounds.measured(*(gaussians[group].get_rows(*rows) for group in ("means", "log_scales")))
             found[place] = np.concatenate([one.lowest[0], one.highest[0], one.largest])
         return found
@@ -255,6 +264,7 @@ class VisibleChunks(Component):
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep, chunks: _ChunksInView) -> PlacedChunks | None:
         """Catch up the chunks that a step's view shows, and send their list. A repeated step is the same again."""
         if chunks.of_rows is not self._found:  # rows have moved since, and all have taken every step
+            self._divide(_pool_of(model))
             everything = np.arange(len(self._last), dtype=np.uint32)
             chunks = _ChunksInView(self, everything, None, self._found, len(everything), whole=True)
         if chunks.missed is not None:
@@ -268,12 +278,11 @@ class VisibleChunks(Component):
         if chunks.whole and pool is None:
             return None
         if pool is not None and len(chunks.numbers) > pool.slots:
-            return PlacedChunks(model, ChunkNumbers(chunks.numbers), None)
-        listed = send_chunks(work, "chunks", chunks.numbers, model[0].count)
+            return PlacedChunks(model, ChunkNumbers(chunks.numbers))
         if pool is None:
-            return PlacedChunks(model, listed, listed)
+            return PlacedChunks(model, send_chunks(work, "chunks", chunks.numbers, model[0].count))
         slots = send_chunks(work, "chunk_slots", pool.place(chunks.numbers, changes=True), pool.rows)
-        return PlacedChunks(_in_pool(model), slots, listed)
+        return PlacedChunks(_in_pool(model), slots)
 
     def _note(self, step: AdamStep) -> None:
         """Put a step into the table, from which steps go that all chunks have taken."""

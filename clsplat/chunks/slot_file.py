@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scratch file of slots, which have the records of chunks."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from io import FileIO
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.chunks.slots import NO_SLOT
+from clsplat.errors import InputError, WriteError, reason_of
+from clsplat.files.atomic import remove, require_room, sync_folder, write_error
+
+
+class ScratchError(InputError):
+    """A scratch file that cannot be used any longer. No row of it has been used that is not as it was written."""
+
+
+class SlotFile:
+    """A file of slots of `slot_bytes` bytes each. A record is at the beginning of a slot.
+
+    moved: function that is called with the bytes of each read or write, and its seconds.
+    """
+
+    def __init__(self, path: Path, slot_bytes: int, file: FileIO) -> None:
+        self.path, self.slot_bytes, self._file = path, slot_bytes, file
+        self.moved: Callable[[int, float], object] = lambda _nbytes, _seconds: None
+
+    @classmethod
+    def new(cls, path: Path, slot_bytes: int, slots: int) -> SlotFile:
+        """A new file of so many slots. Raises WriteError."""
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            made = cls(path, slot_bytes, FileIO(path, "x+"))
+        except OSError as error:
+            raise write_error(path, error, needs=slots * slot_bytes) from None
+        try:
+            made.grow(0, slots)
+        except BaseException:
+            made.close()
+            with suppress(OSError):
+                remove(path)
+            raise
+        return made
+
+    @classmethod
+    def opened(cls, path: Path, slot_bytes: int, *, writable: bool) -> SlotFile:
+        """A file that exists. Raises ScratchError."""
+        try:
+            return cls(path, slot_bytes, FileIO(path, "r+" if writable else "r"))
+        except OSError as error:
+            raise ScratchError(f"{path} cannot be opened: {reason_of(error)}") from None
+
+    @property
+    def slots(self) -> int:
+        """Number of slots that the file has."""
+        return os.fstat(self._file.fileno()).st_size // self.slot_bytes
+
+    @property
+    def closed(self) -> bool:
+        """True after `close`."""
+        return self._file.closed
+
+    @property
+    def writable(self) -> bool:
+        """True if it was made, or opened to write."""
+        return self._file.writable()
+
+    @property
+    def is_lost(self) -> bool:
+        """True if the file has been removed, or another is in its place. What it has can still be read."""
+        try:
+            return not os.path.samestat(os.fstat(self._file.fileno()), self.path.stat())
+        except OSError:
+            return True
+
+    def sync(self) -> None:
+        """Have all that was written on the disk. Raises WriteError."""
+        try:
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise write_error(str(self.path), error) from None
+        sync_folder(self.path.parent)
+
+    def grow(self, slots: int, more: int) -> None:
+        """Reserve room behind the first `slots` slots, so that a full disk is known before a row is written. Raises
+        WriteError."""
+        offset, nbytes = slots * self.slot_bytes, more * self.slot_bytes
+        try:
+            with require_room(self.path, nbytes):
+                if hasattr(os, "posix_fallocate"):
+                    os.posix_fallocate(self._file.fileno(), offset, nbytes)
+                else:
+                    self._file.truncate(offset + nbytes)
+        except OSError as error:
+            raise error if isinstance(error, WriteError) else write_error(self.path, error, needs=nbytes) from None
+
+    def cut(self, slots: int) -> None:
+        """Give back what is behind the first slots, if possible."""
+        with suppress(OSError):
+            self._file.truncate(slots * self.slot_bytes)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def read(self, slots: NDArray[np.int64], records: NDArray[Any]) -> None:
+        """Read records (k,) from slots. Those without a slot stay as they are. Raises ScratchError."""
+        for place, slot, length in self._runs(slots, records.itemsize):
+            self.read_at(slot, 0, records[place : place + length])
+
+    def write(self, slots: NDArray[np.int64], records: NDArray[Any]) -> None:
+        """Write records (k,) to slots. Raises WriteError."""
+        for place, slot, length in self._runs(slots, records.itemsize):
+            self.write_at(slot, 0, records[place : place + length])
+
+    def read_at(self, slot: int, offset: int, into: NDArray[Any]) -> None:
+        """Read bytes that begin at an offset in a slot. Raises ScratchError."""
+        left, start, begin = into.view(np.uint8).reshape(-1).data, time.perf_counter(), slot * self.slot_bytes + offset
+        try:
+            self._file.seek(begin)
+            while left and (count := self._file.readinto(left)):
+                left = left[count:]
+        except OSError as error:
+            raise ScratchError(f"{self.path} cannot be read ({reason_of(error)})") from None
+        if left:
+            raise ScratchError(f"{self.path}: has been cut: {len(left):,} bytes at {begin:,} are missing")
+        self.moved(into.nbytes, time.perf_counter() - start)
+
+    def write_at(self, slot: int, offset: int, values: NDArray[Any]) -> None:
+        """Write bytes to an offset in a slot. Raises WriteError."""
+        left, start = np.ascontiguousarray(values).view(np.uint8).reshape(-1).data, time.perf_counter()
+        try:
+            self._file.seek(slot * self.slot_bytes + offset)
+            while left:
+                left = left[self._file.write(left) :]
+        except OSError as error:
+            raise write_error(str(self.path), error, needs=values.nbytes) from None
+        self.moved(values.nbytes, time.perf_counter() - start)
+
+    def _runs(self, slots: NDArray[np.int64], nbytes: int) -> Iterator[tuple[int, int, int]]:
+        """Yield (place, slot, length) of records of so many bytes that follow each other in the file."""
+        for place, slot, length in runs(slots):
+            step = length if nbytes == self.slot_bytes else 1
+            for begin in range(0, length, step):
+                yield place + begin, slot + begin, step
+
+
+def runs(slots: NDArray[np.int64]) -> Iterator[tuple[int, int, int]]:
+    """Yield (place, slot, length) of each run of slots that follow each other. NO_SLOT is left out."""
+    ends = np.flatnonzero((np.diff(slots) != 1) | (slots[:-1] == NO_SLOT)) + 1
+    for begin, end in pairwise([0, *ends.tolist(), len(slots)]):
+        if begin < end and slots[begin] != NO_SLOT:
+            yield begin, int(slots[begin]), end - begin
