@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event, Thread
@@ -82,10 +83,11 @@ def _every_second_bit(number: int) -> int:
     return sum((number >> 2 * bit & 1) << bit for bit in range(24))
 
 
-def write_scene(folder: Path, chunks: int, views: int, *, near: bool) -> None:
+def write_scene(folder: Path, chunks: int, views: int, *, near: bool, height: float = CAMERA_HEIGHT) -> None:
     """Write a COLMAP folder of cameras above the plain, which look down, with photographs of noise.
 
     near: the cameras stand beside each other, as on a flight; otherwise anywhere.
+    height: of the cameras above the plain, world units.
     """
     rng = np.random.default_rng(1)
     sparse, images = folder / "sparse" / "0", folder / "images"
@@ -97,7 +99,7 @@ def write_scene(folder: Path, chunks: int, views: int, *, near: bool) -> None:
     for index in range(views):
         number = chunks // 3 + 8 * index if near else int(rng.integers(chunks))
         x, y = CELL * _every_second_bit(number), CELL * _every_second_bit(number >> 1)
-        place = f"{-x} {y} {CAMERA_HEIGHT * CELL}"  # half a turn around x: the camera looks down
+        place = f"{-x} {y} {height * CELL}"  # half a turn around x: the camera looks down
         lines.append(f"{index + 1} 0 1 0 0 {place} 1 {index:04d}.png\n\n")
         write_image(images / f"{index:04d}.png", rng.random((HEIGHT, WIDTH, 3)).astype(np.float32))
     (sparse / "images.txt").write_text("".join(lines))
@@ -106,10 +108,13 @@ def write_scene(folder: Path, chunks: int, views: int, *, near: bool) -> None:
 
 
 class MemoryPeak:
-    """Largest anonymous and shared memory of this process while it is watched, in bytes."""
+    """Largest anonymous and shared memory of a process while it is watched, in bytes.
 
-    def __init__(self) -> None:
-        self.bytes = 0
+    process: its number; by default this one.
+    """
+
+    def __init__(self, process: int | None = None) -> None:
+        self.bytes, self._status = 0, Path(f"/proc/{process or 'self'}/status")
         self._done = Event()
         self._thread = Thread(target=self._watch, daemon=True)
 
@@ -123,9 +128,10 @@ class MemoryPeak:
 
     def _watch(self) -> None:
         while not self._done.wait(SECONDS_BETWEEN_LOOKS):
-            lines = Path("/proc/self/status").read_text().splitlines()
-            kept = [int(line.split()[1]) for line in lines if line.startswith(("RssAnon", "RssShmem"))]
-            self.bytes = max(self.bytes, 1024 * sum(kept))
+            with suppress(OSError):  # the process may have ended
+                lines = self._status.read_text().splitlines()
+                kept = [int(line.split()[1]) for line in lines if line.startswith(("RssAnon", "RssShmem"))]
+                self.bytes = max(self.bytes, 1024 * sum(kept))
 
 
 def large_trainer(scene: Scene, config: TrainConfig, arguments: Any, count: int, scratch: Path) -> Trainer:
