@@ -34,14 +34,14 @@ from typing import Any
 
 import numpy as np
 from measuring import number, plain_parser, tool
+from plain import CELL_ROWS, SeededArray, write_scene
 from stress_kills import DEADLINE, Killer, end_of, tail
-from stress_large import MemoryPeak, SeededArray, write_scene
+from stress_large import MemoryPeak
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.selection import list_devices
 from clsplat.errors import ClsplatError
 from clsplat.gaussians import floats_of
-from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.rendering.memory_needs import MODELS
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
@@ -165,7 +165,7 @@ class Trainings:
 
     def __init__(self, folder: Path, options: Any) -> None:
         self.folder, self.options, count, cloud = folder, options, options.gaussians, folder / "points.ply"
-        write_scene(folder / "scene", -(-count // CHUNK_ROWS), options.views, near=False, height=CAMERA_HEIGHT)
+        write_scene(folder / "scene", -(-count // CELL_ROWS), options.views, near=False, height=CAMERA_HEIGHT)
         write_points(cloud, count)
         self.common = [str(folder / "scene"), "--points", str(cloud), *settings(count, options.steps)]
         self.seconds = 0.0
