@@ -11,7 +11,6 @@ uninitialised reads needs with Oclgrind 21.10 (`memory_stand_ins.py`).
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -31,12 +30,11 @@ from clsplat.camera import Camera
 from clsplat.chunks.order import ORDERED_ROWS
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
-from clsplat.device import buffers, launch, program
+from clsplat.device import launch
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device, all_devices
 from clsplat.device.drivers.shapes import Shape
 from clsplat.device.program import Kernel
-from clsplat.device.source import kernel_source
 from clsplat.frame.deep import Merge
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
 from clsplat.images.holdouts import surfaces_of

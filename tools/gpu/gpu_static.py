@@ -46,8 +46,8 @@ from gpu_compilers import TARGETS, Built, Source, ask_package, build_builtins, c
 from gpu_devices import ARCHITECTURES, GPUS, occupancy
 from gpu_intel import IntelBuilt, compiled_for_intel, ocloc
 from gpu_loops import UnknownLoopError, by_pair, cost_of, loop_table, rules_of, unused_rules
-from gpu_measured import CALIBRATION, DRAWN, Fit, Works, beyond, fit_constants, inputs_of, read, with_inputs
-from gpu_model import blocks_of, stages_of, tiles_of, works_of
+from gpu_measured import CALIBRATION, Fit, Works, beyond, fit_constants, inputs_of, read, with_inputs
+from gpu_model import blocks_of, stages_of, works_of
 from gpu_page import PAGE, SHAPE, Predictions, missed_goals, stale_tables, tables_of, trained_and_picture, write_page
 from gpu_recount import recount
 from gpu_rules import ABREAST, ADAM, BY_PAIR, WALK, Rule
@@ -56,9 +56,8 @@ from gpu_shapes import FORMS, SHAPES, frames_in, on_each_gpu
 from measuring import plain_parser, require, tool
 
 from clsplat.files.atomic import atomic_write
-from clsplat.layouts.columns import LOSS_GROUP_COLUMNS, LOSS_GROUP_ROWS, LOSS_PARTS, TILE
+from clsplat.layouts.columns import LOSS_GROUP_COLUMNS, LOSS_GROUP_ROWS, LOSS_PARTS
 from clsplat.progress import aligned
-from clsplat.stages.blend import gradient_items_for, items_for
 
 FRAMES = Path(__file__).with_name("gpu_frames.json")
 CHECKED = (("1x64", "1x32g"), ("sm_89", "sm_90", "gfx1100", "gfx90a"))

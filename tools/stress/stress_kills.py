@@ -23,7 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -59,7 +59,7 @@ sys.exit(main(sys.argv[1:]))
 """
 WHILE_WRITING = 0.4
 """Fraction of the kills that wait until the next checkpoint is being written. Writing takes little of the time."""
-DEADLINE = 300.0
+DEADLINE = 1200.0
 """Maximum seconds of a process, even on a busy machine."""
 
 
@@ -87,17 +87,99 @@ def half_written(run: Path) -> set[str]:
     return {entry.name for entry in os.scandir(folder) if entry.name.startswith(".")} if folder.is_dir() else set()
 
 
+def end_of(process: subprocess.Popen[str]) -> str:
+    """Wait until the training is finished. Returns what it told. Raises ClsplatError with its end if it fails or
+    hangs."""
+    try:
+        _, said = process.communicate(timeout=DEADLINE)
+    except subprocess.TimeoutExpired as error:
+        raise ClsplatError(str(error)) from None
+    if process.returncode != 0:
+        raise ClsplatError(f"a training ended with status {process.returncode}: {tail(said)}")
+    return said
+
+
+def tail(said: str) -> str:
+    """The end of what a process told, in one line."""
+    return " ".join(said.split())[-400:]
+
+
+class Killer:
+    """Kills trainings at random times.
+
+    start: function that starts a training in a folder, or resumes the one there.
+    compare: function that raises ClsplatError if a finished one is not as it should be.
+    lifetime: seconds of a training that is not killed.
+    """
+
+    def __init__(
+        self,
+        start: Callable[[Path], subprocess.Popen[str]],
+        compare: Callable[[Path], None],
+        lifetime: float,
+        seed: int,
+    ) -> None:
+        self._start, self._compare, self._lifetime = start, compare, lifetime
+        self._random, self.figures = random.Random(seed), Figures()
+
+    def kill_once(self, run: Path) -> bool:
+        """Start or resume the run's training, and kill it at a random time. Returns False if it finished before."""
+        before = half_written(run)
+        process = self._start(run)
+        try:
+            # Most kills come at any time; a fifth come in the first quarter, in which the process starts.
+            wait = self._lifetime * self._random.uniform(0.0, 0.25 if self._random.random() < 0.2 else 0.9)
+            process.wait(timeout=wait)
+        except subprocess.TimeoutExpired:
+            end = time.monotonic() + 10.0
+            if self._random.random() < WHILE_WRITING:
+                while time.monotonic() < end and process.poll() is None and not half_written(run) - before:
+                    pass
+                time.sleep(self._random.uniform(0, 1e-3))
+            process.kill()
+            process.communicate(timeout=DEADLINE)
+            if process.returncode == 0:  # it finished while this process waited for a checkpoint
+                return False
+            self.figures.kills += 1
+            self.figures.writing += bool(half_written(run) - before)
+            self.figures.before += not list(run.glob("checkpoints/step-*.npz"))
+            return True
+        end_of(process)
+        return False
+
+    def survive(self, run: Path, count: int) -> Figures:
+        """Kill `count` times. Every finished training is compared; the last one is finished at the end."""
+        start = time.monotonic()
+        while self.figures.kills < count:
+            if not self.kill_once(run):
+                self._finished(run)
+                shutil.rmtree(run)
+            print(f"{self.figures.kills} kills, {self.figures.compared} trainings", file=sys.stderr, flush=True)
+        if run.exists():
+            end_of(self._start(run))
+            self._finished(run)
+        self.figures.seconds = time.monotonic() - start
+        return self.figures
+
+    def _finished(self, run: Path) -> None:
+        try:
+            self._compare(run)
+        except ClsplatError as error:
+            raise ClsplatError(f"after {self.figures.kills} kills {error}") from None
+        self.figures.compared += 1
+
+
 class Kills:
     """Trainings of one scene in one folder."""
 
-    def __init__(self, folder: Path, device: str | None, seed: int, *, scratch: bool) -> None:
-        self.folder, self.random, self.figures, self.scratch = folder, random.Random(seed), Figures(), scratch
+    def __init__(self, folder: Path, device: str | None, *, scratch: bool) -> None:
+        self.folder, self.scratch = folder, scratch
         self.more = ("--device", device) if device else ()
         self.scene = write_scene(folder / "scene")
         self.whole = folder / "whole"
-        self.end_of(self.start(folder / "first"))  # builds the kernels
+        end_of(self.start(folder / "first"))  # builds the kernels
         start = time.monotonic()
-        self.end_of(self.start(self.whole))
+        end_of(self.start(self.whole))
         self.lifetime = time.monotonic() - start
         self.model = (self.whole / "model.ply").read_bytes()
         self.steps = self.steps_of(self.whole)
@@ -111,71 +193,26 @@ class Kills:
         command += ["--resume"] if (run / "config.toml").exists() else [str(self.scene), *settings]
         return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
-    def end_of(self, process: subprocess.Popen[str]) -> None:
-        """Wait until the training is finished. Raises ClsplatError with its last output if it fails or hangs."""
-        try:
-            _, said = process.communicate(timeout=DEADLINE)
-        except subprocess.TimeoutExpired as error:
-            raise ClsplatError(str(error)) from None
-        if process.returncode != 0:
-            raise ClsplatError(f"a training ended with status {process.returncode}: {said.strip()[-400:]}")
-
     @staticmethod
     def steps_of(run: Path) -> list[int]:
         """The steps in metrics.jsonl."""
         return [json.loads(line)["step"] for line in (run / "metrics.jsonl").read_text().splitlines()]
 
-    def kill_once(self, run: Path) -> bool:
-        """Start or resume the run's training, and kill it at a random time. Returns False if it finished before."""
-        before = half_written(run)
-        process = self.start(run)
-        try:
-            # Most kills come at any time; a fifth come in the first quarter, in which the process starts.
-            wait = self.lifetime * self.random.uniform(0.0, 0.25 if self.random.random() < 0.2 else 0.9)
-            process.wait(timeout=wait)
-        except subprocess.TimeoutExpired:
-            end = time.monotonic() + 10.0
-            if self.random.random() < WHILE_WRITING:
-                while time.monotonic() < end and process.poll() is None and not half_written(run) - before:
-                    pass
-                time.sleep(self.random.uniform(0, 1e-3))
-            process.kill()
-            process.communicate(timeout=DEADLINE)
-            if process.returncode == 0:  # it finished while this process waited for a checkpoint
-                return False
-            self.figures.kills += 1
-            self.figures.writing += bool(half_written(run) - before)
-            self.figures.before += not list(run.glob("checkpoints/step-*.npz"))
-            return True
-        self.end_of(process)
-        return False
-
     def compare(self, run: Path) -> None:
         """Raise ClsplatError if a finished run differs from the undisturbed one."""
         if (run / "model.ply").read_bytes() != self.model:
-            raise ClsplatError(f"after {self.figures.kills} kills model.ply differs")
+            raise ClsplatError("model.ply differs")
         if (steps := self.steps_of(run)) != self.steps:
-            raise ClsplatError(f"after {self.figures.kills} kills metrics.jsonl has the steps {steps}")
+            raise ClsplatError(f"metrics.jsonl has the steps {steps}")
         if left := list(run.rglob(".*.clsplat-tmp")):
             raise ClsplatError(f"a half-written file has stayed: {left[0].name}")
         named = {manifest.path for _, manifest in Run.open(run).manifests()}
         if named != set(run.absolute().glob("scratch/*")) or bool(named) != (self.scratch and run != self.whole):
-            raise ClsplatError(f"{run}/scratch: has not the files that checkpoints name, {named}")
-        self.figures.compared += 1
+            raise ClsplatError(f"{run}/scratch has not the files that checkpoints name, {named}")
 
-    def survive(self, count: int) -> Figures:
-        """Kill `count` times. Every finished training is compared; the last one is finished at the end."""
-        start, run = time.monotonic(), self.folder / "run"
-        while self.figures.kills < count:
-            if not self.kill_once(run):
-                self.compare(run)
-                shutil.rmtree(run)
-            print(f"{self.figures.kills} kills, {self.figures.compared} trainings", file=sys.stderr, flush=True)
-        if run.exists():
-            self.end_of(self.start(run))
-            self.compare(run)
-        self.figures.seconds = time.monotonic() - start
-        return self.figures
+    def survive(self, count: int, seed: int) -> Figures:
+        """Kill `count` times (`Killer.survive`)."""
+        return Killer(self.start, self.compare, self.lifetime, seed).survive(self.folder / "run", count)
 
 
 @tool("stress_kills")
@@ -191,7 +228,8 @@ def main(arguments: Sequence[str]) -> int:
     if options.kills < 1:
         parser.error(f"--kills {options.kills}: expected at least 1")
     with tempfile.TemporaryDirectory(prefix="clsplat-kills-") as folder:
-        figures = Kills(Path(folder), options.device, options.seed, scratch=options.scratch).survive(options.kills)
+        kills = Kills(Path(folder), options.device, scratch=options.scratch)
+        figures = kills.survive(options.kills, options.seed)
     if options.json:
         print(json.dumps(asdict(figures), indent=2))
         return 0

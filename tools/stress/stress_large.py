@@ -2,7 +2,7 @@
 """Train a model that is larger than the memory it may have, and say what its steps take.
 
     tools/stress/run large [--gaussians 20e6] [--degree 3] [--steps 300] [--max-host-mem 4GiB] [--max-device-mem SIZE]
-        [--scratch DIR] [--dense] [--near] [--views 60] [--device DEVICE] [--control SHARE]
+        [--scratch DIR] [--dense] [--near] [--views 60] [--device DEVICE] [--json] [--control SHARE]
 
 The model is a plain of cells, a chunk of Gaussians each, made by a seed block by block; each camera looks at a small
 part of it. Prints the time of a step, the bytes that a step moves, the peak of anonymous and shared memory, and a
@@ -14,11 +14,13 @@ reads and writes for it (Linux), and its peak.
 from __future__ import annotations
 
 import hashlib
+import json
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -26,15 +28,14 @@ from typing import Any
 import numpy as np
 from measuring import plain_parser
 from numpy.typing import NDArray
+from plain import CELL, SeededArray, settings, timed_steps, write_scene
 from typing_extensions import Self
 
-from clsplat.arrays import Float32
 from clsplat.chunks.gathering import SourceList
 from clsplat.config.checks import parse_bytes
-from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
+from clsplat.config.training import TrainConfig
 from clsplat.device.selection import open_device
 from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
-from clsplat.images.writing import write_image
 from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.optimisation.density_rules import FRESH
 from clsplat.scenes.loading import load_scene
@@ -44,80 +45,20 @@ from clsplat.training.density import RowPlan
 from clsplat.training.memory import UNLIMITED, HostMemory
 from clsplat.training.trainer import Trainer
 
-WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
-CELL = 1.0
-"""Side of a chunk's cell, world units."""
-CAMERA_HEIGHT = 9.0
-"""World units above the plain. A camera sees some 11 x 8 cells."""
 DIGEST_ROWS = 1 << 18
 SECONDS_BETWEEN_LOOKS = 0.02
 REMOVED_EVERY, CLONED_EVERY = 50, 20
 """Density control removes one in this many Gaussians of a chunk, and clones one in this many."""
 
 
-@dataclass(frozen=True)
-class SeededArray:
-    """A parameter group of the plain, of which any rows can be made."""
-
-    group: str
-    shape: tuple[int, ...]
-
-    def get_rows(self, start: int, stop: int) -> Float32:
-        """Rows [start, stop), from whole chunks."""
-        chunks = range(start // CHUNK_ROWS, -(-stop // CHUNK_ROWS))
-        made = np.concatenate([_chunk(self.group, number, self.shape[1:]) for number in chunks])
-        first = CHUNK_ROWS * chunks[0]
-        return made[start - first : stop - first]
-
-    def get(self) -> Float32:
-        """All rows."""
-        return self.get_rows(0, self.shape[0])
-
-
-def _chunk(group: str, number: int, shape: tuple[int, ...]) -> Float32:
-    rng = np.random.default_rng((list(PARAMETER_GROUPS).index(group), number))
-    values = rng.random((CHUNK_ROWS, *shape), np.float32)
-    if group == "means":
-        x, y = (_every_second_bit(number >> axis) for axis in range(2))
-        return ((values * (1.0, 1.0, 0.2) + (x, y, 0.0)) * CELL).astype(np.float32)
-    if group == "log_scales":
-        return (values - 4.5).astype(np.float32)
-    return (values - 0.5).astype(np.float32) * np.float32(0.1 if group == "sh_rest" else 1.0)
-
-
-def _every_second_bit(number: int) -> int:
-    """The even bits of a number, moved together: a coordinate of a Z-order curve."""
-    return sum((number >> 2 * bit & 1) << bit for bit in range(24))
-
-
-def write_scene(folder: Path, chunks: int, views: int, *, near: bool) -> None:
-    """Write a COLMAP folder of cameras above the plain, which look down, with photographs of noise.
-
-    near: the cameras stand beside each other, as on a flight; otherwise anywhere.
-    """
-    rng = np.random.default_rng(1)
-    sparse, images = folder / "sparse" / "0", folder / "images"
-    sparse.mkdir(parents=True)
-    images.mkdir()
-    camera = f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}\n"
-    (sparse / "cameras.txt").write_text(camera)
-    lines = []
-    for index in range(views):
-        number = chunks // 3 + 8 * index if near else int(rng.integers(chunks))
-        x, y = CELL * _every_second_bit(number), CELL * _every_second_bit(number >> 1)
-        place = f"{-x} {y} {CAMERA_HEIGHT * CELL}"  # half a turn around x: the camera looks down
-        lines.append(f"{index + 1} 0 1 0 0 {place} 1 {index:04d}.png\n\n")
-        write_image(images / f"{index:04d}.png", rng.random((HEIGHT, WIDTH, 3)).astype(np.float32))
-    (sparse / "images.txt").write_text("".join(lines))
-    points = [f"{index + 1} {index % 10} {index // 10} 0 90 90 90 0.1\n" for index in range(100)]
-    (sparse / "points3D.txt").write_text("".join(points))
-
-
 class MemoryPeak:
-    """Largest anonymous and shared memory of this process while it is watched, in bytes."""
+    """Largest anonymous and shared memory of a process while it is watched, in bytes.
 
-    def __init__(self) -> None:
-        self.bytes = 0
+    process: its number; by default this one.
+    """
+
+    def __init__(self, process: int | None = None) -> None:
+        self.bytes, self._status = 0, Path(f"/proc/{process or 'self'}/status")
         self._done = Event()
         self._thread = Thread(target=self._watch, daemon=True)
 
@@ -131,9 +72,10 @@ class MemoryPeak:
 
     def _watch(self) -> None:
         while not self._done.wait(SECONDS_BETWEEN_LOOKS):
-            lines = Path("/proc/self/status").read_text().splitlines()
-            kept = [int(line.split()[1]) for line in lines if line.startswith(("RssAnon", "RssShmem"))]
-            self.bytes = max(self.bytes, 1024 * sum(kept))
+            with suppress(OSError):  # the process may have ended
+                lines = self._status.read_text().splitlines()
+                kept = [int(line.split()[1]) for line in lines if line.startswith(("RssAnon", "RssShmem"))]
+                self.bytes = max(self.bytes, 1024 * sum(kept))
 
 
 def large_trainer(scene: Scene, config: TrainConfig, arguments: Any, count: int, scratch: Path) -> Trainer:
@@ -215,29 +157,17 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--near", action="store_true")
     parser.add_argument("--device")
     parser.add_argument("--control", type=float, metavar="SHARE")
+    parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args(argv)
     count = int(arguments.gaussians)
-    optimiser, density = OptimiserConfig(sparse=not arguments.dense), DensityConfig(every=0)
-    config = TrainConfig(
-        iterations=max(arguments.steps, 1000),
-        sh_degree=arguments.degree,
-        sh_degree_every=0,
-        warmup=(),
-        optimiser=optimiser,
-        density=density,
-        view_order="near" if arguments.near else "random",
-    )
+    config = settings(arguments.steps, arguments.degree, dense=arguments.dense)
+    config = replace(config, view_order="near" if arguments.near else "random")
     with tempfile.TemporaryDirectory() as folder, MemoryPeak() as peak:
         write_scene(Path(folder), -(-count // CHUNK_ROWS), arguments.views, near=arguments.near)
         scene = replace(load_scene(Path(folder), test_every=0), unit=CELL)
         begin = time.perf_counter()
         trainer = large_trainer(scene, config, arguments, count, arguments.scratch or Path(folder) / "scratch")
-        made, times = time.perf_counter() - begin, []
-        for _ in range(arguments.steps):
-            begin = time.perf_counter()
-            trainer.train_step()
-            trainer.device.queue.finish()
-            times.append(time.perf_counter() - begin)
+        made, times = time.perf_counter() - begin, timed_steps(trainer, arguments.steps)
         begin = time.perf_counter()
         trainer.catch_up()
         caught, moved = time.perf_counter() - begin, trainer.model.moved_bytes
@@ -245,9 +175,13 @@ def main(argv: Sequence[str]) -> int:
         controlled = control(trainer, arguments.control) if arguments.control is not None else ""
         text += f", {digest(trainer)} after density control" if controlled else ""
         trainer.close()
+    if arguments.json:
+        print(json.dumps({**times, "peak": peak.bytes, "digest": text}))
+        return 0
     print(
         f"{count:,} Gaussians of degree {arguments.degree}, {'dense' if arguments.dense else 'sparse'} Adam, "
-        f"{arguments.steps} steps: {1e3 * np.median(times):.0f} ms a step (median), {1e3 * np.mean(times):.0f} (mean), "
+        f"{arguments.steps} steps: {times['median_ms']:.0f} ms a step (median), {times['mean_ms']:.0f} (mean), "
+        f"{times['processor_ms']:.0f} of all threads (median), "
         f"{moved / arguments.steps / 2**20:.0f} MiB moved a step, {made:.0f} s to begin, {caught:.0f} s to catch up, "
         f"peak {peak.bytes / 2**20:,.0f} MiB, digest {text}"
     )

@@ -1,0 +1,333 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Train one scene at many limits of memory, on parts of a device, watched and killed, and compare the models' bytes.
+
+    tools/stress/run limits [--gaussians 3e5] [--steps 90] [--views 24] [--kills 20] [--seed 0] [--only WORD,...]
+        [--devices DEVICE,...]
+
+The scene is the plain of `run large`, with a point for each Gaussian to begin with. Density control, SH degrees,
+opacity resets, warm-up sizes and checkpoints come in between. Prints a table: the limit, the peak of anonymous and
+shared memory, steps a second, and a digest of model.ply and of the losses in metrics.jsonl. The exit status is 1 if a
+digest differs from that of the training without a limit on the same device, or of the same batch.
+
+--devices: devices of clsplat devices, of which the first trains under all circumstances, others without a limit and at
+two. If not given: one of each driver. --only: rows of the table whose names have one of the words, and those that they
+are compared with.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from measuring import number, plain_parser, tool
+from plain import CELL_ROWS, SeededArray, write_scene
+from stress_kills import DEADLINE, Killer, end_of, tail
+from stress_large import MemoryPeak
+
+from clsplat.config.training import TrainConfig
+from clsplat.device.selection import list_devices
+from clsplat.errors import ClsplatError
+from clsplat.gaussians import floats_of
+from clsplat.rendering.memory_needs import MODELS
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene
+from clsplat.viewer.pose import Pose
+from clsplat.viewer.training_view import TrainingView
+
+SH_DEGREE = 3
+CAMERA_HEIGHT = 3.0
+"""World units above the plain. A camera sees some 20 chunks, so that a view has more than the least room of a pool."""
+GROWTH_PERCENT = 20
+"""Most growth of the number of Gaussians, per cent."""
+TOO_LITTLE = "1KiB"
+"""A limit that no training keeps, so that it is told the least."""
+WATCHED_TRAINING = """
+import os, sys
+sys.path[:0] = sys.argv.pop(1).split(os.pathsep)
+import stress_limits
+from clsplat.cli import view
+view.training_view = stress_limits.visited(view.training_view)
+from clsplat.cli.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A row of the table.
+
+    name: what is done.
+    flags: the flags that must change no byte.
+    like: name of the row whose bytes it must have; its own for those that others are compared with.
+    least: True for the least main memory that does, as a training with less is told.
+    """
+
+    name: str
+    like: str
+    flags: tuple[str, ...] = ()
+    least: bool = False
+    watched: bool = False
+    killed: bool = False
+
+
+@dataclass(frozen=True)
+class Result:
+    """Result of a row.
+
+    digests: of the model, or of the models of several trainings; none if a training failed.
+    said: what else is to be told.
+    """
+
+    digests: set[str]
+    said: str
+    peak: str = ""
+    rate: str = ""
+
+
+def cases(model: int, first: str, others: Sequence[str]) -> list[Case]:
+    """All rows. model: bytes of parameters and moments. first, others: devices."""
+    half, quarter, eighth = (f"{model // parts >> 20}MiB" for parts in (2, 4, 8))
+    whole, pair, on = "no limit", "two views a step", ("--device", first)
+    parts = ("--device", f"{first}/0,{first}/1", "--batch", "2")
+    found = [
+        Case(whole, whole, on),
+        Case("half the device's memory", whole, (*on, "--max-device-mem", half)),
+        Case("a quarter of the device's memory", whole, (*on, "--max-device-mem", quarter)),
+        Case("an eighth of the device's memory", whole, (*on, "--max-device-mem", eighth)),
+        Case("half the main memory", whole, (*on, "--max-host-mem", half)),
+        Case("a quarter of main memory", whole, (*on, "--max-host-mem", quarter)),
+        Case("the least main memory", whole, on, least=True),
+        Case("killed at a quarter", whole, (*on, "--max-host-mem", quarter), killed=True),
+        Case("watched", whole, on, watched=True),
+        Case("watched at a quarter", whole, (*on, "--max-host-mem", quarter), watched=True),
+        Case(pair, pair, (*on, "--batch", "2")),
+        Case("two parts", pair, parts),
+        Case("two parts at half their memory", pair, (*parts, "--max-device-mem", half)),
+        Case("two parts at the least", pair, parts, least=True),
+    ]
+    for device in others:
+        whole, on = f"device {device}", ("--device", device)
+        found += [
+            Case(whole, whole, on),
+            Case(f"{whole} at a quarter of its memory", whole, (*on, "--max-device-mem", quarter)),
+            Case(f"{whole} at a quarter of main memory", whole, (*on, "--max-host-mem", quarter)),
+        ]
+    return found
+
+
+def settings(count: int, steps: int) -> list[str]:
+    """Flags of every training, so that its events come within these steps."""
+
+    def at(share: float) -> str:
+        return str(max(int(share * steps), 1))
+
+    return [
+        *("--iterations", str(steps), "--points-limit", str(count), "--test-every", "0", "--no-report"),
+        *("--sh-degree", str(SH_DEGREE), "--sh-degree-every", at(0.2), "--warmup", f"{at(0.1)},{at(0.3)}"),
+        *("--checkpoint-every", at(0.13), "--density.start", at(0.2), "--density.every", at(0.15)),
+        *("--density.stop", at(0.9), "--density.opacity-reset-every", at(0.4), "--density.opacity-reset-to", "0.1"),
+        *("--density.max-gaussians", str(count + count * GROWTH_PERCENT // 100)),
+    ]
+
+
+def write_points(path: Path, count: int) -> None:
+    """Write the means of the plain as a PLY of grey and coloured points."""
+    points = np.zeros(count, [(axis, "<f4") for axis in "xyz"] + [(each, "u1") for each in ("red", "green", "blue")])
+    places = SeededArray("means", (count, 3)).get()
+    colours = np.random.default_rng(2).integers(0, 256, (count, 3))
+    for axis in range(3):
+        points["xyz"[axis]], points[("red", "green", "blue")[axis]] = places[:, axis], colours[:, axis]
+    names = {"<f4": "float", "|u1": "uchar"}
+    properties = [f"property {names[points.dtype[name].str]} {name}" for name in points.dtype.names or ()]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header", ""]
+    path.write_bytes("\n".join(head).encode("ascii") + points.tobytes())
+
+
+class Trainings:
+    """Trainings of one scene in one folder.
+
+    options: the command line's.
+    """
+
+    def __init__(self, folder: Path, options: Any) -> None:
+        self.folder, self.options, count, cloud = folder, options, options.gaussians, folder / "points.ply"
+        write_scene(folder / "scene", -(-count // CELL_ROWS), options.views, near=False, height=CAMERA_HEIGHT)
+        write_points(cloud, count)
+        self.common = [str(folder / "scene"), "--points", str(cloud), *settings(count, options.steps)]
+        self.seconds = 0.0
+        """Duration of the longest training without kills."""
+
+    def start(self, case: Case, run: Path, *limit: str) -> subprocess.Popen[str]:
+        """Start a training, or resume it if the run exists. limit: further flags."""
+        child = ["-c", WATCHED_TRAINING, os.pathsep.join(sys.path)] if case.watched else ["-m", "clsplat"]
+        command = [sys.executable, *child, "train", "-o", str(run), *case.flags, *limit]
+        command += ["--resume"] if (run / "config.toml").exists() else self.common
+        command += ["--view", "--port", "0"] if case.watched else []
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+    def least(self, case: Case) -> tuple[str, ...]:
+        """The limit of a case that has the least, as flags; nothing for others."""
+        if not case.least:
+            return ()
+        refused = self.start(case, self.folder / "refused", "--max-host-mem", TOO_LITTLE)
+        _, said = refused.communicate(timeout=DEADLINE)
+        found = re.search(r"expected at least (\d+MiB)", said)
+        if found is None:
+            raise ClsplatError(f"--max-host-mem {TOO_LITTLE}: expected the least that does, found {tail(said)}")
+        return "--max-host-mem", found[1]
+
+    def trained(self, case: Case, limit: tuple[str, ...]) -> Result:
+        """Train, and say what it took."""
+        run = self.folder / "run"
+        shutil.rmtree(run, ignore_errors=True)
+        process, begun = self.start(case, run, *limit), time.monotonic()
+        with MemoryPeak(process.pid) as peak:
+            said = end_of(process)
+        self.seconds = max(self.seconds, time.monotonic() - begun)
+        pictures = re.search(r"(\d+) pictures", said)
+        if case.watched and (pictures is None or pictures[1] == "0"):
+            raise ClsplatError(f"{case.name}: expected pictures, found {tail(said)}")
+        return Result({digest(run)}, pictures[0] if pictures else "", f"{peak.bytes / 2**20:,.0f} MiB", rate(run))
+
+    def killed(self, case: Case) -> Result:
+        """Train, with kills at random times."""
+        run, digests = self.folder / "run", set[str]()
+        shutil.rmtree(run, ignore_errors=True)
+
+        def keep(finished: Path) -> None:
+            digests.add(digest(finished))
+
+        killer = Killer(lambda path: self.start(case, path), keep, self.seconds, self.options.seed)
+        figures = killer.survive(run, self.options.kills)
+        return Result(digests, f"{figures.kills} kills, {figures.writing} of them while a checkpoint was written")
+
+
+def metrics(run: Path) -> list[dict[str, Any]]:
+    """The records of metrics.jsonl."""
+    return [json.loads(line) for line in Run.open(run).metrics_path.read_text("utf-8").splitlines()]
+
+
+def digest(run: Path) -> str:
+    """Digest of the model, and of losses and numbers of Gaussians on the way to it."""
+    hashed = hashlib.sha256((run / "model.ply").read_bytes())
+    for record in metrics(run):
+        hashed.update(json.dumps([record[name] for name in ("step", "loss", "gaussians")]).encode())
+    return hashed.hexdigest()[:12]
+
+
+def rate(run: Path) -> str:
+    """Steps a second after the first report, before which kernels are built."""
+    first, *_, last = metrics(run)
+    return f"{(last['step'] - first['step']) / (last['seconds'] - first['seconds']):.2f}"
+
+
+Page = Callable[[Scene, TrainConfig], AbstractContextManager[Any]]
+
+
+class Visitor:
+    """A viewer whose camera moves before each step, and who counts the pictures."""
+
+    def __init__(self, view: TrainingView, scene: Scene) -> None:
+        self.view, self.camera, self.pictures = view, scene.views[0].camera, 0
+        self.viewer = view.viewing.join(self)
+
+    def __call__(self, trainer: Any, interrupted: Callable[[], bool]) -> None:
+        """Move, and let the training render."""
+        place = self.camera.position + 0.01 * trainer.step
+        self.view.viewing.moved(self.viewer, Pose(self.camera.rotation.T, place, 0.8, 320, 240))
+        self.view(trainer, interrupted)
+
+    def show(self, *_: object) -> None:
+        """Count a picture."""
+        self.pictures += 1
+
+    def tell(self, message: str) -> None:
+        """Fail, as only errors are told."""
+        raise ClsplatError(f"the page was told: {message}")
+
+
+def visited(make: Callable[..., Page]) -> Callable[..., Page]:
+    """A function that opens the page of a training, with a visitor on it."""
+
+    def made(*options: Any) -> Page:
+        page = make(*options)
+
+        @contextmanager
+        def opened(scene: Scene, config: TrainConfig) -> Iterator[Visitor]:
+            with page(scene, config) as view:
+                visitor = Visitor(view, scene)
+                yield visitor
+            print(f"{visitor.pictures} pictures", file=sys.stderr)
+
+        return opened
+
+    return made
+
+
+def devices(given: str | None) -> list[str]:
+    """The devices to train on: those given, or one of each driver."""
+    if given:
+        return given.split(",")
+    by_driver = {(info.platform, info.version): str(info.index) for info in reversed(list_devices())}
+    return sorted(by_driver.values(), key=int)
+
+
+def chosen(rows: Sequence[Case], words: str | None) -> list[Case]:
+    """The rows whose names have one of the words, and those that they are compared with. Raises ClsplatError."""
+    named = [row for row in rows if words is None or any(word in row.name for word in words.split(","))]
+    if not named:
+        raise ClsplatError(f"--only {words}: no such row, expected a part of {', '.join(row.name for row in rows)}")
+    return [row for row in rows if row in named or row.name in {each.like for each in named}]
+
+
+@tool("stress_limits")
+def main(arguments: Sequence[str]) -> int:
+    """Train and compare, and print the table. Returns the exit status."""
+    parser = plain_parser(__doc__)
+    parser.add_argument("--gaussians", type=number, default=300_000)
+    parser.add_argument("--steps", type=int, default=90)
+    parser.add_argument("--views", type=int, default=24)
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only")
+    parser.add_argument("--devices")
+    options = parser.parse_args(arguments)
+    model = options.gaussians * MODELS * 4 * floats_of((SH_DEGREE + 1) ** 2)
+    first, *others = devices(options.devices)
+    rows, found, differ = chosen(cases(model, first, others), options.only), {}, False
+    print("| training | limit | peak | steps/s | digest | |\n|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory(prefix="clsplat-limits-") as folder:
+        trainings = Trainings(Path(folder), options)
+        for case in rows:
+            limit = trainings.least(case)
+            try:
+                took = trainings.killed(case) if case.killed else trainings.trained(case, limit)
+            except ClsplatError as error:
+                took = Result(set(), " ".join(str(error).split()))
+            found[case.name] = took.digests
+            same = bool(took.digests) and took.digests == found[case.like]
+            differ |= not same
+            words = "DIFFERENT" if not same else "same" if case.like != case.name else ""
+            said = ", ".join(word for word in (words, took.said) if word)
+            cells = [case.name, limit_of((*case.flags, *limit)), took.peak, took.rate, ", ".join(took.digests), said]
+            print(f"| {' | '.join(cells)} |", flush=True)
+    return 1 if differ else 0
+
+
+def limit_of(flags: Sequence[str]) -> str:
+    """The limit among these flags."""
+    return next((f"{flag} {value}" for flag, value in pairwise(flags) if flag.startswith("--max")), "")
