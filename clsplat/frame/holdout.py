@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame's holdout, resampled for the rendered pictures: windows, strips and supersampled pictures."""
+"""Resampling of a frame's holdout to the pixels of the pictures that are rendered: windows, strips, supersampled
+pictures."""
 
 from __future__ import annotations
 
@@ -21,9 +22,9 @@ class Cut:
         self._last: Surfaces | None = None
 
     def __call__(self, camera: Camera) -> Surfaces | None:
-        """The surfaces of each pixel of the picture, with depths as in the kernels; None if there are none.
+        """The holdout surfaces of each pixel of the picture, with depths as in the kernels; None if no pixel has any.
 
-        A pixel has the surfaces of the holdout's pixel that contains it.
+        A pixel has the surfaces of that pixel of the holdout in which its corner lies.
         """
         window, holdout = camera.window, self._holdout
         x, y, across, down = (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks that turn the arguments of library calls into arrays for the kernels. Errors name the argument."""
+"""Argument checks of library calls, which convert the arguments for the kernels. Error messages name the argument."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ class Grids:
 
     @classmethod
     def on(cls, device: Device, grids: NDArray[np.float32]) -> Grids:
-        """These grids, and zero moments."""
+        """Upload these grids, with Adam moments of zero."""
         zeros = np.zeros_like(grids)
         return cls(upload(device, grids), upload(device, zeros), upload(device, zeros))
 
@@ -79,7 +79,7 @@ def grid_gradient(
     """Replace the gradient with respect to the transformed image by the gradient with respect to the image.
 
     Returns the gradient with respect to the photograph's grid, plus `weight` times the gradient of its total variation.
-    place: the view's number in the batch; each has its own array.
+    place: index of the view in the batch; the result of each view is in an array of its own.
     """
     _, rows, stride = image.shape
     plane, (across, down) = rows * stride, _spans(width, height)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches values.cl and values_grad.cl: values of Gaussians, any number, blended with the weights of an image."""
+"""Launches values.cl and values_grad.cl: any number of values per Gaussian, blended with the weights of an image."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_VALUES_PER_PASS = 32
 _MAX_REGISTER_SUMS = 64
 """Maximum sums of a work-item that shares its tile, in the forward pass: values times pixels of the work-item."""
 _MAX_LOCAL_SUMS = 2048
-"""Maximum sums of a group in the gradient, values times work-items: they must fit in local memory."""
+"""Maximum sums of a group in the gradient, so that they fit in local memory: values times work-items."""
 
 
 def passes(first: int, depth: int, most: int) -> Iterator[tuple[int, int]]:
@@ -43,7 +43,8 @@ def most_gradients(device: Device) -> int:
 
 @dataclass(frozen=True, eq=False)
 class ValuePass:
-    """Values (n, depth) of all Gaussians, their background (depth,), and the tile lists and results of an image."""
+    """Values (n, depth) of all Gaussians, the values' background (depth,), and the tile lists and results of the image
+    with whose weights the values are blended."""
 
     lists: TileLists
     projected: Projected
@@ -82,7 +83,7 @@ def values_grad(
     """Fill every row of the gradients from d_pixels (height, width, depth) and d_alpha (height, width).
 
     first_slots: (n,), the first slot of each Gaussian.
-    fields: includes absolute gradients if `gradients` has room for them.
+    fields: fields of the slots; with absolute gradients if `gradients.absolute` is wanted.
     """
     height, width, depth = d_pixels.shape
     lists, cells, most = of.lists, of.blended.cells_from_sorted, most_gradients(device)
