@@ -35,7 +35,7 @@ class PassWorkspace(Workspace):
     def array(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
     ) -> DeviceArray:
-        """The array of this name: from this workspace if it is one of BACKWARD_ARRAY_NAMES, else from the shared one."""
+        """The array of this name: from this workspace for BACKWARD_ARRAY_NAMES, otherwise from the shared one."""
         if name in BACKWARD_ARRAY_NAMES:
             return super().array(name, shape, dtype, kept=kept)
         return self._scratch.array(name, shape, dtype, kept=kept)

@@ -138,8 +138,8 @@ def isect_offset_encode(isect_ids: ArrayLike, n_images: int, tile_width: int, ti
     image, tile = keys >> bits, keys & ((1 << bits) - 1)
     if len(keys) and (int(image.max()) >= n_images or int(image.min()) < 0 or int(tile.max()) >= tiles):
         raise InputError(
-            f"isect_ids: found ids beyond the {n_images} images of {tile_width} x {tile_height} tiles, expected ids that "
-            "isect_tiles returns for these numbers"
+            f"isect_ids: found ids beyond the {n_images} images of {tile_width} x {tile_height} tiles, expected ids "
+            "that isect_tiles returns for these numbers"
         )
     counts = np.bincount(image * tiles + tile, minlength=n_images * tiles)
     return (np.cumsum(counts) - counts).astype(np.int32).reshape(n_images, tile_height, tile_width)
