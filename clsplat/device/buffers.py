@@ -52,7 +52,7 @@ class DeviceArray:
 
     @property
     def nbytes(self) -> int:
-        """Bytes in use."""
+        """Number of bytes of the array's elements."""
         return self.size * self.dtype.itemsize
 
     def get(self) -> NDArray[Any]:
@@ -154,7 +154,7 @@ class DeviceArray:
             self.device.calls.blocking_reads += 1
             event = self._copied(_READING, host, self.buffer, src_offset=self._at(start), is_blocking=True)
             self._note("read", event, host.nbytes)
-            self.device.under_way.clear()  # the queue is in order: all earlier work is done
+            self.device.under_way.clear()  # the queue is in order, so that all earlier work is done
 
     def _write(self, values: NDArray[Any], start: int) -> None:
         """Fill the rows from `start` on with the values of a host array, and wait for the device."""
@@ -214,7 +214,7 @@ def _fill_bytes(device: Device, buffer: cl.Buffer, word: NDArray[np.uint32], nby
 
 
 class _Buffer(cl.Buffer):  # type: ignore[misc]  # no types of its own
-    """An OpenCL buffer that supports weak references, by which the memory account notices its end."""
+    """An OpenCL buffer that supports weak references, so that the memory account is told when it is freed."""
 
 
 def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity: int = 0) -> DeviceArray:
@@ -390,7 +390,7 @@ class Workspace:
             return result
         if known is not None:
             known[1].check(commands, numbers)
-            for read in known[1].reads:  # copy into the memory of the result that is returned
+            for read in known[1].reads:  # copy into the host memory of the result that is returned
                 read()
             return known[0]  # type: ignore[no-any-return]  # as above
         command_buffers = self._command_buffers.setdefault(of, {})

@@ -62,14 +62,14 @@ class CommandBuffer:
     """Launches, fills and copies to the host, in order.
 
     entries: for each command a function that puts it on the queue, and its kernel if it is a launch.
-    calls: the number of calls of each kind.
+    calls: numbers of the recorded calls, by kind.
     anew: setter and argument index of each launch parameter, which `set` gives a new value.
     reads: the functions of `entries` that copy to the host.
     given: buffers of the recorded launches that a replay may exchange for others.
 
-    Each launch has its own kernel object, whose other arguments stay set. When a command buffer is dropped, its kernel
-    objects are kept for later command buffers, because pyopencl takes at least 0.2 ms to make a kernel object. A
-    command buffer keeps no array alive: its owner must drop it before one of its arrays is freed.
+    Each launch has its own kernel object, in which the arguments that never change stay set. When a command buffer is
+    dropped, its kernel objects are kept for later command buffers, because pyopencl takes at least 0.2 ms to make one.
+    A command buffer keeps no array alive: its owner must drop it before one of its arrays is freed.
     """
 
     def __init__(self, given: Sequence[cl.Buffer] = ()) -> None:
@@ -129,7 +129,11 @@ class CommandBuffer:
         self._described.append((kernel.name, kernel.variant, size, local, *description))
 
     def set(self, numbers: Iterable[float], given: Sequence[cl.Buffer] = ()) -> None:
-        """Set the values of the launch parameters, in order, and the buffers that replace the recorded `given`."""
+        """Set the arguments that change for the next replay.
+
+        numbers: values of the launch parameters, in order of their launches.
+        given: buffers that replace the recorded `given`.
+        """
         values, old = self._format.pack(*numbers), self._set
         if values != old:
             for place, (set_bytes, index) in enumerate(self.anew):

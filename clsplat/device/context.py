@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The visible devices, and the class of an open device, which has its queue, kernel shape and kernels."""
+"""The list of visible OpenCL devices, and `Device`, an open device with its queue, kernel shape and kernels."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from clsplat.process import undisturbed
 T = TypeVar("T")
 
 SYNC_VARIABLE = "CLSPLAT_SYNC"
-"""Environment variable that makes each launch wait for its kernel. So an error message names the kernel that hangs or
-fails."""
+"""Environment variable that makes each launch wait for its kernel, so that an error message names the kernel that hangs
+or fails."""
 
 
 def all_devices() -> list[cl.Device]:
@@ -207,7 +207,7 @@ class Device:
     ) -> cl.Event:
         """Put a kernel on the queue. Wait for it if `wait`, or if CLSPLAT_SYNC=1.
 
-        Raises DriverError, and CapacityError if the device has no memory left for it.
+        Raises DriverError, and CapacityError if the device has no memory left for the kernel.
         """
         try:
             event = kernel.cl_kernel(self.queue, size, local, *values)
@@ -229,8 +229,8 @@ class Device:
         return self.trials.error(kernel.variant, kernel.name, f"cannot be launched: {' '.join(str(error).split())}")
 
     def record(self, work: Callable[[], T], given: Sequence[cl.Buffer] = ()) -> tuple[T, CommandBuffer | None]:
-        """The result of `work`, and a command buffer of the commands that it put on the queue; None if they cannot be
-        replayed.
+        """Run `work`. Returns its result, and a command buffer of the commands that `work` put on the queue; None if
+        these cannot be replayed.
 
         given: buffers that a replay may exchange for others (`CommandBuffer`).
         """
@@ -256,7 +256,7 @@ class Device:
 
     @property
     def replays(self) -> bool:
-        """True if command buffers may be replayed; False if each launch is waited for, recorded or only tried."""
+        """True if command buffers may be replayed; False if each launch is waited for, profiled or only tried."""
         return not (self.waits or self.recorder.on or self.only_tries)
 
     def _wait_for(self, event: cl.Event, kernel: Kernel) -> None:
@@ -296,7 +296,7 @@ class Device:
         )
 
     def timed(self, work: Callable[[], T]) -> tuple[T, float]:
-        """The result of `work`, and the milliseconds that it took. The device is idle before and after."""
+        """Run `work`, and return its result and milliseconds. The device is idle before and after."""
         self.finish()
         start = time.perf_counter()
         result = work()
@@ -318,7 +318,7 @@ class Device:
         return fused if np.all(results == np.float32(2.0**-24)) else {}
 
     def _with_subgroups(self) -> dict[str, object]:
-        """The first defines of `subgroup_ways` with which items exchange the right values. Raises DeviceError."""
+        """The first defines in `subgroup_ways` with which items exchange the right values. Raises DeviceError."""
         if self._subgroups:
             return self._subgroups[0]
         for defines in subgroup_ways(self.cl_device):

@@ -35,7 +35,7 @@ def host_bytes(count: int) -> NDArray[np.uint8]:
 
 
 def _found(size: int) -> NDArray[np.uint8] | None:
-    # A finalizer may call this function while this thread holds the lock. It then gets new memory instead of waiting.
+    # A finalizer may call this function while this thread holds the lock. None makes the caller allocate new memory.
     if not _lock.acquire(blocking=False):
         return None
     try:

@@ -28,7 +28,7 @@ _RECOMPILED_SIZE_ITEMS = 1 << 16
 def only_tried(device: Device) -> Iterator[None]:
     """Inside the block, launches only try the kernel in the sandbox, if that is necessary; nothing runs on the device.
 
-    So if a driver fails in a trial, no array has been changed yet.
+    So no array has been changed yet if a driver fails in a trial.
     """
     device.only_tries = True
     try:
@@ -123,7 +123,8 @@ def launch_items(device: Device, kernel: Kernel, items: int, *arguments: Any) ->
 def launch_groups(
     device: Device, kernel: Kernel, groups: int | tuple[int, int, int], items: int, *arguments: Any
 ) -> None:
-    """Launch work-groups of `items` work-items. groups: their number, or the sizes of a grid. 0 launches nothing."""
+    """Launch work-groups of `items` work-items. groups: number of groups, or numbers along the three axes of a grid. 0
+    launches nothing."""
     first, *further = groups if isinstance(groups, tuple) else (groups,)
     if all((first, *further)):
         _enqueue(device, kernel, (first * items, *further), (items, *(1 for _ in further)), arguments)

@@ -107,7 +107,7 @@ def _names(selector: str | None) -> list[str]:
 
 
 def _part_of(name: str) -> tuple[str, int | None]:
-    """Split the selector NAME/NUMBER of a part of a device. The number is None if `name` is a whole device's."""
+    """Split the selector NAME/NUMBER of a part of a device. The number is None for the selector of a whole device."""
     whole, slash, number = name.rpartition("/")
     return (whole, int(number)) if slash and whole and number.isdigit() else (name, None)
 

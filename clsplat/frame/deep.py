@@ -114,7 +114,9 @@ class Merge:
 
 
 def deep_sampled(draws: Sequence[DrawDeep], cameras: Sequence[Camera], merge: Merge) -> DrawDeep:
-    """A DrawDeep of the mean over samples of shutter and lens. It uses only the size and window of its own camera.
+    """A DrawDeep of the mean over samples of shutter and lens.
+
+    Of the camera that the DrawDeep is called with, only size and window are used.
 
     draws, cameras: for each sample, a DrawDeep and a camera of the whole frame.
     """
@@ -128,7 +130,7 @@ def deep_sampled(draws: Sequence[DrawDeep], cameras: Sequence[Camera], merge: Me
 
 
 def deep_warped(draw: DrawDeep, warp: Warp, merge: Merge) -> DrawDeep:
-    """A DrawDeep of warped pictures. It uses only the size and window of its own camera.
+    """A DrawDeep of warped pictures. Of the camera that it is called with, only size and window are used.
 
     A pixel is the mean over `Warp.samples` by `Warp.samples` positions, each interpolated bilinearly, because the
     negative weights of a cubic filter would give invalid slices. Pixels in which nothing is visible have no slices.

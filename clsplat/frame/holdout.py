@@ -13,7 +13,7 @@ from clsplat.images.holdouts import Holdout, Surfaces
 class Cut:
     """Function that returns the surfaces of a frame's holdout in a camera's picture.
 
-    The last result is cached, because all samples of a shutter or lens have the same picture.
+    The last result is cached, because it is the same for all samples of shutter and lens.
     """
 
     def __init__(self, holdout: Holdout) -> None:
@@ -44,7 +44,8 @@ class Cut:
 
     @property
     def goes_on(self) -> bool:
-        """True if surfaces touch an edge of the frame, and the file has no pixels beyond this edge."""
+        """True if the holdout may continue outside the frame: surfaces touch an edge, and the file has no pixels
+        beyond it."""
         counts, (width, height) = self._holdout.surfaces.counts, self._holdout.size
         left, top = -self._holdout.x, -self._holdout.y
         right, bottom = left + width - counts.shape[1], top + height - counts.shape[0]

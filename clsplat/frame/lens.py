@@ -56,7 +56,7 @@ class ByMap:
         return self.stmap.width, self.stmap.height
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """Positions in the straight frame, as in `Places`."""
+        """Positions (h, w, 2) in the straight frame of positions in the warped frame, by the map (`Places.places`)."""
         u, v = np.moveaxis(self.stmap.at(x, y), 2, 0)
         return np.stack([u * frame.width, (1 - v) * frame.height], axis=2)
 
@@ -76,7 +76,7 @@ class ByLens:
         return frame.width, frame.height
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """Positions in the straight frame, as in `Places`."""
+        """Positions (h, w, 2) in the straight frame of positions in the warped frame, by the lens (`Places.places`)."""
         bare = self.lens.bare(frame.rotation, frame.translation)
         across, down = np.meshgrid((x - frame.cx) / frame.fx * bare.fx, (y - frame.cy) / frame.fy * bare.fy)
         pixels = np.stack([(across + bare.cx).ravel(), (down + bare.cy).ravel()], axis=1)
@@ -86,8 +86,9 @@ class ByLens:
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """A straight frame, and the mapping to it from a warped frame.
+    """The warp of a frame: the straight frame that is rendered, and the mapping to it from the warped frame.
 
+    source: mapping from positions in the warped frame to positions in the straight frame.
     frame: camera of the whole straight frame.
     """
 

@@ -56,7 +56,7 @@ class FrameRequest:
 
     at: function from a time, relative to this frame in frames, to the camera of the whole frame in its final size.
     after, before: cameras of the next and the previous frame, for motion.
-    lens: the warp of the picture.
+    lens: mapping by which the frame is warped; None for a straight frame.
     sampling: the sampling of this frame; None uses the job's.
     cut: function from a camera to the holdout surfaces in its picture, for all samples of the frame.
     models: function from a time to the Gaussians; None uses the pipeline's model.
@@ -127,7 +127,7 @@ class FramePipeline:
     def _by_kernels(self, frame: FrameRequest) -> DrawAt:
         def draw_at(time: float) -> Draw:
             def draw(camera: Camera, names: Collection[str]) -> Planes:
-                gaussians = self._gaussians if frame.models is None else frame.models(time)  # loaded only now
+                gaussians = self._gaussians if frame.models is None else frame.models(time)  # made when drawn
                 cameras, mattes = (self._background, frame.after, frame.before), self._mattes
                 return drawn_by(self._renderer, gaussians, *cameras, frame.cut, *frame.moved, mattes)(camera, names)
 

@@ -55,9 +55,7 @@ _ROUNDED = (*_TRANSFORM, *("XMIN", "XMAX", "YMIN", "YMAX"), *("PX", "PY", "PZ"))
 _LENS = ("K1", "K2", "K3", "K4", "FOLD", "FOLD_RADIUS")
 
 CAMERA = (*_ROUNDED, "NEAR", "FAR", "HAND", "WINDOW_X", "WINDOW_Y", *_LENS, *(f"{name}_LOW" for name in _ROUNDED))
-"""The fields of a camera.
-
-In order:
+"""The fields of a camera for the projection kernels, in order.
 
 - `cam_from_world`, intrinsics, the limits of x/z and y/z in the Jacobian, and the camera's centre.
 - Near and far plane.
@@ -79,9 +77,7 @@ EWA_CAMERA = (
     *("NEAR", "FAR", "WIDTH", "HEIGHT", "EPS", "RADIUS_CLIP"),
     *(f"{name}_LOW" for name in _EWA_ROUNDED),
 )
-"""The fields of a camera of `kernels/ewa.cl`.
-
-In order:
+"""The fields of a camera for `kernels/ewa.cl`, in order.
 
 - The view matrix, which need not be a rotation; intrinsics; the limits of x/z and y/z in the Jacobian; the cofactors
   of the matrix's 3 x 3 part.
@@ -106,9 +102,7 @@ SPLAT = (
     *_SEEN,
     *("HALF_W", "HALF_H", "INVERSE_L11", "UNUSED"),
 )
-"""A projected Gaussian in 64 bytes, a cache line.
-
-In order:
+"""The fields of a splat, a projected Gaussian, in order. They take 64 bytes, a cache line.
 
 - The mean in whole pixels, and the fraction of a pixel.
 - L11 to L22: the whitening W of docs/gradients.md times sqrt(log2(e) / 2), so that log2(alpha) = LOG2O - u^2 - v^2.

@@ -60,7 +60,7 @@ class Given:
         sh_degree: int | None,
         cameras: int,
     ) -> Given:
-        """Check the arguments of a call. Raises InputError, which names the argument."""
+        """Check the arguments of a call of `rasterize`. Raises InputError, which names the argument."""
         centres = floats("means", means, ("N", 3))
         n = len(centres)
         shapes = GivenShapes.checked(n, covars, quaternions, scales)
@@ -297,7 +297,7 @@ class CameraPass:
             at += by.colors
         with session.lock:
             placed = image_gradients(device, on_image)
-            device.under_way.append(placed)  # host memory must live until the device has read it
+            device.under_way.append(placed)  # host memory must exist until the device has read it
             room, add = gradients.room.arrays, gradients.views > 0
             by_camera = self.projected.gradient(placed, room, add=add, by_camera=cameras)
             by_centre = self._colours_back(gradients, room.means, by.colors, cameras=cameras)

@@ -106,7 +106,7 @@ def spherical_harmonics(
 
     Notes
     -----
-    Signs and order of the basis are in docs/conventions.md. float32 arrays are read in place, and must not change
+    Signs and order of the basis are in docs/conventions.md. float32 arrays may be read in place, and must not change
     before the last `vjp`.
     """
     batch = np.shape(directions)[:-1]

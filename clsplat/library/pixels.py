@@ -195,7 +195,7 @@ class PixelPass(ListedPixels):
 
     A Gaussian contributes to a pixel if its alpha there is at least 1/255. Blending ends before the Gaussian that would
     leave a transmittance of 1e-4 or less. A Gaussian is culled if its mean is over 1e9 pixels away, or if a or c of
-    its conic is outside 1e-15 to 1e15. Raises CapacityError if the device has no room for the (tile, Gaussian) pairs.
+    its conic is outside 1e-15 to 1e15. Raises CapacityError if the device has no memory for the (tile, Gaussian) pairs.
     """
 
     def __init__(
@@ -226,7 +226,7 @@ def screen_gaussians(
     depths: (n,), by which Gaussians are sorted, ties by index.
     radii: (n, 2) int32; a radius of 0 culls the Gaussian.
 
-    C-contiguous float32 host arrays are not copied.
+    If the device shares the host's memory, C-contiguous float32 host arrays are not copied.
     """
     arrays = (means2d, conics, opacities, depths, colours)
     return ScreenGaussians(placed(device, radii, np.int32), *(placed(device, array) for array in arrays))

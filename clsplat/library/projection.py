@@ -87,7 +87,10 @@ class HostedGradients(NamedTuple):
 
 
 def hosted_gradients(device: Device, count: int, *, covariances: bool) -> HostedGradients:
-    """Allocate gradients with respect to `count` Gaussians. covariances: instead of quaternions and scales."""
+    """Allocate gradients with respect to `count` Gaussians.
+
+    covariances: True for gradients with respect to covariances instead of quaternions and scales.
+    """
     means = hosted(device, (count, 3))
     if covariances:
         covars = hosted(device, (count, 6))
@@ -250,8 +253,8 @@ def fully_fused_projection(
 
     Notes
     -----
-    Zwicker et al., EWA splatting, 2002; docs/gradients.md, section 22. float32 arrays are read in place, and must not
-    change before the last `vjp`.
+    Zwicker et al., EWA splatting, 2002; docs/gradients.md, section 22. float32 arrays may be read in place, and must
+    not change before the last `vjp`.
     """
     given_means = floats("means", means, ("N", 3))
     count = len(given_means)

@@ -91,5 +91,6 @@ def session_of(device: Device | str | None = None) -> LibrarySession:
     """
     if isinstance(device, Device):
         return _session(device)
-    # cached, as listing the devices takes as long as projecting 500,000 Gaussians; the variables may change the list
+    # Cached, because a list of the devices takes as long as a projection of 500,000 Gaussians. The environment
+    # variables are part of the key, because they may change the list.
     return _named(device, tuple(os.environ.get(name) for name in _DEVICE_CHOICE_VARIABLES))

@@ -259,7 +259,7 @@ class _GivenLists:
 
 
 def _checked_size(tile_size: int, image_width: int, image_height: int) -> tuple[int, int]:
-    """Width and height in pixels. Raises InputError."""
+    """Check the tile size, and return the image's width and height in pixels. Raises InputError."""
     if whole(tile_size) != TILE:
         raise InputError(f"tile_size: got {tile_size}, expected {TILE}, the only size that the kernels support")
     size = whole(image_width) or 0, whole(image_height) or 0

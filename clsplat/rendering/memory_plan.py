@@ -97,7 +97,7 @@ class Plan:
 
     @property
     def pieces(self) -> tuple[bool, bool]:
-        """True for each of two things that are divided: the parameters, into streamed parts; the image, into bands."""
+        """Two flags: True if the parameters are streamed in parts, and True if the image is divided into bands."""
         return self.streamed, self.bands > 1
 
     @property
@@ -124,7 +124,7 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
     also streamed in parts. Bands come first because they repeat little work, while parts cross the bus in every step.
     A frame with more pairs than `Plan.pairs` is divided by `stages.duplicate.plan_bands`.
 
-    alignment: the number of rows is a multiple of this.
+    alignment: number of which `Plan.rows` must be a multiple if parameters are streamed.
     Raises CapacityError if not even the smallest pieces fit.
     """
     photographs = min(max(budget - need.total - need.moving, 0) // 2, need.photographs)

@@ -143,7 +143,7 @@ class Rasterizer:
         self.capacity = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS_PER_BAND)
 
     def antialias(self, *, on: bool) -> None:
-        """Switch to antialiased models, or back to others (`Gaussians.antialiased`)."""
+        """Use the kernels for antialiased models (`Gaussians.antialiased`) if `on`, otherwise those for the others."""
         if on == self._antialiased:
             return
         defines = kernel_defines(self.config, antialiased=on)

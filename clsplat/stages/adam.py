@@ -38,12 +38,12 @@ class AdamStep:
         return self.rates[group] / shrunk, root
 
     def corrections(self, updates: int) -> tuple[float, float]:
-        """1 - beta1^t and 1 / sqrt(1 - beta2^t) of the t-th update."""
+        """The factors 1 - beta1^t and 1 / sqrt(1 - beta2^t) of the t-th update; `updates` is t."""
         return 1.0 - self.config.beta1**updates, (1.0 - self.config.beta2**updates) ** -0.5
 
     @property
     def scales(self) -> dict[str, float]:
-        """rate sqrt(1 - beta2^t) / (1 - beta1^t) of the groups that the step updates."""
+        """Step sizes, rate sqrt(1 - beta2^t) / (1 - beta1^t), of the groups that the step updates, by group."""
         groups = [group for group in self.rates if group != "sh_rest" or self.updates_sh_rest]
         by_group = {group: self.corrected(group) for group in groups}
         return {group: rate / root for group, (rate, root) in by_group.items()}

@@ -29,7 +29,7 @@ APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON = 0.9, 0.999, 1e-15
 class PhotoLens:
     """Photograph and lens of a view, for the kernels.
 
-    photograph, lens: rows in the arrays of their entries.
+    photograph, lens: their rows in the arrays of colour entries (`Gains`).
     centre: the principal point, as fractions of the image's width and height.
     flat: False for a panorama, which cannot have a vignette.
     """
@@ -47,9 +47,9 @@ class PhotoLens:
 
 @dataclass(frozen=True)
 class GainEntries:
-    """The column sums from which gains are updated, and settings of the update by Adam.
+    """Settings of `step_gains`, the update of colour entries by Adam.
 
-    first_row: row of the first entry in the column sums.
+    first_row: row of the first entry in the column sums of `entry_gradient`.
     mix_rate: learning rate of mixes, as a fraction of the rate of gains.
     centred: True if the mean of each entry over all rows is subtracted after a step.
     """
@@ -70,7 +70,7 @@ PLAIN_GAINS = GainEntries()
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """Gains of all photographs, (photographs, entries) float32 each.
+    """Colour entries of all photographs or of all lenses, with their Adam state: (photographs, entries) float32 each.
 
     logs: the first three entries are the base-2 logarithms of the gains; the others are colour mixes.
     start: initial values of `logs`.
@@ -151,7 +151,7 @@ def entry_gradient(
     size: tuple[int, int],
     place: int = 0,
 ) -> DeviceArray:
-    """Column sums (model.sums, stride) of the gradient with respect to entries of 0 that are applied to the render.
+    """Column sums (model.sums, stride) of the gradient with respect to colour entries of 0, applied to the render.
 
     The sum over the columns, multiplied by ln 2 for logarithms, is the gradient (docs/gradients.md, (184) to (186)).
     place: index of the view in the batch; the result of each view is in an array of its own.

@@ -75,7 +75,7 @@ def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[De
 _MIN_STRIP_ITEMS = 32
 """Number of work-items per tile from which sums over a tile's pixels are in the order of kernels/shared/strips.h."""
 _MIN_TILE_ITEMS = 8
-"""Minimum number of work-items per tile, if several share one: a row of a block of pixels (kernels/shared/blocks.h)."""
+"""Minimum number of work-items per tile, unless one has it alone: a row of a pixel block (kernels/shared/blocks.h)."""
 
 
 def tile_items(device: Device) -> int:
@@ -119,8 +119,8 @@ def items_for(tiles: int, units: int, items: int, most: int) -> int:
 
 
 def gradient_items(device: Device, tiles: int) -> int:
-    """Number of work-items that share a tile in `blend_grad`, in a frame of `tiles` tiles. Numbers from 32 on give the
-    same result."""
+    """Number of work-items that share a tile in `blend_grad`, in a frame of `tiles` tiles. All numbers of 32 or more
+    give the same bits."""
     items = tile_items(device)
     if device.kind != "gpu" or items < _MIN_STRIP_ITEMS or device.shape.by_gaussian:
         return items
@@ -211,7 +211,7 @@ def count_pairs(
     vector computes the alpha of all its lanes.
     """
     width, height = camera.width, camera.height
-    planes = _planes(work, width, height, kept=True)  # the planes of `blend`, rewritten with the same values
+    planes = _planes(work, width, height, kept=True)  # `blend` has filled them; they get the same values again
     counts = work.array("counts", (lists.band.tiles * tile_items(device), 2), np.uint32)
     arrays = (lists.ranges, lists.gaussian_from_sorted, splats, background, *planes, counts)
     launch_tiles(device, "blend", {"COUNT_PAIRS": True}, lists, -(-width // TILE), width, height, *arrays)

@@ -17,7 +17,7 @@ BOUNDS_FLOATS = 7
 
 @stage("bounds")
 def bounds(device: Device, work: Workspace, gaussians: DeviceGaussians, chunks: ChunkList) -> Float32:
-    """The bounds (chunks, BOUNDS_FLOATS) of these chunks.
+    """Compute the bounds of these chunks, (chunks, BOUNDS_FLOATS), and wait for them.
 
     An entry NO_CHUNK in the list has empty bounds: from infinity to -infinity.
     """

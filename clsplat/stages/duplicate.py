@@ -76,9 +76,9 @@ class Totals:
     arriving: Callable[[], NDArray[Any]] | None = None
 
     def elements(self, most: int, name: str) -> Elements:
-        """The number of elements of a kernel, which is the field `name` of READBACK.
+        """The number of elements that a kernel processes: `most`, or in a pass by capacity field `name` of READBACK.
 
-        most: the number itself, or in a pass by capacity an upper bound of the number, which the kernel then reads.
+        most: the number. In a pass by capacity, an upper bound of the number that the kernel reads from READBACK.
         """
         return Elements(most, self.on_device, READBACK.index(name))
 
@@ -102,8 +102,8 @@ class Counted(Totals):
 class Pairs:
     """Pairs in order of depth; pairs of equal depth are in order of the Gaussian's index.
 
-    tile_keys: (pairs).
-    pair_ids: (pairs, 2), slot and Gaussian.
+    tile_keys: (pairs), the tile of each pair, counted from the band's first tile.
+    pair_ids: (pairs, 2), the slot and the Gaussian of each pair.
     elements: the number of pairs that these arrays hold.
     """
 
@@ -121,7 +121,7 @@ def count(
     all_bits: bool = False,
     readback: DeviceArray | None = None,
 ) -> Counted:
-    """The visible Gaussians, the number of their pairs, and the bits in which their depths differ.
+    """List the visible Gaussians, and count their pairs and the bits in which their depths differ.
 
     Waits for the device.
 

@@ -54,7 +54,7 @@ def device_bytes(photographs: int, sizes: Sequence[tuple[int, int]]) -> int:
 def apply_grid(
     device: Device, work: Workspace, grids: Grids, photograph: int, image: DeviceArray, width: int, height: int
 ) -> DeviceArray:
-    """Planes (3, rows, stride) of the image, width x height pixels, with the colour transforms of the photograph."""
+    """Apply a photograph's colour transforms to an image, width x height pixels. Returns planes (3, rows, stride)."""
     _, rows, stride = image.shape
     seen = work.array("appearance_seen", image.shape)
     sizes = (photograph, stride, rows * stride, *_spans(width, height))

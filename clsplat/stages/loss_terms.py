@@ -79,7 +79,7 @@ class AlphaTerm(LossTerm):
         return self.weight, pixels
 
     def launch(self, compared: Compared, plane: int, first: int) -> None:
-        """Launch alpha_loss.cl, which writes the fourth plane."""
+        """Launch alpha_loss.cl, which writes the fourth plane of the gradient."""
         assert plane == compared.target.shape[0] - 1 == 3, "alpha is the plane after the colours"
         _, rows, stride = compared.target.shape
         blended, kernel = compared.blended, compared.device.kernels("alpha_loss").alpha_loss

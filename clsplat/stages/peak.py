@@ -25,8 +25,8 @@ _COPY_BYTES = 256 * 2**20
 class Limits:
     """The peak rates of a device.
 
-    pairs_per_second, gradient_pairs_per_second: arithmetic of blending and of its gradient, without memory traffic and
-        with every lane in use.
+    pairs_per_second, gradient_pairs_per_second: pairs of a Gaussian and a pixel in the arithmetic of blending and of
+        its gradient, without memory traffic and with every lane in use.
     copy_bytes_per_second: bytes read plus bytes written by a copy too large for the caches.
     lanes, items: the kernel shape of all measurements.
     """

@@ -38,7 +38,7 @@ SCREEN_GRADIENT_BYTES = 8
 
 
 def gaussian_bytes(*, keeps_culled: bool) -> int:
-    """Bytes per Gaussian: splat and tile count, and `shown` if culling is switched off."""
+    """Bytes per Gaussian of `Projected`: splat and tile count, and `shown` if culling is switched off."""
     return 4 * (len(SPLAT) + 1 + keeps_culled)
 
 
@@ -67,7 +67,8 @@ class Projected:
     def chunk_arguments(self) -> tuple[object, ...]:
         """Last arguments of kernels with `chunk_defines`: CHUNK_PARAMETERS of `kernels/shared/chunks.h`.
 
-        The list is passed as a buffer, not as an array, because the profile takes the last arrays for updated ones.
+        The list is passed as a buffer, not as an array, because the profile takes a kernel's last arrays for those that
+        the kernel updates.
         """
         return () if self.chunks is None else (self.chunks.numbers.buffer, self.chunks.model_rows)
 
@@ -270,7 +271,7 @@ def project_step(
     """Do the work of `project_grad` and `stages.adam.adam` in one kernel, which keeps no gradients in memory.
 
     model: parameters, first and second moments. If only some chunks were projected, only their Gaussians take the step.
-    The other arguments are passed on to the two functions.
+    The other arguments are those of the two functions.
     """
     parameters, config = model[0], step.config
     n = projected.tile_counts.shape[0]

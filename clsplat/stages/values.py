@@ -24,19 +24,22 @@ _MAX_LOCAL_SUMS = 2048
 
 
 def passes(first: int, depth: int, most: int) -> Iterator[tuple[int, int]]:
-    """First value and number of values of each pass over the values [first, depth). most: values per pass."""
+    """Yield the first value and the number of values of each pass over the values [first, depth).
+
+    most: maximum number of values per pass.
+    """
     for begin in range(first, depth, most):
         yield begin, min(most, depth - begin)
 
 
 def most_values(device: Device) -> int:
-    """Maximum number of values per forward pass."""
+    """Maximum number of values per pass of `values`."""
     items = tile_items(device)
     return MAX_VALUES_PER_PASS if items == 1 else min(max(_MAX_REGISTER_SUMS * items // (TILE * TILE), 2), 16)
 
 
 def most_gradients(device: Device) -> int:
-    """Maximum number of values per pass of the gradient."""
+    """Maximum number of values per pass of `values_grad`."""
     items = tile_items(device)
     return MAX_VALUES_PER_PASS if items == 1 else min(_MAX_LOCAL_SUMS // items, 16)
 
@@ -108,7 +111,7 @@ def values_grad(
 def _gradient_by_cell(
     device: Device, work: Workspace, of: ValuePass, d_pixels: DeviceArray, d_alpha: DeviceArray | None
 ) -> DeviceArray:
-    """The image's gradient in the order in which `values_grad` reads it, (tiles, depth + 1, pixels of a tile)."""
+    """Reorder the image's gradient as `values_grad` reads it: (tiles, depth + 1, pixels of a tile)."""
     height, width, depth = d_pixels.shape
     by_cell = work.array("gradient_by_cell", (of.lists.band.tiles, depth + 1, TILE * TILE))
     given = [] if d_alpha is None else [d_alpha]

@@ -28,7 +28,7 @@ MAX_BINARY_CACHE_BYTES = 256 << 20
 500 KB; all binaries of the tests take 90 MB."""
 
 BINARIES_VARIABLE = "CLSPLAT_BINARIES"
-"""Environment variable that names another folder for the cache."""
+"""Environment variable that names another folder for the cached binaries."""
 
 
 def folder() -> Path:

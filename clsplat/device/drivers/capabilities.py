@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import pyopencl as cl
 
 PRETEND_VARIABLE = "CLSPLAT_PRETEND"
-"""Environment variable whose value, separated by commas, replaces capabilities of every device."""
+"""Environment variable that lists, separated by commas, the capabilities that every device pretends to have."""
 
 
 @dataclass(frozen=True)

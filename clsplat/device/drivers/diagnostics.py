@@ -25,7 +25,7 @@ _LOAD_LIBRARY_CODE = "import ctypes, sys; ctypes.CDLL(sys.argv[1])"
 
 
 def _outcome(*command: str) -> subprocess.CompletedProcess[str] | None:
-    """The exit status and output of a command; None if it did not finish in time."""
+    """Run a command, and return its exit status and output; None if it does not finish in time."""
     try:
         return subprocess.run(command, capture_output=True, text=True, timeout=driver_timeout(), check=False)
     except subprocess.TimeoutExpired:

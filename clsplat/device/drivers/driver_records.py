@@ -96,7 +96,7 @@ def _entry(value: object) -> Entry:
 
 
 _RECORDS_LOCK = threading.Lock()
-"""Lock of `_unwritten`, as several devices may be used by several threads."""
+"""Lock for `_unwritten`, as each of several devices may be used by a thread of its own."""
 _unwritten: dict[Path, list[tuple[str, str, Entry]]] = {}
 """Entries that could not be written yet, by file: driver, shape, and the entry to add."""
 
@@ -175,5 +175,5 @@ def rewrite(path: Path, changed: Callable[[], Mapping[str, Any]]) -> None:
 
 @lru_cache(maxsize=8)
 def tell_once(text: str) -> None:
-    """Warn once per process."""
+    """Warn with this text, once per process."""
     warnings.warn(text, stacklevel=2)

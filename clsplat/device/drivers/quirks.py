@@ -202,8 +202,8 @@ def of_maker(platform_name: str, device_name: str, maker: str) -> bool:
 def driver_files(environment: Mapping[str, str] = os.environ) -> list[Path]:
     """The .icd files; each contains the name of a driver's library.
 
-    They are in the system's folder, or instead in the folder that an environment variable names, and in Python
-    packages.
+    The files are in the system's folder or, instead, the folder that OCL_ICD_VENDORS names; and in pyopencl's own
+    folder of libraries.
     """
     folders = [Path(environment.get(_ICD_VENDORS) or "/etc/OpenCL/vendors")]
     spec = importlib.util.find_spec("pyopencl")

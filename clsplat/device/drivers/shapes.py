@@ -207,7 +207,7 @@ def shapes_in_turn(device: cl.Device) -> list[Shape]:
 
 
 def shapes_to_try(device: cl.Device, first: Shape, failed: Mapping[str, str]) -> list[Shape]:
-    """`first` and then `shapes_in_turn`, without the shapes in which the driver has failed.
+    """The shape `first` and then those of `shapes_in_turn`, without shapes in which the driver has failed.
 
     If the driver has failed in every shape, `first` is tried again, because the cause may be gone.
     """
@@ -216,7 +216,7 @@ def shapes_to_try(device: cl.Device, first: Shape, failed: Mapping[str, str]) ->
 
 
 def instead(device: cl.Device, wanted: Shape, other: Shape, failure: str) -> str:
-    """The warning that `other` is used instead of the wanted shape."""
+    """The text of the warning that the shape `other` is used instead of the wanted shape."""
     return (
         f"{title(device)}: kernels in the shape {wanted.label} failed: {failure}; {other.label} is "
         f"used instead (clsplat selftest tries {wanted.label} again)"

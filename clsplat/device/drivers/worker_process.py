@@ -230,8 +230,8 @@ _NO_PYTHON_ADVICE = (
 def python_module(module: str, *words: str) -> list[str]:
     """The command that runs a module of this package.
 
-    Unlike `python -m`, it imports nothing from the current folder. Raises DriverError if Python does not know the path
-    of its executable.
+    Unlike `python -m`, the command imports nothing from the current folder. Raises DriverError if Python does not know
+    the path of its executable.
     """
     if not sys.executable:  # another program may embed Python
         raise DriverError(f"sys.executable is empty, {_NO_PYTHON_ADVICE}")
