@@ -10,7 +10,7 @@ os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
 from clsplat.device.drivers import quirks
 from clsplat.process import undisturbed
 
-# these set environment variables that a driver reads when it is loaded
+# the next three calls set environment variables that a driver reads when it is loaded
 quirks.make_cache_folder()
 quirks.pin_threads()
 quirks.offer_packaged()

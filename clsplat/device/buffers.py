@@ -83,7 +83,9 @@ class DeviceArray:
 
     def _check(self, values: NDArray[Any]) -> None:
         if values.shape != self.shape or values.dtype != self.dtype:
-            raise ValueError(f"got {values.dtype}{values.shape}, expected {self.dtype}{self.shape}")
+            raise ValueError(
+                f"values: got {values.dtype} of shape {values.shape}, expected {self.dtype} of shape {self.shape}"
+            )
 
     def fill(self, value: float) -> None:
         """Set every element to `value`."""

@@ -136,7 +136,7 @@ class Device:
         kernels = self._kernels.get(key)
         if kernels is None:
             if not self._fma:
-                self._fma.append(self._probe_fma())  # in place, because copies of a device share the list
+                self._fma.append(self._probe_fma())  # appended in place, as copies of a device share the list
             kernels = self._kernels[key] = self._built(stem, {**self._fma[0], **defines}, registers)
         return kernels
 
@@ -331,7 +331,7 @@ class Device:
             except (KernelBuildError, DriverError):
                 continue
             if np.array_equal(got, wanted):
-                self._subgroups.append(defines)  # in place, because copies of a device share the list
+                self._subgroups.append(defines)  # appended in place, as copies of a device share the list
                 return defines
         raise DeviceError(
             f"{title(self.cl_device)}: items of a sub-group do not exchange the right values; choose a shape without "

@@ -68,7 +68,7 @@ def text_of(stem: str) -> str:
     if where.strip() != stem:
         return source
     if old not in source:
-        raise InputError(f"{BREAK_KERNEL_VARIABLE}={wanted}: {stem}.cl has no such words")
+        raise InputError(f"{BREAK_KERNEL_VARIABLE}={wanted}: {stem}.cl does not contain {old}")
     return source.replace(old, new)
 
 

@@ -164,7 +164,7 @@ class KernelTrials:
         if answer.get("memory"):  # not the driver's fault: this process goes on as if the trial had passed
             driver_records.tell_once(
                 f"{self._device.name.strip()}: not enough memory to try every kernel in a separate process before its "
-                "first use"
+                "first use, so kernels are used without this trial"
             )
         elif trouble := answer.get("trouble"):
             trial = {**asked, "name": name, "build": {"stem": variant.stem, "options": variant.options}}

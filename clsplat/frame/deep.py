@@ -89,7 +89,7 @@ class Merge:
     def __call__(self, pictures: Iterable[Weighted]) -> Float32:
         """Merge one or more pictures into their weighted mean. For each pixel the sum of weights must be 1.
 
-        To limit memory, groups of pictures are merged first, and then their means.
+        To limit memory, groups of pictures are merged first, and then the means of the groups.
         """
         groups = list(self._groups(pictures))
         return groups[0][0] if len(groups) == 1 else self(groups)

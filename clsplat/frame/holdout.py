@@ -24,7 +24,7 @@ class Cut:
     def __call__(self, camera: Camera) -> Surfaces | None:
         """The holdout surfaces of each pixel of the picture, with depths as in the kernels; None if no pixel has any.
 
-        A pixel has the surfaces of that pixel of the holdout in which its corner lies.
+        A pixel gets the surfaces of the holdout's pixel that contains its top left corner.
         """
         window, holdout = camera.window, self._holdout
         x, y, across, down = (

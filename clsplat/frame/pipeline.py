@@ -55,7 +55,7 @@ class FrameRequest:
     """A frame to render by a `FramePipeline`.
 
     at: function from a time, relative to this frame in frames, to the camera of the whole frame in its final size.
-    after, before: cameras of the next and the previous frame, for motion.
+    after, before: cameras of the next and the previous frame, for the channels motion and backward.
     lens: mapping by which the frame is warped; None for a straight frame.
     sampling: the sampling of this frame; None uses the job's.
     cut: function from a camera to the holdout surfaces in its picture, for all samples of the frame.

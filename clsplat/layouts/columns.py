@@ -89,7 +89,7 @@ EWA_GRADIENT = _TRANSFORM
 """The fields of a camera with respect to which `kernels/ewa_grad.cl` computes gradients."""
 
 SUM_ROWS = 64
-"""Number of adjacent numbers in a row that a work-item of `kernels/sums.cl` adds."""
+"""Number of adjacent values of a row that one work-item of `kernels/sums.cl` adds."""
 
 NO_CHUNK = 0x3FFFFF
 """Entry of a list of chunks that stands for no chunk. As a chunk, its rows are past the end of every model."""

@@ -53,5 +53,5 @@ def kernel_defines(
 
 
 def _literal(value: float) -> str:
-    """A float32 as OpenCL C, without rounding."""
+    """The OpenCL C literal of a value, with all digits of its float32."""
     return f"{float(np.float32(value)):.9e}f"

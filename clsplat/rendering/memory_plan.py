@@ -80,7 +80,7 @@ class Plan:
     rows: number of Gaussians whose parameters and moments are on the device at once.
     streamed: True if `rows` is less than all Gaussians, so that parameters are streamed.
     pairs: largest number of (tile, Gaussian) pairs at once.
-    gathers: True if the device moves rows, False if the host does.
+    gathers: True if the device moves rows for density control, False if the host does.
     allowed: memory limit, bytes.
     bands: estimated number of bands of tiles, which are listed and blended one after the other.
     photographs: bytes of photographs that stay on the device.

@@ -17,8 +17,8 @@ from clsplat.optimisation.step_noise import Exploration
 from clsplat.stages.device_gaussians import DeviceGaussians
 
 NOISE_OPACITY_RANGE = 0.16
-"""Opacities above `Exploration.dead` up to which noise is added. Beyond, it would be less than 1.2e-7 of the noise at
-opacity `dead`."""
+"""Width of the range of opacities above `Exploration.dead` in which noise is added. Above it, noise would be less than
+1.2e-7 of the noise at opacity `dead`."""
 
 
 def highest_logit(dead: float) -> float:
@@ -38,7 +38,7 @@ def noise(
 ) -> None:
     """Add a step's noise to the means. Nothing changes if `readback` says that the step's pass has stopped.
 
-    first_row: the row of the model that the first of these Gaussians has.
+    first_row: row in the model of the first of these Gaussians.
     """
     if explore.amount != 0:
         _add_noise(device, explore, gaussians, first_row, readback)

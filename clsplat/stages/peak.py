@@ -43,7 +43,7 @@ def measure_limits(
 ) -> Limits:
     """Measure the best rate of `repeat` runs; each run of arithmetic takes about `seconds`.
 
-    widened: use vectors of 16 lanes where blending does. False always uses the lanes of the kernel shape.
+    widened: True uses vectors of 16 lanes where blending does, False always the lanes of the kernel shape.
     """
     items = tile_items(device)
     defines = {} if widened else {"NARROW": True}

@@ -36,7 +36,7 @@ def pose_rows(
     """Sum the pose gradient of these Gaussians into `sums` (ceil(n / POSE_ROWS), 6).
 
     device: the device with the kernel switches of the camera model.
-    first_row: the row of the model that the first of these Gaussians has, a multiple of POSE_ROWS.
+    first_row: row in the model of the first of these Gaussians, a multiple of POSE_ROWS.
     """
     launch_items(
         device,

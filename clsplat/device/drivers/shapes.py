@@ -69,7 +69,7 @@ class Shape:
             or items & (items - 1)
             or (form and (lanes, items) not in _SHAPES_BY_SUFFIX[form])
         ):
-            raise ValueError(f"{label}: not a shape")
+            raise ValueError(f"{label} is no kernel shape, expected LANESxITEMS, such as 8x1")
         return replace(self, lanes=lanes, items=items, by_gaussian=form == "g", subgroups=form == "s")
 
     @property
