@@ -381,7 +381,7 @@ def _in_the_world(named: ChannelResult, camera: Camera, gaussians: Gaussians | A
     origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
     if (of_distances := camera.depths_of_distances()) is not None:
         named |= {name: named[name] * of_distances for name in ("depth", *DEPTH_PLANES)}
-    if "position" in named and origin.any():  # the sum has the precision of float32
+    if "position" in named and origin.any():  # float32 limits the precision of the sum
         shown = named["count"][:, :, None] > 0
         named["position"] = np.where(shown, named["position"] + origin, 0).astype(np.float32)
     return named
