@@ -32,8 +32,8 @@ _begin_read = getattr(
     _inner, "_enqueue_read_buffer", lambda queue, buffer, host, **how: cl.enqueue_copy(queue, host, buffer, **how)
 )
 _begin_fill = getattr(_inner, "_enqueue_fill_buffer", cl.enqueue_fill_buffer)
-"""pyopencl's functions inside `enqueue_copy` and `enqueue_fill_buffer`, which do not first ask the driver about both
-ends and the queue. A version of pyopencl that lacks them gets `enqueue_copy` and `enqueue_fill_buffer`."""
+"""pyopencl's inner functions that start writes, reads and fills. They are quicker than `enqueue_copy` and
+`enqueue_fill_buffer`, which first query the buffers and the queue, but not every version of pyopencl has them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,22 +52,22 @@ class DeviceArray:
 
     @property
     def nbytes(self) -> int:
-        """Bytes in use."""
+        """Number of bytes of the array's elements."""
         return self.size * self.dtype.itemsize
 
     def get(self) -> NDArray[Any]:
-        """A copy on the host; waits for the device."""
+        """Return a copy on the host; wait for the device."""
         host = np.empty(self.shape, self.dtype)
         self.read_into(host)
         return host
 
     def set(self, values: NDArray[Any]) -> None:
-        """Copy from the host; waits for the device. Raises ValueError if the shape or dtype differs."""
+        """Copy `values` from the host, and wait for the device. Raises ValueError if the shape or dtype differs."""
         self._check(values)
         self._write(values, 0)
 
     def send(self, values: NDArray[Any]) -> None:
-        """Copy from the host without waiting. `values` must not change until the host has waited for the device.
+        """Copy `values` from the host without waiting. They must not change until the host has waited for the device.
 
         Raises ValueError if the shape or dtype differs, or the array is not C-contiguous.
         """
@@ -83,10 +83,12 @@ class DeviceArray:
 
     def _check(self, values: NDArray[Any]) -> None:
         if values.shape != self.shape or values.dtype != self.dtype:
-            raise ValueError(f"got {values.dtype}{values.shape}, expected {self.dtype}{self.shape}")
+            raise ValueError(
+                f"values: got {values.dtype} of shape {values.shape}, expected {self.dtype} of shape {self.shape}"
+            )
 
     def fill(self, value: float) -> None:
-        """Set every element."""
+        """Set every element to `value`."""
         if self.size:
             self.device.calls.fills += 1
             pattern = np.asarray(value, self.dtype)
@@ -103,7 +105,7 @@ class DeviceArray:
             self.device.recorder.add(name, event, self.nbytes if nbytes is None else nbytes)
 
     def read_into(self, host: NDArray[Any]) -> None:
-        """Copy to a C-contiguous array of the same shape on the host; waits for the device."""
+        """Copy to a C-contiguous host array of the same shape, and wait for the device."""
         self._read(host, 0)
 
     def begin_get(self, into: NDArray[Any] | None = None) -> Callable[[], NDArray[Any]]:
@@ -139,25 +141,25 @@ class DeviceArray:
         return finish
 
     def get_rows(self, start: int, stop: int) -> NDArray[Any]:
-        """Return a host copy of the rows [start, stop); `start` needs no alignment. Waits for the device."""
+        """Return a host copy of the rows [start, stop), and wait for the device. `start` needs no alignment."""
         host = np.empty((stop - start, *self.shape[1:]), self.dtype)
         self._read(host, start)
         return host
 
     def set_rows(self, start: int, values: NDArray[Any]) -> None:
-        """Copy from the host to the rows that begin at `start`, which needs no alignment; waits for the device."""
+        """Copy `values` from the host to the rows from `start` on, and wait. `start` needs no alignment."""
         self._write(values, start)
 
     def _read(self, host: NDArray[Any], start: int) -> None:
-        """Fill a host array with the rows that begin at `start`, and wait."""
+        """Fill a host array with the rows from `start` on, and wait for the device."""
         if host.size:
             self.device.calls.blocking_reads += 1
             event = self._copied(_READING, host, self.buffer, src_offset=self._at(start), is_blocking=True)
             self._note("read", event, host.nbytes)
-            self.device.under_way.clear()  # the queue is in order: all earlier work is done
+            self.device.under_way.clear()  # the queue is in order, so that all earlier work is done
 
     def _write(self, values: NDArray[Any], start: int) -> None:
-        """Fill the rows that begin at `start` from a host array, and wait."""
+        """Fill the rows from `start` on with the values of a host array, and wait for the device."""
         if values.size:
             self.device.calls.blocking_writes += 1
             host = np.ascontiguousarray(values, self.dtype)
@@ -166,7 +168,8 @@ class DeviceArray:
             self.device.under_way.clear()
 
     def _copied(self, work: str, *ends: Any, **how: Any) -> cl.Event:
-        """The event of a copy. Raises DriverError or CapacityError if it fails, or a kernel or the device before it."""
+        """Put a copy on the queue, and return its event. Raises DriverError or CapacityError if it or an earlier kernel
+        fails."""
         try:
             return cl.enqueue_copy(self.device.queue, *ends, **how)
         except cl.Error as error:
@@ -200,11 +203,11 @@ def _poison() -> NDArray[np.uint32] | None:
     try:
         return np.array(0x7FC00000 if value == "1" else int(value, 0), np.uint32)
     except (ValueError, OverflowError):
-        raise InputError(f"CLSPLAT_POISON {value}: expected 1, or 32 bits such as 0xff800000") from None
+        raise InputError(f"CLSPLAT_POISON={value}: expected 1, or a 32-bit number such as 0xff800000") from None
 
 
 def _fill_bytes(device: Device, buffer: cl.Buffer, word: NDArray[np.uint32], nbytes: int) -> None:
-    """Fill the buffer's first `nbytes` with the word; bytes after the last whole word get the word's last byte."""
+    """Fill the buffer's first `nbytes` with the word. Bytes after the last whole word get the word's lowest byte."""
     whole = nbytes // 4 * 4
     if whole:
         cl.enqueue_fill_buffer(device.queue, buffer, word, 0, whole)
@@ -213,11 +216,11 @@ def _fill_bytes(device: Device, buffer: cl.Buffer, word: NDArray[np.uint32], nby
 
 
 class _Buffer(cl.Buffer):  # type: ignore[misc]  # no types of its own
-    """A buffer that supports weak references, which the memory account needs."""
+    """An OpenCL buffer that supports weak references, so that the memory account is told when it is freed."""
 
 
 def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity: int = 0) -> DeviceArray:
-    """Allocate a new array with a buffer of at least `capacity` elements.
+    """Allocate a new array, in a buffer of at least `capacity` elements.
 
     Raises CapacityError if the buffer would exceed the device's limit for one buffer, the limit for all buffers
     together (`Device.memory`), or the device's free memory.
@@ -274,8 +277,8 @@ def from_host(device: Device, values: NDArray[Any]) -> DeviceArray:
 
 @dataclass(frozen=True, eq=False)
 class Hosted:
-    """An array that kernels write, and host memory for its values. If the device shares the host's memory, both are the
-    same memory."""
+    """An array that kernels write, and host memory for its values. On a device that shares the host's memory, both are
+    the same memory."""
 
     array: DeviceArray
     _host: NDArray[Any]
@@ -325,16 +328,16 @@ def pinned(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[
 
 
 MAX_COMMAND_BUFFERS_PER_OBJECT = 256
-"""Maximum number of command buffers of an object, enough for photographs of a few sizes. At this number, all command
-buffers are dropped."""
+"""Maximum number of command buffers that a workspace keeps for one object: enough for photographs of a few sizes. At
+this number, all command buffers of the object are dropped."""
 
 
 class Workspace:
     """Scratch arrays by name.
 
-    An array by the same name reuses the buffer of the last call. If that is too small, it is replaced by a buffer of
-    1.5 times the required size, or of exactly that size if memory is `tight`. The workspace also keeps command buffers
-    that use its arrays. They are dropped when one of these arrays gets another buffer.
+    A call of `array` with a name reuses the buffer of the last call with this name. A buffer that is too small is
+    replaced by one of 1.5 times the required size, or of exactly this size if memory is `tight`. The workspace also
+    keeps command buffers that use its arrays. They are dropped when one of these arrays gets another buffer.
     """
 
     def __init__(self, device: Device) -> None:
@@ -370,7 +373,7 @@ class Workspace:
         given: arrays that `make` passes to kernels; for the same key, they may be others of the same shape and type.
         before: function that is called before a replay; `make` does the same itself.
 
-        Inside `make`, a further call only makes: its commands belong to the command buffer that is being recorded.
+        A nested call inside `make` only calls its own `make`, as the outer call records all commands.
         """
         device = self._device
         if self._poison is not None or self._use == "0" or device.command_buffers or not device.replays:
@@ -389,7 +392,7 @@ class Workspace:
             return result
         if known is not None:
             known[1].check(commands, numbers)
-            for read in known[1].reads:  # copy into the memory of the result that is returned
+            for read in known[1].reads:  # copy into the host memory of the result that is returned
                 read()
             return known[0]  # type: ignore[no-any-return]  # as above
         command_buffers = self._command_buffers.setdefault(of, {})
@@ -401,13 +404,13 @@ class Workspace:
     def array(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
     ) -> DeviceArray:
-        """The array of this name, whose contents are undefined until they are written.
+        """The scratch array of this name. Its contents are undefined until they are written.
 
-        kept: True keeps the contents of the last call. The last call for this name must have had the same shape.
+        kept: True keeps the contents that the array had. The last call for this name must have had the same shape.
         """
         latest = self._latest.get(name)
         if latest is not None and latest[0].shape == shape and latest[1] is dtype and self._poison is None:
-            return latest[0]  # the usual case
+            return latest[0]
         kind = np.dtype(dtype)
         elements = prod(shape)
         held = self._arrays.get(name)
@@ -418,7 +421,7 @@ class Workspace:
                 self._forget_command_buffers()
             held = self._arrays.pop(name, None)
             latest = self._latest.pop(name, None)
-            del held, latest  # frees the old buffer first: there may not be room for both
+            del held, latest  # frees the old buffer first: memory may not suffice for both
             held = self._arrays[name] = allocate(self._device, (elements,), kind, max(elements, spare))
         if self._poison is not None and not kept:
             _fill_bytes(self._device, held.buffer, self._poison, elements * kind.itemsize)
@@ -427,7 +430,7 @@ class Workspace:
         return array
 
     def clear(self) -> None:
-        """Release every buffer."""
+        """Release every buffer, and drop all command buffers."""
         self._arrays.clear()
         self._latest.clear()
         self._forget_command_buffers()

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Command buffers: recorded launches, fills and copies. A replay puts them on a device's queue without the Python code
-that made them.
+"""Command buffers: launches, fills and copies, recorded once. A replay puts them on a device's queue again, without the
+Python code that prepared them.
 
 CLSPLAT_TAPES=0 disables replays. CLSPLAT_TAPES=check launches everything as usual and compares each launch with the
 recorded launch. An argument that differs is an error, unless it was passed as `LaunchParameter`.
@@ -51,7 +51,7 @@ def typed(value: Any) -> Any:
 
 
 def described(value: Any) -> object:
-    """A form of an argument for comparison: two arguments have equal forms if the kernel gets the same value."""
+    """A form of a kernel argument for comparison. Two arguments have equal forms if the kernel gets the same value."""
     value = typed(value)
     if isinstance(value, cl.MemoryObjectHolder):
         return value.int_ptr
@@ -62,14 +62,14 @@ class CommandBuffer:
     """Launches, fills and copies to the host, in order.
 
     entries: for each command a function that puts it on the queue, and its kernel if it is a launch.
-    calls: the number of calls of each kind.
+    calls: numbers of the recorded calls, by kind.
     anew: setter and argument index of each launch parameter, which `set` gives a new value.
     reads: the functions of `entries` that copy to the host.
-    given: buffers of the recorded launches, in place of which each replay may use others.
+    given: buffers of the recorded launches that a replay may exchange for others.
 
-    Each launch has its own kernel object, whose other arguments stay set. When a command buffer is dropped, its kernel
-    objects are kept for later command buffers, because pyopencl takes at least 0.2 ms to make a kernel object. A
-    command buffer keeps no array alive: its owner must drop it before one of its arrays is freed.
+    Each launch has its own kernel object, in which the arguments that never change stay set. When a command buffer is
+    dropped, its kernel objects are kept for later command buffers, because pyopencl takes at least 0.2 ms to make one.
+    A command buffer keeps no array alive: its owner must drop it before one of its arrays is freed.
     """
 
     def __init__(self, given: Sequence[cl.Buffer] = ()) -> None:
@@ -81,22 +81,22 @@ class CommandBuffer:
         self._described: list[tuple[object, ...]] = []
         self._numbers: list[float] = []
         self._format, self._set = Struct("="), b""
-        """Layout of the launch parameters, and the bytes that they have now."""
+        """Struct layout of all launch parameters, and the bytes of their present values."""
         self._given = {buffer.int_ptr: number for number, buffer in enumerate(given)}
         self._places: list[tuple[Callable[[int, Any], None], int, int]] = []
-        """Setter and argument index of each given buffer, and its number."""
+        """For each argument that is a given buffer: its setter, its argument index, the buffer's index in `given`."""
 
     def __del__(self) -> None:
         for kernel, own in self._owned:
             kernel.spare.append(own)
 
     def add_fill(self, fill: Callable[[], Any], *description: object) -> None:
-        """Append a fill."""
+        """Append a fill of a buffer."""
         self.entries.append((None, fill))
         self._described.append(("a fill", *description))
 
     def add_read(self, read: Callable[[], Any], *description: object) -> None:
-        """Record a copy from the device to the host."""
+        """Append a copy from the device to the host."""
         self.entries.append((None, read))
         self.reads.append(read)
         self._described.append(("a copy to the host", *description))
@@ -129,7 +129,11 @@ class CommandBuffer:
         self._described.append((kernel.name, kernel.variant, size, local, *description))
 
     def set(self, numbers: Iterable[float], given: Sequence[cl.Buffer] = ()) -> None:
-        """Set the values of the launch parameters, in order, and the buffers in place of those given at first."""
+        """Set the arguments that change for the next replay.
+
+        numbers: values of the launch parameters, in order of their launches.
+        given: buffers that replace the recorded `given`.
+        """
         values, old = self._format.pack(*numbers), self._set
         if values != old:
             for place, (set_bytes, index) in enumerate(self.anew):
@@ -149,12 +153,14 @@ class CommandBuffer:
                 f"a replay of {one[0]} would have other arguments: numbers {[p - 4 for p in differing]}"
             )
         given, made = ([described(number) for number in each] for each in (numbers, fresh._numbers))
-        assert given == made, f"numbers given to a command buffer are {list(numbers)}, launched {fresh._numbers}"
+        assert given == made, (
+            f"numbers given to a command buffer are {list(numbers)}, but the launches got {fresh._numbers}"
+        )
 
     def is_all_of(self, calls: Calls) -> bool:
-        """End the recording. calls: numbers of calls since it began.
+        """End the recording. Returns False if a call was not recorded: a write, or a call for which the host waited.
 
-        Returns False if some of these calls were not recorded: a write, or a call for which the host waited.
+        calls: the numbers of calls on the queue since the recording began.
         """
         self.calls = calls
         self._format = Struct("=" + "".join("f" if isinstance(number, float) else "I" for number in self._numbers))

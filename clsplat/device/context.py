@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The visible devices, and the class of an open device, which has its queue, kernel shape and kernels."""
+"""The list of visible OpenCL devices, and `Device`, an open device with its queue, kernel shape and kernels."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from clsplat.process import undisturbed
 T = TypeVar("T")
 
 SYNC_VARIABLE = "CLSPLAT_SYNC"
-"""Environment variable that makes each launch wait for its kernel. So an error message names the kernel that hangs or
-fails."""
+"""Environment variable that makes each launch wait for its kernel, so that an error message names the kernel that hangs
+or fails."""
 
 
 def all_devices() -> list[cl.Device]:
@@ -69,8 +69,8 @@ class Device:
     calls: the numbers of calls on its queue.
     command_buffers: the command buffers that are being recorded.
     under_way: events and buffers that keep host arrays alive while the device may still read them.
-    part: for a part of a device: the whole device and the part's number.
-    index: position in the list of devices, for a part that of the whole device.
+    part: the whole device and the part's number, if this is a part of a device (`open_devices`); otherwise None.
+    index: position in the list of devices. A part has the position of its whole device.
     atomics_faults: the faults that `probe_atomics` has found, shared by all copies of the device; empty before it runs.
     """
 
@@ -125,7 +125,7 @@ class Device:
 
         registers: maximum registers per work-item, if the driver has an option for it; 0 for no limit.
         """
-        if self._why_another:  # shown only now: until this first use, the self-test may still choose another shape
+        if self._why_another:  # not shown when the device is opened: the self-test may choose another shape until now
             tell_once(self._why_another)
         if self._switches:
             text = kernel_source(stem)
@@ -136,7 +136,7 @@ class Device:
         kernels = self._kernels.get(key)
         if kernels is None:
             if not self._fma:
-                self._fma.append(self._probe_fma())  # in place: copies of a device share it
+                self._fma.append(self._probe_fma())  # appended in place, as copies of a device share the list
             kernels = self._kernels[key] = self._built(stem, {**self._fma[0], **defines}, registers)
         return kernels
 
@@ -170,7 +170,7 @@ class Device:
 
     @property
     def is_another(self) -> bool:
-        """True if this shape was chosen because the driver failed in the preferred shape."""
+        """True if the device has its kernel shape because the driver failed in the preferred shape."""
         return bool(self._why_another)
 
     def switched(self, *names: str) -> bool:
@@ -190,7 +190,7 @@ class Device:
 
     @property
     def row_alignment(self) -> int:
-        """Alignment of views: the first row of a view must be a multiple of this. Rows must have four bytes or more.
+        """Alignment of the first row of a view of an array (`DeviceArray.rows`), in rows of four bytes or more.
 
         OpenCL requires sub-buffers to be aligned, and kernels read whole vectors.
         """
@@ -207,14 +207,14 @@ class Device:
     ) -> cl.Event:
         """Put a kernel on the queue. Wait for it if `wait`, or if CLSPLAT_SYNC=1.
 
-        Raises DriverError, and CapacityError if the device has no memory left for it.
+        Raises DriverError, and CapacityError if the device has no memory left for the kernel.
         """
         try:
             event = kernel.cl_kernel(self.queue, size, local, *values)
             self.calls.launches += 1
             if self.waits:
                 self._wait_for(event, kernel)
-            elif wait:  # then the last kernel in the log is the kernel that failed
+            elif wait:  # so that a kernel that crashes is the last one that the log names
                 self.queue.finish()
                 self.under_way.clear()
         except cl.Error as error:
@@ -229,8 +229,8 @@ class Device:
         return self.trials.error(kernel.variant, kernel.name, f"cannot be launched: {' '.join(str(error).split())}")
 
     def record(self, work: Callable[[], T], given: Sequence[cl.Buffer] = ()) -> tuple[T, CommandBuffer | None]:
-        """The result of `work`, and a command buffer of the commands that it put on the queue; None if they cannot be
-        replayed.
+        """Run `work`. Returns its result, and a command buffer of the commands that `work` put on the queue; None if
+        these cannot be replayed.
 
         given: buffers that a replay may exchange for others (`CommandBuffer`).
         """
@@ -256,7 +256,7 @@ class Device:
 
     @property
     def replays(self) -> bool:
-        """True if command buffers may be replayed; False if each launch is waited for, recorded or only tried."""
+        """True if command buffers may be replayed; False if each launch is waited for, profiled or only tried."""
         return not (self.waits or self.recorder.on or self.only_tries)
 
     def _wait_for(self, event: cl.Event, kernel: Kernel) -> None:
@@ -281,21 +281,22 @@ class Device:
         self.under_way.clear()
 
     def failed(self, work: str, error: cl.Error) -> ClsplatError:
-        """The error of a command that is no launch. A kernel's failure, or a lost device, may show only there."""
+        """The error to raise if a command other than a launch fails. An earlier kernel may be the cause, or a lost
+        device."""
         if isinstance(error, cl.MemoryError):
             return self.used_up(work)
         return DriverError(f"{title(self.cl_device)}: {work} failed ({' '.join(str(error).split())})")
 
     def used_up(self, work: str) -> CapacityError:
-        """The error if the driver finds no memory for something, at its allocation or, with many drivers, at its first
-        use."""
+        """The error to raise if the device has no memory left for `work`. Many drivers report this at the first use of
+        a buffer, not at its allocation."""
         used = amount(self.memory.used)
         return CapacityError(
             f"{self.name} has no memory left for {work}, with {used} in use: set --max-device-mem below {used}"
         )
 
     def timed(self, work: Callable[[], T]) -> tuple[T, float]:
-        """The result of `work`, and the milliseconds that it took. The device is idle before and after."""
+        """Run `work`, and return its result and milliseconds. The device is idle before and after."""
         self.finish()
         start = time.perf_counter()
         result = work()
@@ -303,10 +304,10 @@ class Device:
         return result, 1e3 * (time.perf_counter() - start)
 
     def _probe_fma(self) -> dict[str, object]:
-        """The define FMA_BY_CONTRACTION if the compiler fuses a*b + c in vectors. That is then the fastest way to get
-        the bits of fma.
+        """The define FMA_BY_CONTRACTION if the compiler fuses a*b + c in vectors, which is the fastest way to the bits
+        of fma. Otherwise no define.
 
-        Without vectors it is never set: Intel's runtime vectorises loops by itself, and then fuses only some of the
+        Without vectors the result is empty: Intel's runtime vectorises loops by itself, and then fuses only some of the
         multiply-adds.
         """
         if self.shape.lanes == 1:
@@ -317,7 +318,7 @@ class Device:
         return fused if np.all(results == np.float32(2.0**-24)) else {}
 
     def _with_subgroups(self) -> dict[str, object]:
-        """The first defines of `subgroup_ways` with which items exchange the right values. Raises DeviceError."""
+        """The first defines in `subgroup_ways` with which items exchange the right values. Raises DeviceError."""
         if self._subgroups:
             return self._subgroups[0]
         for defines in subgroup_ways(self.cl_device):
@@ -330,7 +331,7 @@ class Device:
             except (KernelBuildError, DriverError):
                 continue
             if np.array_equal(got, wanted):
-                self._subgroups.append(defines)  # in place: copies of a device share it
+                self._subgroups.append(defines)  # appended in place, as copies of a device share the list
                 return defines
         raise DeviceError(
             f"{title(self.cl_device)}: items of a sub-group do not exchange the right values; choose a shape without "
@@ -340,7 +341,7 @@ class Device:
     def _probed(
         self, kernel: Kernel, items: int, shape: int | tuple[int, ...], *numbers: object
     ) -> NDArray[np.float32]:
-        """The array of this shape that the kernel writes, in a single group of `items` work-items.
+        """Run a probe kernel in one group of `items` work-items, and return the array of this shape that it writes.
 
         numbers: further arguments of the kernel.
         """

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Host memory for arrays that a device writes and callers keep. Freed memory is reused.
+"""Allocator of page-aligned host memory for arrays that a device writes and callers keep.
 
-Each new page costs a page fault: for 20 MB these take as long as the projection of 100,000 Gaussians.
+Freed memory is reused, because each new page costs a page fault. For 20 MB the page faults take as long as the
+projection of 100,000 Gaussians.
 """
 
 from __future__ import annotations
@@ -15,16 +16,16 @@ from numpy.typing import NDArray
 HOST_ALIGNMENT_BYTES = 4096
 """Alignment of the memory in bytes. Drivers use memory with this alignment in place instead of copying it."""
 MIN_RECYCLED_BYTES = 1 << 18
-"""Minimum bytes of memory that is kept for reuse. For less, reuse saves no time."""
+"""Minimum size in bytes of a block that is kept for reuse. For smaller blocks, reuse saves no time."""
 MAX_IDLE_BYTES = 1 << 28
-"""Maximum bytes kept for reuse."""
+"""Maximum bytes of all freed blocks together that are kept for reuse."""
 
 _lock = threading.Lock()
 _idle: list[NDArray[np.uint8]] = []
 
 
 def host_bytes(count: int) -> NDArray[np.uint8]:
-    """Uninitialised bytes (count,), aligned to HOST_ALIGNMENT_BYTES. They are freed with the last array that uses
+    """Uninitialised bytes (count,), aligned to HOST_ALIGNMENT_BYTES. They are freed with the last array that views
     them."""
     size = -(-count // HOST_ALIGNMENT_BYTES) * HOST_ALIGNMENT_BYTES
     if size < MIN_RECYCLED_BYTES:
@@ -34,7 +35,7 @@ def host_bytes(count: int) -> NDArray[np.uint8]:
 
 
 def _found(size: int) -> NDArray[np.uint8] | None:
-    # A finalizer may call this function while this thread holds the lock. It then gets new memory instead of waiting.
+    # A finalizer may call this function while this thread holds the lock. None makes the caller allocate new memory.
     if not _lock.acquire(blocking=False):
         return None
     try:
@@ -47,14 +48,14 @@ def _found(size: int) -> NDArray[np.uint8] | None:
 
 
 class _Block:
-    """Memory of arrays. NumPy keeps this object alive as long as one of the arrays exists."""
+    """Owner of a block of host memory. NumPy keeps this object alive as long as an array in the block exists."""
 
     def __init__(self, raw: NDArray[np.uint8]) -> None:
         self._raw = raw
         self.__array_interface__: dict[str, Any] = raw.__array_interface__
 
     def __del__(self) -> None:
-        # An array may be deleted while this thread holds the lock. Its memory is then not reused.
+        # An array may be deleted while this thread holds the lock. Then the block is freed instead of kept for reuse.
         if not _lock.acquire(blocking=False):
             return
         try:

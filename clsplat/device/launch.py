@@ -28,7 +28,7 @@ _RECOMPILED_SIZE_ITEMS = 1 << 16
 def only_tried(device: Device) -> Iterator[None]:
     """Inside the block, launches only try the kernel in the sandbox, if that is necessary; nothing runs on the device.
 
-    So if a driver fails in a trial, no array has been changed yet.
+    So no array has been changed yet if a driver fails in a trial.
     """
     device.only_tries = True
     try:
@@ -38,7 +38,7 @@ def only_tried(device: Device) -> Iterator[None]:
 
 
 def _values(arguments: tuple[Any, ...]) -> list[Any]:
-    """The arguments converted for the kernel: whole numbers become 32 bits, signed or unsigned."""
+    """The arguments as OpenCL takes them: arrays become buffers, and whole numbers are cut to 32 bits."""
     return [
         argument.buffer
         if (kind := type(argument)) is DeviceArray
@@ -48,7 +48,7 @@ def _values(arguments: tuple[Any, ...]) -> list[Any]:
 
 
 def _type(value: Any) -> Any:
-    """The type of an argument for pyopencl; None if it is not a scalar."""
+    """The NumPy type of a scalar kernel argument, for pyopencl; None for other arguments."""
     if isinstance(value, int):
         return np.uint32
     if isinstance(value, float):
@@ -57,9 +57,10 @@ def _type(value: Any) -> Any:
 
 
 def form_of(device: Device, size: tuple[int, ...], local: tuple[int, ...] | None) -> str:
-    """The kind of launch by size, for a driver that compiles a kernel anew for each kind; usually empty.
+    """Words for the size of a launch, if the driver compiles a kernel anew for some sizes; otherwise empty.
 
-    The group size is not part of it: a group size may be an image's width, and each width would then need a trial.
+    A kernel has a trial for each of these words. The group size is not among them: it may be an image's width, and each
+    width would then need a trial.
     """
     if not device.compiles_by_size:
         return ""
@@ -84,7 +85,7 @@ def _first(
         raise device.trials.fail(
             kernel.variant,
             kernel.name,
-            f"has {prod(local)} items in a group, but the driver allows {most}",
+            f"has {prod(local)} items in a group, but the driver allows at most {most}",
         )
     typed = [value if kind is None else np.dtype(kind).type(value) for kind, value in zip(types, values, strict=True)]
     device.trials.launch(kernel, size, local, typed, form)
@@ -122,7 +123,8 @@ def launch_items(device: Device, kernel: Kernel, items: int, *arguments: Any) ->
 def launch_groups(
     device: Device, kernel: Kernel, groups: int | tuple[int, int, int], items: int, *arguments: Any
 ) -> None:
-    """Launch work-groups of `items` work-items. groups: their number, or the sizes of a grid. 0 launches nothing."""
+    """Launch work-groups of `items` work-items. groups: number of groups, or numbers along the three axes of a grid. 0
+    launches nothing."""
     first, *further = groups if isinstance(groups, tuple) else (groups,)
     if all((first, *further)):
         _enqueue(device, kernel, (first * items, *further), (items, *(1 for _ in further)), arguments)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Account of a device's memory: bytes in use, and the limit."""
+"""Memory account of a device: the bytes of its buffers, their peak, and the limit of --max-device-mem."""
 
 from __future__ import annotations
 

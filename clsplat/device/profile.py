@@ -16,7 +16,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 TRANSFERS_STAGE = "transfers"
-"""Name for work outside all stages: copies of the camera and the background."""
+"""Name under which work outside all stages is recorded: copies of the camera and the background."""
 
 
 @dataclass
@@ -69,8 +69,7 @@ class Calls:
 
 
 class Recorder:
-    """The recorder of a device. Inside `recording` it records every launch and transfer, by stage; otherwise it is
-    off."""
+    """Recorder of a device's launches and transfers, by stage. It is on only inside a `recording` block."""
 
     def __init__(self, queue: cl.CommandQueue) -> None:
         self._queue = queue
@@ -137,7 +136,7 @@ D = TypeVar("D", bound=Recorded)
 
 
 UPDATED_ARRAYS_BY_KERNEL: dict[str, int] = {}
-"""Number of array arguments that a kernel reads and writes, by the kernel's name. They are its last arguments."""
+"""Number of arrays that a kernel both reads and writes, by the kernel's name. They are its last array arguments."""
 
 
 def stage(name: str, **updated: int) -> Callable[[Callable[Concatenate[D, P], R]], Callable[Concatenate[D, P], R]]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel builds, once per source and set of defines."""
+"""Building of OpenCL programs from kernel files: source text, defines and options, compilation, built kernels."""
 
 from __future__ import annotations
 
@@ -31,14 +31,15 @@ class Variant:
 
     @cached_property
     def digest(self) -> str:
-        """A name that is unique to the text and options."""
+        """Hexadecimal digest that identifies the text and options."""
         text = "\0".join((self.stem, self.source, *self.options))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def anew(self, salt: str) -> Variant:
-        """The same kernels with a text that no driver has cached, because a cache entry may be of an aborted build.
+        """The same kernels in a text that no driver has cached, because a cached build may have been aborted.
 
-        The text differs in more than a comment, as PoCL's cache is keyed by the preprocessor's output.
+        salt: random hexadecimal digits, which become part of the text; empty leaves the text as it is. They are in a
+        typedef, not in a comment, because PoCL's cache is keyed by the preprocessor's output.
         """
         return replace(self, source=f"{self.source}typedef int anew_{salt};\n") if salt else self
 
@@ -50,7 +51,7 @@ def variant_of(stem: str, defines: Mapping[str, object], options: str) -> Varian
 
 
 def text_of(stem: str) -> str:
-    """The source of a kernel file, modified by BREAK_KERNEL_VARIABLE if set. Raises InputError if that is invalid."""
+    """The source of a kernel file, modified by CLSPLAT_BREAK_KERNEL if set. Raises InputError if that is invalid."""
     source = kernel_source(stem)
     wanted = os.environ.get(BREAK_KERNEL_VARIABLE)
     if not wanted:
@@ -67,15 +68,15 @@ def text_of(stem: str) -> str:
     if where.strip() != stem:
         return source
     if old not in source:
-        raise InputError(f"{BREAK_KERNEL_VARIABLE}={wanted}: {stem}.cl has no such words")
+        raise InputError(f"{BREAK_KERNEL_VARIABLE}={wanted}: {stem}.cl does not contain {old}")
     return source.replace(old, new)
 
 
 def build(context: cl.Context, device: cl.Device, variant: Variant) -> tuple[cl.Program, str]:
     """Compile a kernel file. Returns the program, and the salt (`Variant.anew`) that its build needed, usually empty.
 
-    A failed build is repeated once, with a text that is unique to this process. The reasons: an aborted build leaves a
-    program without kernels in PoCL's cache, and another process that builds the same text may remove its files there.
+    A failed build is repeated once, with a text that is unique to this process. PoCL's cache has two faults: it may
+    hold a program without kernels from an aborted build, and another process may remove files of a build under way.
 
     Raises KernelBuildError with the device, options, log and source; and DriverError for a program without kernels.
     """
@@ -135,7 +136,7 @@ class Kernel:
 
 
 class Kernels:
-    """The kernels of a source file with certain defines, as attributes. Each kernel object is made once."""
+    """The built kernels of a kernel file with certain defines. Each kernel is an attribute, by its name."""
 
     def __init__(self, variant: Variant, program: cl.Program) -> None:
         self._kernels = {kernel.function_name: Kernel(variant, program, kernel) for kernel in program.all_kernels()}

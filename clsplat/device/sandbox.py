@@ -32,13 +32,13 @@ from clsplat.device.program import Kernel, Variant, text_of
 from clsplat.errors import DriverError
 
 SANDBOX_IDLE_SECONDS = 20.0
-"""Seconds after which an idle sandbox process is ended: it occupies device memory, and starts again in 0.5 s."""
+"""Seconds after which an idle sandbox process is ended, as it occupies device memory. The next one starts in 0.5 s."""
 MAX_TRIAL_BYTES = 2 << 30
-"""Maximum bytes of the arrays of a launch that is tried. With more the kernel is only built, as memory may not suffice
-for the arrays in both processes."""
+"""Maximum bytes of a launch's arrays for which the launch is tried. With larger arrays the kernel is only built, as
+memory may not suffice for the arrays in both processes."""
 MAX_TRIAL_ITEMS = 1 << 17
-"""Maximum work-items along each axis of a launch that is tried, which takes almost no time. For larger launches PoCL
-compiles the same code; for fewer than 65,536 items it compiles other code."""
+"""Maximum work-items along each axis of a trial launch. Such a launch takes almost no time. PoCL compiles the same code
+for larger launches, but other code for fewer than 65,536 items."""
 
 
 class _Process:
@@ -51,9 +51,10 @@ class _Process:
         self._timer: threading.Timer | None = None
 
     def ask(self, trial: Mapping[str, Any]) -> dict[str, Any]:
-        """The outcome of a trial, as `sandbox_worker` sends it. `lasting` is False if the failure is not the driver's.
+        """Run a trial and return its outcome, as `sandbox_worker` sends it.
 
-        A crash counts only if a second try crashes too, as another program may have killed the driver's linker.
+        If the process ends without an answer, `lasting` in the outcome says whether the driver is to blame. A crash
+        counts only if a second try crashes too, as another program may have killed the driver's linker.
         Raises TrialInterrupted, and DriverError if the process cannot be started.
         """
         try:
@@ -64,7 +65,8 @@ class _Process:
                     raise
                 return self._once(trial)
         except WorkerEndedError as ended:
-            return {"memory": ended.killed, "trouble": f"the process that tried it {ended}", "lasting": ended.crashed}
+            trouble = f"fails its trial: the sandbox process {ended}"
+            return {"memory": ended.killed, "trouble": trouble, "lasting": ended.crashed}
 
     def _once(self, trial: Mapping[str, Any]) -> dict[str, Any]:
         with self._lock:
@@ -117,9 +119,9 @@ class KernelTrials:
 
     @cached_property
     def known(self) -> dict[str, str]:
-        """Names of the builds and launches that passed, with the salt (`Variant.anew`) that each text needs.
+        """The builds and launches that passed, by name, each with the salt (`Variant.anew`) that its text needs.
 
-        In a worker process: names of the builds and launches that have begun.
+        In a worker process: the builds and launches that have begun, without salts.
         """
         return {} if regardless() else dict(driver_records.entry(self._device, self._shape).kernels)
 
@@ -143,11 +145,11 @@ class KernelTrials:
             self._try(kernel.variant, kernel.name, f"{kernel.variant.digest} {kernel.name}{form}", {"launch": launch})
 
     def built(self, variant: Variant, salt: str) -> None:
-        """Record the salt that the build in this process needed."""
+        """Record the salt (`Variant.anew`) that the build in this process needed."""
         self.known[variant.digest] = salt or self.known[variant.digest]
 
     def _try(self, variant: Variant, kernel: str, name: str, asked: Mapping[str, Any] = {}) -> None:
-        """Try a build, or the launch in `asked`, in the sandbox. Nothing happens if the driver's record has `name`."""
+        """Try a build, or the launch in `asked`, in the sandbox, unless a trial of this name has passed before."""
         if regardless():
             self.known.setdefault(name, "")
             if self.say is not None:
@@ -159,18 +161,18 @@ class KernelTrials:
             raise DriverError(self._failed[name])
         text = variant.anew(self.known.get(variant.digest, ""))
         answer = _process(self._index).ask({"build": asdict(text), **asked})
-        if answer.get("memory"):  # not the driver's fault; the trial is not repeated
+        if answer.get("memory"):  # not the driver's fault: this process goes on as if the trial had passed
             driver_records.tell_once(
                 f"{self._device.name.strip()}: not enough memory to try every kernel in a separate process before its "
-                "first use"
+                "first use, so kernels are used without this trial"
             )
         elif trouble := answer.get("trouble"):
             trial = {**asked, "name": name, "build": {"stem": variant.stem, "options": variant.options}}
             error = self.fail(variant, kernel, trouble, trial, lasting=answer.get("lasting", True))
-            self._failed[name] = str(error)  # this process will not try it again
+            self._failed[name] = str(error)  # so that this process does not repeat the trial
             raise error
         self.known[name] = str(answer.get("salt", ""))
-        if "salt" in answer:  # not set if the compiler reports an error: it will do so here too
+        if "salt" in answer:  # there is no salt if the compiler refuses the text; this process gets the same error
             driver_records.remember(self._device, self._shape, kernels={name: self.known[name]})
 
     def fail(

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sandbox process, which tries kernels. If the driver crashes, it ends this process and not the caller's."""
+"""Main module of the sandbox process, which builds and launches kernels for trial. A crash of the driver ends this
+process, and not the process that wants the kernels."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ from clsplat.errors import DriverError, KernelBuildError
 
 
 def _given(context: cl.Context, queue: cl.CommandQueue, kind: str, value: Any) -> Any:
-    """The kernel argument that `_described` encoded; a buffer is filled with zeros."""
+    """Make the kernel argument that `sandbox._described` encoded. A buffer is filled with zeros."""
     if kind == "local":
         return cl.LocalMemory(value)
     if kind != "buffer":
@@ -38,7 +39,10 @@ class _Stage:
         self._kernels: dict[str, dict[str, Any]] = {}
 
     def answer(self, message: dict[str, Any]) -> dict[str, Any]:
-        """Build a kernel file, and launch a kernel if requested."""
+        """Build the kernel file that a message names, and launch a kernel if the message asks for it.
+
+        Returns the answer that `sandbox.KernelTrials` expects: `salt`, or the reason why the trial failed.
+        """
         text = message["build"]
         variant = Variant(text["stem"], text["source"], tuple(text["options"]))
         try:
@@ -68,7 +72,8 @@ class _Stage:
 
 
 def _serve(index: int) -> None:
-    """Answer messages until the parent ends. This process then ends even if a driver hangs."""
+    """Answer the parent's messages until its pipe is closed. If a driver hangs, this process ends after 1.5 times the
+    message's time limit, with a traceback."""
     stage = None
     for line in sys.stdin:
         message = json.loads(line)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The list of devices, selection of devices from it, and their opening, once for each device."""
+"""The list of OpenCL devices, their selection by --device or CLSPLAT_DEVICE, and their opening, once each."""
 
 from __future__ import annotations
 
@@ -100,14 +100,14 @@ def find_device(selector: str | None) -> DeviceInfo:
 
 
 def _names(selector: str | None) -> list[str]:
-    """The selectors in `selector`, which are separated by commas. Raises DeviceError if it is not text."""
+    """The selectors in a list that is separated by commas. Raises DeviceError if `selector` is not text."""
     if not isinstance(selector, str | None):
         raise DeviceError(f"device is {selector!r}, expected text, such as '0', 'gpu' or a part of a name")
     return device_names(selector)
 
 
 def _part_of(name: str) -> tuple[str, int | None]:
-    """NAME and NUMBER of a part, written NAME/NUMBER; the number is None for a whole device."""
+    """Split the selector NAME/NUMBER of a part of a device. The number is None for the selector of a whole device."""
     whole, slash, number = name.rpartition("/")
     return (whole, int(number)) if slash and whole and number.isdigit() else (name, None)
 
@@ -147,11 +147,11 @@ def open_devices(
 ) -> list[Device]:
     """Open the devices of a list of selectors (see `select`), separated by commas.
 
-    NAME/K is part K, from 0, of a device. OpenCL divides the device into max(2, largest K + 1) equal parts.
+    NAME/K selects part K of a device, counted from 0. OpenCL divides the device into max(2, largest K + 1) equal parts.
     Without a limit, repeated calls return the same object for the same device.
 
     memory_limit: maximum bytes of all buffers of each returned device.
-    profile: make queues that record timings.
+    profile: True makes queues that record timings.
     Raises DeviceError if a device is named twice.
     """
     chosen: list[tuple[int, int | None]] = []

@@ -24,8 +24,8 @@ def kernel_root() -> Path:
 def kernel_source(stem: str) -> str:
     """The text of `stem`.cl, with each `#include "..."` (relative to the kernel root) inserted once.
 
-    Drivers cache builds by the source text. So headers are inserted here, instead of by the compiler's `-I`, and their
-    changes are noticed.
+    Headers are inserted here, not by the compiler's `-I`. Drivers cache builds by the source text, and would otherwise
+    miss a change of a header.
     """
     seen: set[str] = set()
     lines: list[str] = []

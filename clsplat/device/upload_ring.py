@@ -15,16 +15,18 @@ from clsplat.device.context import Device
 from clsplat.errors import CapacityError
 
 UPLOAD_RING_SLOTS = 3
-"""Number of slots: for the array in use, for the array of the work queued next, and for the array being uploaded."""
+"""Number of slots of a ring: one each for the array in use, the array that the next work uses, and the array being
+uploaded."""
 
 
 @dataclass(eq=False)
 class _Slot:
     """Memory for an array on the device, and pinned memory of the same size on the host.
 
-    key: key of the array in the slot.
+    key: the caller's key of the uploaded array (`UploadRing.begin`).
+    held: the uploaded array, in the memory of `array`.
     arrived: event of the copy to the device.
-    used: event of the last launch that uses the array.
+    used: event of the last launch that uses the uploaded array.
     """
 
     array: DeviceArray
@@ -36,8 +38,8 @@ class _Slot:
 
 
 class UploadRing:
-    """Memory for UPLOAD_RING_SLOTS arrays of at most `nbytes` each. Raises CapacityError if there is not enough
-    memory."""
+    """A ring of UPLOAD_RING_SLOTS arrays, at most `nbytes` bytes each, that are uploaded before the device needs them.
+    Raises CapacityError if there is not enough memory."""
 
     def __init__(self, device: Device, nbytes: int) -> None:
         self._device, self.nbytes = device, nbytes
@@ -51,7 +53,8 @@ class UploadRing:
         """The slots, in order of their last use; the least recently used is first."""
 
     def begin(self, key: object, values: NDArray[Any]) -> None:
-        """Start to upload an array, for `take`. Nothing happens if it is too large or its upload has already begun."""
+        """Start to upload an array, which `take` returns by its key. Arrays that are too large or already in the ring
+        are skipped."""
         if values.nbytes > self.nbytes or any(slot.key == key for slot in self._slots):
             return
         done = cl.enqueue_marker(self._device.queue)
@@ -75,7 +78,7 @@ class UploadRing:
     def take(self, key: object) -> DeviceArray | None:
         """The uploaded array with this key, for later launches; None if it was not uploaded.
 
-        It is valid until UPLOAD_RING_SLOTS - 1 other arrays have been uploaded or taken.
+        The array is valid until UPLOAD_RING_SLOTS - 1 other arrays have been uploaded or taken.
         """
         for slot in self._slots:
             if slot.key == key and slot.arrived is not None:
@@ -91,5 +94,5 @@ class UploadRing:
 
     @property
     def taken(self) -> int:
-        """Bytes on the device."""
+        """Bytes of device memory that the ring occupies."""
         return UPLOAD_RING_SLOTS * self.nbytes

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps between the kernels and a frame's file: windows, filters, samples, warps, strips and deep pictures."""
+"""Steps between the kernels and a frame's file: windows, filters, samples, lens warps, strips and deep pictures."""

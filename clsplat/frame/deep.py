@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Deep pictures: rendered by the kernels, averaged over samples of shutter and lens, and warped (docs/pictures.md).
 
-A `DrawDeep` returns the slices of a camera's picture as planes (bins, DEEP_FLOATS, H, W): premultiplied red, green and
-blue, alpha, and depth. Pixels with fewer slices have zeros after the last slice.
+A `DrawDeep` returns the slices of a camera's picture by depth, as planes (bins, DEEP_FLOATS, H, W): premultiplied red,
+green and blue, alpha, and depth. A pixel with fewer slices than `bins` has zeros after its last slice.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from clsplat.stages.deep import DEEP_FLOATS
 from clsplat.stages.deep_merge import deep_merge, merge_bytes
 
 DrawDeep = Callable[[Camera], Float32]
-"""Function from a camera to the planes of its picture. The planes may be a view of another array."""
+"""Function from a camera to the planes of its deep picture. The planes may be a view of another array."""
 Convert = Callable[[Float32, Float32], Float32]
 """Function from premultiplied rgb (h, w, 3) and its alpha (h, w) to rgb in another colour space."""
 Weighted = tuple[Float32, Float32]
-"""Planes of a picture, and weights (H, W) of its pixels."""
+"""Planes of a deep picture, and weights (H, W) of its pixels."""
 _MERGE_MEMORY_DIVISOR = 16
-"""The device's memory limit divided by this is the limit of a merge. Rendering uses the rest."""
+"""Divisor of the device's memory limit that gives the limit of a merge. Rendering uses the rest."""
 _WARP_BATCH_PIXELS = 1 << 14
 """Number of pixels that are warped at a time, which limits the memory on the host."""
 
 
 def render_deep(renderer: Renderer, gaussians: Gaussians, camera: Camera, bins: int) -> Float32:
-    """Slices (bins, H, W, 5) of a camera's picture. The camera may have a window."""
+    """Render the slices (bins, H, W, 5) of a camera's picture by depth. The camera may have a window."""
     larger, rows, columns = on_tiles(camera)
     return renderer.render_deep(gaussians, larger, bins)[:, rows, columns]
 
@@ -62,13 +62,13 @@ def deep_in_strips(draw: DrawDeep, rows: Callable[[Camera], int]) -> DrawDeep:
 
 
 def deep_converted(draw: DrawDeep, convert: Convert) -> DrawDeep:
-    """A DrawDeep of the planes with colours in another colour space."""
+    """A DrawDeep that converts the colours of `draw` to another colour space."""
 
     def drawn(camera: Camera) -> Float32:
         planes = np.array(draw(camera))
         alpha = planes[:, 3]
         there = alpha > 0
-        # plane by plane: a quarter faster than a mask over three planes
+        # one plane at a time, which takes a quarter less time than a mask over three planes
         rgb = np.stack([planes[:, channel][there] for channel in range(3)], axis=1)
         converted = convert(rgb[None], alpha[there][None])[0]
         for channel in range(3):
@@ -79,7 +79,7 @@ def deep_converted(draw: DrawDeep, convert: Convert) -> DrawDeep:
 
 
 class Merge:
-    """Function that averages deep pictures, with weights for each pixel. Colours must be linear."""
+    """Weighted mean of deep pictures on the device, with weights for each pixel. Colours must be linear."""
 
     def __init__(self, device: Device, bins: int) -> None:
         self.bins, self._device, self._work = bins, device, Workspace(device)
@@ -87,9 +87,9 @@ class Merge:
         self._pixels = max(limit // merge_bytes(DEEP_PICTURES, bins), TILE)
 
     def __call__(self, pictures: Iterable[Weighted]) -> Float32:
-        """The weighted mean of one or more pictures. For each pixel the sum of weights must be 1.
+        """Merge one or more pictures into their weighted mean. For each pixel the sum of weights must be 1.
 
-        To limit memory, groups of pictures are merged, and then the results of these merges.
+        To limit memory, groups of pictures are merged first, and then the means of the groups.
         """
         groups = list(self._groups(pictures))
         return groups[0][0] if len(groups) == 1 else self(groups)
@@ -114,7 +114,9 @@ class Merge:
 
 
 def deep_sampled(draws: Sequence[DrawDeep], cameras: Sequence[Camera], merge: Merge) -> DrawDeep:
-    """A DrawDeep of the mean over samples. Of the camera that is passed to it, only size and window are used.
+    """A DrawDeep of the mean over samples of shutter and lens.
+
+    Of the camera that the DrawDeep is called with, only size and window are used.
 
     draws, cameras: for each sample, a DrawDeep and a camera of the whole frame.
     """
@@ -128,10 +130,10 @@ def deep_sampled(draws: Sequence[DrawDeep], cameras: Sequence[Camera], merge: Me
 
 
 def deep_warped(draw: DrawDeep, warp: Warp, merge: Merge) -> DrawDeep:
-    """A DrawDeep of warped pictures. Of the camera that is passed to it, only size and window are used.
+    """A DrawDeep of warped pictures. Of the camera that it is called with, only size and window are used.
 
-    A pixel is the mean over `Warp.samples` by `Warp.samples` positions, each interpolated bilinearly: the negative
-    weights of a cubic filter would give invalid slices. Pixels in which nothing is visible have no slices.
+    A pixel is the mean over `Warp.samples` by `Warp.samples` positions, each interpolated bilinearly, because the
+    negative weights of a cubic filter would give invalid slices. Pixels in which nothing is visible have no slices.
     """
 
     def bent(camera: Camera) -> Float32:

@@ -27,8 +27,8 @@ from clsplat.images.frame_files import MAX_HALF_FLOAT, FrameFileHeader, deep_spe
 from clsplat.images.writing import write_rows
 
 _ENCODE_BATCH_PIXELS = 1 << 16
-"""Number of pixels that are encoded at a time, which limits the memory on the host and gives every thread of the
-encoder some rows."""
+"""Number of pixels that are encoded at a time: few enough to limit the memory on the host, and enough to give every
+thread of the encoder some rows."""
 
 
 def write_deep(
@@ -49,7 +49,7 @@ def write_deep(
     """
     encoding, header = encoding or Encoding(), header or FrameFileHeader()
     if path.suffix.lower() != ".exr":
-        raise InputError(f"{path}: deep samples need an .exr file")
+        raise InputError(f"{path}: deep samples need an .exr file, but the name ends in {path.suffix!r}")
     spec = deep_spec(camera.width, camera.height, encoding, header)
     seen: list[bool] = []
 
@@ -72,14 +72,14 @@ def write_deep(
 def _samples(
     slices: Float32, convert: Convert | None, *, half: bool
 ) -> tuple[NDArray[np.int32], dict[str, NDArray[Any]]]:
-    """The number of samples in each pixel, and the samples' values by channel, pixel after pixel.
+    """The number of samples in each pixel (h, w), and the samples' values by channel, pixel after pixel.
 
-    slices: planes of a few rows.
+    slices: planes (bins, DEEP_FLOATS, h, w) of a few rows.
     """
     _, floats, height, width = slices.shape
     planes = np.ascontiguousarray(slices.swapaxes(0, 1)).reshape(floats, -1)
     counts = (slices[:, 3] > 0).sum(axis=0, dtype=np.int32)
-    # in each pixel, the used slices precede the empty ones: sample k of pixel p is at k H W + p
+    # a pixel's used slices precede its empty ones, so that sample k of pixel p is at index k h w + p of a plane
     first = np.cumsum(counts.ravel(), dtype=np.int64) - counts.ravel()
     pixels = np.repeat(np.arange(height * width), counts.ravel())
     at = (np.arange(len(pixels)) - first[pixels]) * (height * width) + pixels

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The type `Draw`, a function that renders channels of a camera's picture, and the Draw that calls the kernels."""
+"""The type `Draw`, a function that renders channels of a camera's picture, and the `Draw` that calls the kernels."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from clsplat.rendering.renderer import OBJECTS_PER_COVERAGE_PASS, Renderer
 from clsplat.stages.channels import Features
 
 Planes = dict[str, NDArray[Any]]
-"""Channels by name, (height, width) or (height, width, floats). rgb is composited over the background; over black, that
-is rgb premultiplied by alpha."""
+"""Channels by name, (height, width) or (height, width, floats). rgb is composited over the background. Over black it is
+premultiplied by alpha."""
 Draw = Callable[[Camera, Collection[str]], Planes]
 """Function from a camera and the names of channels to their planes."""
 
@@ -43,7 +43,7 @@ def drawn_by(
     moved, earlier: Gaussians at the end of motion and of backward motion; None if they do not move.
     mattes: mattes by channel name.
 
-    Planes may be non-contiguous. The encoder, which may run in another thread, makes them contiguous.
+    The planes may be non-contiguous, as the encoder makes them contiguous, perhaps in another thread.
     """
 
     def draw(camera: Camera, names: Collection[str]) -> Planes:
@@ -90,15 +90,15 @@ def in_two(light: Draw, rest: Draw) -> Draw:
 
 
 def feature_floats(names: Collection[str]) -> int:
-    """Floats per Gaussian that are blended for these channels; 0 for colour alone."""
+    """Number of floats per Gaussian that are blended for these channels in addition to colour."""
     _, rest = light_and_rest(names)
     floats = Features.of(feature_names(rest)).floats if rest else 0
     return max(floats, OBJECTS_PER_COVERAGE_PASS) if any(name in CRYPTOMATTE_CHANNELS for name in names) else floats
 
 
 def on_tiles(camera: Camera) -> tuple[Camera, slice, slice]:
-    """A camera whose picture is extended to begin at a tile border of its frame; and the rows and columns of the
-    original picture in it."""
+    """Extend a camera's picture so that it begins at a tile border of its frame. Returns the camera of the larger
+    picture, and the rows and columns of the original picture in it."""
     if camera.window is None:
         return camera, slice(None), slice(None)
     left, top = camera.window.x % TILE, camera.window.y % TILE

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame's holdout, resampled for the rendered pictures: windows, strips and supersampled pictures."""
+"""Resampling of a frame's holdout to the pixels of the pictures that are rendered: windows, strips, supersampled
+pictures."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from clsplat.images.holdouts import Holdout, Surfaces
 class Cut:
     """Function that returns the surfaces of a frame's holdout in a camera's picture.
 
-    The last result is cached, because all samples of a shutter or lens have the same picture.
+    The last result is cached, because it is the same for all samples of shutter and lens.
     """
 
     def __init__(self, holdout: Holdout) -> None:
@@ -21,9 +22,9 @@ class Cut:
         self._last: Surfaces | None = None
 
     def __call__(self, camera: Camera) -> Surfaces | None:
-        """The surfaces of each pixel of the picture, with depths as in the kernels; None if there are none.
+        """The holdout surfaces of each pixel of the picture, with depths as in the kernels; None if no pixel has any.
 
-        A pixel has the surfaces of the holdout's pixel that contains it.
+        A pixel gets the surfaces of the holdout's pixel that contains its top left corner.
         """
         window, holdout = camera.window, self._holdout
         x, y, across, down = (
@@ -43,7 +44,8 @@ class Cut:
 
     @property
     def goes_on(self) -> bool:
-        """True if surfaces touch an edge of the frame, and the file has no pixels beyond this edge."""
+        """True if the holdout may continue outside the frame: surfaces touch an edge, and the file has no pixels
+        beyond it."""
         counts, (width, height) = self._holdout.surfaces.counts, self._holdout.size
         left, top = -self._holdout.x, -self._holdout.y
         right, bottom = left + width - counts.shape[1], top + height - counts.shape[0]

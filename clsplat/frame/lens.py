@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Warps: the position of each pixel of a distorted picture in a straight picture, by an STMap or a photograph's lens.
+"""Lens distortion of rendered frames: where a distorted picture's pixels lie in a straight picture, by an STMap or a
+photograph's lens.
 
-The straight picture is rendered as far as these positions reach, also beyond the frame. `warp` samples it.
+The straight picture is rendered as far as these positions reach, also beyond the frame. Module `warp` samples it.
 """
 
 from __future__ import annotations
@@ -18,18 +19,18 @@ from clsplat.images.stmap import StMap
 from clsplat.scenes.dataset import Lens
 
 MAX_BEYOND_EDGE_FRAMES = 1.0
-"""Maximum distance of a position beyond an edge of the straight frame, in frame sizes. Farther out nothing is visible,
-because the values of a map may be arbitrary there."""
+"""Maximum distance of a position beyond an edge of the straight frame, in frame sizes. Pixels with a larger distance
+show nothing, because the values of a map may be arbitrary there."""
 PLACE_STEP_PX = 2.0**-20
-"""Positions are rounded to multiples of this, in pixels, so that subtraction of a window's corner is exact."""
+"""Step in pixels to whose multiples positions are rounded, so that subtraction of a window's corner is exact."""
 INTERPOLATION_MARGIN_PX = 2
 """Number of pixels on each side of a position that the interpolation reads."""
 PROBE_GRID_SIDE = 33
-"""Number of positions across and down by which properties of the whole warp are estimated."""
+"""Number of positions across, and down, at which the properties of a whole warp are estimated."""
 MAX_SINGLE_SAMPLE_PX = 1.25
-"""Maximum size of a warped pixel, in straight pixels, for a single sample."""
+"""Maximum size of a warped pixel, in pixels of the straight picture, up to which a single sample is enough."""
 MAX_WARP_SAMPLES = 16
-"""Maximum number of samples across a pixel, and down."""
+"""Maximum number of samples across a warped pixel, and down."""
 _HALF_PIXEL_STEPS = ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
 
 
@@ -37,7 +38,7 @@ class Places(Protocol):
     """A mapping from positions in a warped picture to positions in a straight picture."""
 
     def size(self, frame: Camera) -> tuple[int, int]:
-        """Width and height of the warped frame for a straight frame."""
+        """Width and height of the warped frame that belongs to a straight frame."""
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
         """Positions (h, w, 2) in the straight frame of the positions x (w,), y (h,) of the warped frame, all in pixels.
@@ -55,7 +56,7 @@ class ByMap:
         return self.stmap.width, self.stmap.height
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """Positions in the straight frame, as in `Places`."""
+        """Positions (h, w, 2) in the straight frame of positions in the warped frame, by the map (`Places.places`)."""
         u, v = np.moveaxis(self.stmap.at(x, y), 2, 0)
         return np.stack([u * frame.width, (1 - v) * frame.height], axis=2)
 
@@ -64,8 +65,8 @@ class ByMap:
 class ByLens:
     """The mapping of a photograph's lens.
 
-    The straight frame is that of the camera of `Lens.bare`, at any size. The warped picture is the photograph's view,
-    with its distortion, at the same size.
+    The straight frame is that of the camera that `Lens.bare` returns, at any size. The warped picture shows what the
+    photograph shows, with the lens's distortion, at the same size.
     """
 
     lens: Lens
@@ -75,7 +76,7 @@ class ByLens:
         return frame.width, frame.height
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """Positions in the straight frame, as in `Places`."""
+        """Positions (h, w, 2) in the straight frame of positions in the warped frame, by the lens (`Places.places`)."""
         bare = self.lens.bare(frame.rotation, frame.translation)
         across, down = np.meshgrid((x - frame.cx) / frame.fx * bare.fx, (y - frame.cy) / frame.fy * bare.fy)
         pixels = np.stack([(across + bare.cx).ravel(), (down + bare.cy).ravel()], axis=1)
@@ -85,8 +86,9 @@ class ByLens:
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """A straight frame, and the mapping to it from a warped frame.
+    """The warp of a frame: the straight frame that is rendered, and the mapping to it from the warped frame.
 
+    source: mapping from positions in the warped frame to positions in the straight frame.
     frame: camera of the whole straight frame.
     """
 
@@ -94,7 +96,8 @@ class Warp:
     frame: Camera
 
     def at(self, x: Float64, y: Float64) -> Float64:
-        """Positions (h, w, 2) in the straight frame; NaN where they are too far outside."""
+        """Positions (h, w, 2) in the straight frame of positions x (w,), y (h,) in the warped frame; NaN where they are
+        too far outside."""
         places = np.round(self.source.places(self.frame, x, y) / PLACE_STEP_PX) * PLACE_STEP_PX
         size = np.array([self.frame.width, self.frame.height])
         with np.errstate(invalid="ignore"):
@@ -105,15 +108,16 @@ class Warp:
 
     @property
     def shown(self) -> Camera:
-        """A camera that has the size of the warped frame. Only its size and window are valid, not its rays."""
+        """A camera of the warped frame's size. Only its size and window are valid, not its rays."""
         width, height = self.source.size(self.frame)
         return replace(self.frame, width=width, height=height)
 
     @cached_property
     def _grid(self) -> tuple[Float64, Float64]:
-        """Positions (33, 33, 2) of pixels that are spread over the frame, and sizes (33, 33) of these pixels.
+        """Positions (33, 33, 2) in the straight frame of pixels spread over the warped frame, and their sizes (33, 33).
 
-        The size is the distance to the position of the next pixel, across or down, whichever is larger.
+        A pixel's size is the distance between its opposite sides in the straight frame, across or down, whichever is
+        larger.
         """
         width, height = self.source.size(self.frame)
         x, y = ((np.arange(PROBE_GRID_SIDE) / (PROBE_GRID_SIDE - 1)) * (side - 1) + 0.5 for side in (width, height))
@@ -125,18 +129,18 @@ class Warp:
 
     @property
     def empty(self) -> float:
-        """Fraction of the frame in which nothing is visible."""
+        """Estimated fraction of the warped frame in which nothing is visible."""
         return float(np.isnan(self._grid[0][:, :, 0]).mean())
 
     @cached_property
     def samples(self) -> int:
-        """Number of samples across a pixel, and down."""
+        """Number of samples across a warped pixel, and down: 1, or more if pixels are larger in the straight frame."""
         most = np.nanmax(self._grid[1], initial=0.0)
         return 1 if most <= MAX_SINGLE_SAMPLE_PX else min(int(np.ceil(most - 1e-3)), MAX_WARP_SAMPLES)
 
     @cached_property
     def clamp(self) -> float:
-        """`Window.clamp` for all windows of the straight frame."""
+        """The value of `Window.clamp`, the Jacobian's limit, for all windows of the straight frame."""
         places = self._grid[0].reshape(-1, 2)
         if np.isnan(places).all():
             return JACOBIAN_CLAMP_HALF_FRAMES
@@ -145,9 +149,10 @@ class Warp:
         return max(JACOBIAN_CLAMP_HALF_FRAMES, float((2 * beyond / size).max()))
 
     def of_window(self, camera: Camera) -> tuple[Float64, Camera | None]:
-        """Positions (k height, k width, 2) of a picture's samples in the straight frame, and the window around them.
+        """Positions (k height, k width, 2) in the straight frame of a warped picture's samples, and a camera whose
+        window contains them.
 
-        The window is None if nothing is visible.
+        k is `samples`. The camera is None if nothing is visible.
         """
         x, y = (camera.window.x, camera.window.y) if camera.window else (0, 0)
         samples = self.samples
@@ -164,7 +169,8 @@ class Warp:
 
 
 def distorted_places(lens: Lens, straight: Camera) -> Float64:
-    """Positions (height, width, 2) in the straight picture of the pixels of the distorted picture; NaN for none."""
+    """Positions (height, width, 2) in the straight picture of the distorted picture's pixels; NaN where a pixel has no
+    ray."""
     grid = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     rays = lens.cam_from_img(np.stack([axis.ravel() for axis in grid], axis=1))
     places = rays * (straight.fx, straight.fy) + (straight.cx, straight.cy)
@@ -172,7 +178,8 @@ def distorted_places(lens: Lens, straight: Camera) -> Float64:
 
 
 def undistorted_places(lens: Lens, straight: Camera) -> Float64:
-    """Positions (height, width, 2) in the distorted picture of the pixels of the straight picture; NaN for none."""
+    """Positions (height, width, 2) in the distorted picture of the straight picture's pixels; NaN where the lens shows
+    none."""
     x = (np.arange(straight.width) + 0.5 - straight.cx) / straight.fx
     y = (np.arange(straight.height) + 0.5 - straight.cy) / straight.fy
     across, down = np.meshgrid(x, y)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mattes of a frame: masks of named objects."""
+"""Cryptomatte mattes of a frame: which named object each Gaussian belongs to."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Matte:
-    """The objects of a matte.
+    """The objects of a matte, and the Gaussians of each object.
 
     names: names of the objects.
-    owners: (n,), the index of each Gaussian's object.
+    owners: (n,), the index in `names` of each Gaussian's object.
     """
 
     names: tuple[str, ...]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All passes that make a frame, always in the same order.
+"""The frame pipeline: all passes that make a frame, always in the same order.
 
 The kernels render in the model's colour space. The result is converted to linear light, filtered, averaged over
 samples, and warped; at the end it is converted to the colour space of the file. A strip is a window of the picture, and
@@ -40,23 +40,23 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.stages.holdout import held_bytes
 
 BLANK_COLOUR_TOLERANCE = 1e-6
-"""Maximum difference from the background's colour at which a pixel counts as empty. It is not 0, because averages of
-equal samples are rounded."""
+"""Maximum difference from the background's colour at which a pixel counts as empty. It is not 0, because a mean of
+equal samples may differ from them by rounding."""
 
 
 DrawAt = Callable[[float], Draw]
-"""Function from a time to the Draw at that time. The time is relative to the frame, in frames; 0 if nothing moves."""
+"""Function from a time to the `Draw` at this time. The time is relative to the frame, in frames; 0 if nothing moves."""
 Pass = Callable[[DrawAt], DrawAt]
-"""A step in making a frame: a function from the Draw of the previous step to its own Draw."""
+"""A step in making a frame: a function from the `DrawAt` of the previous step to the `DrawAt` of this one."""
 
 
 @dataclass(frozen=True)
 class FrameRequest:
-    """A frame that the pipeline of a job draws.
+    """A frame to render by a `FramePipeline`.
 
     at: function from a time, relative to this frame in frames, to the camera of the whole frame in its final size.
-    after, before: cameras of the next and the previous frame, for motion.
-    lens: the warp of the picture.
+    after, before: cameras of the next and the previous frame, for the channels motion and backward.
+    lens: mapping by which the frame is warped; None for a straight frame.
     sampling: the sampling of this frame; None uses the job's.
     cut: function from a camera to the holdout surfaces in its picture, for all samples of the frame.
     models: function from a time to the Gaussians; None uses the pipeline's model.
@@ -79,13 +79,13 @@ def at_each_time(apply: Callable[[Draw], Draw]) -> Pass:
 
 
 def _at_its_samples(at: Callable[[float], Camera], sampling: SamplingConfig, draw: DrawAt) -> DrawAt:
-    """A pass that averages the samples of shutter and lens."""
+    """A pass that averages samples over the time of the shutter and the area of the lens."""
     (middle, cameras), times = sample_cameras(at, sampling), sampling.sample_times
     return lambda time: sampled(draw(time), middle, cameras, lambda index: draw(times[index]))
 
 
 class FramePipeline:
-    """Renders the frames of a job."""
+    """Renderer of the frames of a job, with all passes from the kernels to the file's colours."""
 
     def __init__(
         self,
@@ -100,7 +100,7 @@ class FramePipeline:
         """Prepare colours, and check the settings of a job.
 
         recorded: the model's colour space (`colour.recorded_space`).
-        background: colour of the background in that space; black if alpha is written.
+        background: colour of the background in the model's colour space; black if alpha is written.
         mattes: mattes by channel name.
         Raises InputError for settings and colour spaces that are not compatible.
         """
@@ -113,7 +113,7 @@ class FramePipeline:
     def draw(self, frame: FrameRequest) -> tuple[Draw, Callable[[Planes], Planes]]:
         """The Draw of a frame, and a function that converts its planes to the file's colours without the device.
 
-        The Draw uses only the size and the window of its camera, which is the picture's or a strip's.
+        The Draw uses only the size and the window of the camera that it is called with, the picture's or a strip's.
         """
         draw = self._by_kernels(frame)
         for apply in self._passes(frame):
@@ -127,7 +127,7 @@ class FramePipeline:
     def _by_kernels(self, frame: FrameRequest) -> DrawAt:
         def draw_at(time: float) -> Draw:
             def draw(camera: Camera, names: Collection[str]) -> Planes:
-                gaussians = self._gaussians if frame.models is None else frame.models(time)  # not before it is drawn
+                gaussians = self._gaussians if frame.models is None else frame.models(time)  # made when drawn
                 cameras, mattes = (self._background, frame.after, frame.before), self._mattes
                 return drawn_by(self._renderer, gaussians, *cameras, frame.cut, *frame.moved, mattes)(camera, names)
 
@@ -136,7 +136,7 @@ class FramePipeline:
         return draw_at
 
     def _passes(self, frame: FrameRequest) -> list[Pass]:
-        """The passes of a frame after the kernels, in order."""
+        """The passes of a frame that follow the kernels, in order."""
         sampling, framing = self._sampling(frame), self.config.framing
         passes: list[Pass] = []
         if self._in_light(frame):
@@ -152,12 +152,12 @@ class FramePipeline:
         return passes
 
     def _to_light(self, draw: Draw) -> Draw:
-        """Convert the picture to linear light."""
+        """A Draw that converts the pictures of `draw` to linear light."""
         colours = self.colours
         return lambda camera, names: converted(draw(camera, names), colours, colours.model, colours.light)
 
     def _in_strips(self, frame: FrameRequest, draw: Draw) -> Draw:
-        """Render the picture in strips that leave memory for the model and its pairs."""
+        """A Draw that renders in strips, which leave device memory for the model and its pairs."""
         device, framing = self._renderer.device, self.config.framing
 
         def drawn(camera: Camera, names: Collection[str]) -> Planes:
@@ -169,8 +169,8 @@ class FramePipeline:
     def draw_deep(self, bins: int, frame: FrameRequest) -> tuple[DrawDeep, Convert, Callable[[Camera], int]]:
         """Prepare a deep frame, as `draw` prepares a flat one.
 
-        Returns three functions: one renders the frame, one converts its colours to the file's colour space, and one
-        gives the number of rows of a strip for a camera.
+        Returns three functions: the first renders the frame, the second converts its colours to the file's colour
+        space, and the third gives the number of rows of a strip for a camera.
         """
         sampling, colours, device = self._sampling(frame), self.colours, self._renderer.device
         space = colours.light if self._in_light(frame) else colours.model
@@ -195,22 +195,22 @@ class FramePipeline:
         return draw, between(space, colours.output), rows
 
     def _with_ranks(self, planes: Planes) -> Planes:
-        """The planes, in which mattes are converted to the form that files have."""
+        """The planes, with mattes converted to Cryptomatte's ranks of ids and coverages, as files store them."""
         return {
             name: ranked(plane, self._mattes[name].names) if name in self._mattes else plane
             for name, plane in planes.items()
         }
 
     def _sampling(self, frame: FrameRequest) -> SamplingConfig:
-        """The sampling of the frame if it has one, otherwise of the job."""
+        """The sampling settings of the frame if it has its own, otherwise those of the job."""
         return frame.sampling or self.config.sampling
 
     def _in_light(self, frame: FrameRequest) -> bool:
-        """True if pixels of the frame are averages, which must be computed in linear light."""
+        """True if pixels of the frame are averages of samples, which must be computed in linear light."""
         return self._sampling(frame).on or self.config.framing.supersample > 1 or frame.lens is not None
 
     def is_blank(self, planes: Planes, frame: FrameRequest) -> bool | None:
-        """True if the planes of `draw`, before conversion, show only the background; None if no channel tells it."""
+        """True if the planes of `draw`, before conversion, show only the background. None if no channel shows that."""
         for name in ("alpha", "count", "depth"):
             if name in planes:
                 return not planes[name].any()
@@ -223,9 +223,9 @@ class FramePipeline:
 
 
 def converted(planes: Planes, colours: Colours, source: str, target: str) -> Planes:
-    """The planes with rgb in another colour space.
+    """The planes with rgb converted from colour space `source` to `target`.
 
-    If there is alpha, rgb is divided by it before the conversion and multiplied after; otherwise pixels are opaque.
+    If the planes have alpha, rgb is divided by alpha before the conversion and multiplied by it afterwards.
     """
     if source == target or "rgb" not in planes:
         return planes

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Averages of a frame over samples: over the area of a pixel (supersampling), the time of the shutter, and the lens.
 
-The positions of samples are fixed, and samples of shutter and lens have equal weights. So frames are as repeatable, to
-the last bit, as without samples. Only linear light is averaged. Channels that cannot be averaged come from a single
-sample.
+The positions of samples are fixed, and samples of shutter and lens have equal weights. So frames can be repeated to the
+last bit, as without samples. Only linear light is averaged. Channels that cannot be averaged come from a single sample.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
 
 
 def filter_taps(config: FramingConfig) -> NDArray[np.float32]:
-    """Weights of the samples along a line across a pixel and its margins; symmetric, with a sum of 1."""
+    """Weights of the pixel filter for the samples in a line across a pixel and its margins. Their sum is 1."""
     samples, radius = config.supersample, _FILTER_RADII_PX[config.filter]
     margin = samples * _margin(config)
     at = (np.arange(-margin, samples + margin) + 0.5) / samples - 0.5
@@ -41,12 +40,12 @@ def filter_taps(config: FramingConfig) -> NDArray[np.float32]:
 
 
 def _margin(config: FramingConfig) -> int:
-    """Number of pixels beyond the picture's edge that the filter reads."""
+    """Number of pixels beyond the picture's edge that the pixel filter reads."""
     return int(np.ceil(_FILTER_RADII_PX[config.filter] - 0.5))
 
 
 def finer(camera: Camera, config: FramingConfig) -> Camera:
-    """The camera of the picture to filter: `supersample` times larger, with the margin that the filter reads.
+    """The camera of the supersampled picture: `supersample` times larger, with the margin that the filter reads.
 
     Raises InputError like `FramingConfig.check_model`.
     """
@@ -61,8 +60,8 @@ def finer(camera: Camera, config: FramingConfig) -> Camera:
 def supersampled(draw: Draw, config: FramingConfig) -> Draw:
     """A Draw that filters rgb and alpha of a picture `supersample` times larger. Other channels are not filtered.
 
-    `draw` must return rgb in linear light, because only that may be averaged. The order of summation does not depend on
-    the position of the picture in its frame.
+    `draw` must return rgb in linear light, because only linear light may be averaged. The order of summation does not
+    depend on the position of the picture in its frame.
     """
     samples = config.supersample
     if samples == 1:
@@ -89,7 +88,7 @@ def lens_points(count: int) -> Float64:
 
 
 def lens_radius(camera: Camera, config: SamplingConfig) -> float:
-    """Radius of the lens in scene units. camera: camera of a whole frame."""
+    """Radius of the lens opening in scene units. camera: the camera of a whole frame."""
     if config.f_stop is None:
         return config.aperture or 0.0
     focal_length = camera.fx * (config.sensor_width or SENSOR_WIDTH_MM) / camera.width / 1000 / (config.metres or 1.0)
@@ -99,8 +98,8 @@ def lens_radius(camera: Camera, config: SamplingConfig) -> float:
 def through_lens(camera: Camera, x: float, y: float, focus: float) -> Camera:
     """The camera moved to a point (x, y) of its lens, in scene units.
 
-    It is sheared so that points at depth `focus` do not move in the picture. Raises InputError for a camera without an
-    image plane.
+    Its principal point moves too, so that points at depth `focus` do not move in the picture. Raises InputError for a
+    camera without an image plane.
     """
     if not camera.is_pinhole:
         raise InputError(f"depth of field is not defined for {camera.projection} cameras; use a perspective camera")
@@ -116,7 +115,7 @@ def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tup
     """The camera at the middle of shutter time and lens, and the camera of each sample, all of whole frames.
 
     at: function from a time, relative to the frame in frames, to the camera, such as `Shot.at`.
-    A single sample has the camera at the middle.
+    If there is a single sample, its camera is the one at the middle.
     """
     middle = at(config.middle)
     if not config.on or config.samples == 1:
@@ -132,10 +131,10 @@ def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tup
 
 
 def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera], light: Callable[[int], Draw] | None = None) -> Draw:
-    """A Draw whose rgb and alpha are the mean over the cameras. Other channels cannot be averaged and come from the
-    middle camera.
+    """A Draw whose rgb and alpha are means over samples. Other channels cannot be averaged and come from the middle
+    camera.
 
-    middle, cameras: cameras of whole frames. Of the camera that is passed to the Draw, only size and window are used.
+    middle, cameras: cameras of whole frames. Of the camera that the Draw is called with, only size and window are used.
     light: function from a sample's number to its Draw; None uses `draw` for all samples.
     `draw` must return rgb in linear light. Sums are float64, in the order of the cameras.
     """

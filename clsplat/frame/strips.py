@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendering in strips, for frames that are too large for the device's memory, and writing by strips, for the host's."""
+"""Strips of a large picture: rendering strip by strip to save device memory, and writing so to save host memory."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def strip_rows(
     config: FramingConfig | None = None,
     planes: int = 0,
 ) -> int:
-    """Rows of a strip, a multiple of the tile size, such that memory is left for the model and its pairs.
+    """Number of rows of a strip, a multiple of the tile size, that leaves memory for the model and its pairs.
 
-    This is the picture's height if it fits in a single strip.
+    If the picture fits in a single strip, the number is the picture's height.
 
     names: names of the channels to render.
     config: the framing; with supersampling, rendered strips are larger than written strips.
@@ -45,25 +45,29 @@ def strip_rows(
     samples = config.supersample if config else 1
     most = min(frame_pixels(device, feature_floats(names), planes), STRIP_PIXELS)
     across = -(-camera.width * samples // TILE) * TILE * samples
-    rows = most // across - 2 * TILE  # leaves room for windows that begin inside a tile, and for a filter's margins
+    rows = most // across - 2 * TILE  # less two tiles: windows may begin inside a tile, and filters have margins
     if rows >= camera.height:
         return camera.height
     return max(rows // TILE, 1) * TILE
 
 
 def deep_rows(device: Device, camera: Camera, bins: int, pictures: int = 1) -> int:
-    """Rows of a deep picture's strips, in whole tiles, for `bins` slices.
+    """Number of rows of a deep picture's strips, a multiple of the tile size.
 
-    pictures: number of pictures that each pixel is the mean of.
+    bins: maximum number of slices per pixel.
+    pictures: number of pictures of which each pixel is the mean.
     """
     floats = DEEP_FLOATS * bins
     most = DEEP_STRIP_FLOATS if pictures == 1 else DEEP_MERGE_FLOATS // min(pictures, DEEP_PICTURES)
     pixels = min(most // floats, frame_pixels(device, planes=4 * floats))
-    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # with the padding of the first and last tile
+    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # 2 TILE: padding of the first and last tile
 
 
 def strips(camera: Camera, rows: int) -> Iterator[Camera]:
-    """Cameras of the picture's strips, of at most `rows` rows, from the top. All but the last end at tile borders."""
+    """Yield the cameras of a picture's strips, from the top, of at most `rows` rows each.
+
+    Every strip but the last ends at a tile border of the frame.
+    """
     if rows >= camera.height:
         yield camera
         return
@@ -76,7 +80,7 @@ def strips(camera: Camera, rows: int) -> Iterator[Camera]:
 
 
 def in_strips(draw: Draw, rows: int) -> Draw:
-    """A Draw that renders in strips. This limits the memory on the device, not on the host."""
+    """A Draw that renders a picture in strips and joins them. This saves memory on the device, not on the host."""
 
     def drawn(camera: Camera, names: Collection[str]) -> Planes:
         parts = [draw(strip, names) for strip in strips(camera, rows)]
@@ -86,18 +90,21 @@ def in_strips(draw: Draw, rows: int) -> Draw:
 
 
 def check_parts(camera: Camera, encoding: Encoding, views: int = 1) -> None:
-    """Raise InputError for several parts or views: a file stores one after the other, so strips cannot be written.
+    """Raise InputError if an EXR file of several parts or views would have to be written in strips.
+
+    A file stores whole parts and views one after the other, so that a strip of all of them cannot be written.
 
     views: number of views in the file, 2 for a stereo pair.
     """
     if views > 1:
         raise InputError(
             f"--stereo: a picture of {camera.width}x{camera.height} is written in strips here, expected a file for "
-            "each eye: {eye} in -o"
+            "each eye: put {eye} into the name that -o gives"
         )
     if encoding.parts == "several":
         raise InputError(
-            f"--parts several: a picture of {camera.width}x{camera.height} is written in strips here, expected one part"
+            f"--parts several: a picture of {camera.width}x{camera.height} is written in strips here, expected "
+            "--parts one"
         )
 
 

@@ -20,11 +20,11 @@ from clsplat.frame.draw import Draw, Planes
 from clsplat.frame.lens import Warp
 
 _SAMPLE_ROWS_PER_BATCH = 128
-"""Number of rows that are sampled at a time, which limits the memory on the host."""
+"""Number of rows of samples that are interpolated at a time, which limits the memory on the host."""
 
 
 def warped(draw: Draw, warp: Warp) -> Draw:
-    """A Draw of warped pictures, which uses only the size and window of its camera.
+    """A Draw of warped pictures. Of the camera that it is called with, only size and window are used.
 
     `draw` renders windows of the straight frame, with rgb in linear light. A pixel's rgb and alpha are means of
     `Warp.samples` x `Warp.samples` samples, interpolated by the Catmull-Rom cubic. Other channels come from the nearest

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layouts and constants that host and kernels share. Kernels include them as `kernels/shared/layouts.h`.
+"""Array layouts (columns by name) and constants that Python and the kernels share.
+
+Kernels include them as `kernels/shared/layouts.h`.
 
 `python -m clsplat.layouts.columns > kernels/shared/layouts.h` generates that file.
 """
@@ -40,7 +42,7 @@ CHUNK_ROWS = 1024
 """Number of consecutive rows of a model in a chunk; the last chunk may have fewer."""
 
 POSE_ROWS = 64
-"""Number of Gaussians whose terms of a pose gradient are added in sequence, before the sums are added."""
+"""Number of Gaussians whose terms of a pose gradient one work-item adds in sequence, to a partial sum."""
 
 _TRANSFORM = (
     *(f"R{row}{column}" for row in range(3) for column in range(3)),
@@ -53,15 +55,13 @@ _ROUNDED = (*_TRANSFORM, *("XMIN", "XMAX", "YMIN", "YMAX"), *("PX", "PY", "PZ"))
 _LENS = ("K1", "K2", "K3", "K4", "FOLD", "FOLD_RADIUS")
 
 CAMERA = (*_ROUNDED, "NEAR", "FAR", "HAND", "WINDOW_X", "WINDOW_Y", *_LENS, *(f"{name}_LOW" for name in _ROUNDED))
-"""The fields of a camera.
-
-In order:
+"""The fields of a camera for the projection kernels, in order.
 
 - `cam_from_world`, intrinsics, the limits of x/z and y/z in the Jacobian, and the camera's centre.
 - Near and far plane.
 - HAND: 1, or -1 if the rotation is a reflection.
-- The first pixel in its frame (`Camera.window`).
-- A fisheye's coefficients, and the largest angle and distance from the axis that it shows.
+- The position in the whole frame of the image's first pixel (`Camera.window`).
+- A fisheye's coefficients, and the largest angle and distance from the axis that the lens shows.
 - _LOW: the rounding errors of the first item's values in float32. With them, a mean on the image is accurate to
   1e-6 pixels, and the ellipse of a needle to 1e-4.
 """
@@ -77,9 +77,7 @@ EWA_CAMERA = (
     *("NEAR", "FAR", "WIDTH", "HEIGHT", "EPS", "RADIUS_CLIP"),
     *(f"{name}_LOW" for name in _EWA_ROUNDED),
 )
-"""The fields of a camera of `kernels/ewa.cl`.
-
-In order:
+"""The fields of a camera for `kernels/ewa.cl`, in order.
 
 - The view matrix, which need not be a rotation; intrinsics; the limits of x/z and y/z in the Jacobian; the cofactors
   of the matrix's 3 x 3 part.
@@ -91,10 +89,10 @@ EWA_GRADIENT = _TRANSFORM
 """The fields of a camera with respect to which `kernels/ewa_grad.cl` computes gradients."""
 
 SUM_ROWS = 64
-"""Number of adjacent numbers that a work-item of `kernels/sums.cl` adds."""
+"""Number of adjacent values of a row that one work-item of `kernels/sums.cl` adds."""
 
 NO_CHUNK = 0x3FFFFF
-"""Entry of a list of chunks that stands for no chunk. All its rows are past the end of every model."""
+"""Entry of a list of chunks that stands for no chunk. As a chunk, its rows are past the end of every model."""
 
 _SEEN = ("LOG2O", "RED", "GREEN", "BLUE", "DEPTH")
 """Fields that have the same meaning and position in SPLAT and RAY, so that blending can read both."""
@@ -104,9 +102,7 @@ SPLAT = (
     *_SEEN,
     *("HALF_W", "HALF_H", "INVERSE_L11", "UNUSED"),
 )
-"""A projected Gaussian in 64 bytes, a cache line.
-
-In order:
+"""The fields of a splat, a projected Gaussian, in order. They take 64 bytes, a cache line.
 
 - The mean in whole pixels, and the fraction of a pixel.
 - L11 to L22: the whitening W of docs/gradients.md times sqrt(log2(e) / 2), so that log2(alpha) = LOG2O - u^2 - v^2.
@@ -119,13 +115,13 @@ RAY = (
     *_SEEN,
     *("VY", "VZ", "COLUMNS", "ROWS"),
 )
-assert len(RAY) == len(SPLAT), "both are stored in the same array"
-assert all(RAY.index(name) == SPLAT.index(name) for name in _SEEN), "blending reads both"
+assert len(RAY) == len(SPLAT), "rows of RAY and of SPLAT are stored in the same array"
+assert all(RAY.index(name) == SPLAT.index(name) for name in _SEEN), "blending reads these fields of RAY and SPLAT"
 """A projected Gaussian of a camera model along rays, such as equirectangular or fisheye.
 
 F: direction of the mean.
 U, V: a ray r in the camera has u = U.r / F.r and v = V.r / F.r, so that log2(alpha) = LOG2O - u^2 - v^2.
-DEPTH: the distance.
+DEPTH: the distance of the mean from the camera's centre.
 COLUMNS, ROWS: the bounding box in tiles: 16 bits for the first tile, 16 for the end (kernels/shared/tile.h).
 """
 
@@ -139,7 +135,8 @@ nearness, 1 / depth, is last (`kernels/shared/splat.h`: SLOT_WEIGHT, SLOT_NEAR).
 SLOT_PLAIN = SLOT.index("ABSX")
 
 REFUSED = ("parameters", "gradients", "moments", "steps")
-"""Reasons for which adam.cl does not update an element, and counts it."""
+"""Reasons for which adam.cl refuses to update an element: the parameter, its gradient, its moments or the step are not
+finite or too large. adam.cl counts the refused elements by reason."""
 
 COUNTED = ("VISIBLE", "PAIRS", "KEY_COMPLEMENT", "LARGEST_KEY", "LONGEST")
 
@@ -158,7 +155,7 @@ DEEP_SLICE = ("RED", "GREEN", "BLUE", "ALPHA", "DEPTH")
 """A slice of a deep picture at a pixel: premultiplied colour, alpha, and depth."""
 
 DEEP_LEVELS = 64
-"""Number of values of the slack s, (74) of docs/pictures.md, that are tried for a pixel's slices."""
+"""Number of values of the slack s, (74) of docs/pictures.md, that are tried to cut a pixel into slices."""
 
 DEEP_PICTURES = 16
 """Maximum number of deep pictures that are merged at once."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pass of a camera over arrays of Gaussians: projection, colours and pixels, and the gradients of these."""
+"""The pass of one camera over arrays of Gaussians: projection, colours and pixels, and their gradients."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Given:
         sh_degree: int | None,
         cameras: int,
     ) -> Given:
-        """Check the arguments of a call. Raises InputError, which names the argument."""
+        """Check the arguments of a call of `rasterize`. Raises InputError, which names the argument."""
         centres = floats("means", means, ("N", 3))
         n = len(centres)
         shapes = GivenShapes.checked(n, covars, quaternions, scales)
@@ -95,7 +95,7 @@ def check_coefficients(sh_degree: int, found: int) -> None:
 
 
 class Gradients:
-    """Gradients with respect to the arguments of a call, summed over its cameras."""
+    """Gradients with respect to the arguments of a call of `rasterize`, summed over its cameras."""
 
     def __init__(self, given: Given, device: Device) -> None:
         self.given = given
@@ -133,10 +133,10 @@ class Gradients:
 
 @dataclass(frozen=True)
 class PassSettings:
-    """Settings that all cameras of a call share.
+    """Settings that all cameras of a call of `rasterize` share.
 
     mode: one of RASTERIZE_RENDER_MODES.
-    alpha_max: the cap of alpha.
+    alpha_max: maximum of a Gaussian's alpha at a pixel.
     compensated: multiply opacities by the compensation for the low-pass filter.
     absolute: also compute sums over pixels of absolute gradients.
     differentiable: keep data that speed up the gradient.
@@ -153,7 +153,7 @@ class PassSettings:
 class ViewGradients:
     """Gradients with respect to a camera's projected Gaussians, on the host. None counts as 0.
 
-    on_image: with respect to the arrays of `Ewa` except the compensations, by name.
+    on_image: gradients with respect to the arrays of `Ewa` except the compensations, by name.
     opacities: (N,), with respect to the compensated opacities.
     colors: (N, D), with respect to the blended colours.
     """
@@ -164,10 +164,10 @@ class ViewGradients:
 
 
 class CameraPass:
-    """The pass of one camera over the Gaussians. It keeps the device memory for its gradient until it is deleted.
+    """The pass of one camera over the Gaussians. The object keeps device memory for the gradient until it is deleted.
 
     index: index of the camera.
-    background: (D,), or None.
+    background: (D,), or None for black.
     """
 
     def __init__(
@@ -196,7 +196,7 @@ class CameraPass:
                 harmonics(device, self._harmonics, self._colours.array)
             factors = self.compensations
             self.opacities: Float32 = given.opacities.copy() if factors is None else given.opacities * factors
-            """(N,), after compensation. A copy, as the caller may change its array."""
+            """Opacities (N,) after compensation. They are a copy, as the caller may change its array."""
             splats, blended = self.projected.arrays, self.opacities if settings.compensated else covers
             flat = (splats.means2d, splats.conics, blended, self._values(), splats.depths, splats.radii)
             view = (screen_gaussians(device, *flat), (camera.width, camera.height), self._behind(background))
@@ -204,14 +204,14 @@ class CameraPass:
         self._has_background = background is not None
 
     def _values(self) -> Float32 | DeviceArray:
-        """(N, X): the values to blend, with the depth last."""
+        """The values to blend (N, X), as the render mode wants them: colours, then the depth."""
         if not self.with_depth:
             return self._colours.array if isinstance(self._colours, Hosted) else self._colours
         depths = self.depths[:, None]
         return np.concatenate([self.colors, depths], axis=1) if self.with_colours else depths
 
     def _behind(self, background: Float32 | None) -> Float32 | None:
-        """(X,): the background, whose depth is 0."""
+        """The background (X,) of the values to blend, with a depth of 0; None for black."""
         if background is None or not self.with_colours:
             return None
         return np.append(background, np.float32(0)) if self.with_depth else np.ascontiguousarray(background)
@@ -233,7 +233,7 @@ class CameraPass:
 
     @property
     def colors(self) -> Float32:
-        """(N, D): the values to blend, without the depth."""
+        """The colours (N, D) to blend, without the depth."""
         if not isinstance(self._colours, Hosted):
             return self._colours
         with self._session.lock:
@@ -255,10 +255,10 @@ class CameraPass:
         return image
 
     def pixel_gradients(self, d_image: ArrayLike, d_alpha: ArrayLike | None) -> dict[str, Float32]:
-        """The gradients of this camera that `Rasterization.vjp_pixels` returns."""
+        """Compute the gradients that `Rasterization.vjp_pixels` returns, for this camera."""
         shape = (self._camera.height, self._camera.width)
         by_image = gradient("d_images", d_image, self.image.shape)
-        assert by_image is not None, "`Rasterization.vjp_pixels` passes one for each camera"
+        assert by_image is not None, "`Rasterization.vjp_pixels` passes a gradient for each camera's image"
         by_alpha = gradient("d_alphas", d_alpha, (*shape, 1))
         by_alpha = None if by_alpha is None else by_alpha.reshape(shape)
         if self._settings.mode.endswith("ED"):
@@ -297,7 +297,7 @@ class CameraPass:
             at += by.colors
         with session.lock:
             placed = image_gradients(device, on_image)
-            device.under_way.append(placed)  # host memory must live until the device has read it
+            device.under_way.append(placed)  # host memory must exist until the device has read it
             room, add = gradients.room.arrays, gradients.views > 0
             by_camera = self.projected.gradient(placed, room, add=add, by_camera=cameras)
             by_centre = self._colours_back(gradients, room.means, by.colors, cameras=cameras)

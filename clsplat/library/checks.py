@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks that turn the arguments of library calls into arrays for the kernels. Errors name the argument."""
+"""Argument checks of library calls, which convert the arguments for the kernels. Error messages name the argument."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def gradient(name: str, values: Any, shape: tuple[int, ...]) -> Float32 | None:
 
 
 def matrices(name: str, given: Any, side: int, count: int | str) -> Float64:
-    """(count, side, side) float64, from one matrix or several. Raises InputError like `floats`."""
+    """The argument as matrices (count, side, side) float64; it may be one matrix. Raises InputError like `floats`."""
     floats(name, given, (count, side, side), (side, side))
     array: Float64 = np.array(given, np.float64)  # a copy: the caller may change the array later
     return array.reshape(-1, side, side)
@@ -71,7 +71,7 @@ def whole(given: Any) -> int | None:
 
 
 def sizes(name: str, given: Any, count: int) -> list[int]:
-    """Lengths in pixels for `count` cameras, from one length for all or one for each. Raises InputError."""
+    """The argument as lengths in pixels for `count` cameras, from one for all or one for each. Raises InputError."""
     each = [whole(size) for size in ([given] * count if np.ndim(given) == 0 else given)]
     lengths = [size for size in each if size is not None and 0 < size < 2**24]
     if not len(lengths) == len(each) == count:
@@ -82,7 +82,7 @@ def sizes(name: str, given: Any, count: int) -> list[int]:
 
 
 def number(name: str, given: Any, least: float, most: float = np.inf) -> float:
-    """A number from `least` to `most`. Raises InputError."""
+    """The argument as a float from `least` to `most`. Raises InputError if it is anything else."""
     value = plain(given)
     if not isinstance(value, (int, float)) or isinstance(value, bool) or not least <= value <= most:
         bound = f"from {least:g} to {most:g}" if np.isfinite(most) else f"of at least {least:g}"
@@ -91,7 +91,7 @@ def number(name: str, given: Any, least: float, most: float = np.inf) -> float:
 
 
 def degree(name: str, given: Any, highest: int, otherwise: str = "") -> int:
-    """A degree of spherical harmonics, 0 to `highest`. Raises InputError.
+    """The argument as a degree of spherical harmonics, 0 to `highest`. Raises InputError if it is anything else.
 
     otherwise: other accepted values, as text for the error message.
     """

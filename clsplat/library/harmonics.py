@@ -25,7 +25,7 @@ class HarmonicColors:
     Attributes
     ----------
     colors : (..., 3) float32
-        0 where the mask is False.
+        The colours; 0 where the mask is False.
     """
 
     colors: Float32
@@ -59,7 +59,7 @@ class HarmonicColors:
             device = session.device
             by_directions, by_sh = hosted(device, given.directions.shape), hosted(device, given.sh.shape)
             d_colours = from_host(device, values.reshape(-1, 3))
-            colours = given.directions  # not read: the kernel needs colours only if directions are from a camera
+            colours = given.directions  # a placeholder: the kernel reads colours only if directions are from a camera
             gradients = HarmonicsGradients(by_sh.array, by_directions.array)
             harmonics_grad(device, session.scratch, given, colours, d_colours, gradients)
             batch = self.colors.shape[:-1]
@@ -95,18 +95,18 @@ def spherical_harmonics(
     Returns
     -------
     HarmonicColors
-        The colours. No 0.5 is added to them.
+        The colours. Unlike the colours of a model, they are not raised by 0.5.
 
     Raises
     ------
     InputError
-        If a shape or degree is wrong, or numbers are not finite; it names the argument.
+        If a shape or degree is wrong, or numbers are not finite. The message names the argument.
     DeviceError
         If there is no such device.
 
     Notes
     -----
-    Signs and order of the basis are in docs/conventions.md. float32 arrays are read in place, and must not change
+    Signs and order of the basis are in docs/conventions.md. float32 arrays may be read in place, and must not change
     before the last `vjp`.
     """
     batch = np.shape(directions)[:-1]

@@ -61,7 +61,7 @@ class PixelGradients:
 
 
 class ListedPixels:
-    """An image from projected Gaussians and tile lists. Until it is deleted, it keeps memory for its gradient.
+    """An image from projected Gaussians and tile lists. The object keeps memory for its gradient until it is deleted.
 
     listing: function that makes the tile lists, in arrays of the workspace that it is given.
     gaussians, size, background, alpha_max, backward: as in `PixelPass`.
@@ -96,24 +96,24 @@ class ListedPixels:
             if depth > SPLAT_VALUES:
                 rows = (listed.projected, gaussians.values, self._background, blended)
                 values(capped, ValuePass(listed.lists, *rows), self._image.array)
-            # host memory must live until the device has finished
+            # host memory must exist until the device has finished
             device.under_way.append((gaussians, self._background, self._image, self._alpha))
 
     @property
     def image(self) -> Float32:
-        """(H, W, D): the image over the background; not a copy. Waits for the device."""
+        """The image (H, W, D) over the background, not a copy. Waits for the device."""
         with self._session.lock:
             return self._image.get()
 
     @property
     def alpha(self) -> Float32:
-        """(H, W): alpha, 0 to 1; not a copy. Waits for the device."""
+        """Alpha (H, W), 0 to 1, not a copy. Waits for the device."""
         with self._session.lock:
             return self._alpha.get()
 
     @property
     def tile_counts(self) -> NDArray[np.int32]:
-        """(n,): number of 16 x 16 pixel tiles that each Gaussian reaches, 0 if it is culled; a copy."""
+        """Number (n,) of 16 x 16 pixel tiles that each Gaussian reaches, 0 if it is culled. A copy."""
         with self._session.lock:
             return self._listed.projected.tile_counts.get().view(np.int32)
 
@@ -123,10 +123,11 @@ class ListedPixels:
         """Compute the vector-Jacobian product.
 
         d_image: (H, W, D), the gradient of the loss with respect to the image.
-        d_alpha: (H, W), with respect to alpha; None means 0.
+        d_alpha: (H, W), the gradient of the loss with respect to alpha; None means 0.
         absolute: also compute sums over pixels of absolute gradients.
-        Returns means2d (n, 2), conics (n, 3), opacities (n,), colours (n, D), and background (D,) if there is one.
-        With `absolute` also absolute (n, 2): sums over pixels of the absolute gradients with respect to means2d.
+        Returns gradients by name: means2d (n, 2), conics (n, 3), opacities (n,), colours (n, D), and background (D,) if
+        there is one. With `absolute` also absolute (n, 2): sums over pixels of the absolute gradients with respect to
+        means2d.
         """
         found = self.gradient_on_device(d_image, d_alpha, absolute=absolute)
         with self._session.lock:
@@ -136,7 +137,7 @@ class ListedPixels:
         return arrays
 
     def background_gradient(self, d_image: NDArray[Any]) -> Float32:
-        """(D,): the gradient of the loss with respect to the background."""
+        """The gradient (D,) of the loss with respect to the background."""
         left = np.float32(1) - self.alpha
         by_row = np.matmul(left[:, None, :], np.asarray(d_image, np.float32))  # (H, 1, D)
         by_background: Float32 = by_row.sum(axis=(0, 1), dtype=np.float64).astype(np.float32)
@@ -184,17 +185,17 @@ class ListedPixels:
 
 
 class PixelPass(ListedPixels):
-    """The image of a camera from projected Gaussians. It keeps the device memory for its gradient until it is deleted.
+    """The image of a camera from projected Gaussians. The object keeps memory for its gradient until it is deleted.
 
     gaussians: Gaussians on the session's device. Their values must not change before the last `gradient`.
     size: width and height, pixels.
     background: (D,) float32, or None for black.
-    alpha_max: the cap of alpha, below 1.
+    alpha_max: maximum of a Gaussian's alpha at a pixel, below 1.
     backward: True keeps data that speed up `gradient`.
 
     A Gaussian contributes to a pixel if its alpha there is at least 1/255. Blending ends before the Gaussian that would
     leave a transmittance of 1e-4 or less. A Gaussian is culled if its mean is over 1e9 pixels away, or if a or c of
-    its conic is outside 1e-15 to 1e15. Raises CapacityError if the device has no room for the (tile, Gaussian) pairs.
+    its conic is outside 1e-15 to 1e15. Raises CapacityError if the device has no memory for the (tile, Gaussian) pairs.
     """
 
     def __init__(
@@ -225,14 +226,14 @@ def screen_gaussians(
     depths: (n,), by which Gaussians are sorted, ties by index.
     radii: (n, 2) int32; a radius of 0 culls the Gaussian.
 
-    C-contiguous float32 host arrays are not copied.
+    If the device shares the host's memory, C-contiguous float32 host arrays are not copied.
     """
     arrays = (means2d, conics, opacities, depths, colours)
     return ScreenGaussians(placed(device, radii, np.int32), *(placed(device, array) for array in arrays))
 
 
 def placed(device: Device, array: Array, dtype: DTypeLike = np.float32) -> DeviceArray:
-    """The array on the device: a device array unchanged, a host array without a copy if possible."""
+    """The array on the device. A device array is returned as it is; a host array is not copied if that is possible."""
     return array if isinstance(array, DeviceArray) else from_host(device, np.asarray(array, dtype))
 
 

@@ -30,11 +30,11 @@ from clsplat.stages.ewa import (
 )
 
 _PROJECTED_ARRAY_WIDTHS = {"means2d": 2, "depths": None, "conics": 3, "compensations": None}
-"""Outputs that have gradients, and the length of their last axis; None for one number per Gaussian."""
+"""Outputs of the projection that have gradients, with the length of the last axis; None for one number per Gaussian."""
 
 
 class ProjectedView:
-    """Gaussians projected to a camera's image. It keeps the device memory for its gradient until it is deleted.
+    """Gaussians projected to a camera's image. The object keeps memory for its gradient until it is deleted.
 
     gaussians: arrays on the session's device, which must not change before the last `gradient`.
 
@@ -71,7 +71,7 @@ class ProjectedView:
 
 
 def image_gradients(device: Device, by: Mapping[str, Float32]) -> EwaImageGradients:
-    """Gradients on the device, from host arrays by their names in `Ewa`."""
+    """Upload gradients with respect to the arrays of `Ewa`, given by name."""
 
     def at(name: str) -> DeviceArray | None:
         return from_host(device, by[name]) if name in by else None
@@ -87,7 +87,10 @@ class HostedGradients(NamedTuple):
 
 
 def hosted_gradients(device: Device, count: int, *, covariances: bool) -> HostedGradients:
-    """Allocate gradients for `count` Gaussians."""
+    """Allocate gradients with respect to `count` Gaussians.
+
+    covariances: True for gradients with respect to covariances instead of quaternions and scales.
+    """
     means = hosted(device, (count, 3))
     if covariances:
         covars = hosted(device, (count, 6))
@@ -244,14 +247,14 @@ def fully_fused_projection(
     Raises
     ------
     InputError
-        If a shape is wrong or numbers are not finite; it names the argument.
+        If a shape is wrong or numbers are not finite. The message names the argument.
     DeviceError
         If there is no such device.
 
     Notes
     -----
-    Zwicker et al., EWA splatting, 2002; docs/gradients.md, section 22. float32 arrays are read in place, and must not
-    change before the last `vjp`.
+    Zwicker et al., EWA splatting, 2002; docs/gradients.md, section 22. float32 arrays may be read in place, and must
+    not change before the last `vjp`.
     """
     given_means = floats("means", means, ("N", 3))
     count = len(given_means)
@@ -305,7 +308,7 @@ def checked_cameras(
 
 
 class CameraPlanes(NamedTuple):
-    """Settings that all cameras of a call share, in the order of `EwaCamera`."""
+    """Camera settings that all cameras of a call share, in the order of the fields of `EwaCamera`."""
 
     near: float
     far: float
@@ -317,7 +320,7 @@ class CameraPlanes(NamedTuple):
 def checked_planes(
     near_plane: float, far_plane: float, eps2d: float, radius_clip: float, camera_model: str
 ) -> CameraPlanes:
-    """Check the settings that all cameras share. Raises InputError, which names the argument."""
+    """Check the camera settings that all cameras share. Raises InputError, which names the argument."""
     choice("camera_model", camera_model, EWA_CAMERA_MODELS)
     near, far = number("near_plane", near_plane, -np.inf), number("far_plane", far_plane, -np.inf)
     if not near < far:
@@ -328,7 +331,7 @@ def checked_planes(
 
 
 def check_given(covars: object, quaternions: object, scales: object) -> None:
-    """Raise InputError unless either covars, or quaternions and scales, are given. It names the argument."""
+    """Raise InputError unless either covars, or quaternions and scales, are given. The message names the argument."""
     if covars is None and (quaternions is None or scales is None):
         missing = "quaternions" if quaternions is None else "scales"
         raise InputError(f"{missing} is None, expected an array unless covars is given")
@@ -357,7 +360,7 @@ class GivenShapes:
         if quaternions is not None and scales is not None:
             turns = floats("quaternions", quaternions, (count, 4))
             return cls(turns, floats("scales", scales, (count, 3)))
-        assert covars is not None, "check_given"
+        assert covars is not None, "check_given has refused calls without covars, quaternions and scales"
         given = floats("covars", covars, (count, 6), (count, 3, 3))
         if given.ndim == 2:
             return cls(covariances=given, covariance_layout="upper")
@@ -381,9 +384,9 @@ def full_gradient(upper: Float32) -> Float32:
 
 
 def stacked(arrays: list[NDArray[Any]], each: NDArray[Any] | None = None) -> NDArray[Any]:
-    """Stack the arrays of the cameras. The array of a single camera is not copied.
+    """Stack arrays, one for each camera. The array of a single camera is not copied.
 
-    each: an example of such an array, from which shape and dtype are taken if there are no cameras.
+    each: an example of a camera's array, whose shape and dtype are used if there are no cameras.
     """
     if len(arrays) == 1:
         return arrays[0][None]

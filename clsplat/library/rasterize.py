@@ -20,12 +20,12 @@ from clsplat.library.session import session_of
 from clsplat.rendering.build_flags import DEFAULT_ALPHA_MAX
 
 RASTERIZE_RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-"""Colour, depth, expected depth, and colour followed by one of the depths."""
+"""Render modes: colour, depth, expected depth, and colour followed by one of the depths."""
 RASTERIZE_FILTER_MODES = ("classic", "antialiased")
 
 
 class Rasterization:
-    """Images of C cameras, and the projected Gaussians, on the host.
+    """Images of C cameras and the projected Gaussians, on the host, with their vector-Jacobian products.
 
     The first access to an array waits for the device. The object keeps device memory for the vector-Jacobian products
     until it is deleted. In every array, rows of Gaussians that are not visible are 0.
@@ -57,7 +57,7 @@ class Rasterization:
 
     @cached_property
     def images(self) -> Float32 | list[Float32]:
-        """(C, H, W, X) float32: colours over the background, then the depth in world units.
+        """Images (C, H, W, X) float32: colours over the background, then the depth in world units.
 
         A list of (H, W, X) if the cameras' sizes differ.
         """
@@ -65,43 +65,43 @@ class Rasterization:
 
     @cached_property
     def alphas(self) -> Float32 | list[Float32]:
-        """(C, H, W, 1) float32, 0 to 1, or a list like `images`."""
+        """Alphas (C, H, W, 1) float32, 0 to 1, or a list like `images`."""
         return self._of_pixels(lambda view: view.alpha[:, :, None])
 
     @cached_property
     def radii(self) -> NDArray[np.int32]:
-        """(C, N, 2) int32: half sides of a Gaussian's bounding box in pixels, 0 if it is not visible."""
+        """Radii (C, N, 2) int32: half sides of a Gaussian's bounding box in pixels, 0 if it is not visible."""
         return stacked([view.splats("radii") for view in self._views])
 
     @cached_property
     def means2d(self) -> Float32:
-        """(C, N, 2) float32: pixels; the first pixel's centre is at 0.5. 0 if the Gaussian is not visible."""
+        """Means on the image (C, N, 2) float32, in pixels: the first pixel's centre is at 0.5. 0 if not visible."""
         return stacked([view.splats("means2d") for view in self._views])
 
     @cached_property
     def depths(self) -> Float32:
-        """(C, N) float32: world units along the camera's axis."""
+        """Depths (C, N) float32 along the camera's axis, in world units."""
         return stacked([view.depths for view in self._views])
 
     @cached_property
     def conics(self) -> Float32:
-        """(C, N, 3) float32: a, b, c of the inverse covariance on the image, 1 / px^2."""
+        """Conics (C, N, 3) float32: a, b, c of the inverse covariance on the image, 1 / px^2."""
         return stacked([view.splats("conics") for view in self._views])
 
     @cached_property
     def opacities(self) -> Float32:
-        """(C, N) float32: blended opacities; with rasterize_mode "antialiased" compensated for the low-pass filter."""
+        """Opacities (C, N) float32, with rasterize_mode "antialiased" after compensation for the low-pass filter."""
         return stacked([view.opacities for view in self._views])
 
     @cached_property
     def colors2d(self) -> Float32:
-        """(C, N, D) float32: the blended values without the depth."""
+        """Blended values (C, N, D) float32 without the depth."""
         colors = stacked([view.colors for view in self._views])
         return colors.copy() if np.may_share_memory(colors, self._given.colors) else colors
 
     @cached_property
     def tile_counts(self) -> NDArray[np.int32]:
-        """(C, N) int32: number of 16 x 16 pixel tiles that a Gaussian's ellipse reaches."""
+        """Numbers (C, N) int32 of 16 x 16 pixel tiles that a Gaussian's ellipse reaches."""
         return stacked([view.pixels.tile_counts for view in self._views])
 
     def vjp_pixels(
@@ -302,7 +302,7 @@ def rasterize(
     covars : (N, 3, 3) or (N, 6) array_like, optional
         Symmetric covariances, or xx, xy, xz, yy, yz, zz, instead of quaternions and scales.
     alpha_max : float
-        The cap of a Gaussian's alpha.
+        Maximum of a Gaussian's alpha at a pixel.
     absolute_gradients : bool
         Also compute sums of the absolute gradients of means2d.
     differentiable : bool
@@ -319,7 +319,7 @@ def rasterize(
     Raises
     ------
     InputError
-        If a shape is wrong, a setting is out of range, or numbers are not finite; it names the argument.
+        If a shape is wrong, a setting is out of range, or numbers are not finite. The message names the argument.
     DeviceError
         If there is no such device, or it fails.
 
@@ -345,7 +345,7 @@ def rasterize(
 
 
 def _backgrounds(given: ArrayLike | None, count: int, channels: int) -> list[Float32 | None]:
-    """The background (D,) of each camera, from one for all or one for each. Raises InputError."""
+    """The background (D,) of each camera, from one background for all or one for each. Raises InputError."""
     if given is None:
         return [None] * count
     rows = floats("backgrounds", given, (count, channels), (channels,))
@@ -359,7 +359,8 @@ def check_channels(channels: int) -> None:
 
 
 def checked_modes(render_mode: str, rasterize_mode: str, alpha_max: float) -> float:
-    """Check the modes, and return the cap of alpha. Raises InputError, which names the argument."""
+    """Check render_mode, rasterize_mode and alpha_max, and return alpha_max. Raises InputError, which names the
+    argument."""
     choice("render_mode", render_mode, RASTERIZE_RENDER_MODES)
     choice("rasterize_mode", rasterize_mode, RASTERIZE_FILTER_MODES)
     return number("alpha_max", alpha_max, 1 / 255, 1 - 1e-6)

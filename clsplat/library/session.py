@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An open device for the library's calls, with its working memory."""
+"""Sessions of the library: an open device with the working memory and the lock that all calls on it share."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from clsplat.rendering.build_flags import kernel_defines
 
 _PAIR_ARRAY_NAMES = ("ranges", "gaussian_from_sorted", "slot_from_sorted", "cells_from_sorted")
 BACKWARD_ARRAY_NAMES = frozenset(("splats", "tile_counts", "first_slots", "transmittance", "stops", *_PAIR_ARRAY_NAMES))
-"""Names of the arrays of a forward pass that its gradient reads. Each pass has its own; all other arrays are shared."""
+"""Names of the arrays of a forward pass that its gradient reads. Each pass has its own. All other arrays are shared."""
 MAX_IDLE_WORKSPACES = 4
 """Maximum number of workspaces of deleted passes that are kept for later passes."""
 
 
 class PassWorkspace(Workspace):
-    """The arrays of a pass that its gradient reads. Other arrays are in the session's workspace."""
+    """Workspace of a pass, for the arrays that its gradient reads. Other arrays are in the session's workspace."""
 
     def __init__(self, device: Device, scratch: Workspace) -> None:
         super().__init__(device)
@@ -35,14 +35,14 @@ class PassWorkspace(Workspace):
     def array(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
     ) -> DeviceArray:
-        """The array of this name: of this workspace if in BACKWARD_ARRAY_NAMES, otherwise of the shared workspace."""
+        """The array of this name: from this workspace for BACKWARD_ARRAY_NAMES, otherwise from the shared one."""
         if name in BACKWARD_ARRAY_NAMES:
             return super().array(name, shape, dtype, kept=kept)
         return self._scratch.array(name, shape, dtype, kept=kept)
 
 
 class LibrarySession:
-    """A device and its working memory. Only the thread that holds the `lock` may use it.
+    """A device and its working memory. Only the thread that holds the `lock` may use them.
 
     All calls share kernels and scratch arrays. This is safe, as the device's queue runs in order.
     """
@@ -65,7 +65,7 @@ class LibrarySession:
             self._idle.append(work)
 
     def capped(self, alpha_max: float) -> Device:
-        """The device, with this cap of alpha in the kernels of blending and its gradient."""
+        """The device with kernels in which a Gaussian's alpha at a pixel is at most `alpha_max`."""
         defines = kernel_defines(RasterizerConfig(), alpha_max=alpha_max)
         return self.device.with_switches(defines) if defines else self.device
 
@@ -91,5 +91,6 @@ def session_of(device: Device | str | None = None) -> LibrarySession:
     """
     if isinstance(device, Device):
         return _session(device)
-    # cached, as listing the devices takes as long as projecting 500,000 Gaussians; the variables may change the list
+    # Cached, because a list of the devices takes as long as a projection of 500,000 Gaussians. The environment
+    # variables are part of the key, because they may change the list.
     return _named(device, tuple(os.environ.get(name) for name in _DEVICE_CHOICE_VARIABLES))

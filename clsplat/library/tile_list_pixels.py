@@ -128,7 +128,7 @@ def rasterize_to_pixels(
     masks : (..., tile_height, tile_width) array_like of bool, optional
         Tiles that are False show only the background.
     alpha_max : float
-        The cap of alpha, between 0 and 1.
+        Maximum of a Gaussian's alpha at a pixel, between 0 and 1.
     device : Device or str, optional
         An open device, or a name as `clsplat devices` lists them.
 
@@ -140,7 +140,7 @@ def rasterize_to_pixels(
     Raises
     ------
     InputError
-        If the tile size, a shape or a number is wrong; it names the argument.
+        If the tile size, a shape or a number is wrong. The message names the argument.
     DeviceError
         If there is no such device.
 
@@ -172,7 +172,7 @@ def rasterize_to_pixels(
 
 @dataclass(frozen=True, eq=False)
 class _GivenSplats:
-    """Checked splats, with leading axes flattened to one: (rows, 2), (rows, 3), (rows, D) and (rows,).
+    """Checked splats of all images, with the leading axes of each array flattened to one axis of rows.
 
     batch: the sizes of the leading axes; the last is N.
     """
@@ -219,7 +219,7 @@ class _ImageLists:
     gaussians: Int64
 
     def from_row(self, first: int) -> _ImageLists:
-        """The lists with `first` subtracted from all rows."""
+        """A copy of the lists with `first` subtracted from the rows of all Gaussians."""
         return _ImageLists(self.begins, self.counts, self.gaussians - first)
 
 
@@ -259,7 +259,7 @@ class _GivenLists:
 
 
 def _checked_size(tile_size: int, image_width: int, image_height: int) -> tuple[int, int]:
-    """Width and height in pixels. Raises InputError."""
+    """Check the tile size, and return the image's width and height in pixels. Raises InputError."""
     if whole(tile_size) != TILE:
         raise InputError(f"tile_size: got {tile_size}, expected {TILE}, the only size that the kernels support")
     size = whole(image_width) or 0, whole(image_height) or 0
@@ -278,7 +278,7 @@ def _pixels(
     background: Float32 | None,
     alpha_max: float,
 ) -> ListedPixels:
-    """The pixels of one image."""
+    """Blend one image of these splats in the tiles of these lists."""
     with session.lock:
         device, n = session.device, len(given.means2d)
         arrays = (given.means2d, given.conics, given.opacities, given.opacities, given.colors)
@@ -313,7 +313,7 @@ def _shapes_of(values: ArrayLike, last: int) -> list[tuple[int | str, ...]]:
 
 
 def _lists(isect_offsets: ArrayLike, flatten_ids: ArrayLike, tiles: tuple[int, int], count: int) -> tuple[Int64, Int64]:
-    """The lists as integers. Raises InputError if they do not match the numbers of tiles and Gaussians."""
+    """Offsets and ids as int64. Raises InputError if they do not match the numbers of tiles and Gaussians."""
     offsets, ids = np.asarray(isect_offsets), np.asarray(flatten_ids)
     if offsets.ndim < 2 or offsets.shape[-2:] != tiles or offsets.dtype.kind not in "iu":
         wanted = f"integers (..., {tiles[0]}, {tiles[1]})"
@@ -329,7 +329,7 @@ def _lists(isect_offsets: ArrayLike, flatten_ids: ArrayLike, tiles: tuple[int, i
 
 
 def _masks(masks: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """(images, tiles): True for tiles that are drawn. Raises InputError."""
+    """Masks as an array (images, tiles), True for tiles that are drawn. Raises InputError."""
     tiles = prod(shape[-2:])
     if masks is None:
         return np.ones((prod(shape[:-2]), tiles), np.bool_)
@@ -340,7 +340,7 @@ def _masks(masks: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.bool_]
 
 
 def _own_of(listed: Int64, batch: tuple[int, ...], image: int) -> slice:
-    """The rows of an image's Gaussians. In packed arrays, they go from the first to the last row in its lists."""
+    """The rows of an image's Gaussians. In packed arrays they reach from the first to the last row in its lists."""
     if len(batch) > 1:
         return slice(image * batch[-1], (image + 1) * batch[-1])
     return slice(int(listed.min()), int(listed.max()) + 1) if len(listed) else slice(0, 0)

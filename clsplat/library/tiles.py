@@ -28,7 +28,7 @@ def isect_tiles(
     image_ids: ArrayLike | None = None,
     n_images: int | None = None,
 ) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]]:
-    """List the (tile, Gaussian) pairs in which the tile overlaps the Gaussian's bounding box, its mean +- its radii.
+    """List the (tile, Gaussian) pairs in which the tile overlaps the Gaussian's bounding box, mean +- radii.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def isect_tiles(
 def _tiles_of_boxes(
     means: Float32, reach: Float32, tile_size: int, tiles: tuple[int, int]
 ) -> tuple[Int64, Int64, Int64]:
-    """The number of tiles in each Gaussian's bounding box, then the Gaussian and the tile of each pair.
+    """The number of tiles in each Gaussian's bounding box (n,), then the Gaussian and the tile of each pair (pairs,).
 
     tiles: number of tiles across and down.
     """
@@ -137,7 +137,10 @@ def isect_offset_encode(isect_ids: ArrayLike, n_images: int, tile_width: int, ti
     bits = tiles.bit_length()
     image, tile = keys >> bits, keys & ((1 << bits) - 1)
     if len(keys) and (int(image.max()) >= n_images or int(image.min()) < 0 or int(tile.max()) >= tiles):
-        raise InputError(f"isect_ids: found ids beyond the {n_images} images of {tile_width} x {tile_height} tiles")
+        raise InputError(
+            f"isect_ids: found ids beyond the {n_images} images of {tile_width} x {tile_height} tiles, expected ids "
+            "that isect_tiles returns for these numbers"
+        )
     counts = np.bincount(image * tiles + tile, minlength=n_images * tiles)
     return (np.cumsum(counts) - counts).astype(np.int32).reshape(n_images, tile_height, tile_width)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Build defines of the kernels for a RasterizerConfig. The default config needs no defines."""
+"""Kernel build defines for the settings of the rasterizer (`RasterizerConfig`). The defaults need no defines."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _HALF_LOG2E = 0.5 * math.log2(math.e)
 
 
 DEFAULT_ALPHA_MAX = 0.99
-"""The default cap of alpha."""
+"""Default maximum of a Gaussian's alpha at a pixel."""
 
 
 def kernel_defines(
@@ -22,12 +22,12 @@ def kernel_defines(
     """The kernels' defines for `config`, only for settings that differ from the default.
 
     antialiased: True for an antialiased model.
-    alpha_max: the cap of alpha in library calls.
+    alpha_max: maximum of a Gaussian's alpha at a pixel; library calls choose their own.
     """
     config, default = config.switches(), RasterizerConfig()
     defines: dict[str, object] = {}
     if config.extent == "3sigma":
-        # Whole cells of a tile are skipped, so that the result would depend on the kernel shape.
+        # Skips of rows and columns are off: they skip whole cells, so that results would depend on the kernel shape.
         defines.update(EXTENT_BUDGET=_literal(9 * _HALF_LOG2E), NO_ROW_SKIP=True, NO_COLUMN_SKIP=True)
     elif config.extent == "constant":
         defines["EXTENT_BUDGET"] = _literal(-math.log2(config.alpha_min))
@@ -53,5 +53,5 @@ def kernel_defines(
 
 
 def _literal(value: float) -> str:
-    """A float32 as OpenCL C, without rounding."""
+    """The OpenCL C literal of a value, with all digits of its float32."""
     return f"{float(np.float32(value)):.9e}f"

@@ -29,8 +29,8 @@ def largest_contributions(
     """The largest contribution (n,) of each Gaussian to one camera's image, in pixels.
 
     A contribution is the sum over the image's pixels of alpha times transmittance, like `--density.min-contribution`.
-    It is 0 if the camera does not see the Gaussian. The kernel of the gradient of blending computes it; the gradient of
-    the image does not matter. Raises CapacityError if the device's memory is too small.
+    It is 0 if the camera does not see the Gaussian. The kernel of blending's gradient computes contributions, for any
+    gradient of the image. Raises CapacityError if the device's memory is too small.
     """
     config = config or RasterizerConfig()
     alpha_alone = drop_sh(gaussians, 0)  # contributions do not depend on colour

@@ -20,11 +20,11 @@ from clsplat.stages.sort import scratch_bytes
 _EXTRA_CHANNEL_PLANES = 4
 """Planes that a frame with extra channels needs in addition to its features: median, first, count and index."""
 MODELS = 3
-"""Arrays per parameter in a training step: the parameter and two moments."""
+"""Number of arrays per parameter in a training step of one view: the parameter and Adam's two moments."""
 _VISIBLE_MARK_BYTES = 4
-"""Bytes per Gaussian in a step with several views: the mark that some view shows it."""
+"""Bytes per Gaussian in a step of several views, for the mark that some view shows it."""
 _SMALL_ARRAYS_BYTES = 4096
-"""Bytes of camera, background, totals and other small arrays."""
+"""Upper bound in bytes of the camera, background, totals and other small arrays together."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,12 @@ class StepMemory:
 
     fields: the columns of a slot.
     photographs: number of pixels of all photographs that may stay on the device.
-    turns: number of arrays for the partial sums of the loss (`stages.loss.loss`).
+    turns: number of arrays for the partial sums of the loss, which successive steps use in turn (`stages.loss.loss`).
     masks: True if photographs have masks, or there is an alpha loss.
     row_bytes: bytes per Gaussian of the training's components.
     pixel_bytes: bytes per pixel of the training's components.
     by_chunk: True if a step may run over the chunks in view.
-    pool: as in `Need`.
+    pool: bytes for parameters and moments of the Gaussians on the device; None leaves it to the plan.
     """
 
     fields: SlotFields
@@ -61,7 +61,7 @@ def plan_frame(
     planes: int = 0,
     moved: int = 0,
 ) -> Plan:
-    """Memory plan of a frame without training. Raises CapacityError.
+    """Plan the device memory for a frame without training. Raises CapacityError.
 
     floats: parameters of a Gaussian (`ShStorage.floats`).
     features: floats of each Gaussian that are blended to extra channels.
@@ -82,7 +82,7 @@ def plan_step(
     *,
     models: int = MODELS,
 ) -> Plan:
-    """Memory plan of a training step with any of the cameras. Raises CapacityError.
+    """Plan the device memory for a training step with any of the cameras. Raises CapacityError.
 
     models: number of arrays per parameter. The default is the number for a step of one view.
     """
@@ -94,7 +94,7 @@ def plan_step(
         planes = max(planes, pixels + loss.scratch_bytes(device, camera.height, tiles_of(camera)[0] * TILE, step.turns))
     frame = _frame_need(device, gaussians, floats_of(coefficients), planes, config)
     fields = step.fields
-    # Without a limit of memory, room for the lists by append is added to that for the lists by sort.
+    # Without a memory limit, lists may be made by append or by sort; memory is planned for both.
     appends = device.shape.items > 1 and device.memory.limit is None
     screen = project.SCREEN_GRADIENT_BYTES + 4 * fields.contributions
     statistics = density.gaussian_bytes(contributions=fields.contributions)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plan of the device memory: how the work is divided so that it fits the limit. Policy only: no OpenCL."""
+"""Device memory plan: the division into tile bands and streamed parts by which a frame or training step fits the limit.
+
+Policy only: no OpenCL.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +32,9 @@ class Need:
     planes: bytes of all arrays that are as large as the image.
     scratch: bytes of all other arrays.
     photographs: bytes of the photographs, which the device keeps between steps if it has room.
-    statistics: those of `row` that come and go with the parameters, if chunks do.
-    held: those of `row` that a step over the chunks in view needs of all Gaussians too; None if steps cannot run so.
+    statistics: bytes of `row` that are part of a chunk's record, where Gaussians are streamed by chunk.
+    held: bytes of `row` that every Gaussian needs, in view or not, in a step over the chunks in view; None if steps
+    take all chunks.
     pool: bytes for parameters, moments and statistics of the Gaussians on the device; None leaves it to the plan.
     """
 
@@ -50,7 +54,7 @@ class Need:
 
     @property
     def pairs(self) -> int:
-        """Number of pairs, estimated before the first frame."""
+        """Estimated number of (tile, Gaussian) pairs of a frame that shows all Gaussians."""
         return ESTIMATED_PAIRS_PER_GAUSSIAN * self.gaussians
 
     @property
@@ -65,25 +69,25 @@ class Need:
 
     @property
     def moving(self) -> int:
-        """Bytes of a second copy of parameters and moments, which exists while rows are moved."""
+        """Bytes of a second copy of parameters and moments, which exists while density control moves rows."""
         return self.gaussians * self.model
 
 
 ESTIMATED_PAIRS_PER_GAUSSIAN = 8
 """Estimated number of tiles that a Gaussian reaches. Trained scenes have 3 to 8."""
 PAIRS_IN_VIEW = 4
-"""Pairs for each Gaussian on the device for which a plan by chunks leaves room. A chunk also has Gaussians that are not
-in view."""
+"""Number of pairs per Gaussian on the device for which a plan by chunks leaves memory. It is less than
+ESTIMATED_PAIRS_PER_GAUSSIAN, because not all Gaussians of a chunk are in view."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Division of the work, so that it fits the memory.
+    """The division of a frame or training step, so that it fits the memory.
 
     rows: number of Gaussians whose parameters and moments are on the device at once.
-    streamed: True if these are not all Gaussians.
+    streamed: True if `rows` is less than all Gaussians, so that parameters are streamed.
     pairs: largest number of (tile, Gaussian) pairs at once.
-    gathers: True if the device moves rows, False if the host does.
+    gathers: True if the device moves rows for density control, False if the host does.
     allowed: memory limit, bytes.
     bands: estimated number of bands of tiles, which are listed and blended one after the other.
     photographs: bytes of photographs that stay on the device.
@@ -100,16 +104,16 @@ class Plan:
 
     @property
     def pieces(self) -> tuple[bool, bool]:
-        """True for each part that is divided: parameters, image."""
+        """Two flags: True if the parameters are streamed in parts, and True if the image is divided into bands."""
         return self.streamed, self.bands > 1
 
     @property
     def tight(self) -> bool:
-        """True if there is no spare memory."""
+        """True if the work is divided or rows are moved by the host, so that no memory is to spare."""
         return any(self.pieces) or not self.gathers
 
     def __str__(self) -> str:
-        """The line that training prints."""
+        """The plan in a line of text, which training prints."""
         how = []
         if self.streamed:
             within = "" if self.need.pool is None else " within --max-host-mem"
@@ -123,11 +127,11 @@ class Plan:
 def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
     """Divide the work according to the estimated number of pairs.
 
-    If not everything fits at once, the tiles are divided into bands. If that would make many bands, the parameters are
+    If not everything fits at once, the tiles are divided into bands. If there would be many bands, the parameters are
     also streamed in parts. Bands come first because they repeat little work, while parts cross the bus in every step.
     A frame with more pairs than `Plan.pairs` is divided by `stages.duplicate.plan_bands`.
 
-    alignment: the number of rows is a multiple of this.
+    alignment: number of which `Plan.rows` must be a multiple if parameters are streamed.
     Raises CapacityError if not even the smallest pieces fit.
     """
     photographs = min(max(budget - need.total - need.moving, 0) // 2, need.photographs)
@@ -164,7 +168,7 @@ def _too_little(need: Need, least: int, budget: int) -> CapacityError:
 
 
 def _plan_by_chunk(need: Need, held: int, budget: int, max_allocation: int) -> Plan:
-    """Plan for steps over the chunks in view. A view may show all Gaussians that are on the device at once.
+    """Plan steps over the chunks in view, such that a view may show all Gaussians that are on the device at once.
 
     Raises CapacityError if not even one chunk fits.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The forward pass and its gradient, as sequences of the stages."""
+"""The rasterizer: the forward pass of a frame and its gradient, as sequences of the stages."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ R = TypeVar("R")
 class ListedBand:
     """A band of tiles with the pairs and lists of its Gaussians.
 
-    pairs: None if the lists were made by append.
+    pairs: the pairs before their sort by tile; None if the lists were made by append.
     """
 
     counted: Totals
@@ -60,15 +60,15 @@ class ListedBand:
 
 
 MAX_COUNTED_PASSES = 3
-"""Number of passes by capacity whose counts are retained: the current pass, the one before, and a repeated pass."""
+"""Number of passes by capacity whose counts are kept on the host: the current, the previous and a repeated pass."""
 
 
 @dataclass
 class PairCapacity:
     """Capacity of a pass that is launched before its number of pairs is known: "a pass by capacity".
 
-    pairs: number of pairs that fit in its arrays.
-    turn: index of the array for its counts, below MAX_COUNTED_PASSES.
+    pairs: number of pairs that fit in the pass's arrays.
+    turn: index of the host array that gets the pass's counts, below MAX_COUNTED_PASSES.
     appends: True if the lists may be made by append (`stages.append`), if the device supports that.
     """
 
@@ -79,7 +79,7 @@ class PairCapacity:
 
 @dataclass(eq=False)
 class ForwardPass:
-    """One forward pass: every stage's arrays, valid until the rasterizer's next forward pass.
+    """One forward pass: the arrays of all stages, which are valid until the rasterizer's next forward pass.
 
     bands: one band of all tiles, unless memory is short.
     listed: the lists of the last band.
@@ -102,7 +102,7 @@ class ForwardPass:
 
     @property
     def inputs(self) -> ImageInputs:
-        """Input of the stages that compute more from this pass, such as channels and the gradient."""
+        """Input of the stages that compute channels or the gradient from this pass."""
         camera = self.camera
         return ImageInputs(self.projected.splats, self.background, camera.width, camera.height, self.camera_array)
 
@@ -110,8 +110,8 @@ class ForwardPass:
 class Rasterizer:
     """The rendering pipeline on one device, with its workspace, which may be shared.
 
-    capacity: largest number of (tile, Gaussian) pairs in one band; the owner sets it from its memory plan.
-    readback: (len(READBACK),) uint32, the numbers that each pass reads back, with the counts of `adam`.
+    capacity: largest number of (tile, Gaussian) pairs in one band; `follow` sets it from a memory plan.
+    readback: (len(READBACK),) uint32, the numbers that the host reads after each pass (`columns.READBACK`).
     """
 
     def __init__(
@@ -128,14 +128,14 @@ class Rasterizer:
         self.antialias(on=antialiased)
         self.work = work or Workspace(device)
         self._sent: WeakKeyDictionary[Camera, NDArray[np.float32]] = WeakKeyDictionary()  # training has few cameras
-        """A camera and its last background, as `send` sends them. The device may still read them."""
+        """Each camera's packed fields and last background, as `send` sends them. The device may still read them."""
         aligned = -(-len(CAMERA) // device.row_alignment) * device.row_alignment
         self._view = allocate(device, (aligned + 3,), np.float32)
         self._camera, self._background = self._view.reshaped(len(CAMERA)), self._view.rows(aligned, aligned + 3)
         self._kept: WeakKeyDictionary[Camera, DeviceArray] = WeakKeyDictionary()
         self._kept_background = allocate(device, (3,), np.float32)
         self._colours: NDArray[np.float32] | None = None
-        """The host's array that `_kept_background` was sent from."""
+        """The host array from which `_kept_background` was sent."""
         self.readback = allocate(device, (len(READBACK),), np.uint32)
         self.readback.fill(0)
         self._arriving: NDArray[np.uint32] | None = None
@@ -143,7 +143,7 @@ class Rasterizer:
         self.capacity = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS_PER_BAND)
 
     def antialias(self, *, on: bool) -> None:
-        """Switch to antialiased models, or back to others (`Gaussians.antialiased`)."""
+        """Use the kernels for antialiased models (`Gaussians.antialiased`) if `on`, otherwise those for the others."""
         if on == self._antialiased:
             return
         defines = kernel_defines(self.config, antialiased=on)
@@ -166,7 +166,8 @@ class Rasterizer:
         return not self.work.tight and self._switches.depth_sort != "pairs"
 
     def send(self, camera: Camera, background: NDArray[np.float32] | DeviceArray) -> tuple[DeviceArray, DeviceArray]:
-        """Camera and background on the device. A background on the host is sent with the camera, in one copy."""
+        """Send camera and background to the device, in one copy, and return their arrays. A background that is on the
+        device already is returned as it is."""
         sent = self._sent.get(camera)
         if sent is None:
             sent = self._sent[camera] = np.zeros(self._view.shape, np.float32)
@@ -183,8 +184,8 @@ class Rasterizer:
     def keep(self, camera: Camera, background: NDArray[np.float32]) -> tuple[DeviceArray, DeviceArray]:
         """Camera and background on the device, for passes by capacity.
 
-        A camera stays there as long as its object, so that a training sends each of its cameras once. The background's
-        array is always the same, and is sent again if `background` is not the object of the last call.
+        A camera's array exists as long as the camera object, so that a training sends each of its cameras once. The
+        background's array is always the same, and is sent again if `background` is not the object of the last call.
         """
         array = self._kept.get(camera)
         if array is None:
@@ -209,14 +210,14 @@ class Rasterizer:
     ) -> ForwardPass:
         """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2).
 
-        background: (3,) float32, on the host or the device, or what `send` or `keep` of camera and background returned.
+        background: (3,) float32, on the host or the device; or the two arrays that `send` or `keep` returned.
         backward: True if a gradient will follow. If False, the work that only a gradient needs is left out.
         room: capacity with which to run without waiting for the number of pairs. If there are more pairs, the pass has
         no effect (docs/decisions/0025-launch-by-capacity.md). None counts the pairs first.
         thinning: random dropout of the model's Gaussians in this pass.
         nearness: like `nearness` of `blend`.
-        chunks: the only chunks of the model that may be in view; None takes the whole model, or, of a streamed model
-            whose pool knows it, the chunks in view. With ChunkNumbers the pairs are counted first.
+        chunks: the only chunks of the model that may be in view. None takes the whole model; if the model is streamed
+            and its pool finds the chunks in view, only these. ChunkNumbers cannot be given together with `room`.
         """
         device, work = self.device_of(camera), self.work
         if chunks is None and isinstance(gaussians, HostGaussians) and gaussians.pool is not None and gaussians.culls:
@@ -244,13 +245,13 @@ class Rasterizer:
                 del listed  # this band may need the memory for larger arrays
                 listed = self._list(device, projected, band, tiles_of(camera), counted if one else None)
                 blended = blend(device, work, listed.lists, inputs, record=records and one, nearness=nearness)
-            assert listed is not None, "an image has a tile"
+            assert listed is not None, "an image has at least one tile"
             return projected, bands, listed, blended, counted.refused
 
         if room is None:
             return ForwardPass(camera, camera_array, colours, *make())
         size, how = (camera.width, camera.height), (backward, thinning is not None, nearness)
-        assert not isinstance(chunks, ChunkNumbers), "the host moves chunks in the middle of the pass"
+        assert not isinstance(chunks, ChunkNumbers), "no pass by capacity: the host moves chunks in the middle of it"
         rows = chunks and chunks.key
         key = (self.readback, device, colours, *size, *how, room.pairs, room.turn, by_append, rows)
         made = work.replayed(gaussians, key, make, thinning_numbers(thinning), (camera_array,))
@@ -259,7 +260,11 @@ class Rasterizer:
     def _in_view(
         self, gaussians: HostGaussians, pool: ChunkPool, camera: Camera
     ) -> tuple[AnyGaussians, ChunkList | ChunkNumbers | None]:
-        """The rows of a pool, and the slots that the camera may show; the whole model if that is not known."""
+        """The pool's rows and the slots of the chunks that the camera may show.
+
+        If the pool has too few slots: the whole model and the numbers of these chunks. If the pool cannot find them:
+        the whole model alone.
+        """
         if pool.cull is None:
             return gaussians, None
         numbers = pool.cull(camera)
@@ -273,22 +278,22 @@ class Rasterizer:
         return room.appends and room.pairs <= MAX_MEAN_PAIRS * tiles[0] * tiles[1] and appends(device)
 
     def _host(self, turn: int) -> NDArray[np.uint32]:
-        """Host memory for a copy of the counts."""
+        """Host memory for the counts of a pass by capacity. turn: `PairCapacity.turn`."""
         if self._arriving is None:
             self._arriving = pinned(self.device, (MAX_COUNTED_PASSES, len(READBACK)), np.uint32)
         row: NDArray[np.uint32] = self._arriving[turn]
         return row
 
     def listed(self, frame: ForwardPass, band: Band) -> ListedBand:
-        """The band with its pairs and lists. With several bands it reuses the memory of the previous band."""
+        """The band with its pairs and lists. If a frame has several bands, each reuses the memory of the one before."""
         if len(frame.bands) == 1:
             return frame.listed
         return self._list(self.device_of(frame.camera), frame.projected, band, tiles_of(frame.camera))
 
     def by_band(self, frame: ForwardPass, work_on: Callable[[ListedBand], R]) -> list[R]:
-        """Results of `work_on` for each of the frame's bands in turn.
+        """Results of `work_on` for the frame's bands, in order.
 
-        The lists of a band are not kept: the next band may need the memory for larger lists.
+        The lists of a band are not kept, as the next band may need the memory for larger lists.
         """
         return [work_on(self.listed(frame, band)) for band in frame.bands]
 
@@ -305,7 +310,7 @@ class Rasterizer:
         motion: Motion,
         held: Held | None = None,
     ) -> Channels:
-        """The frame's extra channels.
+        """Blend the frame's extra channels.
 
         held: the holdout, as for `hold_out`.
         """
@@ -315,7 +320,8 @@ class Rasterizer:
         return self.by_band(frame, lambda listed: channels(device, work, wanted, rows, listed.lists, *pixels))[-1]
 
     def shares(self, frame: ForwardPass, rows: DeviceArray, held: Held | None = None) -> DeviceArray:
-        """Planes (floats + 2, height, stride); the first `floats` are weighted means of `rows`.
+        """Blend any values of the Gaussians. Returns planes (floats + 2, rows, stride); the first `floats` are the
+        weighted means of `rows`.
 
         rows: (n, floats), any values of each Gaussian.
         held: the holdout, as for `hold_out`.
@@ -326,7 +332,7 @@ class Rasterizer:
         return self.by_band(frame, lambda listed: channels(device, work, wanted, rows, listed.lists, *pixels))[-1].means
 
     def deep(self, frame: ForwardPass, bins: int) -> DeviceArray:
-        """The frame in slices by depth: the array of `stages.deep`."""
+        """The frame in slices by depth, for a deep picture: the array of `stages.deep`."""
         device = self.device_of(frame.camera)
         pixels = (frame.inputs, frame.blended)
         return self.by_band(frame, lambda listed: deep(device, self.work, bins, listed.lists, *pixels))[-1]
@@ -381,7 +387,7 @@ class Rasterizer:
         *,
         fields: SlotFields = PLAIN_SLOTS,
     ) -> Slots:
-        """The gradient of blending: one row per pair, or with several bands one sum per Gaussian."""
+        """Compute the gradient of blending: a row for each pair or, with several bands, a sum for each Gaussian."""
         device, work = self.device_of(frame.camera), self.work
         pixels = (frame.inputs, frame.blended, image_gradient)
 
@@ -398,5 +404,5 @@ class Rasterizer:
             sums = add_slots(device, work, listed.counted.tile_counts, slots(listed), sums)
 
         self.by_band(frame, add)
-        assert sums is not None, "an image has a tile"
+        assert sums is not None, "an image has at least one tile"
         return Slots(sums, fields=fields)

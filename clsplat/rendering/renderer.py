@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The renderer that callers use: from a model and a camera to arrays on the host."""
+"""The renderer that callers use: it renders a model and a camera to image, alpha and channels on the host."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ Other channels, if requested: (H, W) or (H, W, floats) float32, as docs/channels
 
 
 def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:
-    """Which SH coefficients of a model the settings keep for rendering, and how they are stored.
+    """The SH coefficients of a model that the settings keep for rendering, and how they are stored.
 
     Raises InputError if a coefficient is too large for float16.
     """
@@ -80,7 +80,7 @@ def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:
 
 
 class Renderer:
-    """Renders models, and keeps the last one on the device. It may share another owner's rasterizer and its memory.
+    """Renderer of models. It keeps the last model on the device, and may share another owner's rasterizer.
 
     Parameters
     ----------
@@ -220,9 +220,10 @@ class Renderer:
         count: int,
         holdout: Surfaces | None = None,
     ) -> Float32:
-        """(H, W, count): coverage of each pixel by each of `count` objects, the sum of the weights of its Gaussians.
+        """Render the coverage (H, W, count) of each pixel by each of `count` objects. It is the sum of the blending
+        weights of an object's Gaussians.
 
-        owners: (n,), the object of each Gaussian.
+        owners: (n,), the index of each Gaussian's object.
         holdout: as for `render`.
         Raises errors like `render`.
         """
@@ -240,11 +241,10 @@ class Renderer:
         return shares
 
     def render_deep(self, gaussians: Gaussians, camera: Camera, bins: int) -> Float32:
-        """(bins, H, W, 5): the view in slices by depth, front to back in each pixel.
+        """Render the view in slices by depth, (bins, H, W, 5), front to back in each pixel.
 
         The last axis is red, green, blue (premultiplied), alpha, and the slice's depth. All are 0 behind a pixel's last
-        slice.
-        The result is a view of planes.
+        slice. The result is a view of planes.
         """
         camera.check()
         on_device, camera = self._placed(gaussians, camera, planes=4 * DEEP_FLOATS * bins)
@@ -277,20 +277,20 @@ class Renderer:
     def _motion(
         self, gaussians: Gaussians | AnyGaussians, on_device: AnyGaussians, ahead: _MotionEnd, back: _MotionEnd
     ) -> Motion:
-        """Both ends of motion, with means on the device or on the host, like the model."""
+        """The cameras and means at the ends of motion and of backward motion; means are on the device or the host, like
+        the model."""
         cameras = self._sent(ahead, gaussians), self._sent(back, gaussians)
         return Motion(*cameras, self._moved(on_device, ahead), self._moved(on_device, back))
 
     def _sent(self, end: _MotionEnd, gaussians: Gaussians | AnyGaussians) -> DeviceArray:
-        """The camera of an end of motion on the device, relative to the origin of the means there."""
+        """The packed camera of an end of motion on the device, relative to the origin of the means at that end."""
         counted = gaussians if end.gaussians is None else end.gaussians
         local = counted.local(end.camera) if isinstance(counted, Gaussians) else end.camera
         return upload(self.device, pack_camera(local))
 
     def _moved(self, gaussians: AnyGaussians, end: _MotionEnd) -> AnyGaussians | None:
-        """The means at an end of motion, on the device or on the host like the Gaussians. Raises ValueError if their
-        number differs.
-        """
+        """The means at an end of motion, on the device or the host like the Gaussians. Raises ValueError if there are
+        more or fewer than in the model."""
         moved = end.gaussians
         if moved is None:
             return None
@@ -309,11 +309,12 @@ class Renderer:
         *,
         moved: int = 0,
     ) -> tuple[AnyGaussians, Camera]:
-        """The model on the device, or on the host if a frame of this size leaves too little room, and the camera
-        relative to its origin.
+        """The model on the device, or on the host if a frame of this size leaves too little memory; and the camera
+        relative to the model's origin.
 
+        features: floats of each Gaussian that are blended to extra channels.
         planes: bytes per pixel in addition to the picture's.
-        moved: number of further sets of means.
+        moved: number of further sets of means, for motion.
         """
         if isinstance(gaussians, HostGaussians) and features:
             return replace(gaussians, culls=False), camera
@@ -369,18 +370,18 @@ def _motion_end(
 
 
 def _pixels_of(planes: Channels, camera: Camera, *, contiguous: bool) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Both arrays of planes on the host, without padding and with the plane axis last."""
+    """The planes `means` and `whole` on the host, without padding and with the plane axis last."""
     arrays = (planes.means, planes.whole)
     means, whole = (array.get()[:, : camera.height, : camera.width].transpose(1, 2, 0) for array in arrays)
     return (np.ascontiguousarray(means), np.ascontiguousarray(whole)) if contiguous else (means, whole)
 
 
 def _in_the_world(named: ChannelResult, camera: Camera, gaussians: Gaussians | AnyGaussians) -> ChannelResult:
-    """The channels with depths along the camera's axis, and positions in world coordinates."""
+    """Convert channels from the kernels' coordinates: depths along the camera's axis, positions in the world."""
     origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
     if (of_distances := camera.depths_of_distances()) is not None:
         named |= {name: named[name] * of_distances for name in ("depth", *DEPTH_PLANES)}
-    if "position" in named and origin.any():  # the sum is as precise as float32 allows
+    if "position" in named and origin.any():  # float32 limits the precision of the sum
         shown = named["count"][:, :, None] > 0
         named["position"] = np.where(shown, named["position"] + origin, 0).astype(np.float32)
     return named

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The SH coefficients of a model that change its colours visibly, and how to store them. Policy only: no OpenCL."""
+"""Storage of a model's SH coefficients for rendering: only bands that change colours visibly, as float32 or float16.
+
+Policy only: no OpenCL.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,9 @@ from numpy.typing import NDArray
 from clsplat.errors import InputError
 
 MIN_DROPPED_SH_FRACTION = 0.5
-"""Each Gaussian stores its own degree if at least this fraction of the coefficients above band 0 can be left out.
+"""Minimum fraction of the coefficients above band 0 that can be left out, for each Gaussian to have its own SH degree.
 
-From this fraction on, a frame takes no longer with the degrees than without them (docs/performance.md).
+From this fraction on, a frame takes no longer with a degree for each Gaussian than without (docs/performance.md).
 """
 
 _HALF_MAX = float(np.finfo(np.float16).max)
@@ -31,9 +34,9 @@ def change_bounds(band: NDArray[np.float32], degree: int) -> NDArray[np.float64]
 def needed_degrees(sh: NDArray[np.float32], tolerance: float) -> NDArray[np.uint8]:
     """The lowest degree (n,) of each Gaussian above which all bands can be left out within `tolerance`.
 
-    The tolerance bounds the change of each channel, before the floor at 0, by `change_bounds`. At 0 only bands of zeros
-    are left out.
     sh: (n, K, 3).
+    tolerance: largest change of a colour channel, before the floor at 0, as bounded by `change_bounds`. A tolerance of
+    0 leaves out only bands of zeros.
     """
     degrees = np.zeros(len(sh), np.uint8)
     undecided = np.arange(len(sh))
@@ -44,7 +47,7 @@ def needed_degrees(sh: NDArray[np.float32], tolerance: float) -> NDArray[np.uint
         if tolerance > 0:
             left_out = left_out + change_bounds(band, degree)
             falls_away = left_out.max(axis=1) <= tolerance
-        else:  # the coefficients themselves: squares in a norm may underflow to zero
+        else:  # not by `change_bounds`, as squares of coefficients may underflow to zero
             falls_away = ~band.any(axis=(1, 2))
         degrees[undecided[~falls_away]] = degree
         undecided, left_out = undecided[falls_away], left_out[falls_away]

@@ -21,7 +21,7 @@ from clsplat.stages.device_gaussians import DeviceGaussians
 
 @dataclass(eq=False)
 class AdamStep:
-    """A step of Adam: its constants, its number (from 1), and the learning rate of each group."""
+    """A step of Adam: settings, the step's number (from 1), and the learning rate of each parameter group."""
 
     config: OptimiserConfig
     number: int
@@ -38,12 +38,12 @@ class AdamStep:
         return self.rates[group] / shrunk, root
 
     def corrections(self, updates: int) -> tuple[float, float]:
-        """1 - beta1^t and 1 / sqrt(1 - beta2^t) of the t-th update."""
+        """The factors 1 - beta1^t and 1 / sqrt(1 - beta2^t) of the t-th update; `updates` is t."""
         return 1.0 - self.config.beta1**updates, (1.0 - self.config.beta2**updates) ** -0.5
 
     @property
     def scales(self) -> dict[str, float]:
-        """rate sqrt(1 - beta2^t) / (1 - beta1^t) of the groups that the step updates."""
+        """Step sizes, rate sqrt(1 - beta2^t) / (1 - beta1^t), of the groups that the step updates, by group."""
         groups = [group for group in self.rates if group != "sh_rest" or self.updates_sh_rest]
         by_group = {group: self.corrected(group) for group in groups}
         return {group: rate / root for group, (rate, root) in by_group.items()}
@@ -67,10 +67,10 @@ def adam(
     (`columns.REFUSED`).
     """
     readback = readback or allocate(device, (len(READBACK),), np.uint32)
-    counts = readback.buffer  # passed as a buffer, so that the profile counts no traffic: it is written only on a fault
+    counts = readback.buffer  # a buffer, which the profile does not count: the kernel writes it only on a fault
     config = step.config
     beta1, beta2, epsilon = config.beta1, config.beta2, config.epsilon
-    abreast = max(device.shape.lanes, 4)  # ABREAST in adam.h
+    abreast = max(device.shape.lanes, 4)  # elements per work-item: ABREAST in adam.h
     for group, about in PARAMETER_GROUPS.items():
         if group == "sh_rest" and not step.updates_sh_rest:
             continue
@@ -81,7 +81,7 @@ def adam(
         if size == 0:
             continue
         if config.late:
-            assert tile_counts is not None, "late is refused in batches"
+            assert tile_counts is not None, "optimiser.late needs the tile counts of a view"
             kernel = device.kernels("adam", {"WIDTH": size // rows}).adam_visible
             launch_items(device, kernel, -(-rows // abreast), rows, *constants, tile_counts, *arrays)
         else:
@@ -101,8 +101,8 @@ def add_view(
 ) -> None:
     """Add the gradients of the Gaussians visible in a view to the sums over the earlier views.
 
-    tile_counts: (n,) uint32, of the view; 0 for a Gaussian that is not visible.
-    sh_rest: also add the higher SH bands.
+    tile_counts: (n,) uint32, tile counts in the view; 0 for a Gaussian that is not visible.
+    sh_rest: also add the gradients of the higher SH bands.
     """
     rows = tile_counts.shape[0]
     for group in PARAMETER_GROUPS:

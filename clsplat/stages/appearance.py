@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches appearance.cl and a colour model's kernels: photographs without their colours, gradient, and update.
+"""Launches appearance.cl and a colour model's kernels, which remove a photograph's own colours and learn them by Adam.
 
 A new colour model is a row of COLOUR_MODELS (config/colour_models.py), a kernel file and its twin of the same name.
 """
@@ -29,7 +29,7 @@ APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON = 0.9, 0.999, 1e-15
 class PhotoLens:
     """Photograph and lens of a view, for the kernels.
 
-    photograph, lens: rows in the arrays of their entries.
+    photograph, lens: their rows in the arrays of colour entries (`Gains`).
     centre: the principal point, as fractions of the image's width and height.
     flat: False for a panorama, which cannot have a vignette.
     """
@@ -40,16 +40,16 @@ class PhotoLens:
     flat: bool = True
 
     def place(self, width: int, height: int) -> tuple[float, float, float]:
-        """The principal point in pixels; then 1 / (half the image's diagonal)^2, or 0 for a panorama."""
+        """The principal point x, y in pixels, and 1 / (half the image's diagonal)^2, which is 0 for a panorama."""
         scale = 4 / (width**2 + height**2) if self.flat else 0.0
         return self.centre[0] * width, self.centre[1] * height, scale
 
 
 @dataclass(frozen=True)
 class GainEntries:
-    """The column sums from which gains are updated, and settings of the update by Adam.
+    """Settings of `step_gains`, the update of colour entries by Adam.
 
-    first_row: row of the first entry in the column sums.
+    first_row: row of the first entry in the column sums of `entry_gradient`.
     mix_rate: learning rate of mixes, as a fraction of the rate of gains.
     centred: True if the mean of each entry over all rows is subtracted after a step.
     """
@@ -60,8 +60,8 @@ class GainEntries:
 
     @classmethod
     def of_lens(cls, model: ColourModel) -> GainEntries:
-        """The update of a lens's entries. Their column sums come after the photograph's; their mean over the lenses is
-        not moved to 0."""
+        """Settings for the update of a lens's entries. Their column sums come after those of the photograph, and their
+        mean over the lenses is not moved to 0."""
         return cls(first_row=model.entries, centred=False)
 
 
@@ -70,15 +70,16 @@ PLAIN_GAINS = GainEntries()
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """Gains of all photographs, (photographs, entries) float32 each.
+    """Colour entries of all photographs or of all lenses, with their Adam state: (photographs, entries) float32 each.
 
     logs: the first three entries are the base-2 logarithms of the gains; the others are colour mixes.
     start: initial values of `logs`.
     first, second: Adam's moments.
     gains: 2^logs.
-    moved: scratch.
-    begins (photographs + 1,), others, weights (n,): a sparse matrix, stored like a `csr_array`. The matrix times
-    `logs - start` is added to the gradient, so that the gains are pulled towards their initial values.
+    moved: scratch array for the update.
+    begins (photographs + 1,), others, weights (n,): row starts, column indices and values of a sparse matrix, as in
+    SciPy's `csr_array`. The matrix times `logs - start` is added to the gradient, so that the gains are pulled towards
+    their initial values.
     """
 
     logs: DeviceArray
@@ -128,7 +129,7 @@ def develop(
     """Remove the colours of a photograph and its lens from `target`, in place.
 
     colours: (photographs, model.entries).
-    lenses: (number of lenses, model.lens_entries); None if that is 0.
+    lenses: (number of lenses, model.lens_entries); None if a lens has no entries.
     target: planes (3 or more, rows, stride) of the photograph, the first three of which are colours.
     size: width and height in pixels.
     """
@@ -150,10 +151,10 @@ def entry_gradient(
     size: tuple[int, int],
     place: int = 0,
 ) -> DeviceArray:
-    """Column sums (model.sums, stride) of the gradient with respect to entries of 0 that are applied to the render.
+    """Column sums (model.sums, stride) of the gradient with respect to colour entries of 0, applied to the render.
 
     The sum over the columns, multiplied by ln 2 for logarithms, is the gradient (docs/gradients.md, (184) to (186)).
-    place: the view's number in the batch; each has its own array.
+    place: index of the view in the batch; the result of each view is in an array of its own.
     """
     _, rows, stride = image.shape
     down = rows // TILE

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches append.cl: the lists of a pass by capacity, without a sort of all pairs, for groups of several items."""
+"""Launches append.cl: tile lists by append with atomics, each sorted by its own group, for a pass by capacity.
+
+The kernels are for groups of several work-items. They replace the radix sorts of all pairs.
+"""
 
 from __future__ import annotations
 
@@ -18,21 +21,21 @@ from clsplat.stages.project import Projected
 from clsplat.stages.ranges import TileLists
 
 APPEND_PAIR_BYTES = 12
-"""Bytes per pair in addition to the lists: its depth and slot, and the Gaussian of the slot."""
+"""Bytes per pair in addition to the lists: the pair's depth and slot, and the slot's Gaussian."""
 
 MAX_MEAN_PAIRS, MAX_LIST_PAIRS = 1500, 8192
-"""The most pairs of a tile, on average and in the longest list, for which lists are made by append.
+"""Maximum pairs per tile for which lists are made by append: on average, and in the longest list.
 
-A group sorts each list, and beyond 2,048 pairs all of its steps go through global memory. Longer lists leave too few
-groups for too much work: the radix sort is faster.
+One group sorts each list, in global memory if the list has more than 2,048 pairs. With longer lists too few groups have
+too much work, and the radix sort is faster.
 """
 
 LOCAL_PAIRS = 2048
-"""Pairs that a group sorts in local memory: 16 KiB of them, half of every device's minimum. A power of two from 16
-on."""
+"""Maximum pairs of a list that a group sorts in local memory. They take 16 KiB, half of what every device has. Must be
+a power of two, 16 or more."""
 
 _OFFSET_ITEMS = 1024
-"""Work-items of each group of `list_offsets`, which has all tiles or all groups of `count_tiles`."""
+"""Work-items in each of the two groups of `list_offsets`: one for all tiles, one for all groups of `count_tiles`."""
 
 
 def appends(device: Device) -> bool:
@@ -51,12 +54,12 @@ def append(
     capacity: int,
     host: NDArray[np.uint32],
 ) -> tuple[Totals, TileLists]:
-    """The lists of `duplicate` and `tile_lists` for at most `capacity` pairs, without waiting.
+    """Make the lists that `duplicate` and `tile_lists` make, for at most `capacity` pairs, without waiting.
 
     With more pairs the pass stops (kernels/append.cl).
 
     readback: (READBACK_SIZE,) uint32, the array that `project_step` gets too.
-    host: host memory for its copy.
+    host: host memory for the copy of `readback`.
     """
     (n,), number, items = projected.tile_counts.shape, tiles[0] * tiles[1], device.shape.items
     groups = -(-n // items)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches blend.cl and blend_grad.cl."""
+"""Launches blend.cl and blend_grad.cl: alpha blending of each tile's Gaussians from front to back, and its gradient."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from clsplat.stages.device_camera import padded_size
 from clsplat.stages.ranges import TileLists
 
 BLEND_PIXEL_BYTES = 20
-"""Bytes per pixel, padding included: image, transmittance, stop."""
+"""Bytes per pixel of `Blended`, padding included: image, transmittance and stop."""
 
 
 def gradient_pair_bytes(fields: SlotFields) -> int:
-    """Bytes per pair that the gradient needs: cells and a slot."""
+    """Bytes per pair that the gradient of blending needs: the pair's cells and its slot."""
     return 4 + 4 * fields.floats
 
 
@@ -46,8 +46,11 @@ class ImageInputs:
 
 @dataclass(frozen=True, eq=False)
 class Blended:
-    """Planes padded to whole tiles: image (3, rows, stride), transmittance (rows, stride), stops (rows, stride).
+    """Results of `blend`, as planes padded to whole tiles.
 
+    image: (3, rows, stride).
+    transmittance: (rows, stride).
+    stops: (rows, stride) int32, the sorted index of the first pair that is not added to the pixel; -1 in padding.
     cells_from_sorted: (pairs) uint32, the cells in which each pair's Gaussian contributes, as bits; or None.
     nearness: (rows, stride), the sum of weight / depth, if requested.
     """
@@ -60,7 +63,7 @@ class Blended:
 
 
 def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
-    """Arrays for the image, transmittance and stops of a frame. kept: keep their contents from the last call."""
+    """Arrays for the image, transmittance and stops of a frame. kept: True keeps their contents from the last call."""
     rows, stride = padded_size(width, height)
     return (
         work.array("image", (3, rows, stride), kept=kept),
@@ -70,9 +73,9 @@ def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[De
 
 
 _MIN_STRIP_ITEMS = 32
-"""The fewest work-items that share a tile for which sums over its pixels have the order of kernels/shared/strips.h."""
+"""Number of work-items per tile from which sums over a tile's pixels are in the order of kernels/shared/strips.h."""
 _MIN_TILE_ITEMS = 8
-"""The fewest work-items that share a tile, if several do: one row of a block of pixels (kernels/shared/blocks.h)."""
+"""Minimum number of work-items per tile, unless one has it alone: a row of a pixel block (kernels/shared/blocks.h)."""
 
 
 def tile_items(device: Device) -> int:
@@ -83,21 +86,24 @@ def tile_items(device: Device) -> int:
 
 
 _BUSY_ITEMS = 4096
-"""Number of work-items per compute unit above which larger groups in `blend` only add instructions: 16 tiles of 256
-work-items or 32 of 128, as predicted for NVIDIA's GPUs (docs/gpu-static.md)."""
+"""Number of work-items per compute unit above which larger groups in `blend` only add instructions. It is 16 tiles of
+256 work-items or 32 of 128, as predicted for NVIDIA's GPUs (docs/gpu-static.md)."""
 
 
 _GRADIENT_TILES = 12
-"""Number of tiles per compute unit up to which `blend_grad` is quicker in the largest group, as predicted for NVIDIA's
-GPUs: for fox (11) 0.52 ms in place of 0.62, for a frame with 13 and shorter lists 0.18 in place of 0.17. A group of 128
-takes longer than one of 64 in both."""
+"""Number of tiles per compute unit up to which `blend_grad` is quicker in groups of 256 than in groups of 64.
+
+The limit is a prediction for NVIDIA's GPUs. The scene fox, with 11 tiles per unit, takes 0.52 ms instead of 0.62. A
+frame with 13 tiles per unit and shorter lists takes 0.18 ms instead of 0.17. Groups of 128 are slower than 64 in both.
+"""
 
 
 def frame_items(device: Device, tiles: int) -> int:
-    """Number of work-items that share a tile in `blend` and `sort_lists`, for so many tiles. No result depends on it.
+    """Number of work-items that share a tile in `blend` and `sort_lists`, in a frame of `tiles` tiles. No result
+    depends on this number.
 
-    A frame with few tiles for a GPU's units waits for its longest lists. More work-items sort such a list in less time,
-    and more warps walk shorter parts of it.
+    A frame with few tiles for a GPU's units waits for its longest lists. More work-items sort a long list in less time,
+    and more warps blend it in shorter parts.
     """
     items = tile_items(device)
     if device.kind != "gpu" or items == 1:
@@ -113,7 +119,8 @@ def items_for(tiles: int, units: int, items: int, most: int) -> int:
 
 
 def gradient_items(device: Device, tiles: int) -> int:
-    """Number of work-items that share a tile in `blend_grad`, for so many tiles. No result depends on it from 32 on."""
+    """Number of work-items that share a tile in `blend_grad`, in a frame of `tiles` tiles. All numbers of 32 or more
+    give the same bits."""
     items = tile_items(device)
     if device.kind != "gpu" or items < _MIN_STRIP_ITEMS or device.shape.by_gaussian:
         return items
@@ -127,7 +134,7 @@ def gradient_items_for(tiles: int, units: int, items: int, most: int) -> int:
 
 _GRADIENT_REGISTERS = {64: 96}
 """Maximum registers per work-item of `blend_grad`, by the number of work-items that share a tile, where the driver
-accepts a limit. Without a limit NVIDIA's assembler takes 80, with which loads have to wait for one another."""
+accepts a limit. Without it NVIDIA's assembler uses only 80, so few that loads have to wait for one another."""
 
 
 def launch_tiles(
@@ -169,7 +176,7 @@ def blend(
 
     Pixels of other tiles are left unchanged.
 
-    record: keep the cells that the gradient has to visit, if the kernel shape supports it.
+    record: also fill `cells_from_sorted`, by which the gradient skips cells, if the kernel shape supports it.
     nearness: also blend 1 / depth.
     items: number of work-items that share a tile; None for `frame_items`.
     """
@@ -198,13 +205,13 @@ def count_pairs(
     background: DeviceArray,
     camera: Camera,
 ) -> tuple[int, int]:
-    """Numbers of contributing and of evaluated pairs of a Gaussian and a pixel, from a counting build of blend.cl.
+    """Count the contributing and the evaluated pairs of a Gaussian and a pixel, by a counting build of blend.cl.
 
     A pair contributes if the Gaussian's colour is added to the pixel. It is evaluated if its alpha is computed; a
     vector computes the alpha of all its lanes.
     """
     width, height = camera.width, camera.height
-    planes = _planes(work, width, height, kept=True)  # the planes of `blend`, rewritten with the same values
+    planes = _planes(work, width, height, kept=True)  # `blend` has filled them; they get the same values again
     counts = work.array("counts", (lists.band.tiles * tile_items(device), 2), np.uint32)
     arrays = (lists.ranges, lists.gaussian_from_sorted, splats, background, *planes, counts)
     launch_tiles(device, "blend", {"COUNT_PAIRS": True}, lists, -(-width // TILE), width, height, *arrays)
@@ -223,7 +230,7 @@ def blend_grad(
     *,
     fields: SlotFields = PLAIN_SLOTS,
 ) -> DeviceArray:
-    """Partial gradients (pairs, fields.floats): the row of each pair is its slot.
+    """Compute the partial gradients of all pairs, (pairs, fields.floats). The row of a pair is its slot.
 
     image_gradient: (3, rows, stride). An optional fourth plane is the gradient with respect to the transmittance.
     If the fields include nearness, the last plane is the gradient with respect to nearness.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches bounds.cl: the bounds of a model's chunks."""
+"""Launches bounds.cl: bounding boxes and greatest scales of a model's chunks."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from clsplat.stages.chunk_lists import ChunkList
 from clsplat.stages.device_gaussians import DeviceGaussians
 
 BOUNDS_FLOATS = 7
-"""Floats for each chunk's bounds: least and greatest coordinates of the means, greatest log scale."""
+"""Number of floats in a chunk's bounds: least and greatest coordinates of the means, and the greatest log scale."""
 
 
 @stage("bounds")
 def bounds(device: Device, work: Workspace, gaussians: DeviceGaussians, chunks: ChunkList) -> Float32:
-    """The bounds (chunks, BOUNDS_FLOATS) of these chunks.
+    """Compute the bounds of these chunks, (chunks, BOUNDS_FLOATS), and wait for them.
 
-    Bounds of NO_CHUNK are empty: from infinity to -infinity.
+    An entry NO_CHUNK in the list has empty bounds: from infinity to -infinity.
     """
     count = chunks.numbers.shape[0]
     items = 1 if device.shape.lanes > 1 or device.max_group < DEFAULT_GROUP_ITEMS else DEFAULT_GROUP_ITEMS

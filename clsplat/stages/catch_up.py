@@ -24,22 +24,22 @@ from clsplat.stages.device_gaussians import DeviceGaussians
 from clsplat.stages.project import CPU_STEP_ROWS, step_numbers
 
 _TABLE_NUMBERS = 2 + len(PARAMETER_GROUPS)
-"""Numbers of a step in the table: two roots for Adam, and each group's learning rate."""
+"""Columns of a step table (`step_numbers`): two factors of Adam, then a learning rate for each parameter group."""
 _ABREAST = 4
-"""Elements that an item updates at once in kernel shapes of one lane (`kernels/shared/adam.h`)."""
+"""Elements that a work-item updates at once in kernel shapes of one lane (`kernels/shared/adam.h`)."""
 
 
 def step_table(steps: Iterable[AdamStep]) -> Float32:
-    """The table (steps, numbers) of `catch_up`, for steps in sequence."""
+    """Table (steps, _TABLE_NUMBERS) by which `catch_up` takes consecutive steps of Adam."""
     return np.array([step_numbers(step, NO_EXPLORATION) for step in steps], np.float32).reshape(-1, _TABLE_NUMBERS)
 
 
 @dataclass(frozen=True, eq=False)
 class StepTable:
-    """Steps of Adam in sequence.
+    """A table of consecutive steps of Adam on the device.
 
-    numbers: (steps, numbers), `step_table`.
-    first_step: number of the first one.
+    numbers: (steps, _TABLE_NUMBERS), a `step_table`.
+    first_step: the number of the step in row 0.
     """
 
     numbers: DeviceArray
@@ -63,19 +63,20 @@ def catch_up(
     table: StepTable,
     readback: DeviceArray,
 ) -> None:
-    """Take the missed steps of these chunks up to step `step`, with gradient zero, to the bits of steps over all rows.
+    """Take the steps of Adam that these chunks missed, up to step `step`, with gradients of zero.
 
-    Nothing changes if `readback` says that the step's pass has stopped.
+    The bits are those of steps that update all rows of the model. Nothing changes if `readback` says that the step's
+    pass has stopped.
 
     model: parameters, first and second moments of the whole model.
     last: (entries of chunks,) uint32, the last step that each chunk has taken with its gradients.
-    caught: (chunks of the model,) uint32, the last step up to which each has been caught up; `step` is written for
-    these chunks. So a second call for one step, which is repeated, changes nothing.
-    table: has all missed steps.
+    caught: (chunks of the model,) uint32, the step up to which each chunk has caught up. The call writes `step` for
+    these chunks, so that a second call for the same step changes nothing.
+    table: must contain all missed steps.
     readback: (READBACK_SIZE,) uint32. Its last four entries count refused updates of elements, one for each step.
     """
     if step > table.last_step:
-        raise ValueError(f"table: has steps {table.first_step} to {table.last_step}, expected up to {step}")
+        raise ValueError(f"table: has steps {table.first_step} to {table.last_step}, but step {step} is needed")
     entries, coefficients = chunks.numbers.shape[0], model[0].coefficients
     sh_width = 3 * (coefficients - 1)
     if device.shape.lanes > 1:
@@ -100,7 +101,7 @@ def catch_up(
         np.uint32(sh_width),
         *(config.beta1, config.beta2, config.epsilon),
         *(PARAMETER_GROUPS["means"].limit ** 2, PARAMETER_GROUPS["sh_dc"].limit ** 2),
-        readback.buffer,  # a buffer, so that the profile counts no traffic: it is written only on a fault
+        readback.buffer,  # a buffer, which the profile does not count: the kernel writes it only on a fault
         *(arrays[group] for arrays in model for group in PARAMETER_GROUPS),
     )
     noted = (chunks.model_rows, chunks.numbers, np.uint32(step), readback.buffer, caught)

@@ -24,14 +24,15 @@ from clsplat.stages.project import Projected
 from clsplat.stages.ranges import TileLists
 
 FEATURE_WIDTHS = floats_of("features")
-"""Floats of each feature."""
+"""Number of floats of each feature, by its name. Features are values of a Gaussian that are blended into a channel."""
 DEPTH_PLANES, WHOLE_NUMBER_PLANES = tuple(floats_of("depths")), tuple(floats_of("whole"))
-"""Names of the planes that follow the blended features, and of the integer planes, in the order of channels.cl."""
+"""Names of the depth planes, which follow the blended features, and of the integer planes, in channels.cl's order."""
 
 
 @dataclass(frozen=True)
 class Features:
-    """The blended features, in the order of FEATURE_WIDTHS; depth is always included, as it costs almost nothing."""
+    """The features that a frame blends, in the order of FEATURE_WIDTHS. Depth is always one of them, as it costs almost
+    nothing."""
 
     names: tuple[str, ...] = ("depth",)
 
@@ -40,23 +41,23 @@ class Features:
         """Depth and the `wanted` features. Raises ValueError for an unknown name."""
         kept = {"depth", *wanted}
         if unknown := kept - FEATURE_WIDTHS.keys():
-            raise ValueError(f"no such features: {', '.join(sorted(unknown))}")
+            raise ValueError(f"no such features: {', '.join(sorted(unknown))}; expected {', '.join(FEATURE_WIDTHS)}")
         return cls(tuple(name for name in FEATURE_WIDTHS if name in kept))
 
     @property
     def offsets(self) -> dict[str, int]:
-        """Offset of each feature in a row."""
+        """Offset in floats of each feature in a Gaussian's row."""
         ends = accumulate(FEATURE_WIDTHS[name] for name in self.names)
         return {name: end - FEATURE_WIDTHS[name] for name, end in zip(self.names, ends, strict=True)}
 
     @property
     def floats(self) -> int:
-        """Number of floats in a row of features."""
+        """Number of floats in a Gaussian's row of features."""
         return sum(FEATURE_WIDTHS[name] for name in self.names)
 
     @property
     def defines(self) -> dict[str, object]:
-        """Defines for both kernels."""
+        """Defines for features.cl and channels.cl."""
         return {"FEATURES": self.floats, **{f"FEATURE_{name.upper()}": at for name, at in self.offsets.items()}}
 
     def named(self, means: NDArray[Any], whole: NDArray[Any]) -> dict[str, NDArray[Any]]:
@@ -69,7 +70,7 @@ class Features:
 
 @dataclass(frozen=True)
 class Floats:
-    """Rows of arbitrary values that are blended like features."""
+    """Rows of `floats` arbitrary values per Gaussian, which are blended like features."""
 
     floats: int
 
@@ -81,7 +82,7 @@ class Floats:
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """Planes padded to whole tiles; `Features.named` splits them.
+    """Channels of a frame, as planes padded to whole tiles. `Features.named` splits them into channels by name.
 
     means: (floats + 2, rows, stride), the features, then the planes of DEPTH_PLANES.
     whole: (2, rows, stride), the planes of WHOLE_NUMBER_PLANES.
@@ -117,7 +118,7 @@ def features(
     projected: Projected,
     motion: Motion,
 ) -> DeviceArray:
-    """Features of each visible Gaussian, (n, wanted.floats)."""
+    """Compute the features of each visible Gaussian, (n, wanted.floats)."""
     rows = work.array("features", (gaussians.count, wanted.floats))
     after, before = motion.after, motion.after if motion.before is None else motion.before
     moments = (motion.moved, motion.earlier)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches deep.cl: a frame in slices by depth (docs/pictures.md)."""
+"""Launches deep.cl: the samples of a deep picture, which are slices of a frame by depth (docs/pictures.md)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from clsplat.stages.blend import Blended, ImageInputs, launch_tiles
 from clsplat.stages.ranges import TileLists
 
 DEEP_FLOATS = len(DEEP_SLICE)
-"""Floats per pixel and slice."""
+"""Number of floats of one slice at a pixel."""
 
 
 @stage("deep")
@@ -25,9 +25,10 @@ def deep(
     inputs: ImageInputs,
     blended: Blended,
 ) -> DeviceArray:
-    """Slices (bins, DEEP_FLOATS, rows, stride) of the tiles in the lists; `blended` must be of the same tiles.
+    """Slices (bins, DEEP_FLOATS, rows, stride) of the frame, filled for the tiles in the lists.
 
     bins: maximum number of slices per pixel.
+    blended: the frame, in which these tiles must have been blended.
     """
     plane_rows, stride = blended.stops.shape
     planes = work.array("deep", (bins, DEEP_FLOATS, plane_rows, stride), kept=lists.band.first > 0)

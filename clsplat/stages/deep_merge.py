@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches deep_merge.cl: several deep pictures as one (docs/pictures.md)."""
+"""Launches deep_merge.cl: the weighted merge of several deep pictures into one (docs/pictures.md)."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from clsplat.stages.deep import DEEP_FLOATS
 
 
 def merge_bytes(pictures: int, bins: int) -> int:
-    """Bytes per pixel for a merge: the pictures, their weights, the order of their slices, and the result."""
+    """Bytes per pixel for a merge of deep pictures: pictures, weights, the order of all slices, and the result."""
     return pictures * (4 + bins * (4 * DEEP_FLOATS + 5)) + 4 * DEEP_FLOATS * bins
 
 
 @stage("deep_merge")
 def deep_merge(device: Device, work: Workspace, pictures: DeviceArray, weights: DeviceArray) -> DeviceArray:
-    """The merged deep picture (bins, DEEP_FLOATS, pixels), an array of the workspace.
+    """Merge deep pictures into one (bins, DEEP_FLOATS, pixels), an array of the workspace.
 
     pictures: (P, bins, DEEP_FLOATS, pixels), P at most DEEP_PICTURES.
     weights: (P, pixels), not negative, with a sum near 1.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras in the layout that the kernels read."""
+"""Cameras in the layout that the kernels read (`columns.CAMERA`), and sizes of images in whole tiles."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ assert CAMERA[len(_CAMERA_FIELDS) :] == tuple(
     f"{name}_LOW" for name in _CAMERA_FIELDS[: len(CAMERA) - len(_CAMERA_FIELDS)]
 )
 FARTHEST_PLANE = float(np.finfo(np.float32).max)
-"""Far plane, in world units, for a camera without one. It is finite, because infinity split into two floats would give
+"""Far plane, in world units, of a camera that has none. It is finite, because infinity split into two floats would give
 NaN."""
 _TRANSLATION_FIELDS, _POSITION_FIELDS = ("T0", "T1", "T2"), ("PX", "PY", "PZ")
 _ROTATION_FIELDS = tuple(tuple(f"R{row}{column}" for column in range(3)) for row in range(3))
 
 
 def pack_camera(camera: Camera) -> NDArray[np.float32]:
-    """The camera's values as float32 in the order of `columns.CAMERA`; fields ending in _LOW hold their rounding
-    errors.
+    """The camera's values as float32 in the order of `columns.CAMERA`. Fields that end in _LOW are rounding errors of
+    the others.
 
     Raises InputError for a panorama of more than a full turn.
     """
@@ -37,7 +37,7 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
         "FY": camera.fy,
         "CX": camera.cx,
         "CY": camera.cy,
-        "NEAR": max(camera.near, 0.0),  # depth does not order points behind the camera
+        "NEAR": max(camera.near, 0.0),  # not behind the camera, where depth does not order points
         "FAR": min(camera.far, FARTHEST_PLANE),
         "HAND": float(np.copysign(1.0, np.linalg.det(camera.rotation))),
         "XMIN": -camera.cx / camera.fx - window.clamp * half_w,
@@ -62,10 +62,10 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
 
 
 def padded_size(width: int, height: int) -> tuple[int, int]:
-    """(rows, stride) of an image's planes, padded to whole tiles."""
+    """Rows and stride of an image's planes in pixels, padded to whole tiles."""
     return -(-height // TILE) * TILE, -(-width // TILE) * TILE
 
 
 def tiles_of(camera: Camera) -> tuple[int, int]:
-    """Number of tiles across and down."""
+    """Numbers of tiles across and down in a camera's image."""
     return -(-camera.width // TILE), -(-camera.height // TILE)

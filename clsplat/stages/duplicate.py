@@ -21,20 +21,21 @@ from clsplat.stages.scan import Elements, chunking, scan
 from clsplat.stages.sort import SORT_KEY_BYTES, sort
 
 MAX_PAIRS_PER_BAND = 2**31 - 1024
-"""Maximum number of pairs in a band: stops are signed 32-bit integers, and kernels read slightly past the last pair."""
+"""Maximum number of pairs in a band. A pixel's stop, a position in a list, is a signed 32-bit integer, and kernels read
+slightly past the last pair."""
 
 
 DUPLICATE_GAUSSIAN_BYTES = 3 * 4 + SORT_KEY_BYTES + 3 * 4
-"""Bytes per Gaussian: its first slot, place among the visible and depth key; the sort's buffers; and in order of depth
-its index, its number of tiles and their offset."""
+"""Bytes per Gaussian: its entries of `first_slots`, `gaussian_from_visible` and `depth_keys`, of the sort by depth, and
+of `gaussian_from_rank`, `rank_counts` and `offsets`."""
 BAND_GAUSSIAN_BYTES = 4
-"""Additional bytes per Gaussian if there are several bands: its number of tiles in the current band."""
+"""Additional bytes per Gaussian if there are several bands: the number of its tiles in the current band."""
 BAND_TILE_BYTES = 4
-"""Bytes per tile if there are several bands: its number of pairs."""
+"""Additional bytes per tile if there are several bands: the number of its pairs."""
 
 
 def pair_bytes(*, sorts_pairs: bool) -> int:
-    """Bytes per pair: tile, slot and Gaussian. If sorts_pairs, also tile, Gaussian and depth of each slot, and a sort
+    """Bytes per pair: its tile, slot and Gaussian. If `sorts_pairs`, also tile, Gaussian and depth by slot, and a sort
     of the pairs by depth."""
     return 12 + (12 + SORT_KEY_BYTES if sorts_pairs else 0)
 
@@ -56,14 +57,14 @@ class Band:
 class Totals:
     """The numbers of visible Gaussians and of their pairs.
 
-    tile_counts, first_slots: (n), the number of tiles of each Gaussian, and its first slot, a prefix sum of these.
+    tile_counts, first_slots: (n), each Gaussian's number of tiles, and its first slot, a prefix sum of tile_counts.
     visible, pairs: the numbers of visible Gaussians and of pairs; pairs are capped at 2^32 - 1.
-    refused: the counts of `adam`.
+    refused: numbers of elements that `adam` did not update, by reason (`columns.REFUSED`).
 
     In a pass launched by capacity (`PairCapacity`), `visible` and `pairs` are upper bounds, and these fields are set:
 
-    on_device: the READBACK array from which its kernels read these numbers.
-    arriving: function that waits for the host's copy of that array, and returns it.
+    on_device: the READBACK array from which the pass's kernels read the two numbers.
+    arriving: function that waits for the host's copy of the READBACK array, and returns it.
     """
 
     tile_counts: DeviceArray
@@ -75,9 +76,9 @@ class Totals:
     arriving: Callable[[], NDArray[Any]] | None = None
 
     def elements(self, most: int, name: str) -> Elements:
-        """The field `name` of READBACK, as the number of elements of a kernel.
+        """The number of elements that a kernel processes: `most`, or in a pass by capacity field `name` of READBACK.
 
-        most: the number itself, or an upper bound of it in a pass by capacity.
+        most: the number. In a pass by capacity, an upper bound of the number that the kernel reads from READBACK.
         """
         return Elements(most, self.on_device, READBACK.index(name))
 
@@ -86,7 +87,7 @@ class Totals:
 class Counted(Totals):
     """The visible Gaussians and the number of their pairs.
 
-    gaussian_from_visible, depth_keys: (visible), in order of the Gaussians.
+    gaussian_from_visible, depth_keys: (visible), index and depth key of each visible Gaussian, in order of the index.
     least_key: a lower bound of the depth keys.
     key_bits: the number of low bits that can be set in a key minus least_key.
     """
@@ -101,8 +102,8 @@ class Counted(Totals):
 class Pairs:
     """Pairs in order of depth; pairs of equal depth are in order of the Gaussian's index.
 
-    tile_keys: (pairs).
-    pair_ids: (pairs, 2), slot and Gaussian.
+    tile_keys: (pairs), the tile of each pair, counted from the band's first tile.
+    pair_ids: (pairs, 2), the slot and the Gaussian of each pair.
     elements: the number of pairs that these arrays hold.
     """
 
@@ -120,12 +121,13 @@ def count(
     all_bits: bool = False,
     readback: DeviceArray | None = None,
 ) -> Counted:
-    """The visible Gaussians, the number of their pairs, and the bits in which their depths differ.
+    """List the visible Gaussians, and count their pairs and the bits in which their depths differ.
 
     Waits for the device.
 
     all_bits: assume that depths differ in all 32 bits.
-    readback: (READBACK_SIZE,) uint32, the array that is read back. If `adam` used it, its counts are in the result.
+    readback: (READBACK_SIZE,) uint32, the array that the host reads. Elements that `adam` refused and counted in it are
+    in the result; None for an array without counts.
     """
     readback = readback or work.array("readback", (len(COUNTED),), np.uint32)
     first_slots, gaussian_from_visible, depth_keys = _compact(device, work, projected, readback)
@@ -154,7 +156,7 @@ def count_by_capacity(
     capacity: int,
     host: NDArray[np.uint32],
 ) -> Counted:
-    """Like `count`, but without waiting. With more than `capacity` pairs the pass stops (kernels/duplicate.cl).
+    """Count like `count`, but without waiting. With more than `capacity` pairs the pass stops (kernels/duplicate.cl).
 
     readback: (READBACK_SIZE,) uint32, the same array that `project_step` gets.
     host: host memory for a copy of `readback`.
@@ -180,7 +182,7 @@ def count_by_capacity(
 def _compact(
     device: Device, work: Workspace, projected: Projected, readback: DeviceArray, capacity: int | None = None
 ) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
-    """Fill readback; return the first slots (n), the visible Gaussians (n) and their depth keys (n)."""
+    """Fill `readback`, and return the first slots (n), the visible Gaussians (n) and their depth keys (n)."""
     tile_counts = projected.tile_counts
     (n,) = tile_counts.shape
     shown = projected.shown or tile_counts
@@ -209,7 +211,7 @@ def count_band(
     *,
     all_bits: bool = False,
 ) -> Counted:
-    """Like `count`, for the tiles of the band only. Overwrites the results of an earlier count in the workspace."""
+    """Count like `count`, for the tiles of a band only. Overwrites the arrays of an earlier count in the workspace."""
     n = projected.tile_counts.shape[0]
     band_counts = work.array("band_counts", (n,), np.uint32)
     kernel, arrays = device.kernels("duplicate").band_counts, (projected.tile_counts, projected.splats, band_counts)
@@ -221,7 +223,7 @@ def count_band(
 def plan_bands(
     device: Device, work: Workspace, projected: Projected, counted: Counted, tiles: tuple[int, int], capacity: int
 ) -> tuple[Band, ...]:
-    """The fewest bands that have at most `capacity` pairs each. Raises CapacityError if a single tile has more."""
+    """The fewest bands of at most `capacity` pairs each. Raises CapacityError if a single tile has more pairs."""
     if counted.pairs <= capacity:
         return (Band(0, tiles[0] * tiles[1]),)
     n = projected.tile_counts.shape[0]
@@ -271,7 +273,7 @@ def duplicate(
 def duplicate_and_sort(
     device: Device, work: Workspace, splats: DeviceArray, counted: Counted, tiles: tuple[int, int], band: Band
 ) -> Pairs:
-    """The same pairs as from `duplicate`, but by a sort of all pairs by depth, as in the code of Kerbl et al.
+    """Make the same pairs as `duplicate`, but by a sort of all pairs by depth, as in the code of Kerbl et al.
 
     With the sort by tile that follows, this equals one sort by 64-bit keys: tile in the upper half, depth in the lower.
     """

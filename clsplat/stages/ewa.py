@@ -27,7 +27,7 @@ EWA_CAMERA_DEFINES = {model.gsplat: model.ewa for model in CAMERA_MODELS if mode
 EWA_CAMERA_MODELS = tuple(EWA_CAMERA_DEFINES)
 
 EWA_CLAMP_FRACTION = 0.15
-"""For the Jacobian of a pinhole camera, means are clamped this far beyond the image's edges: a fraction of its side."""
+"""Margin around the image, as a fraction of its side, to which means are clamped in a pinhole camera's Jacobian."""
 
 _TWO_FLOAT_FIELDS = tuple(name.removesuffix("_LOW") for name in EWA_CAMERA if name.endswith("_LOW"))
 
@@ -57,7 +57,7 @@ class EwaCamera:
 
     @property
     def defines(self) -> dict[str, object]:
-        """Defines of the kernels. Raises InputError if the model is not one of EWA_CAMERA_MODELS."""
+        """Kernel defines of the camera model. Raises InputError if it is not one of EWA_CAMERA_MODELS."""
         if self.model not in EWA_CAMERA_MODELS:
             raise InputError(f"camera model {self.model!r}: expected one of {', '.join(EWA_CAMERA_MODELS)}")
         return {EWA_CAMERA_DEFINES[self.model]: True} if EWA_CAMERA_DEFINES[self.model] else {}
@@ -80,7 +80,7 @@ class EwaCamera:
         return np.asarray(-inverse.T @ by_inverse @ inverse.T, np.float64)
 
     def packed(self) -> Float32:
-        """The camera in the order of `columns.EWA_CAMERA`."""
+        """The camera's fields as float32 in the order of `columns.EWA_CAMERA`."""
         rotation, shift = self.viewmat[:3, :3], self.viewmat[:3, 3]
         fx, fy, cx, cy = (self.intrinsics[at] for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
         cofactors = np.stack([np.cross(rotation[(i + 1) % 3], rotation[(i + 2) % 3]) for i in range(3)])
@@ -116,7 +116,7 @@ class PlacedEwaCamera:
 
     @classmethod
     def on(cls, device: Device, camera: EwaCamera) -> PlacedEwaCamera:
-        """The camera on this device."""
+        """Upload a camera's fields to this device."""
         return cls(camera, from_host(device, camera.packed()))
 
 

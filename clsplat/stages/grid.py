@@ -30,7 +30,7 @@ class Grids:
 
     @classmethod
     def on(cls, device: Device, grids: NDArray[np.float32]) -> Grids:
-        """These grids, and zero moments."""
+        """Upload these grids, with Adam moments of zero."""
         zeros = np.zeros_like(grids)
         return cls(upload(device, grids), upload(device, zeros), upload(device, zeros))
 
@@ -54,7 +54,7 @@ def device_bytes(photographs: int, sizes: Sequence[tuple[int, int]]) -> int:
 def apply_grid(
     device: Device, work: Workspace, grids: Grids, photograph: int, image: DeviceArray, width: int, height: int
 ) -> DeviceArray:
-    """Planes (3, rows, stride) of the image, width x height pixels, with the colour transforms of the photograph."""
+    """Apply a photograph's colour transforms to an image, width x height pixels. Returns planes (3, rows, stride)."""
     _, rows, stride = image.shape
     seen = work.array("appearance_seen", image.shape)
     sizes = (photograph, stride, rows * stride, *_spans(width, height))
@@ -79,7 +79,7 @@ def grid_gradient(
     """Replace the gradient with respect to the transformed image by the gradient with respect to the image.
 
     Returns the gradient with respect to the photograph's grid, plus `weight` times the gradient of its total variation.
-    place: the view's number in the batch; each has its own array.
+    place: index of the view in the batch; the result of each view is in an array of its own.
     """
     _, rows, stride = image.shape
     plane, (across, down) = rows * stride, _spans(width, height)

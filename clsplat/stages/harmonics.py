@@ -19,16 +19,16 @@ from clsplat.errors import InputError
 from clsplat.stages.sums import padded, row_sums
 
 MAX_SH_BASIS_DEGREE = 4
-"""The highest supported degree."""
+"""The highest degree of spherical harmonics that the kernels support."""
 
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """Input for n colours.
+    """Input of harmonics.cl and harmonics_grad.cl for n colours.
 
     directions: (n, 3), of any length.
     sh: (n, K, 3), K at least (degree + 1)^2; further coefficients are ignored.
-    mask: (n,) or (n, 2), int32; rows that are not positive are skipped.
+    mask: (n,) or (n, 2), int32; rows whose first entry is not positive are skipped.
     centre: (6,), a camera's `centre_array`. With it, `directions` holds the means, and colours are increased by 0.5
     and clamped at 0.
     """
@@ -46,7 +46,7 @@ class Harmonics:
 
     @property
     def used(self) -> int:
-        """Number of coefficients used. Raises InputError for an unsupported degree."""
+        """Number of coefficients per channel that the degree uses. Raises InputError for an unsupported degree."""
         used = (self.degree + 1) ** 2
         if not 0 <= self.degree <= MAX_SH_BASIS_DEGREE:
             raise InputError(f"sh_degree is {self.degree}: expected 0 to {MAX_SH_BASIS_DEGREE}")
@@ -56,7 +56,7 @@ class Harmonics:
 
     @property
     def defines(self) -> dict[str, object]:
-        """Defines of both kernels."""
+        """Defines that harmonics.cl and harmonics_grad.cl share."""
         wanted = {
             "CAMERA": self.centre is not None,
             "MASKED": self.mask is not None,
@@ -66,7 +66,7 @@ class Harmonics:
 
     @property
     def arguments(self) -> tuple[object, ...]:
-        """The kernels' arguments after the number of colours."""
+        """Arguments that both kernels share, after the number of colours."""
         centre = () if self.centre is None else (self.centre,)
         mask = () if self.mask is None else (self.mask.size // max(self.count, 1), self.mask)
         return (self.sh.shape[1], self.used, *centre, self.directions, self.sh, *mask)

@@ -18,7 +18,7 @@ from clsplat.stages.device_camera import padded_size
 from clsplat.stages.ranges import TileLists
 
 HELD_PIXEL_BYTES = 4 + 4 * len(HOLDOUT_SURFACE_FIELDS)
-"""Bytes per pixel with one surface."""
+"""Bytes that a pixel with one holdout surface takes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Held:
     """Holdout surfaces on the device.
 
     starts: (rows * stride + 1) uint32, the index of each padded pixel's first surface, then the number of surfaces.
-    surfaces: (S, 4) float32.
+    surfaces: (S, 4) float32, columns HOLDOUT_SURFACE_FIELDS.
     """
 
     starts: DeviceArray
@@ -39,12 +39,12 @@ class Held:
 
 
 def held_bytes(surfaces: Surfaces | None) -> int:
-    """Bytes per pixel that the surfaces of an image take."""
+    """Bytes per pixel that the holdout surfaces of an image take on the device; 0 without surfaces."""
     return 0 if surfaces is None else 4 + 4 * len(HOLDOUT_SURFACE_FIELDS) * surfaces.dense
 
 
 def upload_held(device: Device, surfaces: Surfaces) -> Held:
-    """Upload the surfaces of an image, which has at least one."""
+    """Upload the holdout surfaces of an image, at least one."""
     height, width = surfaces.counts.shape
     counts = np.zeros(padded_size(width, height), np.int64)
     counts[:height, :width] = surfaces.counts

@@ -20,22 +20,22 @@ from clsplat.stages.loss_terms import Compared, LossTerm
 from clsplat.stages.target import is_photograph, sample_defines
 
 LOSS_PIXEL_BYTES = 12
-"""Bytes of the image's gradient per pixel, padding included."""
+"""Bytes per pixel of the gradient with respect to the image, padding included."""
 
 _MIN_BLOCK_ROWS = 32
-"""Minimum number of rows in a block. In smaller blocks the ten rows shared with its neighbours cost too much."""
+"""Minimum number of rows in a block. In a smaller block, the ten rows shared with its neighbours cost too much."""
 
 
 @dataclass(frozen=True)
 class _Blocks:
-    """Blocks of pixels that groups process.
+    """Blocks of pixels that groups of the loss kernel process.
 
-    rows, columns: size of a block, pixels.
+    rows, columns: size of a block in pixels.
     groups: number of groups; if each block has its own group: the numbers of blocks across and down, and of channels.
-    field: floats between two derivatives of a row, in groups that keep derivatives.
+    field: floats that a row of one of the three partial derivatives takes; 0 in groups of several items.
     partials, sums: lengths in floats of two arrays, the partial derivatives and the partial sums.
 
-    The order of the sums depends on the number of columns. No other result depends on the blocks.
+    The order in which the loss is summed depends on the columns of a block. No other result depends on the blocks.
     """
 
     rows: int
@@ -55,17 +55,17 @@ def _blocks(device: Device, height: int, stride: int) -> _Blocks:
         return _Blocks(rows, columns, (across, down, 3), 0, partials, sums)
     columns = -(-stride // (-(-stride // LOSS_COLUMNS) * TILE)) * TILE
     across = -(-stride // columns)
-    rows = max(-(-height * across // shape.chunks), _MIN_BLOCK_ROWS)  # gives at most three blocks per chunk
+    rows = max(-(-height * across // shape.chunks), _MIN_BLOCK_ROWS)  # at most three blocks per chunk
     blocks = 3 * -(-height // rows) * across
     groups = blocks if blocks < 3 * shape.chunks else shape.chunks
-    field = 16 * ((columns // 16 + 2) | 1)  # odd: rows at power-of-two distances evict each other from a cache
+    field = 16 * ((columns // 16 + 2) | 1)  # odd, as rows at power-of-two distances evict each other from a cache
     return _Blocks(rows, columns, groups, field, partials=groups * LOSS_RING * 3 * field, sums=9 * height * across)
 
 
-def scratch_bytes(device: Device, height: int, stride: int, turns: int = 1) -> int:
-    """Bytes of the partial derivatives, and of `turns` arrays of partial sums."""
+def scratch_bytes(device: Device, height: int, stride: int, sums_arrays: int = 1) -> int:
+    """Bytes of the partial derivatives, and of `sums_arrays` arrays of the loss's partial sums."""
     blocks = _blocks(device, height, stride)
-    return 4 * (blocks.partials + turns * blocks.sums)
+    return 4 * (blocks.partials + sums_arrays * blocks.sums)
 
 
 @dataclass(eq=False)
@@ -75,10 +75,10 @@ class Loss:
     gradient: (3, rows, stride), with an additional plane for each of the alpha and depth terms.
     sums: (3, ...), partial sums of SSIM, of |x - y| and of (x - y)^2. With further terms the array has one axis, and
     the partial sums of these terms follow.
-    samples: the number of samples that count.
-    masked: the number of masked samples; their windows still count in SSIM.
-    copy: function that waits for a copy to the host and returns the sums; None if none has been started.
-    further: weight, divisor and number of partial sums of each further term.
+    samples: number of colour samples, three per pixel, that no mask excludes.
+    masked: number of masked samples; their windows still count in SSIM.
+    copy: function that waits for a copy of the sums to the host and returns it; None if no copy has been started.
+    further: weight, divisor and number of partial sums of each loss term other than L1 and D-SSIM.
     """
 
     gradient: DeviceArray
@@ -94,11 +94,11 @@ class Loss:
         return self.copied(self.sums.begin_get())
 
     def copied(self, copy: Callable[[], NDArray[Any]]) -> Loss:
-        """The same loss, whose sums come from `copy`."""
+        """The same loss, whose sums `read` takes from the function `copy`."""
         return Loss(self.gradient, self.sums, self.samples, self.weight, copy, self.masked, self.further)
 
     def read(self) -> tuple[float, float]:
-        """Return (loss, mean squared error); waits for the device."""
+        """Wait for the device, and return the loss and the mean squared error."""
         sums = (self.copy() if self.copy is not None else self.sums.get()).reshape(-1)
         own = sums.size - sum(count for *_, count in self.further)
         ssim, absolute, squared = sums[:own].reshape(3, -1).sum(axis=1, dtype=np.float64) / self.samples
@@ -119,7 +119,7 @@ def loss(
     width: int,
     height: int,
     weight: float,
-    turn: int = 0,
+    sums_index: int = 0,
     *,
     kept: int | None = None,
     blended: Blended | None = None,
@@ -127,9 +127,10 @@ def loss(
 ) -> Loss:
     """Compute (1 - weight) L1 + weight (1 - SSIM) of planes (3, rows, stride), whose padding must be zero.
 
-    target: such planes; or a photograph (height, width, 3), uint8 or float32, if several items share a tile.
-    turn: number of the array for the sums; with another array, earlier sums can still be read.
-    kept: number of pixels that count: the means are over these. Other pixels are zero in both images.
+    target: planes like the image's; or a photograph (height, width, 3), uint8 or float32, if several items share a
+    tile (`tile_items`).
+    sums_index: index of the array for the loss's sums. A call's sums can be read until the next call with this index.
+    kept: number of pixels that no mask excludes, over which the means are taken. The others are zero in both images.
     blended: the render; needed only if there are terms.
     terms: loss terms to add. Each has a plane of the gradient, after the colours, and its own partial sums.
     """
@@ -139,7 +140,7 @@ def loss(
     partials = work.array("loss_partials", (blocks.partials,))
     gradient = work.array("image_gradient", (3 + len(terms), rows, stride))
     own, each = blocks.sums // 3 * 3, rows // TILE * stride
-    sums = work.array(f"loss_sums{turn or ''}", (own + each * len(terms),) if terms else (3, own // 3))
+    sums = work.array(f"loss_sums{sums_index or ''}", (own + each * len(terms),) if terms else (3, own // 3))
     sizes, pictures, results = (width, height, stride, rows * stride), (image, target), (partials, gradient, sums)
     weights = ((1 - weight) / samples, weight / samples)
     defines: dict[str, object] = {"ITEMS": items}
@@ -155,7 +156,7 @@ def loss(
         launch_groups(device, kernels.loss_grad, blocks.groups, items, *sizes, *weights, *pictures, *results)
     further = []
     for number, term in enumerate(terms):
-        assert blended is not None, "a term compares a render"
+        assert blended is not None, "loss terms need the render: argument blended"
         compared = Compared(device, work, blended, target, gradient, sums, samples / 3)
         term.launch(compared, 3 + number, own + each * number)
         further.append((*term.scale(samples / 3), each))

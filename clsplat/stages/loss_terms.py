@@ -15,9 +15,10 @@ from clsplat.layouts.columns import TILE
 from clsplat.stages.blend import Blended
 
 ALPHA_PIXEL_BYTES = 9
-"""Bytes of the alpha loss per pixel, padding included: alpha, its gradient and, rounded up, its sums."""
+"""Bytes of the alpha loss per pixel, padding included: alpha, its gradient and, rounded up, the partial sums."""
 DEPTH_PIXEL_BYTES = 17
-"""Bytes of the depth loss per pixel, padding included: nearness, its gradient, target and weight, and the sums."""
+"""Bytes of the depth loss per pixel, padding included: nearness, its gradient, target and weight, and the partial
+sums, rounded up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +29,7 @@ class Compared:
     be the photograph itself, (height, width, 3).
     gradient: planes (3 + terms, rows, stride); each term writes its own plane.
     sums: all partial sums of the loss; each term writes `rows / TILE * stride` of them.
-    pixels: number of pixels that count.
+    pixels: number of pixels that no mask excludes.
     """
 
     device: Device
@@ -48,11 +49,12 @@ class LossTerm:
 
     @property
     def key(self) -> object:
-        """Settings of the launch. A command buffer replays it only if they are unchanged; None prevents replays."""
+        """Settings that the launch depends on. A command buffer replays the launch only if they are equal. None
+        prevents replays."""
         return None
 
     def scale(self, pixels: float) -> tuple[float, float]:
-        """Weight and divisor of the sums."""
+        """Weight and divisor of the sum of all partial sums, for `pixels` pixels that no mask excludes."""
         raise NotImplementedError
 
     def launch(self, compared: Compared, plane: int, first: int) -> None:
@@ -69,15 +71,15 @@ class AlphaTerm(LossTerm):
 
     @property
     def key(self) -> object:
-        """The weight."""
+        """The weight, the only setting that the launch depends on."""
         return self.weight
 
     def scale(self, pixels: float) -> tuple[float, float]:
-        """The weight, and the number of pixels."""
+        """The weight, and the number of pixels as the divisor."""
         return self.weight, pixels
 
     def launch(self, compared: Compared, plane: int, first: int) -> None:
-        """Launch alpha_loss.cl, which writes the fourth plane."""
+        """Launch alpha_loss.cl, which writes the fourth plane of the gradient."""
         assert plane == compared.target.shape[0] - 1 == 3, "alpha is the plane after the colours"
         _, rows, stride = compared.target.shape
         blended, kernel = compared.blended, compared.device.kernels("alpha_loss").alpha_loss
@@ -88,7 +90,7 @@ class AlphaTerm(LossTerm):
 
 @dataclass(frozen=True, eq=False)
 class DepthTerm(LossTerm):
-    """Weighted absolute differences between the render's nearness, 1 / depth, and known values.
+    """Weighted sum of absolute differences between the render's nearness, 1 / depth, and known values.
 
     planes: (2, rows, stride) float32, nearness and weight; the weight is 0 where nearness is unknown.
     factor: weight of the sum in the loss.
@@ -98,13 +100,13 @@ class DepthTerm(LossTerm):
     factor: float
 
     def scale(self, pixels: float) -> tuple[float, float]:  # noqa: ARG002
-        """The factor, and 1: the factor already contains the division."""
+        """The factor, and a divisor of 1, as the factor already contains the division."""
         return self.factor, 1.0
 
     def launch(self, compared: Compared, plane: int, first: int) -> None:
         """Upload the known depths, and launch depth_loss.cl."""
         blended, (_, rows, stride) = compared.blended, compared.gradient.shape
-        assert blended.nearness is not None, "blended with nearness"
+        assert blended.nearness is not None, "the depth loss needs an image blended with nearness"
         aims = compared.work.array("depth_aims", (2, rows, stride))
         aims.send(self.planes)
         kernel = compared.device.kernels("depth_loss").depth_loss

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches noise.cl, which moves the means of nearly transparent Gaussians."""
+"""Launches noise.cl, MCMC's noise: random moves of the means of nearly transparent Gaussians."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from clsplat.optimisation.step_noise import Exploration
 from clsplat.stages.device_gaussians import DeviceGaussians
 
 NOISE_OPACITY_RANGE = 0.16
-"""No noise is added above opacity `dead` plus this: it would be under 1.2e-7 of the noise at opacity `dead`."""
+"""Width of the range of opacities above `Exploration.dead` in which noise is added. Above it, noise would be less than
+1.2e-7 of the noise at opacity `dead`."""
 
 
 def highest_logit(dead: float) -> float:
@@ -27,7 +28,8 @@ def highest_logit(dead: float) -> float:
 
 
 def noise_numbers(explore: Exploration) -> tuple[float, ...]:
-    """Arguments of `noise` that change from step to step: the key's words and the amount; empty without noise."""
+    """Arguments of add_noise that change from step to step: the words of the random key, and the amount of noise. Empty
+    without noise."""
     return () if explore.amount == 0 else (*map(LaunchParameterWord, explore.key), LaunchParameter(explore.amount))
 
 
@@ -36,7 +38,7 @@ def noise(
 ) -> None:
     """Add a step's noise to the means. Nothing changes if `readback` says that the step's pass has stopped.
 
-    first_row: row of the first of these Gaussians in the model.
+    first_row: row in the model of the first of these Gaussians.
     """
     if explore.amount != 0:
         _add_noise(device, explore, gaussians, first_row, readback)

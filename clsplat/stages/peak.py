@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches peak.cl: the device's peak rates, to which the stages are compared."""
+"""Launches peak.cl: the device's peak rates of arithmetic and copies, to which `clsplat bench` compares the stages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from clsplat.stages.blend import tile_items
 
 _PEAK_SPLATS = 64
 _GROUPS_PER_COMPUTE_UNIT = {"cpu": 4, "gpu": 32, "other": 32}
-"""Groups per compute unit: enough to keep all compute units busy until the end."""
+"""Groups per compute unit of a measurement, by kind of device: enough to keep all compute units busy until the end."""
 _COPY_BYTES = 256 * 2**20
 
 
@@ -25,8 +25,8 @@ _COPY_BYTES = 256 * 2**20
 class Limits:
     """The peak rates of a device.
 
-    pairs_per_second, gradient_pairs_per_second: arithmetic of blending and of its gradient, without memory traffic and
-        with every lane in use.
+    pairs_per_second, gradient_pairs_per_second: pairs of a Gaussian and a pixel in the arithmetic of blending and of
+        its gradient, without memory traffic and with every lane in use.
     copy_bytes_per_second: bytes read plus bytes written by a copy too large for the caches.
     lanes, items: the kernel shape of all measurements.
     """
@@ -43,7 +43,7 @@ def measure_limits(
 ) -> Limits:
     """Measure the best rate of `repeat` runs; each run of arithmetic takes about `seconds`.
 
-    widened: use vectors of 16 lanes where blending does. False always uses the lanes of the kernel shape.
+    widened: True uses vectors of 16 lanes where blending does, False always the lanes of the kernel shape.
     """
     items = tile_items(device)
     defines = {} if widened else {"NARROW": True}
@@ -57,7 +57,7 @@ def measure_limits(
 
 
 def _splats() -> NDArray[np.float32]:
-    """Splats that differ, are faint, and are wide enough to cover every pixel of a tile."""
+    """Splats for the measurement of arithmetic: all different and faint, and wide enough to cover a whole tile."""
     index = np.arange(_PEAK_SPLATS)
     splats = np.zeros((_PEAK_SPLATS, len(SPLAT)), np.float32)
     columns = {"L11": 0.02, "L12": 0.005, "L22": 0.02, "RED": 0.3, "GREEN": 0.5, "BLUE": 0.7}
@@ -93,7 +93,7 @@ def _copy_rate(device: Device, nbytes: int, repeat: int) -> float:
     n = min(nbytes, device.max_allocation // 4, device.budget // 4) // 4 // copied * copied
     source, copy = allocate(device, (n,), np.float32), allocate(device, (n,), np.float32)
     source.fill(1.0)
-    copy.fill(0.0)  # the host maps the pages now, and not in the measurement
+    copy.fill(0.0)  # so that the host maps the memory's pages before the measurement
     kernel = device.kernels("peak", {"ITEMS": tile_items(device), "NARROW": True}).limit_copy
     runs = [device.timed(lambda: launch_items(device, kernel, n // copied, n, source, copy)) for _ in range(repeat + 1)]
     return 8e3 * n / min(ms for _, ms in runs)

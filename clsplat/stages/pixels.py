@@ -24,10 +24,10 @@ def pixels_from_planes(device: Device, blended: Blended, pixels: DeviceArray, al
 def planes_from_pixels(
     device: Device, work: Workspace, d_pixels: DeviceArray, d_alpha: DeviceArray | None = None
 ) -> DeviceArray:
-    """The image gradient (3, rows, stride) for `blend_grad`, from d_pixels (height, width, depth), depth 1 to 3.
+    """Make the image gradient (3, rows, stride) for `blend_grad` from d_pixels (height, width, depth), depth 1 to 3.
 
     d_alpha: (height, width); adds a fourth plane, the gradient with respect to the transmittance.
-    The padding is not written.
+    The padding of the planes is not written.
     """
     height, width, depth = d_pixels.shape
     rows, stride = padded_size(width, height)

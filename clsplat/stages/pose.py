@@ -16,9 +16,9 @@ point)."""
 
 
 def sums_of(work: Workspace, count: int, numbers: int = POSE_NUMBERS) -> DeviceArray:
-    """An array for partial sums of the gradient of a pose or lens: a row for every POSE_ROWS of the `count` Gaussians.
+    """An array for partial sums of the gradient of a pose or lens, which `pose_rows` or `lens_rows` fills.
 
-    `pose_rows` or `lens_rows` fills it.
+    It has a row of `numbers` sums for every POSE_ROWS of the `count` Gaussians.
     """
     return work.array(f"rows_of_{numbers}", (-(-count // POSE_ROWS), numbers))
 
@@ -36,7 +36,7 @@ def pose_rows(
     """Sum the pose gradient of these Gaussians into `sums` (ceil(n / POSE_ROWS), 6).
 
     device: the device with the kernel switches of the camera model.
-    first_row: these Gaussians start at this row of the model, a multiple of POSE_ROWS.
+    first_row: row in the model of the first of these Gaussians, a multiple of POSE_ROWS.
     """
     launch_items(
         device,
@@ -65,9 +65,9 @@ def lens_rows(
 
 @stage("pose")
 def sum_of(device: Device, work: Workspace, sums: DeviceArray) -> DeviceArray:
-    """The sum (1, numbers) of the rows of partial sums (m, numbers).
+    """Add the rows of partial sums (m, numbers) to one row (1, numbers).
 
-    This is the gradient with respect to the rotation and translation of `Camera.moved`, or to ln fx, ln fy, cx, cy.
+    The row is the gradient with respect to the rotation and translation of `Camera.moved`, or to ln fx, ln fy, cx, cy.
     """
     kernel, numbers, level = device.kernels("pose", {"LANES": 1}).pose_sums, sums.shape[1], 0
     while sums.shape[0] > 1:

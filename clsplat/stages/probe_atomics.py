@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches probe_atomics.cl: the probe of a driver's integer atomics, on which lists by append depend. Where they are
-faulty, a step sorts with sort_radix.cl.
+"""Launches probe_atomics.cl: the probe of a driver's integer atomics, which lists by append need (append.cl). If the
+atomics are faulty, a step sorts with sort_radix.cl.
 
-As a program, `python -m clsplat.stages.probe_atomics INDEX`, it prints the fault of a device.
+As a program, `python -m clsplat.stages.probe_atomics INDEX`, the module prints the fault of a device.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from clsplat.device.selection import open_device
 from clsplat.errors import DriverError, KernelBuildError
 
 _GROUPS, _COUNTERS = 64, 5
-"""Groups of the probe, enough that several run at a time, and counters that their items share."""
+"""Number of groups of the probe, so many that several run at a time, and number of counters that their items share."""
 
 
 def atomics_fault(device: Device) -> str:
-    """The fault of integer atomics in global and in local memory, in words; empty if kernels may count with them.
+    """The fault of a device's integer atomics in global or local memory, in words; empty if they count correctly.
 
-    The first call probes them in the device's shape.
+    The first call launches the probe in the device's kernel shape.
     """
     if not device.atomics_faults:
         found = _found(device)
@@ -55,9 +55,10 @@ def _found(device: Device) -> str:
 
 
 def _are_counts(places: NDArray[np.integer], counters: NDArray[np.integer]) -> bool:
-    """True if the places of each counter's items are 0, 1, 2, ... in some order.
+    """True if each counter gave its items the values 0, 1, 2, ... in some order.
 
-    counters: (keys, items), which columns tell one counter from another.
+    places: (items,), the value that each item got.
+    counters: (keys, items), the keys that identify each item's counter.
     """
     order = np.lexsort((places, *counters))
     begins = np.ones(len(places), np.bool_)

@@ -31,14 +31,14 @@ is read in runs long enough for prefetching. With groups of a single vector a st
 
 STEP_REGISTERS = 88
 """Maximum registers per item of `project_step`, where the driver accepts a limit. Adam is bound by memory latency, so
-more items at a time help more than registers. Code by clang for NVIDIA spills nothing with 88, and 8 bytes with 80."""
+more items at a time help more than registers. Clang's code for NVIDIA spills nothing with 88, and 8 bytes with 80."""
 
 SCREEN_GRADIENT_BYTES = 8
 """Bytes per Gaussian of the screen-space gradient; 4 more if contributions are kept."""
 
 
 def gaussian_bytes(*, keeps_culled: bool) -> int:
-    """Bytes per Gaussian: splat and tile count, and `shown` if culling is switched off."""
+    """Bytes per Gaussian of `Projected`: splat and tile count, and `shown` if culling is switched off."""
     return 4 * (len(SPLAT) + 1 + keeps_culled)
 
 
@@ -46,9 +46,10 @@ def gaussian_bytes(*, keeps_culled: bool) -> int:
 class Projected:
     """Projected Gaussians.
 
-    splats: (n, SPLAT).
-    tile_counts: (n), 0 where culled.
-    shown: with culling switched off, (n), 0 for Gaussians without a splat. Otherwise None: their tile_counts are 0.
+    splats: (n, SPLAT), in the columns of `layouts.columns.SPLAT`.
+    tile_counts: (n), the number of tiles that each Gaussian reaches; 0 for a culled Gaussian.
+    shown: (n), 0 for Gaussians without a splat, if frustum culling is switched off. Otherwise None, as then their tile
+    counts are 0.
     chunks: the chunks of the model whose Gaussians were projected; None for the whole model.
     """
 
@@ -59,14 +60,15 @@ class Projected:
 
     @property
     def chunk_defines(self) -> dict[str, object]:
-        """Defines of kernels that read arrays of the model by these rows."""
+        """Defines of kernels that find a projected Gaussian in the model's arrays."""
         return {} if self.chunks is None else {"CHUNKS": True}
 
     @property
     def chunk_arguments(self) -> tuple[object, ...]:
-        """The last arguments of such kernels, CHUNK_PARAMETERS of `kernels/shared/chunks.h`.
+        """Last arguments of kernels with `chunk_defines`: CHUNK_PARAMETERS of `kernels/shared/chunks.h`.
 
-        The list is a buffer and not an array, so that the profile takes the arrays before it as those that are updated.
+        The list is passed as a buffer, not as an array, because the profile takes a kernel's last arrays for those that
+        the kernel updates.
         """
         return () if self.chunks is None else (self.chunks.numbers.buffer, self.chunks.model_rows)
 
@@ -79,7 +81,7 @@ class Projected:
 
 
 def thinning_numbers(thinning: Thinning | None) -> tuple[float, ...]:
-    """Arguments of `project` that change from step to step."""
+    """Arguments of `project` for dropout of Gaussians, which change from step to step; empty without dropout."""
     if thinning is None:
         return ()
     return (*map(LaunchParameterWord, (*thinning.key, thinning.threshold)), LaunchParameter(thinning.factor))
@@ -109,7 +111,7 @@ def project(
 ) -> Projected:
     """Project all Gaussians that thinning does not drop, and count their tiles (Kerbl et al. 2023, section 4).
 
-    chunks: the chunks whose Gaussians are projected; the result has their rows. None projects the whole model.
+    chunks: the chunks whose Gaussians are projected and have rows in the result. None projects the whole model.
     """
     n = gaussians.count if chunks is None else chunks.rows
     splats = work.array("splats", (n, len(SPLAT)))
@@ -156,7 +158,7 @@ class Slots:
     """Partial gradients of the pairs.
 
     values: (pairs, fields.floats), or (n, fields.floats) if already summed by Gaussian.
-    first_slots: (n), where each Gaussian's slots begin; None if already summed.
+    first_slots: (n), the first slot of each Gaussian; None if `values` are already summed.
     """
 
     values: DeviceArray
@@ -219,8 +221,9 @@ def project_grad(
     """Compute `gradients` and `screen` of the visible Gaussians from the slots of their pairs.
 
     sh_rest: also compute the gradient of the higher SH bands.
-    explore: its penalties are added.
-    by_lens: (n, 4), filled with each Gaussian's gradient with respect to the lens of a camera with an image plane.
+    explore: penalties on opacity and scale, whose gradients are added.
+    by_lens: (n, 4), filled with each Gaussian's gradient with respect to the logs of the focal lengths and to the
+    principal point in pixels, for a camera with an image plane.
     """
     weights, build = explore.weights, _build(device)
     defines = {**_defines(gaussians, slots, sh_rest=sh_rest), **build.defines}
@@ -242,8 +245,8 @@ def project_grad(
 
 
 def step_numbers(step: AdamStep, explore: Exploration) -> tuple[float, ...]:
-    """Arguments of `project_step` that change with the step: penalty weights, two roots for Adam, and each group's
-    learning rate."""
+    """Arguments of `project_step` that change with the step: penalty weights, Adam's factors 1 / sqrt(1 - beta2^t) for
+    most groups and for sh_rest, and each group's learning rate over 1 - beta1^t."""
     rates, number, every = step.rates, step.number, step.config.sh_rest_every
     shrunk, root = of_rest, root_of_rest = step.corrections(number)
     if every > 1:
@@ -265,10 +268,10 @@ def project_step(
     *,
     explore: Exploration = NO_EXPLORATION,
 ) -> None:
-    """`project_grad` and `stages.adam.adam` in one kernel, which keeps no gradients in memory.
+    """Do the work of `project_grad` and `stages.adam.adam` in one kernel, which keeps no gradients in memory.
 
-    model: parameters, first and second moments. If only some chunks were projected, no other Gaussian takes the step.
-    The other arguments are passed on to the two functions.
+    model: parameters, first and second moments. If only some chunks were projected, only their Gaussians take the step.
+    The other arguments are those of the two functions.
     """
     parameters, config = model[0], step.config
     n = projected.tile_counts.shape[0]
@@ -290,7 +293,7 @@ def project_step(
         *(config.beta1, config.beta2, config.epsilon),
         *numbers[weights:],
         *(PARAMETER_GROUPS["means"].limit ** 2, PARAMETER_GROUPS["sh_dc"].limit ** 2),
-        readback.buffer,  # not the array, so that the profile counts no traffic: it is written only on a fault
+        readback.buffer,  # a buffer, which the profile does not count: the kernel writes it only on a fault
         *(arrays[group] for arrays in model for group in PARAMETER_GROUPS),
         *projected.chunk_arguments,
     )
@@ -305,14 +308,14 @@ def project_step(
 
 
 class _Build(NamedTuple):
-    """Gaussians per work-item of the gradient, and a define if this differs from the lanes of the kernel shape."""
+    """Gaussians per work-item of the gradient, and the define LANES if they are not the lanes of the kernel shape."""
 
     lanes: int
     defines: dict[str, object]
 
 
 def _build(device: Device) -> _Build:
-    """The build of the gradient. If Gaussians are evaluated along rays, it has a single lane, as in the projection."""
+    """The build of the gradient. It has a single lane if Gaussians are evaluated along rays, like the projection."""
     return _Build(1, {"LANES": 1}) if device.switched("RAYS") else _Build(device.shape.lanes, {})
 
 
@@ -324,9 +327,9 @@ def _defines(gaussians: DeviceGaussians, slots: Slots, *, sh_rest: bool) -> dict
 def _inputs(
     gaussians: DeviceGaussians, camera_array: DeviceArray, projected: Projected, slots: Slots
 ) -> tuple[object, ...]:
-    """The arguments of both kernels after the number of rows."""
+    """The arguments that `project_grad` and `project_step` share, after the number of rows."""
     first_slots = (
         slots.first_slots or projected.tile_counts
-    )  # the kernel does not read it if the slots are already summed
+    )  # a placeholder if the slots are already summed: then the kernel does not read first slots
     counts = (projected.tile_counts, first_slots, slots.values, projected.splats)
     return (gaussians.coefficients, camera_array, *counts)

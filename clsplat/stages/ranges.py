@@ -17,7 +17,7 @@ from clsplat.stages.sort import SORT_KEY_BYTES, sort
 TILE_SORT_PAIR_BYTES = SORT_KEY_BYTES + 8
 """Bytes per pair: its key and position in the sort by tile, `gaussian_from_sorted` and `slot_from_sorted`."""
 RANGE_TILE_BYTES = 8
-"""Bytes per tile: the begin and end of its list."""
+"""Bytes per tile of its range: the begin and end of its list."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +37,9 @@ class TileLists:
 
 @stage("ranges")
 def tile_lists(device: Device, work: Workspace, pairs: Pairs, band: Band, *, all_bits: bool = False) -> TileLists:
-    """Sort pairs, already in order of depth, by tile. The sort is stable: each tile's Gaussians are front to back.
+    """Sort pairs, already in order of depth, by tile. The sort is stable, so that each tile's list is front to back.
 
-    all_bits: sort by 32 bits. False sorts by the bits that tile numbers need.
+    all_bits: True sorts by 32 bits, False by as many as the tile numbers need.
     """
     count, elements = pairs.tile_keys.shape[0], pairs.elements
     bits = 32 if all_bits else max(band.tiles - 1, 1).bit_length()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches sampling.cl: lower limits of the scales, from the sampling rate of the photographs."""
+"""Launches sampling.cl: lower limits of the scales from the photographs' sampling rate, as in Mip-Splatting."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import AnyGaussians, parts
 
 SAMPLING_GAUSSIAN_BYTES = 4
-"""Bytes per Gaussian: its smallest scale."""
+"""Bytes per Gaussian for the lower limit of its scales."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,22 +13,22 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
 
 CHUNK_ELEMENTS_PER_ITEM = 16
-"""A chunk has this many elements per work-item of a group, or a multiple of this."""
+"""Elements of a chunk for each work-item of its group, in groups of several items: this number or a multiple of it."""
 MIN_CHUNK_ELEMENTS, MAX_SINGLE_CHUNK_ELEMENTS = 1024, 1 << 14
-"""For groups of one item: minimum elements of a chunk, and maximum elements that are scanned as one chunk. Several
-chunks need a second launch, which takes longer than they save with so few elements."""
+"""For groups of one item: minimum elements of a chunk, and maximum elements that are scanned as a single chunk. Several
+chunks need a second launch, which with fewer elements takes longer than the chunks save."""
 MAX_SCAN_GROUPS = 2048
-"""Maximum number of groups in a scan or sort, for groups of several items. It is limited because each group reads the
-counts of all groups before it."""
+"""Maximum number of groups in a scan or sort, for groups of several items. More would cost too much, because each group
+reads the counts of all groups before it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Elements:
     """The number of elements that a kernel processes: `most`, or counts[place] if `counts` is given.
 
-    counts[place] is at most `most`.
-
-    Launches are sized for `most` (kernels/shared/count.h).
+    most: number of elements for which launches are sized. counts[place] must not be larger.
+    counts, place: array on the device and index in it, from which the kernel reads the number
+    (kernels/shared/count.h).
     """
 
     most: int
@@ -37,12 +37,12 @@ class Elements:
 
     @property
     def arguments(self) -> tuple[Any, ...]:
-        """The kernel arguments that give the number."""
+        """The kernel arguments that give the number of elements."""
         return (self.most,) if self.counts is None else (self.counts.buffer, self.place)
 
     @property
     def defines(self) -> dict[str, object]:
-        """The defines of kernels that take these arguments."""
+        """The defines of kernels that take `arguments`."""
         return {} if self.counts is None else {"BY_CAPACITY": True}
 
 

@@ -31,9 +31,9 @@ def settle(
 
     model: parameters, first and second moments.
     last: (n,) uint32, the last step that each Gaussian took.
-    missed: (MOST_MISSED + 1, groups, 3), `MissedSteps.rounded` after `step`.
-    tile_counts: (n,) uint32, of a view. Only visible Gaussians, where it is not 0, are settled, and marked as having
-    taken the next step too. None: settle all.
+    missed: (MOST_MISSED + 1, groups, 3), the result of `MissedSteps.rounded` after step `step`.
+    tile_counts: (n,) uint32, the tile counts of a view. Only Gaussians whose count is not 0, the visible ones, are
+    settled, and `step + 1` is written to `last` for them. None settles all Gaussians.
     """
     n, coefficients = model[0].count, model[0].coefficients
     visible = {} if tile_counts is None else {"VISIBLE": True}

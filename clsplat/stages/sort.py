@@ -16,15 +16,15 @@ from clsplat.device.launch import launch_groups
 from clsplat.stages.scan import Elements, chunking
 
 MAX_BITONIC_KEYS = 2048
-"""Maximum number of keys for bitonic sort. With positions they take 16 KiB of local memory. Every device has 32 KiB."""
+"""Maximum number of keys for bitonic sort. Keys and positions then take 16 KiB of local memory; every device has 32."""
 
 BITONIC_KEYS_BY_KIND = {"cpu": 512, "gpu": 1024, "other": 1024}
-"""Number of keys up to which bitonic sort is faster than the launches of radix sort."""
+"""Number of keys up to which bitonic sort, a single launch, is faster than radix sort, by kind of device."""
 
 
 _SORTED_ARRAYS = ("keys", "positions")
 SORT_KEY_BYTES = 16
-"""Bytes per sorted key: keys and positions, each in two alternating arrays."""
+"""Bytes per key of a sort: the key and its position, each in two alternating arrays."""
 
 WIDE_DIGIT_BITS, MIN_WIDE_DIGIT_KEYS = 13, 1 << 17
 """Bits of a wide digit, and the number of keys from which it is used, for groups of one item.

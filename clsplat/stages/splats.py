@@ -17,12 +17,12 @@ from clsplat.stages.project import Projected, Slots
 SPLAT_VALUES = 3
 """Number of values of a splat that blend.cl blends: its columns RED to BLUE."""
 SLOT_MOMENT_FIELDS = SLOT.index("RED")
-"""Number of fields in a slot before those for the gradients with respect to values."""
+"""Number of fields in a slot before the fields of the gradient with respect to values."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScreenGaussians:
-    """Projected Gaussians as arrays.
+    """Projected Gaussians as an array for each property, like the results of gsplat's projection.
 
     radii: (n, 2) int32 in pixels; a Gaussian with a radius of 0 is culled.
     means2d: (n, 2) in pixels.
@@ -105,9 +105,9 @@ def splats_grad(
 ) -> None:
     """Fill every row of the gradients from the pairs' slots. Slots may include absolute gradients.
 
-    kept: the slots hold gradients of the first `kept` values only.
+    kept: number of values, from the first on, whose gradients the slots hold.
     """
-    assert slots.first_slots is not None, "there are no bands here"
+    assert slots.first_slots is not None, "expected slots of pairs, not their sums over bands"
     n, width = gradients.values.shape
     defines: dict[str, object] = {"LANES": 1, "VALUES": kept, **slots.fields.defines}
     launch_items(
@@ -133,7 +133,7 @@ def splats_grad(
 def add_values(
     device: Device, projected: Projected, slots: Slots, d_values: DeviceArray, first: int, count: int
 ) -> None:
-    """Fill `count` columns of d_values (n, width), from column `first` on, with sums of the slots (pairs, count)."""
+    """Sum each Gaussian's slots (pairs, count) into `count` columns of d_values (n, width), from column `first` on."""
     n, width = d_values.shape
     kernel = device.kernels("splats_grad", {"LANES": 1, "VALUES": count}).add_values
     counts = (projected.tile_counts, slots.first_slots)

@@ -11,7 +11,8 @@ from clsplat.layouts.columns import SUM_ROWS
 
 
 def padded(count: int) -> int:
-    """Number of columns that `row_sums` needs for `count` numbers: whole blocks. The rest must be zeros."""
+    """Number of columns that `row_sums` needs for `count` numbers: a multiple of SUM_ROWS. The columns after the
+    numbers must be zeros."""
     return -(-count // SUM_ROWS) * SUM_ROWS
 
 

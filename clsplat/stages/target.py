@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches target.cl: the planes of a photograph, in the layout of a blended image."""
+"""Launches target.cl: a photograph composited over the background, as planes in the layout of a blended image."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SOURCE_PIXEL_BYTES = 16
 MASK_PIXEL_BYTES = 4
 """Maximum bytes per pixel of a photograph's mask."""
 TARGET_PIXEL_BYTES = 12 + SOURCE_PIXEL_BYTES
-"""Bytes per pixel, padding included: three planes, and the photograph."""
+"""Bytes per pixel that a target takes, padding included: three planes, and the photograph."""
 
 
 def is_photograph(array: DeviceArray) -> bool:
@@ -30,13 +30,13 @@ def is_photograph(array: DeviceArray) -> bool:
 
 
 def sample_defines(photograph: DeviceArray) -> dict[str, object]:
-    """Defines of kernels that read a photograph: kernels/shared/photograph.h."""
+    """Defines of kernels that read a photograph by kernels/shared/photograph.h."""
     return {"BYTES": True} if photograph.dtype == np.uint8 else {}
 
 
 def on_device(work: Workspace, image: NDArray[Any] | DeviceArray) -> DeviceArray:
-    """A photograph for `target`. An image on the host is uploaded without waiting: it must not change until the host
-    has waited for the device."""
+    """Upload an image for `target`, unless it is on the device already. The upload does not wait: the image must not
+    change until the host has waited for the device."""
     if isinstance(image, DeviceArray):
         return image
     source = work.array("target_source", image.shape, image.dtype)
@@ -59,14 +59,14 @@ def target(
     (3, rows, stride).
 
     alpha: add a fourth plane, the alpha.
-    in_planes: False if only `stages.loss.loss` reads the result. It is then the photograph itself if that has no alpha
-    or mask and several items share a tile (`tile_items`).
+    in_planes: False if only `stages.loss.loss` reads the result. A photograph without alpha and mask is then returned
+    as it is if several items share a tile (`tile_items`).
 
     A fifth channel is a mask, 0 where a pixel does not count. These pixels become zero in the planes, and in the render
     `blended` too; the gradient of blending skips them. An image on the host is uploaded as `on_device` does.
     """
     source = on_device(work, image)
-    device.under_way.append(source.buffer)  # it may use the host's memory, which must live until the kernel has run
+    device.under_way.append(source.buffer)  # a buffer may be host memory, which must exist until the kernel has run
     height, width, channels = source.shape
     if not (in_planes or alpha) and is_photograph(source) and tile_items(device) > 1:
         return source

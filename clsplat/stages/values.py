@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches values.cl and values_grad.cl: values of Gaussians, any number, blended with the weights of an image."""
+"""Launches values.cl and values_grad.cl: any number of values per Gaussian, blended with the weights of an image."""
 
 from __future__ import annotations
 
@@ -20,30 +20,34 @@ MAX_VALUES_PER_PASS = 32
 _MAX_REGISTER_SUMS = 64
 """Maximum sums of a work-item that shares its tile, in the forward pass: values times pixels of the work-item."""
 _MAX_LOCAL_SUMS = 2048
-"""Maximum sums of a group in the gradient, values times work-items: they must fit in local memory."""
+"""Maximum sums of a group in the gradient, so that they fit in local memory: values times work-items."""
 
 
 def passes(first: int, depth: int, most: int) -> Iterator[tuple[int, int]]:
-    """First value and number of values of each pass over the values [first, depth). most: values per pass."""
+    """Yield the first value and the number of values of each pass over the values [first, depth).
+
+    most: maximum number of values per pass.
+    """
     for begin in range(first, depth, most):
         yield begin, min(most, depth - begin)
 
 
 def most_values(device: Device) -> int:
-    """Maximum number of values per forward pass."""
+    """Maximum number of values per pass of `values`."""
     items = tile_items(device)
     return MAX_VALUES_PER_PASS if items == 1 else min(max(_MAX_REGISTER_SUMS * items // (TILE * TILE), 2), 16)
 
 
 def most_gradients(device: Device) -> int:
-    """Maximum number of values per pass of the gradient."""
+    """Maximum number of values per pass of `values_grad`."""
     items = tile_items(device)
     return MAX_VALUES_PER_PASS if items == 1 else min(_MAX_LOCAL_SUMS // items, 16)
 
 
 @dataclass(frozen=True, eq=False)
 class ValuePass:
-    """Values (n, depth) of all Gaussians, their background (depth,), and the tile lists and results of an image."""
+    """Values (n, depth) of all Gaussians, the values' background (depth,), and the tile lists and results of the image
+    with whose weights the values are blended."""
 
     lists: TileLists
     projected: Projected
@@ -82,7 +86,7 @@ def values_grad(
     """Fill every row of the gradients from d_pixels (height, width, depth) and d_alpha (height, width).
 
     first_slots: (n,), the first slot of each Gaussian.
-    fields: includes absolute gradients if `gradients` has room for them.
+    fields: fields of the slots; with absolute gradients if `gradients.absolute` is wanted.
     """
     height, width, depth = d_pixels.shape
     lists, cells, most = of.lists, of.blended.cells_from_sorted, most_gradients(device)
@@ -107,7 +111,7 @@ def values_grad(
 def _gradient_by_cell(
     device: Device, work: Workspace, of: ValuePass, d_pixels: DeviceArray, d_alpha: DeviceArray | None
 ) -> DeviceArray:
-    """The image's gradient in the order in which `values_grad` reads it, (tiles, depth + 1, pixels of a tile)."""
+    """Reorder the image's gradient as `values_grad` reads it: (tiles, depth + 1, pixels of a tile)."""
     height, width, depth = d_pixels.shape
     by_cell = work.array("gradient_by_cell", (of.lists.band.tiles, depth + 1, TILE * TILE))
     given = [] if d_alpha is None else [d_alpha]

@@ -112,13 +112,14 @@ def test_how_lists_are_made(default_device: Device, monkeypatch: pytest.MonkeyPa
     listed = {"index": default_device.index, "name": "a device", "shape": "1 lanes x 64 items"}
     monkeypatch.setenv("CLSPLAT_SHAPE", "1x64")
     (finding,) = list_findings([{**listed, "shape": "8 lanes x 1 items"}, listed])
-    assert (finding.state, finding.text) == ("ok", f"{default_device.index}: a device, by append")
+    lists = f"{default_device.index}: a device lists the Gaussians of tiles"
+    assert (finding.state, finding.text) == ("ok", f"{lists} by append")
     monkeypatch.setenv("CLSPLAT_PRETEND", "no-atomics")
     (finding,) = list_findings([listed])
     assert finding.state == "note"
-    assert finding.text == f"{default_device.index}: a device, by radix sort: it has no 32-bit integer atomics"
+    assert finding.text == f"{lists} by radix sort, because it has no 32-bit integer atomics"
     (finding,) = list_findings([{**listed, "index": 999}])
-    assert "by radix sort: the probe fails: " in finding.text
+    assert "by radix sort, because the probe fails: " in finding.text
     monkeypatch.setenv("CLSPLAT_DRIVER_TIMEOUT", "0.01")
     (finding,) = list_findings([listed])
     assert finding.text.endswith("does not finish within 0.01 s")

@@ -60,7 +60,7 @@ def test_a_group_that_the_driver_does_not_allow(
     monkeypatch.setattr(Kernel, "most_items", lambda *_: 32)
     monkeypatch.setattr(launch, "tells_group_sizes", lambda _: True)
     label = default_device.shape.label
-    wanted = rf"shape {label}: words\.cl, words, has 64 items in a group, but the driver allows 32"
+    wanted = rf"shape {label}: words\.cl, words, has 64 items in a group, but the driver allows at most 32"
     with pytest.raises(DriverError, match=wanted):
         launch.launch_groups(default_device, words, 1, 64, 1, 2, 0.5, np.uint64(3), None)
 

@@ -269,7 +269,7 @@ def test_a_table_that_ends_too_early_is_refused(default_device: Device) -> None:
         upload(default_device, np.zeros(1, np.uint32)),
         upload(default_device, step_table(steps_of(DENSE, 1, 4))),
     )
-    with pytest.raises(ValueError, match="has steps 1 to 4, expected up to 5"):
+    with pytest.raises(ValueError, match="has steps 1 to 4, but step 5 is needed"):
         steps = (last, last, 5, StepTable(table, 1))
         catch_up(default_device, DENSE, model, chunks, *steps, fresh_readback(default_device))
 

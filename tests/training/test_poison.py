@@ -57,7 +57,7 @@ def test_memory_is_poisoned_when_asked_for(default_device: Device, monkeypatch: 
                 assert_same_bits(array.get().view(np.uint8)[:whole], pattern[:whole])
                 array.fill(0)
     monkeypatch.setenv("CLSPLAT_POISON", "much")
-    refuses("CLSPLAT_POISON much: expected 1, or 32 bits", Workspace, default_device)
+    refuses("CLSPLAT_POISON=much: expected 1, or a 32-bit number", Workspace, default_device)
 
 
 @pytest.mark.parametrize("word", WORDS)

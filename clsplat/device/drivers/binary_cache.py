@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cache of built programs, for a driver without its own cache, which would build everything again in each process.
+"""Cache of built OpenCL programs (binaries) in files, for a driver that has no cache of its own.
 
-A file begins with a digest of its contents, as a driver may crash on a truncated binary. Its name is a digest of
-everything the binary depends on: the text, the options, the driver and its settings, and the processor.
+A file begins with a digest of its contents, as a driver may crash on a truncated binary. The file's name is a digest of
+everything that the binary depends on: the text, the options, the driver and its settings, and the processor.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from clsplat.device.drivers.quirks import TARGET_VARIABLE_PREFIX, wants_cache
 from clsplat.files.atomic import atomic_write
 
 MAX_BINARY_CACHE_BYTES = 256 << 20
-"""Maximum bytes of all files; beyond it the least recently used are removed. A binary takes 30 to 500 KB, and those of
-all tests take 90 MB."""
+"""Maximum bytes of all files of the cache. Beyond it, the least recently used files are removed. A binary takes 30 to
+500 KB; all binaries of the tests take 90 MB."""
 
 BINARIES_VARIABLE = "CLSPLAT_BINARIES"
-"""Environment variable that names another folder for the cache."""
+"""Environment variable that names another folder for the cached binaries."""
 
 
 def folder() -> Path:
@@ -48,7 +48,7 @@ def _path(device: cl.Device, digest: str) -> Path:
 
 
 def load(context: cl.Context, device: cl.Device, digest: str, options: Sequence[str]) -> cl.Program | None:
-    """The saved program for a variant's digest; None if there is none or it cannot be used."""
+    """The saved program for a variant's digest; None if no file has it or the driver refuses it."""
     if not wants_cache(device):
         return None
     path = _path(device, digest)
@@ -85,7 +85,7 @@ def save(device: cl.Device, digest: str, program: cl.Program) -> None:
 
 
 def _make_room(place: Path) -> None:
-    """Remove the oldest files beyond MAX_BINARY_CACHE_BYTES."""
+    """Remove the least recently used files of a folder, until the rest take at most MAX_BINARY_CACHE_BYTES."""
     files = []
     for entry in os.scandir(place):
         if not re.fullmatch(r"[0-9a-f]{32}\.bin", entry.name):  # CLSPLAT_BINARIES may name a folder of other files

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import pyopencl as cl
 
 PRETEND_VARIABLE = "CLSPLAT_PRETEND"
-"""Environment variable with the capabilities to pretend for every device, separated by commas."""
+"""Environment variable that lists, separated by commas, the capabilities that every device pretends to have."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ _CAPABILITIES_BY_WORD: dict[str, dict[str, Any]] = {
     "no-contraction": {"contraction": False},
     "no-atomics": {"atomics": False},
 }
-"""Changes of the capabilities by the word in CLSPLAT_PRETEND."""
+"""Fields of `Capabilities` and their new values, by the word in CLSPLAT_PRETEND that sets them."""
 _ATOMICS = {"cl_khr_global_int32_base_atomics", "cl_khr_local_int32_base_atomics"}
-"""Extensions of OpenCL 1.0 that OpenCL 1.1 made part of every device."""
+"""Extensions for integer atomics that a device of OpenCL 1.0 may lack. From OpenCL 1.1 on every device has them."""
 _LIMIT_FIELDS = {"group": "group", "local-memory": "local_memory", "allocation": "allocation"}
 """Limits that CLSPLAT_PRETEND can lower: the fields of `Capabilities`, by their names in the variable."""
 
@@ -61,7 +61,7 @@ def pretended() -> str:
 
 
 def capabilities_of(device: cl.Device) -> Capabilities:
-    """The capabilities of a device, with the changes of CLSPLAT_PRETEND. Raises DeviceError if that is invalid."""
+    """The capabilities of a device, as changed by CLSPLAT_PRETEND. Raises DeviceError if its value is invalid."""
     from pyopencl import device_fp_config
 
     exact = bool(device.single_fp_config & device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A processor name that PoCL 3.0's compiler accepts.
+"""Processor name (LLVM target CPU) that PoCL 3.0's compiler accepts.
 
 The PoCL that pip installs has LLVM 14, which identifies AMD processors by their family. For Zen 5 and later it reports
 "generic", a name that its own front end refuses, so nothing can be built. Zen 4 is identified as Zen 3, which has no
-AVX-512. But PoCL links built-ins that use AVX-512, so kernels with vectors of 16 crash. Later versions of PoCL name the
-processor by its features, as this module does. See docs/decisions/0020-processors-are-named-by-features.md.
+AVX-512. But PoCL links built-ins that use AVX-512, so kernels with vectors of 16 crash. Like later versions of PoCL,
+this module names the processor by its features. See docs/decisions/0020-processors-are-named-by-features.md.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ CPU_NAMES_BY_FEATURES = (
 )
 """Processor names of LLVM, the most capable first, and the features that each requires, named as in Linux."""
 DEVICE_RECORD_BYTES = 2048
-"""Number of bytes of PoCL's device record to search for the name; in PoCL 3.0 it is at byte 640."""
+"""Bytes of PoCL's device record (`cl_device_id`) to search for the processor name. In PoCL 3.0 it is at byte 640."""
 _kept: dict[int, ctypes.Array[ctypes.c_char]] = {}
-"""Processor names that device records now point to, by the address of the pointer. They must stay in memory."""
+"""Processor names to which pointers in device records were set, by the pointer's address. They must stay in memory."""
 
 
 @cache
@@ -45,7 +45,8 @@ def features(path: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
 
 
 def better_name(name: str, present: frozenset[str]) -> str:
-    """The best processor name for these features. If `name`, which LLVM 14 reports, is as good, it is returned."""
+    """The best processor name for the features that are present. `name`, which LLVM 14 reports, is kept if it is as
+    good."""
     if not present or not (name == "generic" or name.startswith("znver")):
         return name
     by_features = next(better for better, needed in CPU_NAMES_BY_FEATURES if needed <= present)
@@ -65,15 +66,17 @@ def name_processor(device: cl.Device) -> str:
     name = _text(_word(address)) or ""
     better = better_name(name, features())
     if better != name:
-        # kept while the process runs: the driver reads it at every build
+        # the name stays in memory while the process runs, as the driver reads it at every build
         _kept[address] = ctypes.create_string_buffer(better.encode())
         ctypes.c_void_p.from_address(address).value = ctypes.addressof(_kept[address])
     return better
 
 
 def _place(record: int) -> int | None:
-    """The address of the pointer to the processor name, which follows the pointer to the target triple; None if it is
-    not found."""
+    """The address of the pointer to the processor name in a device record; None if it is not found.
+
+    The pointer follows the pointer to the target triple, such as x86_64-pc-linux-gnu.
+    """
     for address in range(record, record + DEVICE_RECORD_BYTES, 8):
         triple = _text(_word(address))
         if triple is not None and triple.startswith("x86_64-") and "linux" in triple:

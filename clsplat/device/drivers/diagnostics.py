@@ -25,7 +25,7 @@ _LOAD_LIBRARY_CODE = "import ctypes, sys; ctypes.CDLL(sys.argv[1])"
 
 
 def _outcome(*command: str) -> subprocess.CompletedProcess[str] | None:
-    """The exit status and output of a command; None if it did not finish in time."""
+    """Run a command, and return its exit status and output; None if it does not finish in time."""
     try:
         return subprocess.run(command, capture_output=True, text=True, timeout=driver_timeout(), check=False)
     except subprocess.TimeoutExpired:
@@ -33,14 +33,14 @@ def _outcome(*command: str) -> subprocess.CompletedProcess[str] | None:
 
 
 def _last_line(result: subprocess.CompletedProcess[str]) -> str:
-    """The reason why a process failed: the last line of its errors, or its exit status."""
+    """The reason why a process failed: the last line of its standard error, or its exit status."""
     line = (result.stderr.strip().splitlines() or [f"status {result.returncode}"])[-1]
     return line.removeprefix("OSError: ").removeprefix("clsplat: error: ")
 
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """A finding about a part of the installation, printed as a line.
+    """A finding about a part of the installation, printed as a line of text.
 
     state: ok, note (no action needed) or missing.
     advice: an action to take, or empty.
@@ -119,7 +119,8 @@ def device_findings(devices: Sequence[dict[str, Any]], trouble: str) -> list[Dia
 
 
 def list_findings(devices: Sequence[dict[str, Any]]) -> list[Diagnostic]:
-    """A finding for each device with groups of several items: how training makes the lists of tiles."""
+    """A finding for each device with several work-items in a group: whether training lists each tile's Gaussians by
+    append or by radix sort."""
     findings = []
     for info in devices:
         if " x 1 items" in info["shape"]:
@@ -129,7 +130,8 @@ def list_findings(devices: Sequence[dict[str, Any]]) -> list[Diagnostic]:
             fault = f"the probe of integer atomics does not finish within {driver_timeout():g} s"
         else:
             fault = result.stdout if result.returncode == 0 else f"the probe fails: {_last_line(result)}"
-        text = f"{info['index']}: {name}, by radix sort: {fault}" if fault else f"{info['index']}: {name}, by append"
+        way = f"by radix sort, because {fault}" if fault else "by append"
+        text = f"{info['index']}: {name} lists the Gaussians of tiles {way}"
         findings.append(Diagnostic("lists", "note" if fault else "ok", text))
     return findings
 
@@ -167,9 +169,9 @@ def loader_finding() -> Diagnostic:
 
 
 def findings() -> list[Diagnostic]:
-    """All findings."""
+    """All findings about the installation, in the order in which they are printed."""
     loader = loader_finding()
-    devices, trouble = listed_devices() if loader.state == "ok" else ([], "pyopencl is needed to find one")
+    devices, trouble = listed_devices() if loader.state == "ok" else ([], "devices cannot be listed without pyopencl")
     return [
         loader,
         *driver_findings(driver_files()),

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Driver records in the user's cache: the tests and kernels that passed or failed, per driver and kernel shape.
 
-A record is keyed by device, driver version and kernel sources. So a new version of any of these is tested again.
+A record is keyed by device, driver version and kernel sources. So after a change of any of these, a driver is tested
+again.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ from clsplat.files.locks import briefly_locked
 from clsplat.version import package_version
 
 BREAK_KERNEL_VARIABLE = "CLSPLAT_BREAK_KERNEL"
-"""Environment variable only for tests of `clsplat selftest`. STEM: OLD => NEW replaces words in a kernel's text, to
-simulate a driver that miscompiles an operation."""
+"""Environment variable for tests of `clsplat selftest` only. Its value, STEM: OLD => NEW, replaces words in the text of
+STEM.cl, to simulate a driver that miscompiles an operation."""
 MAX_DRIVER_RECORDS = 16
-"""Maximum number of drivers and versions in the file. The latest are kept; each takes a few KiB."""
+"""Maximum number of records in the file, one for each version of a driver. The latest are kept. Each has a few KiB."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Entry:
     """The record of a driver in one kernel shape.
 
     stages: self-test stages that passed.
-    kernels: names (`sandbox`) of builds and launches that succeeded, with the salt (`Variant.anew`) that each needed.
+    kernels: builds and launches that passed their trial, by name (`sandbox`), with the salt (`Variant.anew`) of each.
     failed: description of the driver's failure, or empty. When an entry is added to a record, None keeps the recorded
     failure.
     trial: if a single kernel failed, its name and the input of `sandbox.again`.
@@ -52,7 +53,7 @@ class Entry:
 
 
 def cache_folder() -> Path:
-    """The folder of clsplat in the user's cache. If the user has no home, as in some containers, it is not writable."""
+    """The folder of clsplat in the user's cache. For a user without a home folder, the path cannot be written to."""
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clsplat"
     except RuntimeError:
@@ -95,13 +96,13 @@ def _entry(value: object) -> Entry:
 
 
 _RECORDS_LOCK = threading.Lock()
-"""Lock of `_unwritten`, as several devices may work in threads."""
+"""Lock for `_unwritten`, as each of several devices may be used by a thread of its own."""
 _unwritten: dict[Path, list[tuple[str, str, Entry]]] = {}
 """Entries that could not be written yet, by file: driver, shape, and the entry to add."""
 
 
 def _read() -> dict[str, Any]:
-    """The contents of the file, with the entries that are not written yet."""
+    """The contents of the records' file, with the entries that are not written yet."""
     try:
         saved = parse_json(memory_path().read_bytes())
     except (OSError, ValueError):
@@ -128,13 +129,13 @@ def _add(saved: dict[str, Any], driver: str, shape: str, addition: Entry) -> Non
 
 
 def entries(device: cl.Device) -> dict[str, Entry]:
-    """All entries of the driver, by LANESxITEMS."""
+    """All entries of the device's driver, by shape label, such as 8x1."""
     shapes = _read().get(driver_key(device))
     return {name: _entry(value) for name, value in shapes.items()} if isinstance(shapes, dict) else {}
 
 
 def entry(device: cl.Device, shape: str) -> Entry:
-    """The entry of the driver for a shape, LANESxITEMS."""
+    """The entry of the device's driver for a shape label, such as 8x1."""
     return entries(device).get(shape, Entry())
 
 
@@ -147,12 +148,12 @@ def remember(
     failed: str | None = None,
     trial: Mapping[str, Any] | None = None,
 ) -> None:
-    """Add to the driver's entry for a shape, LANESxITEMS.
+    """Add to the driver's entry for a shape label, such as 8x1.
 
     failed: None keeps the recorded failure.
     trial: the failed trial, as in `Entry`.
 
-    If the folder is not writable, this warns, and each process tests everything again.
+    If the file cannot be written, a warning says so, and each process tests drivers again.
     """
     path = memory_path()
     addition = Entry(frozenset(stages), kernels or {}, failed, trial or {})
@@ -166,7 +167,7 @@ def remember(
 
 
 def rewrite(path: Path, changed: Callable[[], Mapping[str, Any]]) -> None:
-    """Write the result of `changed` to a JSON file, with other processes and threads locked out. Raises OSError."""
+    """Write the result of `changed` to a JSON file under a lock against other processes and threads. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with briefly_locked(path):
         atomic_write(path, (json.dumps(changed(), indent=1) + "\n").encode())
@@ -174,5 +175,5 @@ def rewrite(path: Path, changed: Callable[[], Mapping[str, Any]]) -> None:
 
 @lru_cache(maxsize=8)
 def tell_once(text: str) -> None:
-    """Warn once per process."""
+    """Warn with this text, once per process."""
     warnings.warn(text, stacklevel=2)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Differences between drivers. Only this module recognises drivers by their names.
+"""Quirks of OpenCL drivers: faults, limits, extensions and settings. Only this module recognises drivers by name.
 
-It is imported before pyopencl: `offer_packaged`, `make_cache_folder` and `pin_threads` set environment variables that
-drivers read when they are loaded.
+The module is imported before pyopencl: `offer_packaged`, `make_cache_folder` and `pin_threads` set environment
+variables that drivers read when they are loaded.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import pyopencl as cl
 
 CL_DEVICE_TYPE_CPU, CL_DEVICE_TYPE_GPU = 2, 4
-"""Bits of a device's type: CL_DEVICE_TYPE_CPU and CL_DEVICE_TYPE_GPU."""
+"""Bits of OpenCL's cl_device_type, copied because this module is imported before pyopencl."""
 TARGET_VARIABLE_PREFIX = "CL_CONFIG_"
 """Prefix of the environment variables that select the processor and options for Intel's compiler."""
 _ICD_FILENAMES = "OCL_ICD_FILENAMES"
@@ -35,7 +35,7 @@ _POCL_AFFINITY = "POCL_AFFINITY"
 _POCL_COUNTS = ("POCL_CPU_MAX_CU_COUNT", "POCL_MAX_PTHREAD_COUNT", "POCL_MAX_COMPUTE_UNITS")
 """Environment variables that limit the number of processors used, in different versions of PoCL."""
 _ICD_VENDORS = "OCL_ICD_VENDORS"
-"""Environment variable that names another folder of .icd files than the system's."""
+"""Environment variable that names a folder of .icd files, to be read instead of the system's."""
 DRIVER_VARIABLES = (
     *(_ICD_VENDORS, _ICD_FILENAMES, _POCL_CACHE, _POCL_AFFINITY, *_POCL_COUNTS),
     *("POCL_DEVICES", "RUSTICL_ENABLE", "CUDA_VISIBLE_DEVICES"),
@@ -99,10 +99,10 @@ def most_lanes(device: cl.Device) -> int:
 
 
 def subgroup_ways(device: cl.Device) -> list[dict[str, object]]:
-    """Defines for kernels with sub-groups, in the order to try.
+    """Sets of defines for kernels with sub-groups, in the order to try.
 
-    Empty if the device offers no sub-groups whose size is known when a kernel is built. `Device.kernels` tests that
-    items exchange the right values before it uses the defines.
+    Empty if the device has no sub-groups whose size is known when a kernel is built. `Device.kernels` tests that
+    work-items exchange the right values before it uses the defines.
     """
     extensions = device.extensions.split()
     if "cl_nv_device_attribute_query" in extensions:  # exchange by inline PTX: NVIDIA's OpenCL has no functions for it
@@ -125,14 +125,14 @@ def register_limit(device: cl.Device, registers: int) -> str:
 
 
 def misnames_processors(device: cl.Device) -> bool:
-    """True for PoCL 3.0, whose compiler may refuse the processor name that it has detected itself."""
+    """True for PoCL 3.0, whose compiler may refuse the processor name that PoCL itself has detected."""
     return str(device.platform.version).startswith("OpenCL 3.0 PoCL 3.0")
 
 
 def tells_group_sizes(device: cl.Device) -> bool:
     """False for a driver that reports a wrong group-size limit for kernels.
 
-    Rusticl of Mesa 22.3 reports 32 for every kernel, and runs groups of 1024.
+    Rusticl of Mesa 22.3 reports a limit of 32 for every kernel, but runs groups of 1024.
     """
     return not _is_rusticl(device)
 
@@ -202,8 +202,8 @@ def of_maker(platform_name: str, device_name: str, maker: str) -> bool:
 def driver_files(environment: Mapping[str, str] = os.environ) -> list[Path]:
     """The .icd files; each contains the name of a driver's library.
 
-    They are in the system's folder, or instead in the folder that an environment variable names, and in Python
-    packages.
+    The files are in the system's folder or, instead, the folder that OCL_ICD_VENDORS names; and in pyopencl's own
+    folder of libraries.
     """
     folders = [Path(environment.get(_ICD_VENDORS) or "/etc/OpenCL/vendors")]
     spec = importlib.util.find_spec("pyopencl")
@@ -252,7 +252,7 @@ def make_cache_folder(environment: MutableMapping[str, str] = os.environ) -> Pat
     owner = os.getpid()
 
     def remove() -> None:
-        if os.getpid() == owner:  # but not in a fork of that process
+        if os.getpid() == owner:  # a fork of this process must not remove the folder
             shutil.rmtree(folder, ignore_errors=True)
 
     atexit.register(remove)
@@ -264,8 +264,8 @@ def pin_threads(environment: MutableMapping[str, str] = os.environ) -> None:
     """Pin PoCL's thread number n to processor number n, in this process and its children.
 
     Otherwise two threads that wake up together may share a processor for whole kernels, while another is idle. Nothing
-    is pinned if the process may use only some processors, or PoCL is set to use fewer: two processes of one thread
-    each would then share the first processor. A variable that is already set is kept.
+    is pinned if this process or PoCL is limited to some processors: two processes of one thread each would then share
+    the first processor. A variable that is already set is kept.
     """
     if sys.platform != "linux" or any(name in environment for name in (_POCL_AFFINITY, *_POCL_COUNTS)):
         return

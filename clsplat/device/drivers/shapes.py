@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel shapes for a device: by rule, from `clsplat tune`, or from CLSPLAT_SHAPE."""
+"""Kernel shapes (lanes x work-items) of a device: the default, the one that `clsplat tune` saved, or CLSPLAT_SHAPE."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from clsplat.files.documents import parse_json
 VECTOR_LANES = (1, 4, 8, 16)
 """Allowed numbers of pixels per vector."""
 BY_GAUSSIAN_SHAPES = ((1, 32), (1, 64))
-"""Lanes and items of the shapes that exist with the suffix `g` too (`Shape.by_gaussian`)."""
+"""Lanes and items of the shapes that may have the suffix `g` (`Shape.by_gaussian`)."""
 SUBGROUP_SHAPES = (*BY_GAUSSIAN_SHAPES, (1, 128), (1, 256))
-"""Lanes and items of the shapes that exist with the suffix `s` too (`Shape.subgroups`)."""
+"""Lanes and items of the shapes that may have the suffix `s` (`Shape.subgroups`)."""
 _SHAPES_BY_SUFFIX = {"g": BY_GAUSSIAN_SHAPES, "s": SUBGROUP_SHAPES}
 
 
@@ -38,8 +38,8 @@ class Shape:
     chunks: number of chunks in a scan or sort if `items` is 1.
     by_gaussian: in the gradient of blending, a work-item has a Gaussian and loops over pixels, instead of the reverse
     (docs/decisions/0023-a-group-shares-a-tile.md). Only for lanes and items in BY_GAUSSIAN_SHAPES.
-    subgroups: in the gradient of blending, the work-items of a sub-group add by exchange of values, with the same
-    bits. Only for lanes and items in SUBGROUP_SHAPES.
+    subgroups: in the gradient of blending, the work-items of a sub-group sum by exchanging values. The sums have the
+    same bits. Only for lanes and items in SUBGROUP_SHAPES.
     """
 
     lanes: int
@@ -55,7 +55,7 @@ class Shape:
 
     @property
     def words(self) -> str:
-        """The label in words."""
+        """The shape in words, such as "8 lanes x 1 items"."""
         form = ", by Gaussian" if self.by_gaussian else ", with sub-groups" if self.subgroups else ""
         return f"{self.lanes} lanes x {self.items} items{form}"
 
@@ -69,12 +69,12 @@ class Shape:
             or items & (items - 1)
             or (form and (lanes, items) not in _SHAPES_BY_SUFFIX[form])
         ):
-            raise ValueError(f"{label}: not a shape")
+            raise ValueError(f"{label} is no kernel shape, expected LANESxITEMS, such as 8x1")
         return replace(self, lanes=lanes, items=items, by_gaussian=form == "g", subgroups=form == "s")
 
     @property
     def digit_bits(self) -> int:
-        """Bits of the radix sort's digit: its counters must fit in local memory."""
+        """Bits of a digit of the radix sort, so few that a counter for each digit fits in local memory."""
         return 11 if self.items == 1 else 8
 
     @property
@@ -84,10 +84,10 @@ class Shape:
 
     @property
     def local_bytes(self) -> int:
-        """Maximum bytes of local memory that a group needs, which is in the sort.
+        """Bytes of local memory that a group needs in the radix sort, which needs the most of all kernels.
 
-        With one item, it holds the counters of wide digits. Otherwise it holds 16 keys per item, 16 counters of 16 bits
-        per item, a sum per item, padding, and a counter per digit.
+        With one item, the sort holds the counters of wide digits. Otherwise it holds 16 keys per item, 16 counters of
+        16 bits per item, a sum per item, padding, and a counter per digit.
         """
         if self.items == 1:
             return 32 << 10
@@ -105,7 +105,7 @@ def default_shape(device: cl.Device) -> Shape:
 
 
 def most_items(device: cl.Device) -> int:
-    """Maximum work-items per group for clsplat's kernels, by the device's limit and its local memory."""
+    """Maximum work-items in a group of clsplat's kernels, by the device's group limit and its local memory."""
     capabilities = capabilities_of(device)
     most = capabilities.group
     while most > 1 and Shape(1, most, 1).local_bytes > capabilities.local_memory:
@@ -144,7 +144,7 @@ def asked_shape() -> str:
 
 
 def wanted_shape(device: cl.Device) -> Shape:
-    """The shape that CLSPLAT_SHAPE requests, or the tuned one, or the default.
+    """The shape that CLSPLAT_SHAPE requests, else the one that `clsplat tune` saved, else the default.
 
     Raises DeviceError if CLSPLAT_SHAPE is invalid, or the device cannot run it.
     """
@@ -179,8 +179,8 @@ def failures(device: cl.Device) -> dict[str, str]:
 def shape_of(device: cl.Device) -> tuple[Shape, str]:
     """The shape for a device that is opened without an explicit shape, and a warning or an empty string.
 
-    It is `wanted_shape`. If the driver has a recorded failure in that shape, it is the first shape without a failure,
-    and there is a warning. Raises DeviceError like `wanted_shape`.
+    The shape is `wanted_shape`. If the driver has a recorded failure in that shape, it is the next shape without a
+    failure, and the warning says so. Raises DeviceError like `wanted_shape`.
     """
     wanted, failed = wanted_shape(device), failures(device)
     shape = shapes_to_try(device, wanted, failed)[0]
@@ -197,7 +197,8 @@ def shape_text(device: cl.Device) -> str:
 
 
 def shapes_in_turn(device: cl.Device) -> list[Shape]:
-    """All shapes in the order to try: the default, the other candidates, then shapes that demand less of a compiler."""
+    """All shapes in the order to try: the default, the others that `clsplat tune` measures, then smaller ones, which
+    demand less of a compiler."""
     first = candidates(device)
     default = first[0]
     smaller = [replace(default, lanes=lanes, items=1) for lanes in (4, 1)] if default.items == 1 else []
@@ -206,16 +207,16 @@ def shapes_in_turn(device: cl.Device) -> list[Shape]:
 
 
 def shapes_to_try(device: cl.Device, first: Shape, failed: Mapping[str, str]) -> list[Shape]:
-    """`first` and then `shapes_in_turn`, without the shapes in which the driver has failed.
+    """The shape `first` and then those of `shapes_in_turn`, without shapes in which the driver has failed.
 
-    If it has failed in every shape, `first` is tried again, because the cause may be gone.
+    If the driver has failed in every shape, `first` is tried again, because the cause may be gone.
     """
     shapes = dict.fromkeys((first, *shapes_in_turn(device)))
     return [shape for shape in shapes if shape.label not in failed] or [first]
 
 
 def instead(device: cl.Device, wanted: Shape, other: Shape, failure: str) -> str:
-    """The warning that `other` is used instead of the wanted shape."""
+    """The text of the warning that the shape `other` is used instead of the wanted shape."""
     return (
         f"{title(device)}: kernels in the shape {wanted.label} failed: {failure}; {other.label} is "
         f"used instead (clsplat selftest tries {wanted.label} again)"
@@ -235,7 +236,7 @@ def saved_path() -> Path:
 
 
 def saved_shapes() -> dict[str, str]:
-    """LANESxITEMS by device and driver. An invalid file is ignored with a warning."""
+    """The shape labels that `clsplat tune` saved, by `device_key`. An invalid file is ignored with a warning."""
     path = saved_path()
     try:
         saved = parse_json(path.read_bytes())
@@ -255,7 +256,7 @@ def saved_shapes() -> dict[str, str]:
 
 
 def save_shape(device: cl.Device, shape: Shape | None) -> None:
-    """Save the shape for the device with its current driver; None removes the entry. Raises OSError."""
+    """Save a shape for the device with its current driver. None removes the saved shape. Raises OSError."""
 
     def changed() -> dict[str, str]:
         with warnings.catch_warnings():

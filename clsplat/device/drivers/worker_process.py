@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Worker processes in Python, in which a driver may crash or hang without harm, and the reasons why they ended."""
+"""Worker processes, in which a driver may crash or hang without harm to this process, and reasons why they ended."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from clsplat.errors import DriverError, InputError, switched_on
 from clsplat.process import MAX_SIGNAL_WAIT_SECONDS, Interrupted, apart, endings
 
 CHILD_MESSAGE_PREFIX = "clsplat-child "
-"""Prefix of lines that are messages to the parent, unlike lines that a driver prints."""
+"""Prefix of the lines by which a worker sends messages. It tells them from lines that a driver prints."""
 DRIVER_TIMEOUT_SECONDS = 120.0
-"""Seconds without a message after which a driver counts as hung. The slowest driver that works takes 60 seconds to
-build a kernel."""
+"""Seconds without a message after which a driver counts as hung. The slowest known driver takes 60 seconds to build a
+kernel."""
 DRIVER_TIMEOUT_VARIABLE = "CLSPLAT_DRIVER_TIMEOUT"
 TRUST_DRIVER_VARIABLE = "CLSPLAT_TRUST_DRIVER"
 _SIGKILL, _SIGTERM = -9, -15
-"""Exit statuses of killed processes. Windows does not define the number of SIGKILL."""
+"""Exit statuses of processes that SIGKILL and SIGTERM ended, as numbers: Windows' Python has no `signal.SIGKILL`."""
 
 
 class TrialInterrupted(Interrupted):
@@ -38,8 +38,9 @@ class TrialInterrupted(Interrupted):
 
 
 class WorkerEndedError(Exception):
-    """Raised if a worker process ends before it answers. The text completes a sentence about the process.
+    """Raised if a worker process ends before it answers.
 
+    text: the end of a sentence whose subject is the process, such as "was ended by signal 6".
     hung: True if the process was ended because it did not answer in time.
     status: exit status of the process; negative for a signal.
     """
@@ -47,7 +48,7 @@ class WorkerEndedError(Exception):
     def __init__(self, text: str, status: int = 0, *, hung: bool = False) -> None:
         super().__init__(text)
         self.hung = hung
-        # True if a driver has ended the process; a Python error has status 1 or 2
+        # True if a driver has ended the process. After an exception in Python the status is 1 or 2.
         self.crashed = hung or status not in (0, 1, 2, _SIGTERM, _SIGKILL)
         self.killed = status == _SIGKILL
 
@@ -73,7 +74,7 @@ def regardless() -> bool:
 
 
 def tell(**values: object) -> None:
-    """Send a message from this process to its parent. It begins a new line, as a driver may have printed text."""
+    """Send a message from this process to its parent. A line break precedes it, as a driver may have printed text."""
     print(f"\n{CHILD_MESSAGE_PREFIX}{json.dumps(values)}", flush=True)
 
 
@@ -121,15 +122,15 @@ _alive: weakref.WeakSet[WorkerProcess] = weakref.WeakSet()
 
 @atexit.register
 def abandon() -> None:
-    """End all worker processes at once. A thread that waits for one gets TrialInterrupted."""
+    """End all worker processes at once. A thread that waits for an answer of a worker gets TrialInterrupted."""
     for child in list(_alive):
         child.close()
 
 
 class WorkerProcess:
-    """A process that answers in lines of JSON. Ctrl-C does not reach it. It ends with its parent, or by `close`.
+    """A child process that answers in lines of JSON. Ctrl-C does not reach it. It ends with its parent, or by `close`.
 
-    Raises DriverError if it cannot be started.
+    Raises DriverError if the process cannot be started.
     """
 
     def __init__(self, command: Sequence[str]) -> None:
@@ -200,7 +201,7 @@ class WorkerProcess:
         return message
 
     def _last_words(self) -> str:
-        """The most informative line of its standard error, in brackets, or an empty string."""
+        """The most informative line of the process's standard error, in brackets, or an empty string."""
         self._readers[1].join(timeout=5)
         words = [line for line in self._errors if line]
         said = next((line for line in words if "ERROR" in line or "Assertion" in line), words[-1] if words else "")
@@ -229,8 +230,8 @@ _NO_PYTHON_ADVICE = (
 def python_module(module: str, *words: str) -> list[str]:
     """The command that runs a module of this package.
 
-    Unlike `python -m`, it imports nothing from the current folder. Raises DriverError if Python does not know the path
-    of its executable.
+    Unlike `python -m`, the command imports nothing from the current folder. Raises DriverError if Python does not know
+    the path of its executable.
     """
     if not sys.executable:  # another program may embed Python
         raise DriverError(f"sys.executable is empty, {_NO_PYTHON_ADVICE}")
