@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks and preparation of a training, before its first step."""
+"""Preparation of a training before its first step: checks, length unit, start points, known depths, settings."""
 
 from __future__ import annotations
 
@@ -64,13 +64,13 @@ def _length_unit(scene: Scene, resumed: Run | None, *, is_prepared: bool) -> flo
 
 
 def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:
-    """Raise InputError, with the setting's `name`, if a run is past its last step."""
+    """Raise InputError if a run has a checkpoint after the last step of `config`. name: the setting in the message."""
     if (done := max((step for step, _ in run.checkpoints()), default=0)) > config.iterations:
-        raise InputError(f"{name} {config.iterations}: {run.path} is already at step {done}; expected more")
+        raise InputError(f"{name} {config.iterations}: {run.path} is already at step {done}; expected more steps")
 
 
 def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:
-    """Scene to train on, with coloured points. It is recorded in the run. Warns of each finding of the sanity checks.
+    """Scene to train on, with coloured points, after recording it in the run. Warns of findings of the sanity checks.
 
     Raises InputError if the run has already been trained, or trained on another scene.
     """
@@ -120,7 +120,7 @@ def settings_of(config: TrainConfig | None, run: Run | None, *, resume: bool) ->
 
 
 def late_settings(config: TrainConfig) -> Iterator[str]:
-    """Describe each non-default setting that takes effect after the last step, or starts before the first."""
+    """Yield a warning for each non-default setting that takes effect after the last step, or before the first."""
     last, expected = config.iterations, f"expected at most --iterations {config.iterations}"
     ends = f"training ends at step {last}"
     density = config.density
