@@ -46,7 +46,7 @@ class Exploration:
 
 
 NO_EXPLORATION = Exploration()
-"""Settings of a step with neither penalties nor noise."""
+"""The exploration of a step with neither penalties nor noise."""
 
 
 def exploration_of(config: TrainConfig, step: int, means_rate: float, count: int, length_unit: float) -> Exploration:

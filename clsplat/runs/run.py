@@ -41,6 +41,7 @@ from clsplat.runs.settings import (
 KEPT_CHECKPOINTS = 2
 """Number of latest checkpoints that a run keeps."""
 SCRATCH_SUFFIX = ".chunks"
+"""Ending of the names of scratch files, which contain chunks of a model."""
 OWNER_DIGITS = 12
 """Number of hexadecimal digits in a scratch file's name that identify its run."""
 SCRATCH_NAME = re.compile(rf"[0-9a-f]{{{OWNER_DIGITS}}}-[0-9a-f]{{8}}{re.escape(SCRATCH_SUFFIX)}")
@@ -139,7 +140,7 @@ class Run:
         ply.write_rows(self.model_path, model, count, rows, comments=[comment(space)])
 
     def write_eval(self, result: Mapping[str, Any]) -> None:
-        """Write eval.json."""
+        """Write the scores of the held-out views, eval.json."""
         atomic_write(self.eval_path, (json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
 
     def write_appearance(self, record: Mapping[str, Any], tables: Mapping[str, NDArray[Any]] | None = None) -> None:
@@ -169,7 +170,8 @@ class Run:
         try:
             line = json.dumps(record, allow_nan=False)
         except ValueError:
-            raise ClsplatError(f"training diverged at step {record.get('step')}: {dict(record)}") from None
+            step = record.get("step")
+            raise ClsplatError(f"training diverged at step {step}: a value is not finite: {dict(record)}") from None
         try:
             with open(self.metrics_path, "a", encoding="utf-8", newline="\n") as file:
                 file.write(line + "\n")

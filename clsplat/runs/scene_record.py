@@ -199,8 +199,7 @@ def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool =
 
 
 def keep(run: Run, scene: Scene, *, resuming: bool) -> None:
-    """Write scene.json, unless the run resumes with a record for its resolution. Warns if a resumed run has no
-    record."""
+    """Write scene.json, unless a resumed run has one for its resolution. Warns if a resumed run has none."""
     known = read(run) if resuming else None
     if known is not None and known["resolution"] == run.config.resolution:
         return

@@ -53,10 +53,10 @@ _ADDED_SETTINGS: dict[str, tuple[str, Any]] = {
     "train.test_most": ("test_every", 0),
     "train.photos": ("test_every", "exact"),
 }
-"""Settings that config.toml files of earlier versions lack, each with a setting that those files have, and the value
-that keeps the behaviour of those versions."""
+"""Settings that earlier versions lack, each with another setting and a value. A config.toml with that other setting but
+without this one gets the value, with which training works as in those versions."""
 _RETIRED_VALUES = {("train.rasterizer.extent", "constant")}
-"""Retired values of current settings. The default replaces them."""
+"""Values that a setting no longer has. The setting's default replaces them."""
 
 
 def config_text(config: TrainConfig, scene: Path | None) -> str:

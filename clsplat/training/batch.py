@@ -78,7 +78,7 @@ def shares(count: int, devices: int) -> list[range]:
 
 @dataclass(frozen=True, eq=False)
 class Losses:
-    """Losses of a step's views."""
+    """Losses of the views of a batch."""
 
     views: tuple[Loss, ...]
 

@@ -36,7 +36,7 @@ PRIOR_COSTS = np.array([8000.0, 0.6, 1.2, 80_000.0])
 PRIOR_COST_WEIGHT_SECONDS = 0.03
 """Weight of the prior costs: they count as much as this many measured seconds."""
 OUTLIER_FACTOR = 4.0
-"""Factor on the usual time of a step above which steps are left out: probably a kernel was built meanwhile."""
+"""Steps that took over this many times the usual time are left out, because a kernel was probably built then."""
 PACE_WINDOW_SECONDS = 60.0
 """Time in seconds before the last report from which the machine's current speed is taken."""
 
@@ -86,7 +86,7 @@ class Forecast:
     def see(self, report: TimedStep) -> None:
         """Record the report of a step."""
         step, count, seconds = report.step, report.gaussians, report.seconds
-        if self.last is None or step <= self.last[0]:  # training has returned to a checkpoint
+        if self.last is None or step <= self.last[0]:  # the first report, or one after a return
             self.begun, self.last = self.begun or (step, count), (step, count, seconds)
             return
         before, previous, at = self.last
@@ -140,7 +140,7 @@ class Forecast:
         return spans
 
     def _grown(self, density: DensityConfig, step: int, number: float, height: float, peak: int) -> float:
-        """Number of Gaussians after the densification of step `step`, from `number` before it and `_height`."""
+        """Number of Gaussians after a densification, with `number` before it. height, peak: results of `_height`."""
         most = max(density.max_gaussians, number)
         if density.growth == "mcmc":
             return min(wanted(density, step, max(round(number), 1)), most)

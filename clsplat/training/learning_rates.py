@@ -22,10 +22,10 @@ def rates_at(config: TrainConfig, step: int, length_unit: float, factor: float) 
 
 
 def largest_rates(config: TrainConfig, steps: range, length_unit: float) -> dict[str, float]:
-    """Upper limit of each group's learning rate in a range of steps, in order.
+    """Upper limit of each parameter group's learning rate over the range `steps`.
 
-    The cooldown counts as at the first step. The means' rate is largest at the first or the last step, because it
-    rises or falls all the way.
+    The factor of the cooldown is largest at the first step. The means' rate is largest at the first or the last step,
+    because it rises or falls all the way.
     """
     rates, cooled = rates_at(config, steps[0], length_unit, 1.0), _cooled(config, steps[0])
     rates["means"] = max(rates["means"], _means_rate(config, steps[-1]) * length_unit * cooled)

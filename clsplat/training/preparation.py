@@ -30,7 +30,7 @@ def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None) -> S
     check_refinable(config, scene.train_views)
     start = config.start_points
     is_prepared = bool(start) and scene.start == start
-    if not len(scene.points) and not start.sky:  # then photographs look at the points of a file, if there is one
+    if not len(scene.points) and not start.sky:  # the length unit follows from the points of --points too
         scene = with_points(scene, start)
     unit = _length_unit(scene, resumed, is_prepared=is_prepared)
     if unit != scene.unit:

@@ -105,7 +105,7 @@ class StepRecord(TypedDict):
 class Bundle:
     """Training step with everything that a replay needs.
 
-    models: "parameters", and the moments "first" and "second".
+    models: parameters and moments, with the keys "parameters", "first" and "second".
     """
 
     record: StepRecord
@@ -193,7 +193,7 @@ def read_bundle(path: Path) -> Bundle:
         if isinstance(error, InputError) and str(path) in str(error):
             raise
         why = f"{type(error).__name__}: {error}"[:300]
-        raise InputError(f"{path}: not a bundle of a training that gave up ({why})") from None
+        raise InputError(f"{path}: is not a bundle ({why}), expected a file trouble-step-*.npz of a run") from None
 
 
 def _bundle_of(saved: Checkpoint, path: Path) -> Bundle:
@@ -286,7 +286,7 @@ def _wrong_in(gaussians: DeviceGaussians) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line of the module's docstring."""
+    """Run the command `python -m clsplat.training.repro_bundle`. Returns its exit status."""
     parser = argparse.ArgumentParser(
         prog="python -m clsplat.training.repro_bundle", description=(__doc__ or "").splitlines()[0]
     )

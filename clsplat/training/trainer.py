@@ -216,7 +216,7 @@ class Trainer:
         return inputs
 
     def _gradient_step(self, needs: StatisticsNeeds) -> StepMaker:
-        """Function that makes the step from `turn` and `room`, or without them a step that counts its pairs first."""
+        """Function that makes a `GradientStep` from `turn` and `room`; without `room` it counts its pairs first."""
         rates, count, unit = self.rates(), self.parameters.count, self.scene.length_unit
         fields = slot_fields(needs, nearness=self.depths.on)
         explore = exploration_of(self.config, self.step, rates["means"], count, unit)
@@ -366,7 +366,7 @@ class Trainer:
     def _next_view(self) -> int:
         if not self.position.queue:
             self.position.queue = self.order.next_pass(self.position.rng)
-            if self.batch is None:  # of a batch, views of the last epoch may not be counted yet
+            if self.batch is None:  # a batch may not have counted the last epoch's views yet
                 self._turn_epoch()
                 self._note(begun=True)
         return self.position.queue.pop()

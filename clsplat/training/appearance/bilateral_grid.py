@@ -74,9 +74,9 @@ class ViewGrid(ViewPart):
         return by_grid
 
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
-        """Take Adam's step for the grid. After a pass through all views, centre all grids: their mean is the identity.
+        """Take Adam's step for the grid. After a pass through all views, also centre all grids.
 
-        Without this the grids could learn a colour change that belongs to the model.
+        Centred grids have the identity as their mean. Their common colour change belongs to the model instead.
         """
         assert own is not None, "made by `gradient`"
         step_grid(self.device, self.grids, self.view, own, self.visit, self.rate, readback)

@@ -24,7 +24,7 @@ def rate_at(config: TrainConfig, step: int, views: int, *, ends: float, hastens:
     """Learning rate of appearance in step number `step`.
 
     views: number of photographs. A photograph has a gradient in only one of this many steps, which shrinks its Adam
-    steps by the root of this number. The rate is multiplied by the root instead.
+    steps by the root of this number. The rate is multiplied by the root to make up for it.
     ends: fraction of the rate that is left at the last step.
     hastens: True to raise the rate in a short training, so that gains can change by as much as in a long one.
     """

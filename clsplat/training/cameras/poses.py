@@ -29,7 +29,7 @@ JACOBI_PAIRS = [
         ((0, 1, 3), (5, 2, 4)),
     )
 ]
-"""Rows and columns that one Jacobi rotation of a 6x6 matrix mixes: all 15 pairs, as five sets of disjoint pairs."""
+"""Pairs of axes that Jacobi rotations of a 6x6 matrix treat: all 15, as five sets of three disjoint pairs."""
 JACOBI_SWEEPS, JACOBI_TOLERANCE = 6, 1e-16
 """Number of passes of Jacobi rotations over all pairs, and relative size of off-diagonals that counts as zero."""
 CAMERA_RATE_END_FRACTION = 0.01

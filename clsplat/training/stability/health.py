@@ -33,7 +33,7 @@ MAX_INCIDENT_GAUSSIANS = 1000
 
 
 class Rows(Protocol):
-    """An array whose first axis is the Gaussians, wherever it is."""
+    """An array with a row for each Gaussian, on the device or the host."""
 
     @property
     def shape(self) -> tuple[int, ...]:

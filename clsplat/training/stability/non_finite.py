@@ -19,10 +19,10 @@ from clsplat.training.stability.health import Incident, RetryBudget
 
 @dataclass(eq=False)
 class LastStep:
-    """Record of a step, to inspect if non-finite values are found after it.
+    """Record of a step, to be inspected if non-finite values are found later.
 
     view, name: index and name of its view.
-    sums: function that returns the sums of its loss, valid until the next step has a loss.
+    sums: function that returns the sums of the view's loss. Call it before the next step has a loss.
     others: further views of the same step.
     """
 
@@ -85,7 +85,7 @@ class NonFiniteMonitor:
         self.last = replace(last, others=(*last.others, view)) if last is not None and same else view
 
     def notice(self, refused: Sequence[int]) -> None:
-        """Record how many elements `adam` refused in the last step, by reason (`REFUSED`), whose loss is read."""
+        """Record how many elements `adam` refused in the last step, by reason (`REFUSED`). Reads its loss."""
         if not any(refused) or self._noticed is not None or self.last is None:
             return
         counts = dict(zip(REFUSED, refused, strict=True))

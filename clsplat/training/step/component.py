@@ -49,7 +49,7 @@ class Component:
 
     @property
     def reads_all_rows(self) -> bool:
-        """True if `before_step` needs Gaussians without postponed changes."""
+        """True if all postponed changes to Gaussians must be made before `before_step`."""
         return True
 
     def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002
@@ -74,7 +74,7 @@ class Component:
         """Return to the state after step number `step`. Later steps failed before they changed a Gaussian."""
 
     def complete_exactly(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
-        """Make those postponed changes to parameters and moments that give the same bits at any time."""
+        """Make the postponed changes to parameters and moments that give the same bits whenever they are made."""
 
     def complete(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
         """Make all postponed changes to parameters and moments. Called when every row is needed."""

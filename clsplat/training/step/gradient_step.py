@@ -133,7 +133,7 @@ class GradientStep:
         else:
             numbers, given = thinning_numbers(self.thinning), (source, sent[0])
             frame, result, slots, own = self.replayed(model[0], key, gradient, numbers, given)
-            self.device.under_way.append(source.buffer)  # the photograph, as in `target`
+            self.device.under_way.append(source.buffer)  # alive until it is read, as in `target`
             frame = frame.by(camera, sent[0])
             probe.forward(frame)
             probe.loss(result)
@@ -265,8 +265,8 @@ class GradientStep:
     def _parts(
         self, model: tuple[AnyGaussians, ...], projected: Projected, placed: PlacedChunks | None
     ) -> Iterator[tuple[int, tuple[DeviceGaussians, ...], Projected, ChunkList | None]]:
-        """Yield the parts of the model that are on the device at once: first row, rows of all arrays, their projection,
-        and the list of their chunks if the step runs over chunks."""
+        """Yield the parts of the model that are on the device at a time. Each is its first row, its rows of all arrays,
+        their projection, and the list of its chunks if the step runs over chunks."""
         work = self.rasterizer.work
         if placed is not None and isinstance(placed.in_model, ChunkNumbers):
             for start, stop, part, slots, numbers in chunk_parts(work, placed.in_model, *model, changes=True):

@@ -82,8 +82,8 @@ class LateAdam(Component):
         settle(self._device, self._config, model, step, last, self._table, readback, tile_counts)
 
     def completed(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> AnyGaussians:
-        """Return the parameters with all rows settled, as a copy if rows have missed steps. So the training keeps its
-        bits."""
+        """Return the parameters with all rows settled. If rows have missed steps it is a copy, so that the training
+        keeps its bits."""
         missed = self.step - self._last.get()
         if not missed.any():
             return parameters

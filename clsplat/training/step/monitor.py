@@ -22,7 +22,7 @@ class StepMonitor(StepProbe):
     """Probe that notices non-finite values, tries the kernels that change the state, and adds statistics for density
     control.
 
-    number: number of views so far, including this one.
+    number: number of views that training has used so far, this one included.
     tried: keys of the steps whose kernels were tried; this step's key is added.
     changes: function that is called before the model changes.
     """

@@ -55,7 +55,7 @@ class Position:
         return Mark(self.step - begun, self._rng_state, list(self.queue), self.controlled)
 
     def go_back(self, mark: Mark) -> None:
-        """Return to a mark."""
+        """Return to the position that `mark` copied, with its random state."""
         self.step, self.queue, self.controlled = mark.step, list(mark.queue), mark.controlled
         self.rng.bit_generator.state = mark.rng
 

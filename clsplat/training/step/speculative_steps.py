@@ -144,7 +144,7 @@ class SpeculativeSteps:
         return step.result if reads_loss else result.copied(lambda: self._sums(step))
 
     def _sums(self, step: _Step) -> NDArray[Any]:
-        """Sums of a step's loss, after it was checked, and repeated if incomplete."""
+        """Sums of a step's loss. The step is checked before, and repeated if it is incomplete."""
         self.settle()
         copy = step.result.copy
         return copy() if copy is not None else step.result.sums.get()

@@ -30,7 +30,7 @@ other, however their coordinates were rounded."""
 
 
 class ViewOrder:
-    """Order of the views of each pass.
+    """Order of the training views in each epoch, a pass through all of them.
 
     cameras: cameras of the training views, as given. The order does not follow refined poses.
     unit: length unit of the scene, in world units.

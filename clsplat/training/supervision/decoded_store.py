@@ -84,7 +84,7 @@ class DecodedStore:
         return pixels
 
     def write(self, key: bytes, pixels: NDArray[Any]) -> None:
-        """Write pixels (H, W, C), uint8 or float32. After a failure, which is noted, nothing more is written."""
+        """Write pixels (H, W, C), uint8 or float32. After a failure the store writes nothing more."""
         if not self.writable:
             return
         path, start = self.path(key), time.perf_counter()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decoding of photographs to the sizes that the warm-up needs, once, or reading them from the cache on the disk.
+"""Decoding of photographs to the sizes that the warm-up needs, or reading of decoded ones from the cache on the disk.
 Policy only: no device."""
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def stored(image: Float32, *, rounds: bool) -> NDArray[Any]:
     """
     levels = np.rint(image * 255)
     fits = 0 <= levels.min() <= levels.max() <= 255
-    if fits and (rounds or np.array_equal(levels * np.float32(1 / 255), image)):  # as target.cl converts them
+    if fits and (rounds or np.array_equal(levels * np.float32(1 / 255), image)):  # as in target.cl, to float
         return levels.astype(np.uint8)
     return np.ascontiguousarray(image, np.float32)
 
