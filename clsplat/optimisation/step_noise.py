@@ -15,8 +15,8 @@ from clsplat.config.training import TrainConfig
 class Exploration:
     """Penalties and noise of a step.
 
-    opacity, scale: weights of two loss terms: the sum of opacities and the sum of scales (three per Gaussian, world
-    units) over the visible Gaussians.
+    opacity, scale: weights of two loss terms. One is the sum of the visible Gaussians' opacities, the other of their
+        scales, three per Gaussian in world units.
     amount: factor of the noise, in 1 / world units. The noise is proportional to the covariance, in squared world
     units.
     dead: opacity at which half of the noise is added.

@@ -112,7 +112,7 @@ def unmixing(mixes: Float64) -> Float64:
 
 
 def inverse(matrix: Float64) -> Float64:
-    """Inverse of a matrix (3, 3) by cofactors, with the same bits on every processor, so that frames have them too."""
+    """Inverse of a matrix (3, 3) by cofactors. Unlike LAPACK's, it has the same bits on every processor."""
     columns = np.stack([np.cross(matrix[(row + 1) % 3], matrix[(row + 2) % 3]) for row in range(3)], axis=1)
     first, second, third = (matrix[0] * columns[:, 0]).tolist()
     result: Float64 = columns / (first + second + third)

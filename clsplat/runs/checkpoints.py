@@ -75,7 +75,7 @@ def read_arrays(path: Path, expected: str) -> Arrays:
     """Read all numeric arrays of an np.savez file, by name.
 
     expected: name of the expected kind of file, for messages.
-    Raises ValueError, InputError or an error of zipfile if the file is anything else. np.load is not used, because it
+    Raises ValueError, InputError or an error of zipfile if the file is anything else. np.load does not read it, as that
     trusts the array size in the header, and decompresses members.
     """
     arrays: Arrays = {}
@@ -140,7 +140,7 @@ def scene_of(path: Path) -> str | None:
 
 
 def read_manifest(path: Path) -> Manifest | None:
-    """Read the manifest of a checkpoint; None if its Gaussians are arrays or the file is damaged."""
+    """Read the manifest of a checkpoint; None if the Gaussians are among its arrays, or the file is damaged."""
     try:
         return manifest_of(*_part(path, SLOTS_KEY, CHECKSUMS_KEY))
     except Exception:  # noqa: BLE001  # as in load_latest_checkpoint, which reports the damage

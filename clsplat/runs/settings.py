@@ -53,8 +53,8 @@ _ADDED_SETTINGS: dict[str, tuple[str, Any]] = {
     "train.test_most": ("test_every", 0),
     "train.photos": ("test_every", "exact"),
 }
-"""Settings that earlier versions lack, each with another setting and a value. A config.toml with that other setting but
-without this one gets the value, with which training works as in those versions."""
+"""Settings that earlier versions did not have, each with an older setting and a value. A config.toml that has the older
+setting but not the new one gets the value for the new one. The value keeps the behaviour of earlier versions."""
 _RETIRED_VALUES = {("train.rasterizer.extent", "constant")}
 """Values that a setting no longer has. The setting's default replaces them."""
 

@@ -86,7 +86,7 @@ class Forecast:
     def see(self, report: TimedStep) -> None:
         """Record the report of a step."""
         step, count, seconds = report.step, report.gaussians, report.seconds
-        if self.last is None or step <= self.last[0]:  # the first report, or one after a return
+        if self.last is None or step <= self.last[0]:  # the first report, or the first after a return to a checkpoint
             self.begun, self.last = self.begun or (step, count), (step, count, seconds)
             return
         before, previous, at = self.last
@@ -162,8 +162,8 @@ class Forecast:
         return 1.0, self.pixels / span.factor**2, span.gaussians, span.reads / span.steps
 
     def _cost(self) -> tuple[Float64, float]:
-        """Seconds that a unit of each of the `_amounts` takes (4,), and the factor by which recent steps took longer
-        than these say."""
+        """Fit the time of a step. Returns the seconds that a unit of each of the `_amounts` takes (4,), and the factor
+        by which recent steps took longer than these seconds predict."""
         spans = self.spans[1:] or self.spans  # the first span includes building kernels
         parts = np.array(self.amounts[-len(spans) :])
         steps, seconds = np.array([(span.steps, span.seconds) for span in spans]).T

@@ -66,7 +66,7 @@ class StepReport:
     """Report of a training step.
 
     step: number of steps done.
-    loss, psnr: loss and PSNR of that step's view, or of all views of its batch.
+    loss, psnr: loss and PSNR of the step's view, or from the means over its batch.
     seconds: training time so far; evaluations, checkpoints and other work do not count.
     """
 
@@ -133,7 +133,7 @@ class TrainingSession:
             self.saved = checkpoint.step
 
     def save(self) -> None:
-        """Write a checkpoint, unless this step has one, or too much of the model is not finite to return to it."""
+        """Write a checkpoint, unless this step has one, or too many Gaussians have non-finite values."""
         if self.run is not None and self.trainer.step > self.saved:
             arrays, state = self.trainer.checkpoint()
             if not self.trainer.monitor.retries.lost:
@@ -145,9 +145,9 @@ class TrainingSession:
     def rescue(self) -> str:
         """Write a checkpoint of the state at the start of the step, if that is intact.
 
-        Called after a failed or interrupted trial of kernels, a failed command of the driver (such as a lost GPU), a
-        lack of device memory, and for a photograph that cannot be read. Returns the end of an error message, which
-        names the checkpoint, or "".
+        Called when a trial of kernels or a command of the driver fails, device memory is used up, or a photograph
+        cannot be read. A lost GPU is such a failure. Returns the end of an error message, which names the checkpoint,
+        or "".
         """
         if self.run is None:
             return ""

@@ -70,7 +70,7 @@ def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:
 
 
 def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:
-    """Scene to train on, with coloured points, after recording it in the run. Warns of findings of the sanity checks.
+    """Record the scene in the run. Returns the scene to train on, whose points have colours. Warns of bad findings.
 
     Raises InputError if the run has already been trained, or trained on another scene.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bundle of a training that stopped because of non-finite numbers, and the replay of its one training step.
+"""Bundle (trouble-step-*.npz) of a training step with non-finite values that ended a training, and its replay.
 
     python -m clsplat.training.repro_bundle RUN/trouble-step-0001234.npz [--device DEVICE] [--json]
 

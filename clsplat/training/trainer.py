@@ -313,7 +313,7 @@ class Trainer:
         return self.renderer.render(self.complete_parameters, self.local(camera), background)
 
     def validate(self) -> bool:
-        """Validate the refined cameras, if that is due. Returns True if it was."""
+        """Validate the refined cameras, if that is due. Returns True if they were validated."""
         if not self.cameras.gate.is_due(self.step):
             return False
         self.settle()

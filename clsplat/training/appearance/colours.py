@@ -45,8 +45,8 @@ by this number.
 """
 
 START_GAIN_STEP_OCTAVES = 2.0**-10
-"""Initial gains from colours of points are rounded to multiples of this, in octaves. So the order of sums that they
-come from does not change them."""
+"""Step, in octaves, to which initial gains from colours of points are rounded. The order of summation then does not
+change them."""
 
 VIEW_PULL_WEIGHT, NEIGHBOUR_PULL_WEIGHT = 0.02, 0.7
 """Weights of two terms of the loss's gradient that pull gains towards the gains from points, per octave of distance.

@@ -22,7 +22,7 @@ LENS_PARAMETERS = 3
 
 
 class RefinedLenses:
-    """Refined lenses of the training views. Views of one lens share its change. Without refinement nothing changes."""
+    """Refined lenses of the training views. Views of one lens share its change. Without refinement no lens changes."""
 
     def __init__(self, config: TrainConfig, views: Sequence[View]) -> None:
         self.on, self._config = config.refine_lenses, config

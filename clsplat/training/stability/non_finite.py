@@ -21,9 +21,9 @@ from clsplat.training.stability.health import Incident, RetryBudget
 class LastStep:
     """Record of a step, to be inspected if non-finite values are found later.
 
-    view, name: index and name of its view.
+    view, name: index and name of the step's view.
     sums: function that returns the sums of the view's loss. Call it before the next step has a loss.
-    others: further views of the same step.
+    others: records of further views of the same step, in a batch.
     """
 
     step: int

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Base class of a training's components, its parts in addition to the Gaussians: appearance, refined cameras, mip
-filter, known depths, late Adam, chunks in view.
+"""Base class of the components of a training, its parts in addition to the Gaussians.
+
+Components are appearance, refined cameras, the mip filter, known depths, late Adam, and chunks in view.
 
 `Trainer` loops over a list of components. A new one is a subclass of `Component` and a line in `Trainer._start`.
 """

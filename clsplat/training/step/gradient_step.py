@@ -115,8 +115,8 @@ class GradientStep:
     ) -> Loss:
         """Update the model (parameters, first and second moments) with a view. Returns the loss.
 
-        gradients: arrays for the gradients of the rows that are on the device at the same time, if a probe or a part of
-        the view reads them. They contain zeros before and after. They change no bit of the model.
+        gradients: arrays for the gradients of rows, as `view_gradients` makes them, if a probe or a part of the view
+        reads gradients. They contain zeros before and after. With or without them the model has the same bits.
         reads_loss: True if the loss will be read. Reading then does not wait for the rest of the step.
         """
         camera = inputs.camera

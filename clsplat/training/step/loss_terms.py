@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loss terms beyond L1 and D-SSIM, as the settings ask for them: alpha loss, depth loss. A new one is a row here."""
+"""Loss terms beyond L1 and D-SSIM, as the settings ask for them: the alpha loss and the depth loss."""
 
 from __future__ import annotations
 

@@ -42,12 +42,12 @@ class Position:
 
     @property
     def rng(self) -> np.random.Generator:
-        """Random generator of the training. The copy of its state is dropped, because the caller may draw numbers."""
+        """Random generator. Reading it drops the saved copy of its state, because the caller may draw numbers."""
         self._rng_state = None
         return self._rng
 
     def mark(self, *, begun: bool = False) -> Mark:
-        """Mark this position.
+        """Return a copy of this position, with the state of the random generator.
 
         begun: True if the step number has already been increased for the current step, which has one view.
         """

@@ -45,8 +45,8 @@ class ImageCache:
     def load(self, index: int, factor: float) -> NDArray[Any]:
         """Photograph of view `index` at 1/factor of its size, on the host; do not write to it.
 
-        The shape is (H, W, 3), or 4 channels with straight alpha, or 5 with a mask that is 0 for pixels that do not
-        count. Raises PhotographError.
+        It is (H, W, 3), or has a fourth channel of straight alpha, and with a mask a fifth. The mask is 0 for pixels
+        that do not count. Raises PhotographError.
         """
         self._enter(factor)
         return self.host.get(index, factor)
