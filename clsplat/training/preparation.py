@@ -140,6 +140,6 @@ def late_settings(config: TrainConfig) -> Iterator[str]:
     late = [step for step in config.warmup if step >= max(last, 2)]
     if late and tuple(config.warmup) != TrainConfig.warmup:
         yield (
-            f"--warmup {','.join(map(str, late))}: the training resolution does not double then, because {ends} at "
-            f"1/{2 ** len(late)} of the size; expected less than --iterations {last}"
+            f"--warmup {','.join(map(str, late))}: the training resolution does not double after these steps, because "
+            f"{ends} at 1/{2 ** len(late)} of the size; expected steps below --iterations {last}"
         )
