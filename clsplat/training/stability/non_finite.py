@@ -156,4 +156,4 @@ def _done(stage: str, lost: int, count: int, *, hopeless: bool) -> str:
         return f"{lost:,} of {count:,} are too many to remove"
     if lost:
         return f"{lost:,} removed"
-    return "these Gaussians are not updated" if stage == "loss" else "their moments begin again from zero"
+    return "the Gaussians concerned are not updated" if stage == "loss" else "their moments begin again from zero"
