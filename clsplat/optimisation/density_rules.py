@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thresholds by which density control marks Gaussians, in float32, exactly as the device compares them."""
+"""Thresholds by which density control clones, splits and prunes Gaussians, as float32 that the device compares with."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import numpy as np
 from clsplat.arrays import Float32
 
 FRESH = np.uint32(1 << 31)
-"""Bit of an entry in a row list: the row is a copy of a Gaussian, and its moments start at zero."""
+"""Bit of an entry in a row list. It marks the row as a new Gaussian, whose moments start at zero."""
 UNWANTED, USELESS = -1.0, -2.0
-"""Score of Gaussians that are not densified, and of Gaussians that are pruned because they contribute too little."""
+"""Scores of Gaussians that are not densified, and of those that are pruned because they contribute too little."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class MarkRules:
     A Gaussian is pruned in any of these cases:
 
     - Its opacity logit is at most `transparent`.
-    - The log of its largest scale is over `oversized`; for a new half over `oversized_half`.
+    - The log of its largest scale is over `oversized`; of a half of a split Gaussian, over `oversized_half`.
     - It is not new and its radius is over `radius`.
     - It contributes at most `contribution` to every view.
 
@@ -63,7 +63,7 @@ def edge(holds: Callable[[Float32], Any]) -> float:
 
 
 def _ordered(value: float) -> int:
-    """The position of a float32 number in the order of all float32 numbers."""
+    """Position of a float32 number in the order of all float32 numbers; that of 0 is 0."""
     bits = int(np.float32(value).view(np.uint32))
     return -(bits & 0x7FFFFFFF) if bits >> 31 else bits
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thinning of the model in a training step (DropGaussian): parameters for the projection kernels."""
+"""Dropout of Gaussians in a training step (--thinning; DropGaussian): parameters for the projection kernels."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from clsplat.config.training import TrainConfig
 from clsplat.optimisation.step_noise import step_key
 
 THINNING_KEY_OFFSET = 0x5EED
-"""Added to the first word of a step's key, so that noise and thinning are independent."""
+"""Number that is added to the first word of a step's key, so that noise and dropout are independent."""
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class Thinning:
     """Random choice of the Gaussians that a step drops.
 
     rate: the fraction of Gaussians that are dropped.
-    key: two 32-bit words. They and a Gaussian's row determine its random word, which decides if it is dropped.
+    key: two 32-bit words. They and a Gaussian's row determine its random word, by which it is dropped or not.
     """
 
     rate: float
@@ -25,7 +25,7 @@ class Thinning:
 
     @property
     def threshold(self) -> int:
-        """A Gaussian is dropped if its 32-bit random word is below this."""
+        """Number below which a Gaussian's 32-bit random word means that it is dropped."""
         return round(self.rate * 2**32)
 
     @property
@@ -35,9 +35,9 @@ class Thinning:
 
 
 def thinning_of(config: TrainConfig, step: int) -> Thinning | None:
-    """The thinning in step number `step`; None if it is off.
+    """Dropout in step number `step`; None without --thinning.
 
-    The rate grows linearly over the steps of the run, up to the configured rate.
+    The rate grows linearly over the steps of the training, up to the value of the setting.
     """
     if config.thinning == 0:
         return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Factors of the steps that a Gaussian missed while no view showed it, for late Adam."""
+"""Factors by which late Adam (--optimiser.late) makes up for the steps that a Gaussian missed while out of view."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class MissedSteps:
     """Factors for Gaussians that missed the last 0 to MOST_MISSED steps.
 
     groups: names of the parameter groups.
-    factors: (MOST_MISSED + 1, groups, 3): how far a parameter moves, as a multiple of its first moment over the root
-    of its second; the factor of the first moment; that of the second.
+    factors: (MOST_MISSED + 1, groups, 3), by the number of missed steps. The first is a parameter's movement, as a
+        multiple of its first moment over the root of its second. The other two multiply the first and second moment.
     """
 
     def __init__(self, config: OptimiserConfig, groups: Sequence[str], factors: Float64 | None = None) -> None:
@@ -28,13 +28,13 @@ class MissedSteps:
             factors = np.zeros((MOST_MISSED + 1, len(groups), 3))
             factors[:, :, 1:] = 1.0
         self.groups, self.factors = tuple(groups), factors
-        # Adam's kernels have the decays in float32. Over 256 steps, 0.999 in float64 would differ from theirs by 3e-6.
+        # float32, as in Adam's kernels: over 256 steps, 0.999 in float64 gives moments that differ by 3e-6
         self._decays = np.array([config.beta1, config.beta2], np.float32).astype(np.float64)
 
     def add(self, scales: Mapping[str, float]) -> None:
-        """Add a step: (190) and (191).
+        """Add a step to the factors (docs/gradients.md, (190) and (191)).
 
-        scales: for the groups that the step updates, rate sqrt(1 - beta2^t) / (1 - beta1^t).
+        scales: rate sqrt(1 - beta2^t) / (1 - beta1^t) of each group that the step updates.
         """
         self.factors[1:] = self.factors[:-1]
         self.factors[0] = 0.0, 1.0, 1.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Penalties and noise of a training step: parameters for the kernels."""
+"""Penalties on opacity and scale, and the noise of MCMC, in a training step: parameters for the kernels."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from clsplat.config.training import TrainConfig
 class Exploration:
     """Penalties and noise of a step.
 
-    opacity, scale: weights of two loss terms: the sum of opacities and the sum of scales (three per Gaussian, world
-    units) over the visible Gaussians.
+    opacity, scale: weights of two loss terms. One is the sum of the visible Gaussians' opacities, the other of their
+        scales, three per Gaussian in world units.
     amount: factor of the noise, in 1 / world units. The noise is proportional to the covariance, in squared world
     units.
     dead: opacity at which half of the noise is added.
@@ -37,16 +37,16 @@ class Exploration:
         return weights if any(weight > 0 for weight in weights) else ()
 
     def of_view(self) -> Exploration:
-        """The part that each view of a batch applies: penalties without noise."""
+        """Copy for a view of a batch: penalties without noise, which the batch adds once."""
         return replace(self, amount=0.0)
 
     def scaled(self, factor: float) -> Exploration:
-        """A copy with `factor` times the noise."""
+        """Copy with `factor` times the noise."""
         return replace(self, amount=factor * self.amount)
 
 
 NO_EXPLORATION = Exploration()
-"""Neither penalties nor noise."""
+"""The exploration of a step with neither penalties nor noise."""
 
 
 def exploration_of(config: TrainConfig, step: int, means_rate: float, count: int, length_unit: float) -> Exploration:
@@ -77,6 +77,6 @@ def _penalties(opacity: float, scale: float, count: int, length_unit: float) -> 
 
 
 def step_key(seed: int, step: int) -> tuple[int, int]:
-    """The two random words of a step, in a training with this seed."""
+    """Two random 32-bit words of a step, in a training with this seed."""
     first, second = np.random.SeedSequence(seed, spawn_key=(step,)).generate_state(2)
     return int(first), int(second)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learnt appearance of a run's photographs: reading appearance.json, which is keyed by photograph name."""
+"""Appearance of a run's photographs for renders: reads gains, channel mixes and vignettes from appearance.json."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from clsplat.images.alpha import Image
 from clsplat.runs.run import Run, run_of
 
 MAX_APPEARANCE_BYTES = 1 << 28
+"""Maximum size of appearance.json in bytes."""
 MAX_LOG2_GAIN = 16.0
+"""Limit of the magnitude of gains, and of a vignette's coefficients and falloff, in octaves."""
 MAX_CHANNEL_MIX = 0.25
 """Exclusive limit of the magnitude of a channel mix. Below it the matrix of any six mixes can be inverted."""
 KINDS_WITH_GAINS = ("exposure", "ppisp")
@@ -26,12 +28,12 @@ KINDS_WITH_GAINS = ("exposure", "ppisp")
 EXPECTED_APPEARANCE_FILE = "a file that clsplat train --appearance writes"
 
 MAX_CENTRE_PICTURE_SIZES = 100.0
-"""Limit of a vignette centre's coordinates, in picture widths and heights."""
+"""Limit of the magnitude of a vignette centre's coordinates, in picture widths and heights."""
 
 Row = Mapping[str, Any]
-"""Entry of one photograph in appearance.json."""
+"""Entry of one photograph in appearance.json, parsed by `_row`."""
 Look = Callable[[str, Image], Image]
-"""Takes a held-out photograph's name and a render (H, W, 3). Returns the render with that photograph's appearance."""
+"""Function of a held-out photograph's name and a render (H, W, 3): the render with that photograph's appearance."""
 
 
 def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
@@ -39,9 +41,8 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
 
     model: the run's folder, or a file in it.
     photograph: its name in the data set, with or without leading folders and extension.
-    Returns three gains, or the nine entries of a 3 x 3 matrix by rows if channels mix.
-    A held-out photograph has the gains that follow from its EXIF, or 1, and no mixes.
-    Raises InputError.
+    Returns three gains, or the nine entries of a 3 x 3 matrix by rows if channels mix. A held-out photograph has the
+    gains that follow from its EXIF exposure, or 1, and no mixes. Raises InputError.
     """
     run = run_of(model)
     path = run.appearance_path if run is not None else None
@@ -74,7 +75,7 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
 
 
 def looks_of_run(run: Run | None) -> Look:
-    """The function of `held_out_looks` for a run; without appearance.json it changes nothing. Raises InputError."""
+    """Function of `held_out_looks` for a run. Without appearance.json renders stay unchanged. Raises InputError."""
     path = run.appearance_path if run is not None else None
     return _looks({} if path is None or not path.exists() else _read(path, _document(path), "held_out"))
 
@@ -111,7 +112,7 @@ def unmixing(mixes: Float64) -> Float64:
 
 
 def inverse(matrix: Float64) -> Float64:
-    """Inverse of a matrix (3, 3) with the same bits on every processor: frames are identified by these values."""
+    """Inverse of a matrix (3, 3) by cofactors. Unlike LAPACK's, it has the same bits on every processor."""
     columns = np.stack([np.cross(matrix[(row + 1) % 3], matrix[(row + 2) % 3]) for row in range(3)], axis=1)
     first, second, third = (matrix[0] * columns[:, 0]).tolist()
     result: Float64 = columns / (first + second + third)
@@ -119,7 +120,7 @@ def inverse(matrix: Float64) -> Float64:
 
 
 def _light(vignette: Float64, centre: Float64, width: int, height: int) -> Float64:
-    """Fraction of light (H, W) that a lens transmits.
+    """Fraction of light that a lens with a vignette transmits, by pixel (H, W).
 
     vignette: (3,), coefficients of the falloff.
     centre: (2,), as fractions of the picture's width and height.
@@ -167,7 +168,7 @@ def _row(record: Any) -> Row:
     Raises ValueError, TypeError, KeyError or OverflowError.
     """
     logs = _numbers("log2_gains", record["log2_gains"], 3, MAX_LOG2_GAIN).tolist()
-    # powers of Python floats: NumPy rounds its powers differently between processors
+    # Python floats, because NumPy's powers are rounded differently from processor to processor
     row = {"gains": np.array([2.0**log for log in logs])}
     if "mixes" in record:
         row["mixes"] = _numbers("mixes", record["mixes"], 6, MAX_CHANNEL_MIX)
@@ -182,5 +183,5 @@ def _row(record: Any) -> Row:
 def _numbers(name: str, values: Any, count: int, most: float) -> Float64:
     numbers = [float(value) for value in values] if isinstance(values, list) else []
     if len(numbers) != count or not all(math.isfinite(value) and abs(value) <= most for value in numbers):
-        raise ValueError(f"{name} is {values}")
+        raise ValueError(f"{name} is {values}, expected {count} numbers of at most {most:g}")
     return np.array(numbers)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoints: NumPy arrays in a zip file that is verified before use.
+"""Checkpoint files: writing, reading and verifying the arrays and the JSON state of a training, in a zip file.
 
 `Trainer.checkpoint` decides what is in one; docs/architecture.md, "The run folder", lists it.
 """
@@ -29,6 +29,7 @@ from clsplat.version import package_version
 STATE_KEY = "state.json"
 """Zip member that holds a checkpoint's state, as JSON bytes. No array may have this name."""
 NPY_MAGIC = b"\x93NUMPY\x01\x00"
+"""First bytes of an array in np.save's format, version 1.0."""
 NPY_HEADER = re.compile(
     r"\{'descr': '([<>|][biufc]\d{1,2})', 'fortran_order': (False|True), "
     r"'shape': \(((?:\d{1,18}(?:, \d{1,18}){0,7},?)?)\), \} *\n"
@@ -39,12 +40,12 @@ Arrays = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """One checkpoint.
+    """Content of a checkpoint file.
 
-    step: optimisation steps done.
+    step: number of views that the training had used.
     arrays: arrays by name.
-    state: JSON values.
-    manifest: where its Gaussians are; None if they are arrays.
+    state: JSON values by name.
+    manifest: scratch file, slots and checksums of the Gaussians; None if the Gaussians are in `arrays`.
     """
 
     step: int
@@ -58,7 +59,7 @@ class Checkpoint:
 
 
 def unusable(checkpoint: Checkpoint, why: str) -> InputError:
-    """Error for a checkpoint that is intact but cannot be resumed from."""
+    """Error for a checkpoint that is intact, but that a training cannot continue from because of `why`."""
     advice = "is it from another run or version?"
     return InputError(f"checkpoint of step {checkpoint.step}: {why}; {advice}")
 
@@ -73,9 +74,9 @@ def digest_of(array: NDArray[Any]) -> str:
 def read_arrays(path: Path, expected: str) -> Arrays:
     """Read all numeric arrays of an np.savez file, by name.
 
-    expected: as in `open_input`.
-    Raises ValueError, InputError or an error of zipfile if the file is anything else.
-    np.load is not used: it trusts the array size in the header, and it decompresses members.
+    expected: name of the expected kind of file, for messages.
+    Raises ValueError, InputError or an error of zipfile if the file is anything else. np.load does not read it, as that
+    trusts the array size in the header, and decompresses members.
     """
     arrays: Arrays = {}
     with open_input(path, expected) as file, ZipFile(_Bounded(file)) as archive:
@@ -105,9 +106,9 @@ def write_checkpoint(path: Path, step: int, arrays: Mapping[str, NDArray[Any]], 
 
 
 def read_checkpoint(path: Path, expected: int | None = None) -> Checkpoint:
-    """Read a checkpoint. Checks that its arrays are as `write_checkpoint` wrote them, and that its step is `expected`
-    if that is given.
+    """Read a checkpoint, and check that its arrays are as `write_checkpoint` wrote them.
 
+    expected: the step that it must have, if given.
     Raises ValueError, InputError or an error of zipfile.
     """
     arrays = read_arrays(path, "a checkpoint")
@@ -130,7 +131,7 @@ def read_checkpoint(path: Path, expected: int | None = None) -> Checkpoint:
 
 
 def scene_of(path: Path) -> str | None:
-    """Digest of the scene that a checkpoint's state names; None if it names none or the file is damaged."""
+    """Digest of the scene that a checkpoint was trained on; None if it records none or the file is damaged."""
     try:
         scene = _part(path)[1].get("scene")
     except Exception:  # noqa: BLE001  # as in load_latest_checkpoint, which reports the damage
@@ -139,7 +140,7 @@ def scene_of(path: Path) -> str | None:
 
 
 def read_manifest(path: Path) -> Manifest | None:
-    """The manifest of a checkpoint; None if it has none or the file is damaged."""
+    """Read the manifest of a checkpoint; None if the Gaussians are among its arrays, or the file is damaged."""
     try:
         return manifest_of(*_part(path, *MANIFEST_ARRAYS))
     except Exception:  # noqa: BLE001  # as in load_latest_checkpoint, which reports the damage
@@ -147,7 +148,7 @@ def read_manifest(path: Path) -> Manifest | None:
 
 
 def _part(path: Path, *names: str) -> tuple[Arrays, dict[str, Any]]:
-    """Some arrays of a checkpoint, those that it has, and its state. Its digests are not checked."""
+    """Read the state of a checkpoint, and those of the arrays `names` that it has. Digests are not checked."""
     arrays: Arrays = {}
     with open_input(path, "a checkpoint") as file, ZipFile(_Bounded(file)) as archive:
         for name in {*names, STATE_KEY} & {name.removesuffix(".npy") for name in archive.namelist()}:
@@ -160,9 +161,9 @@ def _part(path: Path, *names: str) -> tuple[Arrays, dict[str, Any]]:
 
 
 class _Bounded:
-    """File whose `read` is limited to the bytes that remain.
+    """File whose `read` allocates no more than the bytes that remain.
 
-    zipfile asks for the sizes that headers claim, and a plain `read` allocates as many bytes as it is asked for.
+    zipfile asks for the sizes that headers claim, and `read` of a file allocates as many bytes as it is asked for.
     """
 
     def __init__(self, file: BinaryIO) -> None:

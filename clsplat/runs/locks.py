@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exclusive write lock on a run's folder. The operating system holds it, so a killed process leaves no stale lock.
+"""Exclusive write lock of a run folder. The operating system holds it, so a killed process leaves no stale lock.
 
 Locks by marker files are in `clsplat.files.locks`.
 """
@@ -26,14 +26,16 @@ _LOCKED_BYTE_OFFSET = 1 << 30
 """Offset of the locked byte. Windows forbids other processes to read a locked byte, so it lies beyond the file's
 content."""
 _LOCK_HELD_ERRNOS = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
+"""Error numbers of the system if another process holds the lock."""
 _NO_LOCKING_ERRNOS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL, errno.EIO)
+"""Error numbers of the system if the file system has no locks."""
 _held: dict[str, int] = {}
 """Number of times that this process has entered the lock of each folder."""
 
 
 @contextmanager
 def locked(folder: Path, verb: str) -> Iterator[None]:
-    """Hold the exclusive write lock of an existing folder. The same process may enter again.
+    """Hold the exclusive write lock of an existing folder. A process that holds it may enter again.
 
     Raises InputError, which names the process that holds the lock, and OSError if no file can be created there.
     On a file system without locks it warns and keeps no other process out.
@@ -58,7 +60,7 @@ def locked(folder: Path, verb: str) -> Iterator[None]:
 
 
 def _take(path: Path, folder: Path) -> IO[bytes]:
-    """Open and lock the file."""
+    """Open the lock file `path` of `folder`, and lock it. Raises InputError if another process holds the lock."""
     while True:
         file = open(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0)  # noqa: SIM115  # closed by `_give_back`
         try:
@@ -83,7 +85,7 @@ def _take(path: Path, folder: Path) -> IO[bytes]:
 
 
 def try_lock(file: IO[bytes]) -> None:
-    """Lock the file, or raise OSError."""
+    """Lock the file at once. Raises OSError if another process holds the lock, or if there are no locks."""
     file.seek(_LOCKED_BYTE_OFFSET)
     if sys.platform == "win32":
         import msvcrt

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Views with the lenses that a run has refined."""
+"""Views with the lenses that a run has refined (--refine-lenses), for evaluation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clsplat.scenes.scene import View
 
 
 def through_refined(views: Sequence[View], run: Run | None) -> list[View]:
-    """Views with their own poses and, where `run` has refined lenses, the refined lens. Raises InputError like
+    """Copies of the views with the lenses that `run` has refined, and their own poses. Raises InputError like
     `read_cameras`."""
     if run is None or not run.config.refine_lenses or not run.refined_path.is_dir():
         return list(views)

@@ -39,16 +39,19 @@ from clsplat.runs.settings import (
 )
 
 KEPT_CHECKPOINTS = 2
+"""Number of latest checkpoints that a run keeps."""
 SCRATCH_SUFFIX = ".chunks"
+"""Ending of the names of scratch files, which contain chunks of a model."""
 OWNER_DIGITS = 12
+"""Number of hexadecimal digits in a scratch file's name that identify its run."""
 SCRATCH_NAME = re.compile(rf"[0-9a-f]{{{OWNER_DIGITS}}}-[0-9a-f]{{8}}{re.escape(SCRATCH_SUFFIX)}")
-"""Name of a file of chunks: the run, and a number of its own (`runs.scratch`)."""
+"""Name of a scratch file: digits of its run, then random digits (`runs.scratch`)."""
 
 
 class Run:
     """A run folder. `Run.create` makes one, `Run.open` opens an existing one.
 
-    scratch_path: folder of the files of chunks, which may be elsewhere.
+    scratch_path: folder of the scratch files, which may be outside the run folder.
     """
 
     def __init__(self, path: Path, config: TrainConfig, scene: Path | None, *, resuming: bool = False) -> None:
@@ -78,7 +81,7 @@ class Run:
         resume: bool = False,
         overwrite: bool = False,
     ) -> Run:
-        """Make the folder and its config.toml, which records `scene` as an absolute path.
+        """Make the run folder and its config.toml, which records `scene` as an absolute path.
 
         resume: continue an existing run with `config` (see `check_resumed`).
         overwrite: remove the files of an existing run, and nothing else.
@@ -94,7 +97,7 @@ class Run:
                 check_resumed(earlier, config)
                 if (was := earlier.config.background) != config.background:
                     warn(
-                        f"{path}: the background was {was} so far and is {config.background} from here on: "
+                        f"{path}: the background was {was} so far and is {config.background} from here on; "
                         "Gaussians that imitate the old background have to be learnt anew"
                     )
                 scene = scene or earlier.scene
@@ -133,11 +136,11 @@ class Run:
     def save_model_rows(
         self, model: Gaussians, count: int, rows: Callable[[int, int], Gaussians], space: str = "sRGB"
     ) -> None:
-        """Write model.ply of a model that is not in memory as a whole. Arguments as of `ply.write_rows`."""
+        """Write model.ply of a model that is not in memory as a whole. The arguments are those of `ply.write_rows`."""
         ply.write_rows(self.model_path, model, count, rows, comments=[comment(space)])
 
     def write_eval(self, result: Mapping[str, Any]) -> None:
-        """Write eval.json."""
+        """Write the scores of the held-out views, eval.json."""
         atomic_write(self.eval_path, (json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
 
     def write_appearance(self, record: Mapping[str, Any], tables: Mapping[str, NDArray[Any]] | None = None) -> None:
@@ -148,12 +151,11 @@ class Run:
         atomic_write(self.appearance_path, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
 
     def model_record(self) -> dict[str, Any]:
-        """The `step` and `seconds` of model.ply, if known.
+        """Record with `step` and `seconds` of model.ply, if they are known.
 
-        They come from eval.json, which is written after the model. The last metrics may be of a later step, if the run
-        was resumed and then stopped.
-        An eval.json older than the model belongs to an earlier model, for example after an interrupted evaluation.
-        In that case, or without a usable eval.json, the last record of metrics.jsonl is returned.
+        It is eval.json, which is written after the model. Without a usable eval.json, or with one that is older than
+        the model, it is the last record of metrics.jsonl. That may be of a later step than the model, if the run was
+        resumed and then stopped.
         """
         with suppress(OSError, ValueError, InputError):
             if self.eval_path.stat().st_mtime_ns < self.model_path.stat().st_mtime_ns:
@@ -168,19 +170,20 @@ class Run:
         try:
             line = json.dumps(record, allow_nan=False)
         except ValueError:
-            raise ClsplatError(f"training diverged at step {record.get('step')}: {dict(record)}") from None
+            step = record.get("step")
+            raise ClsplatError(f"training diverged at step {step}: a value is not finite: {dict(record)}") from None
         try:
             with open(self.metrics_path, "a", encoding="utf-8", newline="\n") as file:
                 file.write(line + "\n")
-        except OSError as error:  # the system's error for a full disk does not name the file
+        except OSError as error:  # the system's error for a full disk names no file
             raise write_error(self.metrics_path, error, needs=len(line) + 1) from None
 
     def read_metrics(self) -> list[dict[str, Any]]:
-        """Records of metrics.jsonl, without an incomplete last line as left by a crash."""
+        """Records of metrics.jsonl, without an incomplete last line, which a crash leaves."""
         return [record for _, record in self._metrics_lines()]
 
     def truncate_metrics(self, step: int) -> None:
-        """Drop the records of later steps, and an incomplete last line."""
+        """Drop the records of metrics.jsonl that are of later steps than `step`, and an incomplete last line."""
         if self.metrics_path.exists():
             kept = [line for line, record in self._metrics_lines() if record.get("step", 0) <= step]
             atomic_write(self.metrics_path, "".join(line + "\n" for line in kept).encode())
@@ -221,9 +224,9 @@ class Run:
         return sorted((int(match[1]), path) for match, path in matches if match)
 
     def manifests(self) -> list[tuple[Path, Manifest]]:
-        """Checkpoints with their Gaussians in files of chunks, and their manifests, the earliest first.
+        """Paths and manifests of the checkpoints whose Gaussians are in scratch files, the earliest first.
 
-        Damaged ones, and those later than the latest that is known to be intact, are left out.
+        Damaged checkpoints are left out, and checkpoints later than the latest one that is known to be intact.
         """
         found = []
         for step, path in self.checkpoints():
@@ -232,9 +235,9 @@ class Run:
         return found
 
     def give_up_checkpoint(self) -> bool:
-        """Remove the earliest checkpoint in a file of chunks, but not the latest that is known to be intact.
+        """Remove the earliest checkpoint whose Gaussians are in a scratch file, to free slots there.
 
-        Returns False if there is no other. Raises OSError.
+        Returns False if only the latest intact checkpoint is left, which stays. Raises OSError.
         """
         found = self.manifests()
         if self._intact is None or len(found) < 2:
@@ -243,16 +246,16 @@ class Run:
         return True
 
     def _located(self, manifest: Manifest) -> Manifest:
-        """The manifest with the file where it is now: in the folder of the files of chunks, or where it was made."""
+        """The manifest with the current path of its scratch file: in `scratch_path`, or where it was made."""
         here = self.scratch_path.absolute() / manifest.path.name
         return replace(manifest, path=here) if here.is_file() else manifest
 
     def _verified(self, checkpoint: Checkpoint) -> Checkpoint:
-        """The checkpoint, with its chunks verified. Raises ValueError or ScratchError if they are not as written."""
+        """The checkpoint, after verifying its scratch file. Raises ValueError or ScratchError if chunks changed."""
         if checkpoint.manifest is None:
             return checkpoint
         if SCRATCH_NAME.fullmatch(checkpoint.manifest.path.name) is None:
-            raise ValueError(f"{checkpoint.manifest.path} is no file of chunks")
+            raise ValueError(f"it names {checkpoint.manifest.path}, expected a scratch file (*{SCRATCH_SUFFIX})")
         manifest = self._located(checkpoint.manifest)
         with closing(ChunkStore.opened(manifest, writable=False)) as store:
             store.verify()
@@ -261,9 +264,9 @@ class Run:
     def load_latest_checkpoint(self) -> Checkpoint | None:
         """The latest intact checkpoint; None if there are no checkpoints.
 
-        A damaged one is skipped with a warning; InputError if none is intact.
-        In a resuming run, metrics.jsonl is truncated to the checkpoint's step.
-        Temporary files left by a killed process are removed.
+        A damaged checkpoint is skipped with a warning. In a run that is resumed, metrics.jsonl is truncated to the
+        checkpoint's step, and temporary files of a killed process are removed. Raises InputError if there are
+        checkpoints but none is intact.
         """
         checkpoints = self.checkpoints()
         checkpoint: Checkpoint | None = None
@@ -312,7 +315,7 @@ def is_run(path: Path) -> bool:
 
 
 def run_of(model: Path) -> Run | None:
-    """The run that a model belongs to: the folder itself, or the folder that holds the file."""
+    """The run that a model belongs to, if any: `model` itself, or the folder that contains it."""
     return next((Run.open(path) for path in (model, model.parent) if is_run(path)), None)
 
 

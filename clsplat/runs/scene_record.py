@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run's record of its scene, scene.json: name, size and camera of each view, and a digest of each photograph."""
+"""Scene record of a run, scene.json: name, size and camera of each view, and a digest of each photograph."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SCENE_RECORD_FILE_NAME = "scene.json"
 MAX_SCENE_RECORD_BYTES = 256 << 20
 """Size limit of scene.json in bytes, enough for some hundred thousand views."""
 CAMERA_RELATIVE_TOLERANCE = 1e-6
-"""Relative difference up to which camera parameters count as equal: another version may round differently."""
+"""Relative difference up to which camera parameters count as equal, because versions may round differently."""
 _EXPECTED_SCENE_RECORD = "the record of a run's scene"
 
 
@@ -66,7 +66,7 @@ def _view(view: View, digest: str | None) -> dict[str, Any]:
 
 
 def digest_of(record: dict[str, Any]) -> str:
-    """First 128 bits of the SHA-256 of a scene, in hexadecimal, independent of the version that wrote the record."""
+    """Digest of a recorded scene, 32 hexadecimal digits. The version that wrote the record does not change it."""
     scene = {key: value for key, value in record.items() if key not in ("clsplat", "earlier", "length_unit")}
     return hashlib.sha256(json.dumps(scene, sort_keys=True).encode()).hexdigest()[:32]
 
@@ -111,7 +111,7 @@ def read(run: Run) -> dict[str, Any] | None:
 
 
 def length_unit_of(record: dict[str, Any]) -> float | None:
-    """Length unit of a record's training, if it is not the extent. Runs of earlier versions have the extent."""
+    """Length unit with which the recorded training began; None for the extent, as in runs of earlier versions."""
     unit = record.get("length_unit")
     return None if unit is None else float(unit)
 
@@ -137,7 +137,7 @@ def own_cameras(run: Run | None) -> list[Camera]:
 def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
     """Short descriptions of the differences between a run's recorded scene and the scene as it is now.
 
-    If --resolution has changed, new sizes do not count, nor changed photographs that come from another file.
+    If --resolution has changed, other sizes do not count, nor do other photographs that come from another file.
     """
     was, new, resized = earlier["views"], now["views"], earlier["resolution"] != now["resolution"]
     held_out = "held out in one and not in the other"
@@ -168,10 +168,10 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
 
 
 def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool = False) -> bool:
-    """Compare the scene read from `path` with the run's recorded scene; True if it differs and `accept` is set.
+    """Compare the scene read from `path` with the run's recorded scene. Returns True if they differ.
 
-    Raises InputError if it differs and `accept` is not set.
-    Raises InputError if the world's origin differs, because the model would then be displaced.
+    accept: True to accept differences (--accept-changes). Otherwise they raise InputError.
+    Another origin of the world always raises InputError, because the model would be displaced.
     """
     earlier = read(run)
     if earlier is None:
@@ -199,8 +199,7 @@ def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool =
 
 
 def keep(run: Run, scene: Scene, *, resuming: bool) -> None:
-    """Write scene.json, unless the run resumes with a record for its resolution. Warns if a resumed run has no
-    record."""
+    """Write scene.json, unless a resumed run has one for its resolution. Warns if a resumed run has none."""
     known = read(run) if resuming else None
     if known is not None and known["resolution"] == run.config.resolution:
         return
@@ -213,7 +212,7 @@ def keep(run: Run, scene: Scene, *, resuming: bool) -> None:
 
 
 def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
-    """Reasons why scores of these views do not count as held-out scores of the run's scene."""
+    """Reasons, as texts, why scores of these views do not count as held-out scores of the run's scene."""
     try:
         record = read(run)
     except InputError:
@@ -239,7 +238,7 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
 
 
 def _close(a: list[float], b: list[float]) -> bool:
-    """True if two vectors agree relative to their largest number, because a scene may have any scale."""
+    """True if two vectors agree within CAMERA_RELATIVE_TOLERANCE of their largest number."""
     one, other = np.array(a), np.array(b)
     return bool(np.abs(one - other).max() <= CAMERA_RELATIVE_TOLERANCE * max(np.abs(one).max(), np.abs(other).max()))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing settings as config.toml, and reading them."""
+"""Settings in config.toml: writing, reading and checking, also of files of earlier versions."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ _ADDED_SETTINGS: dict[str, tuple[str, Any]] = {
     "train.test_most": ("test_every", 0),
     "train.photos": ("test_every", "exact"),
 }
-"""Settings that config.toml files of earlier versions lack, each with a setting that those files have, and the value
-that keeps the behaviour of those versions."""
+"""Settings that earlier versions did not have, each with an older setting and a value. A config.toml that has the older
+setting but not the new one gets the value for the new one. The value keeps the behaviour of earlier versions."""
 _RETIRED_VALUES = {("train.rasterizer.extent", "constant")}
-"""Retired values of current settings. The default replaces them."""
+"""Values that a setting no longer has. The setting's default replaces them."""
 
 
 def config_text(config: TrainConfig, scene: Path | None) -> str:
@@ -74,8 +74,11 @@ def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
 
 
 def parse_config(text: str, path: Path) -> tuple[TrainConfig, Path | None]:
-    """Configuration and scene path from the file's text (see `read_config`). Warns about ignored settings of earlier
-    versions."""
+    """Settings and scene path from the text of config.toml. Warns of settings of earlier versions that are ignored.
+
+    path: path of the file, for messages.
+    Raises InputError.
+    """
     try:
         document = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -100,9 +103,9 @@ def parse_config(text: str, path: Path) -> tuple[TrainConfig, Path | None]:
 
 
 def _from_table(cls: type[T], table: Any, path: Path, where: str, passed_over: list[str]) -> T:
-    """Build the dataclass `cls` from a table; missing keys keep their defaults.
+    """Build the dataclass `cls` from a table of config.toml, whose name is `where`. Missing keys keep their defaults.
 
-    Settings of earlier versions that had an effect are added to `passed_over`.
+    Settings of earlier versions that are ignored, although they had an effect, are added to `passed_over`.
     """
     if not isinstance(table, dict):
         raise InputError(f"{path}: {where} is {table!r}, expected a table")
@@ -129,7 +132,7 @@ def _from_table(cls: type[T], table: Any, path: Path, where: str, passed_over: l
 
 
 def _meant(key: str, where: str) -> str:
-    """Hint at the table that has a setting of that name, or of a similar one."""
+    """Hint at the table that has a setting of the name `key`, or of a similar one, for a message."""
     tables = {"train": TrainConfig} | {
         f"train.{name}": kind for name, kind in get_type_hints(TrainConfig).items() if is_dataclass(kind)
     }
@@ -145,5 +148,5 @@ def _meant(key: str, where: str) -> str:
 
 @cache
 def _warn_once(text: str) -> None:
-    """Warn once, however often a file is read."""
+    """Warn with the same text only once, however often a file is read."""
     warnings.warn(text)

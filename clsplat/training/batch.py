@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A step of several views, on one device or several. Gradients are summed in the order of the views; then Adam steps.
+"""A training step of several views (--batch), on one device or several: gradients are summed, then Adam steps once.
 
 The first device has the model. Each further device has a thread and a copy of the parameters, and returns the results
-of its views. Neither the speed nor the number of devices changes a bit of the result.
+of its views. Gradients are summed in the order of the views, so neither the speed nor the number of devices changes a
+bit of the result.
 """
 
 from __future__ import annotations
@@ -44,10 +45,10 @@ from clsplat.training.step.inputs import StepRows, ViewInputs, ViewRows
 from clsplat.training.supervision.image_cache import ImageCache
 
 OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PER_PARAMETER = 5, 2
-"""Arrays on a device for each parameter.
+"""Number of arrays for each parameter of the model, on the first device and on each further device.
 
-The first device has parameters, two moments, a view's gradients and their sum. The others have parameters and a view's
-gradients.
+The first has the parameter, two moments, a view's gradient and the sum of gradients; a further device the parameter and
+a view's gradient.
 """
 
 
@@ -64,46 +65,48 @@ def scaled_rates(rates: Mapping[str, float], batch: int) -> dict[str, float]:
     """Learning rates for steps of `batch` views.
 
     Gradients of different views are nearly independent, so their sum grows with the root of their number. Adam divides
-    by that growth, and the rates restore it (the same paper).
+    by that growth, and the rates restore it (Zhao et al. 2024, section 4).
     """
     return {group: rate * sqrt(batch) for group, rate in rates.items()}
 
 
 def shares(count: int, devices: int) -> list[range]:
-    """The consecutive views of a step that each device takes."""
+    """Divide the `count` views of a step among devices. Returns the range of consecutive views of each device."""
     size = -(-count // devices)
     return [range(min(k * size, count), min((k + 1) * size, count)) for k in range(devices)]
 
 
 @dataclass(frozen=True, eq=False)
 class Losses:
-    """Losses of a step's views."""
+    """Losses of the views of a batch."""
 
     views: tuple[Loss, ...]
 
     def read(self) -> tuple[float, float]:
-        """Means of (loss, mean squared error); waits for the device."""
+        """Mean loss and mean squared error of the views; waits for the device."""
         value, squared = np.mean([view.read() for view in self.views], axis=0)
         return float(value), float(squared)
 
 
 @dataclass(eq=False)
 class _AddedView(GradientStep):
-    """A view whose gradients are added to the sums over the views. Its model is the parameters and the sums.
+    """Step of one view that adds the view's gradients to the batch's sums, in place of Adam.
 
-    own: by each view's place, the gradients with respect to the parameters of its parts.
-    noise: noise that the step adds after its last view.
+    It takes the parameters and these sums for its `model`.
+
+    own: gradients of each view's parts, by the view's position in the batch.
+    noise: noise that the batch adds after its last view.
     """
 
     own: dict[int, Sequence[DeviceArray | None]]
     noise: Exploration
 
     def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
-        """Keep the gradients instead of taking a step: all views use the components' state before the batch."""
+        """Keep the parts' gradients, in place of Adam: all views of a batch use the components' state before it."""
         self.own[inputs.place] = own
 
     def update(self, rows: StepRows) -> None:
-        """Add the rows' gradients to the sums. In a sandbox trial, also try the kernels that follow."""
+        """Add the rows' gradients to the sums. In a sandbox trial, also try the kernels that follow the last view."""
         assert rows.gradients is not None, "the batch asks for them"
         parameters, sums = rows.model
         step, counts = self.adam_step, rows.projected.tile_counts
@@ -116,11 +119,11 @@ class _AddedView(GradientStep):
 
 @dataclass(frozen=True, eq=False)
 class ViewOutcome:
-    """Results of a view on another device, on the host until the next step.
+    """Results of a view that a further device computed, on the host until the next step.
 
-    arrays: arrays of its rows, by name.
-    gradients: gradients of its rows, by parameter group.
-    own: gradients with respect to the parameters of each component, such as appearance; None where it has none.
+    arrays: tile counts, splats, screen-space gradients and contributions of all Gaussians, by name.
+    gradients: gradients of all Gaussians, by parameter group.
+    own: gradients of the view's parts, such as its appearance; None for a part without parameters.
     """
 
     arrays: dict[str, NDArray[Any]]
@@ -131,14 +134,14 @@ class ViewOutcome:
 
 @dataclass(eq=False)
 class _RemoteView(GradientStep):
-    """A view on a device other than the model's. Its results go to the host."""
+    """Step of one view on a further device, which copies the view's results to the host, in place of Adam."""
 
     arrays: dict[str, NDArray[Any]]
     outcome: dict[str, NDArray[np.float32]]
     own: list[NDArray[Any] | None]
 
-    def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:  # noqa: ARG002  # the owner does
-        """Copy the gradients to the host."""
+    def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:  # noqa: ARG002
+        """Copy the parts' gradients to the host, for Adam on the first device."""
         self.own.extend(None if gradient is None else gradient.get() for gradient in own)
 
     def update(self, rows: StepRows) -> None:
@@ -160,7 +163,7 @@ class _RemoteView(GradientStep):
 
 
 class Replica:
-    """A further device of a training, with a copy of the parameters and a thread of its own."""
+    """Further device of a training, with a copy of the parameters and a thread of its own."""
 
     def __init__(self, device: Device, config: TrainConfig, photographs: ImageCache) -> None:
         self.device, self.config = device, config
@@ -172,14 +175,14 @@ class Replica:
         self._room: dict[tuple[int, str], NDArray[Any]] = {}
 
     def follow(self, plan: Plan) -> None:
-        """Use as much of the device's memory as the plan allows."""
+        """Use at most the device memory that `plan` allows. Arrays of an earlier plan are freed."""
         self.plan, self.parameters = plan, None
         self._room.clear()
         self.rasterizer.follow(plan)
         self.photographs.follow(plan.photographs)
 
     def take(self, values: Mapping[str, NDArray[np.float32]], coefficients: int) -> None:
-        """Upload the parameters of these groups, with `coefficients` SH coefficients, from the host."""
+        """Upload parameters from the host: `values` by group, of a model with `coefficients` SH coefficients."""
         assert self.plan is not None, "planned before the first step"
         count = self.plan.need.gaussians
         if self.parameters is None or self.parameters.coefficients != coefficients:
@@ -201,11 +204,12 @@ class Replica:
         *,
         splats: bool,
     ) -> ViewOutcome:
-        """Forward, loss and backward of a view.
+        """Run forward, loss and backward of a view on this device.
 
-        place: the view's number among this device's views.
+        place: the view's position among this device's views of the batch.
         factor: divisor of the photographs' resolution.
-        values: parameters of each of `inputs.parts`, for this device.
+        step: step of a view on the first device, whose settings this one shares.
+        values: parameters of each of `inputs.parts`, from `ViewPart.values`.
         splats: True to return splats and screen-space gradients too, which density control uses.
         """
         parameters, photograph = self.parameters, self.photographs.bring(inputs.view, factor)
@@ -228,7 +232,7 @@ class Replica:
         return ViewOutcome(arrays, gradients, view.run((parameters,), here, StepProbe(), room, reads_loss=True), own)
 
     def _host(self, place: int, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> NDArray[Any]:
-        """Host memory that is reused from step to step: fresh pages would cost as much time as the copy."""
+        """Host array that is reused from step to step, because fresh pages would take as much time as the copy."""
         held = self._room.get((place, name))
         if held is None or held.shape != shape:
             held = self._room[place, name] = np.empty(shape, dtype)
@@ -236,7 +240,7 @@ class Replica:
 
 
 class Batch:
-    """The gradients of several views, and Adam's step along their sum.
+    """Steps of several views: gradients of the views on all devices, and Adam's step along their sum.
 
     rasterizer, photographs: rasterizer and image cache of the device that has the model.
     further: the other devices.
@@ -250,7 +254,7 @@ class Batch:
         if len({device.queue.int_ptr for device in devices}) < len(devices):
             raise InputError(
                 f"several devices to train on: got {', '.join(device.name for device in devices)}; two of them share a "
-                "queue and kernels; open each device on its own, because each gets a thread"
+                "queue and kernels; open each device on its own, because each needs a thread of its own"
             )
         self.rasterizer, self.photographs, self.config = rasterizer, photographs, config
         self.replicas = [Replica(device, config, photographs) for device in further]
@@ -259,18 +263,18 @@ class Batch:
         self._room: dict[str, NDArray[np.float32]] = {}
 
     def follow(self, plans: Sequence[Plan]) -> None:
-        """Use at most as much of the further devices' memory as the plans allow. Arrays of earlier plans are freed."""
+        """Use at most the memory that `plans` allow, one for each further device. Arrays of earlier plans are freed."""
         self._sums = self._sent = None
         self._room.clear()
         for replica, plan in zip(self.replicas, plans, strict=True):
             replica.follow(plan)
 
     def changed(self) -> None:
-        """Note that something other than Adam has changed the parameters."""
+        """Note that the parameters were changed, but not by Adam: the next step sends all of them to the devices."""
         self._sent = None
 
     def close(self) -> None:
-        """End the threads."""
+        """End the threads of the further devices."""
         for replica in self.replicas:
             replica.thread.shutdown()
 
@@ -286,9 +290,9 @@ class Batch:
     ) -> Losses:
         """Update the model (parameters, first and second moments) with the views of a step.
 
-        step: the template of a single view's step; its number counts views.
+        step: template for the steps of the single views; its number counts views.
         factor: divisor of the photographs' resolution.
-        probes: function that makes a view's probe.
+        probes: function that makes a view's probe from its inputs and step.
         statistics: True if density control uses the views' gradients.
         """
         batch, work, device = self.config.batch, self.rasterizer.work, step.device
@@ -316,7 +320,7 @@ class Batch:
                 outcome = future.result()
                 losses.append(self._take(model[0], sums, outcome, step_of_view, probes(views[index], step_of_view)))
                 own[index] = [None if each is None else upload(device, each) for each in outcome.own]
-        finally:  # no thread may continue after an error
+        finally:  # after an error no thread may go on with the batch
             under_way: list[Future[Any]] = [*transfers, *(future for _, future in pending)]
             wait([future for future in under_way if not future.cancel()])
         for start, _, (parameters, moments, squares, gradients) in parts(work, *model, sums, keep=True):
@@ -330,7 +334,7 @@ class Batch:
         return Losses(tuple(losses))
 
     def _sums_for(self, device: Device, parameters: AnyGaussians) -> AnyGaussians:
-        """Arrays for the sums, which are zero, as `adam` leaves them."""
+        """Arrays for the sums of gradients. They contain zeros, which `adam` leaves in them after each step."""
         count, coefficients, sums = parameters.count, parameters.coefficients, self._sums
         if sums is None or (sums.count, sums.coefficients) != (count, coefficients):
             del sums
@@ -343,7 +347,7 @@ class Batch:
         return sums
 
     def _send(self, parameters: AnyGaussians) -> list[Future[None]]:
-        """Send the parameters to the further devices, except the higher SH bands if they are unchanged there."""
+        """Begin to send the parameters to the further devices, without the higher SH bands if these are unchanged."""
         if not self.replicas:
             return []
         groups = [group for group in PARAMETER_GROUPS if group != "sh_rest" or self._sent is not parameters]
@@ -368,9 +372,9 @@ class Batch:
         step: _AddedView,
         probes: Callable[[ViewInputs, GradientStep], StepProbe],
     ) -> Loss:
-        """Run a view on the device of the model.
+        """Run the step of a view on the first device.
 
-        model: parameters and sums.
+        model: parameters, and sums of gradients.
         """
         gradients = view_gradients(self.rasterizer.work, model[0])
         inputs = replace(inputs, photograph=self.photographs.bring(inputs.view, factor))
@@ -379,7 +383,7 @@ class Batch:
     def _take(
         self, parameters: AnyGaussians, sums: AnyGaussians, outcome: ViewOutcome, step: _AddedView, probe: StepProbe
     ) -> Loss:
-        """Add the results of a view that another device computed. Uses the scratch memory of a view on this device.
+        """Add a further device's results of a view to the sums. They pass through the scratch arrays of a view here.
 
         parameters: those of the model. A pool has their statistics on the device with them.
         """
@@ -399,7 +403,7 @@ class Batch:
 
 
 def _brought(work: Workspace, device: Device, name: str, values: NDArray[Any]) -> DeviceArray:
-    """Copy an array of another device to this one. The host's copy must stay unchanged until the next step."""
+    """Copy an array from the host to this device. The host's array must stay unchanged until the next step."""
     if device.shares_memory and values.size:
         return shared(device, values)
     array = work.array(name, values.shape, values.dtype.type)

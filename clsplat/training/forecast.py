@@ -15,9 +15,9 @@ from clsplat.training.density.mcmc import wanted
 from clsplat.training.supervision.resolution import by_doubling
 
 PRIOR_GROWTH_FACTOR, PRIOR_GROWTH_EXPONENT = 26.0, 0.6
-"""Prior of the peak growth, in Gaussians that a densification by the paper's rule adds.
+"""Prior of the peak growth: the number of Gaussians that one densification by the paper's rule adds at most.
 
-The prior is a factor times a power of the initial number of Gaussians. Five scenes of 2,754 to 78,868 points add 0.7 to
+It is this factor times the initial number of Gaussians to this power. Five scenes of 2,754 to 78,868 points add 0.7 to
 1.5 times as many.
 """
 GROWTH_RAMP = (0.35, 0.55, 0.75, 0.9)
@@ -25,24 +25,24 @@ GROWTH_RAMP = (0.35, 0.55, 0.75, 0.9)
 PEAK_DENSIFICATIONS = 3
 """Number of densifications after the ramp in which the growth stays at its peak."""
 GROWTH_DECAY_STEPS, GROWTH_FLOOR_FRACTION = 1100.0, 0.2
-"""Time constant in steps of the growth's exponential decay, and the fraction of the peak that it decays to: Gaussians
-that are small enough fall below the threshold."""
+"""Time constant in steps of the growth's exponential decay, and the fraction of the peak that it decays to. Growth
+decays because small Gaussians fall below the gradient threshold."""
 RECENT_DENSIFICATIONS = 4
-"""Number of latest densifications that predict the next ones."""
+"""Number of latest densifications from which the growth by the next ones is predicted."""
 PRIOR_GROWTH_WEIGHT = 0.5
 """Weight of the prior: it counts as much as this many measured densifications at the peak."""
 PRIOR_COSTS = np.array([8000.0, 0.6, 1.2, 80_000.0])
-"""Prior costs of a step, of a pixel, of a Gaussian and of reading a photograph, relative to each other, as on CPUs."""
+"""Prior times of a step, a pixel, a Gaussian, and reading a photograph, relative to each other, as on CPUs."""
 PRIOR_COST_WEIGHT_SECONDS = 0.03
 """Weight of the prior costs: they count as much as this many measured seconds."""
 OUTLIER_FACTOR = 4.0
-"""Steps that took over this many times their usual time are left out: probably a kernel was built meanwhile."""
+"""Steps that took over this many times the usual time are left out, because a kernel was probably built then."""
 PACE_WINDOW_SECONDS = 60.0
-"""Seconds of recent steps that give the machine's current speed."""
+"""Time in seconds before the last report from which the machine's current speed is taken."""
 
 
 class TimedStep(Protocol):
-    """Report of a step (`loop.StepReport`)."""
+    """Fields of a step's report that a forecast reads (`loop.StepReport`)."""
 
     step: int
     gaussians: int
@@ -50,7 +50,7 @@ class TimedStep(Protocol):
 
 
 class Span(NamedTuple):
-    """Steps of one size and number of Gaussians.
+    """Consecutive steps with one picture size and one number of Gaussians.
 
     factor: divisor of the photographs' width and height (`Sizes`).
     reads: number of photographs that are read.
@@ -65,7 +65,7 @@ class Span(NamedTuple):
 
 
 class Forecast:
-    """Seconds until the end of a training. Call `see` with each report, in order.
+    """Forecast of the seconds until the end of a training. Call `see` with each report, in order.
 
     photographs: number of photographs to train on. Each is read when it is first seen, for all sizes.
     pixels: number of pixels of a photograph at full size.
@@ -77,16 +77,16 @@ class Forecast:
         self.begun: tuple[int, int] | None = None
         self.last: tuple[int, int, float] | None = None
         self.spans: list[Span] = []
-        """Steps between two reports."""
+        """Done steps, a span from each report to the next."""
         self.amounts: list[tuple[float, ...]] = []
-        """For each of these spans, the result of `_amounts`."""
+        """Result of `_amounts` for each of `spans`."""
         self.added: list[tuple[int, int]] = []
         """Step of each densification, and the number of Gaussians that it added."""
 
     def see(self, report: TimedStep) -> None:
-        """Record a report."""
+        """Record the report of a step."""
         step, count, seconds = report.step, report.gaussians, report.seconds
-        if self.last is None or step <= self.last[0]:  # training has returned to a checkpoint
+        if self.last is None or step <= self.last[0]:  # the first report, or the first after a return to a checkpoint
             self.begun, self.last = self.begun or (step, count), (step, count, seconds)
             return
         before, previous, at = self.last
@@ -124,7 +124,7 @@ class Forecast:
         return self.config.batch * (read(step) - read(max(before, begin)))
 
     def _ahead(self, step: int, count: int) -> list[Span]:
-        """Remaining steps."""
+        """Remaining steps, as spans with one picture size and one number of Gaussians."""
         density, last, number = self.config.density, self.config.iterations, float(count)
         height, peak = self._height()
         bounds = {last, *(each for each, _ in self.sizes.until if step < each < last)}
@@ -140,7 +140,7 @@ class Forecast:
         return spans
 
     def _grown(self, density: DensityConfig, step: int, number: float, height: float, peak: int) -> float:
-        """Number of Gaussians after a densification."""
+        """Number of Gaussians after a densification, with `number` before it. height, peak: results of `_height`."""
         most = max(density.max_gaussians, number)
         if density.growth == "mcmc":
             return min(wanted(density, step, max(round(number), 1)), most)
@@ -149,7 +149,7 @@ class Forecast:
         return min(max(number + height * _course(density, step, peak), 1.0), most)
 
     def _height(self) -> tuple[float, int]:
-        """Peak growth of a densification by the paper's rule, in Gaussians, and the step of the largest one so far."""
+        """Peak growth of a densification by the paper's rule, in Gaussians, and the step that has added most so far."""
         assert self.begun is not None
         taken = self.added[-RECENT_DENSIFICATIONS:]
         peak = max(self.added, key=lambda one: one[1])[0] if self.added else 0
@@ -158,12 +158,12 @@ class Forecast:
         return added / (PRIOR_GROWTH_WEIGHT + sum(_course(self.config.density, step, peak) for step, _ in taken)), peak
 
     def _amounts(self, span: Span) -> tuple[float, ...]:
-        """Amounts (4,) that the cost of a step is made of: 1, pixels, Gaussians, photographs read."""
+        """Amounts (4,) on which the time of a step depends: 1, pixels, Gaussians, photographs read."""
         return 1.0, self.pixels / span.factor**2, span.gaussians, span.reads / span.steps
 
     def _cost(self) -> tuple[Float64, float]:
-        """The seconds that a unit of each of the `_amounts` takes, (4,), and the factor by which recent steps took
-        longer than that."""
+        """Fit the time of a step. Returns the seconds that a unit of each of the `_amounts` takes (4,), and the factor
+        by which recent steps took longer than these seconds predict."""
         spans = self.spans[1:] or self.spans  # the first span includes building kernels
         parts = np.array(self.amounts[-len(spans) :])
         steps, seconds = np.array([(span.steps, span.seconds) for span in spans]).T
@@ -185,7 +185,7 @@ class Forecast:
 
 
 def _course(density: DensityConfig, step: int, peak: int = 0) -> float:
-    """The growth of a densification by the paper's rule, as a fraction of the peak growth.
+    """Growth of the densification of step `step` by the paper's rule, as a fraction of the peak growth.
 
     peak: step up to which the growth does not decay, even if it would by the density settings alone.
     """

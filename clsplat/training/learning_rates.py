@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learning rates by step."""
+"""Learning rates of the parameter groups by step: exponential decay of the means' rate, cooldown of all rates."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ _RATE_SETTINGS = {name: group.rate for name, group in PARAMETER_GROUPS.items()}
 
 
 def rates_at(config: TrainConfig, step: int, length_unit: float, factor: float) -> dict[str, float]:
-    """Learning rate of each group at a step.
+    """Learning rate of each parameter group at a step.
 
     The means' rate falls exponentially, and is relative to the scene's length unit. All rates fall in the cooldown.
-    factor: factor on all rates, which falls with each return to a checkpoint.
+    factor: factor on all rates, smaller after each return to a checkpoint (`RetryBudget.rate_factor`).
     """
     cooled, given = _cooled(config, step), vars(config.optimiser)
     rates = {name: given[setting] * cooled * factor for name, setting in _RATE_SETTINGS.items()}
@@ -22,15 +22,18 @@ def rates_at(config: TrainConfig, step: int, length_unit: float, factor: float) 
 
 
 def largest_rates(config: TrainConfig, steps: range, length_unit: float) -> dict[str, float]:
-    """Upper limit of each group's learning rate in these steps: the cooldown of the first, and the larger of the means'
-    rates at both ends, between which it rises or falls all the way."""
+    """Upper limit of each parameter group's learning rate over the range `steps`.
+
+    The factor of the cooldown is largest at the first step. The means' rate is largest at the first or the last step,
+    because it rises or falls all the way.
+    """
     rates, cooled = rates_at(config, steps[0], length_unit, 1.0), _cooled(config, steps[0])
     rates["means"] = max(rates["means"], _means_rate(config, steps[-1]) * length_unit * cooled)
     return rates
 
 
 def _cooled(config: TrainConfig, step: int) -> float:
-    """Factor of the cooldown on every learning rate."""
+    """Factor on every learning rate at a step, because of the cooldown; 1 before the cooldown."""
     cooldown = config.optimiser.cooldown
     into = cooldown - max(config.iterations - step, 0)
     return config.optimiser.cooldown_to ** (into / cooldown) if into > 0 else 1.0

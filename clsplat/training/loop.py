@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training from start to end: the loop around the trainer's step, and its output in a run's folder."""
+"""The training loop: steps, reports, evaluations and checkpoints, with its output in a run's folder."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ from clsplat.training.stability.health import MAX_CHECKPOINT_RETURNS, TROUBLE_WI
 from clsplat.training.trainer import Trainer
 
 REPORT_EVERY = 10
-"""Steps between readings of the loss. While the host waits for a loss, the device continues with the rest of the
-step."""
+"""Number of steps between reports, for which the host reads the loss. While it waits, the device continues with the
+rest of the step."""
 GROWTH_LIMIT_FRACTION = 0.97
 """Fraction of --density.max-gaussians from which growth counts as limited. It is below 1 because some Gaussians are
 pruned after the limit was reached."""
 OVERFITTING_DB = 0.2
 """Fall of the held-out views' mean PSNR, in dB, from which a warning reports overfitting.
 
-Trainings that differ only in the seed differ by as much (docs/quality.md).
+The PSNRs of trainings that differ only in the seed differ by as much (docs/quality.md).
 """
 
 
@@ -63,10 +63,10 @@ function should then return."""
 
 @dataclass(frozen=True)
 class StepReport:
-    """Report of a step.
+    """Report of a training step.
 
     step: number of steps done.
-    loss, psnr: loss and PSNR of that step's view, or of all views of its batch.
+    loss, psnr: loss and PSNR of the step's view, or from the means over its batch.
     seconds: training time so far; evaluations, checkpoints and other work do not count.
     """
 
@@ -103,7 +103,7 @@ def _interruption() -> Iterator[Callable[[], int]]:
 
 
 class TrainingSession:
-    """One call of `clsplat.train`: a trainer, its run, and its training time in seconds."""
+    """One call of `clsplat.train`: the trainer, its run (None without), and the training time in seconds."""
 
     def __init__(
         self,
@@ -133,7 +133,7 @@ class TrainingSession:
             self.saved = checkpoint.step
 
     def save(self) -> None:
-        """Write a checkpoint, unless this step has one or the model is too broken to return to."""
+        """Write a checkpoint, unless this step has one, or too many Gaussians have non-finite values."""
         if self.run is not None and self.trainer.step > self.saved:
             arrays, state = self.trainer.checkpoint()
             if not self.trainer.monitor.retries.lost:
@@ -145,10 +145,9 @@ class TrainingSession:
     def rescue(self) -> str:
         """Write a checkpoint of the state at the start of the step, if that is intact.
 
-        Called after a failed or interrupted trial of kernels, after a failed command of the driver (also of a GPU that
-        is lost), where the device's memory is used up, and for a photograph that cannot be read.
-
-        Returns the end of an error message, which names the checkpoint, or "".
+        Called when a trial of kernels or a command of the driver fails, device memory is used up, or a photograph
+        cannot be read. A lost GPU is such a failure. Returns the end of an error message, which names the checkpoint,
+        or "".
         """
         if self.run is None:
             return ""
@@ -170,10 +169,10 @@ class TrainingSession:
         return f"; {self.run.resume_command} continues from the last checkpoint" if self.run and there else ""
 
     def go_back(self) -> bool:
-        """Report non-finite values. After too many steps with such values, go back to the last checkpoint with smaller
-        learning rates.
+        """Report non-finite values. After too many steps with them, go back to the last checkpoint, and continue with
+        smaller learning rates.
 
-        After too many returns it raises ClsplatError. Returns True if training went back.
+        Returns True if training went back. Raises ClsplatError after too many returns.
         """
         trainer, retries = self.trainer, self.trainer.monitor.retries
         self.tell_trouble()
@@ -201,7 +200,7 @@ class TrainingSession:
         return True
 
     def tell_trouble(self) -> None:
-        """Warn of the first incident of each stage, and count the others."""
+        """Warn of the first incident with non-finite values in each stage, and count the later ones."""
         for incident in self.trainer.monitor.incidents:
             self.troubles[incident.stage] += 1
             if self.troubles[incident.stage] == 1:
@@ -235,7 +234,7 @@ class TrainingSession:
         self.announced = plan
 
     def report(self, result: Loss | Losses) -> StepReport | None:
-        """Read the loss of the latest step, and make its report; None if the loss is not finite."""
+        """Read the loss of the latest step, and return the step's report; None if the loss is not finite."""
         start = time.perf_counter()
         value, squared = result.read()
         self.seconds += time.perf_counter() - start
@@ -246,12 +245,12 @@ class TrainingSession:
         return StepReport(self.trainer.step, value, psnr, self.trainer.parameters.count, self.seconds)
 
     def draw(self, camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Image and alpha of the current model, before compositing over the background of evaluations."""
+        """Image of the current model over the background of evaluations, and alpha."""
         result = self.trainer.draw(camera)
         return result.image, result.alpha
 
     def render(self, model: Gaussians, camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Image over black, and alpha, of a model on the host."""
+        """Image of a model on the host, over black, and alpha."""
         result = Renderer(self.trainer.device, config=self.trainer.config.rasterizer).render(model, camera)
         return result.image, result.alpha
 
@@ -279,7 +278,12 @@ class TrainingSession:
     def record(
         self, report: StepReport, *, evaluating: bool, stages: dict[str, float] | None, validated: bool = False
     ) -> None:
-        """Pass the report on, and record it with the data that clsplat.report needs."""
+        """Pass a step's report to `on_step`, and append it to metrics.jsonl, with what report.html needs.
+
+        evaluating: True to evaluate the held-out views.
+        stages: milliseconds by stage, if the step was timed.
+        validated: True if the refined cameras have been validated after the step.
+        """
         if self.on_step is not None:
             self.on_step(report)
         record = asdict(report)
@@ -301,13 +305,13 @@ class TrainingSession:
         self.run.append_metrics({**record, "elapsed": time.perf_counter() - self.began})
 
     def doubt(self) -> None:
-        """Warn if the renders show nothing. If the memory is too small to render, nothing is checked."""
+        """Warn if renders of training views show nothing. Without the memory to render, nothing is checked."""
         with suppress(CapacityError):
             if text := sanity_checks.of_pictures(self.draw, self.trainer.views):
                 warnings.warn(f"step {self.trainer.step}: {text}")
 
     def times_stages(self, steps: range) -> bool:
-        """True if each stage of these steps, which run together, has to be timed. Without a run no step is timed."""
+        """True if each stage of these steps, which run together, has to be timed for the report."""
         config = self.trainer.config
         if config.stages_every == 0:
             return False
@@ -318,7 +322,7 @@ class TrainingSession:
         return any(step in steps for step in self.trainer.config.eval_at) and bool(self.trainer.scene.test_views)
 
     def reports(self, steps: range) -> bool:
-        """True if the loss of these steps is read."""
+        """True if the loss of these steps, which run together, is read."""
         asked = self.evaluates(steps) or self.trainer.cameras.gate.is_due(steps[-1])
         return _reached(REPORT_EVERY, steps) or self.trainer.config.iterations in steps or asked
 
@@ -359,7 +363,7 @@ class TrainingSession:
         except InputError as error:
             if self.run is None:
                 raise
-            if isinstance(error, ScratchError):  # what was read may be wrong, so nothing is written
+            if isinstance(error, ScratchError):  # Gaussians read from the scratch file may be wrong: write nothing
                 raise InputError(f"{error}{self.last_one}") from None
             raise InputError(f"{error}{self.rescue() or f'; go on with: {self.run.resume_command}'}") from None
 
@@ -403,7 +407,7 @@ class TrainingSession:
         return model
 
     def make_steps(self, between: Between | None) -> None:
-        """Run the remaining steps, and the work that is due at their end. Raises Interrupted, after a checkpoint."""
+        """Run the remaining steps, and the work that is due after them. After Ctrl-C, save and raise Interrupted."""
         trainer, last = self.trainer, self.trainer.config.iterations
         with _interruption() as interrupted:
             while True:

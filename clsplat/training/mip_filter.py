@@ -18,7 +18,7 @@ from clsplat.stages.sampling import SAMPLING_GAUSSIAN_BYTES, limit_scales, sampl
 from clsplat.training.step.component import Component, Named
 
 SAMPLING_LIMIT_INTERVAL_STEPS = 100
-"""Steps between updates of the limits: the means move slowly."""
+"""Number of steps between updates of the scales' lower limits. Means move too slowly to need more."""
 
 
 class MipFilter(Component):
@@ -27,7 +27,7 @@ class MipFilter(Component):
 
     def __init__(self, config: TrainConfig, device: Device, work: Workspace, cameras: Sequence[Camera]) -> None:
         self._device, self._work, self._antialiased = device, work, config.antialiased
-        self._least: DeviceArray | None = None  # (n,), None until computed before the next step
+        self._least: DeviceArray | None = None  # (n,), lower limits; None until the next step computes them
         if not self.on:
             return
         self._cameras = upload_cameras(device, cameras)
@@ -39,7 +39,7 @@ class MipFilter(Component):
 
     @property
     def row_bytes(self) -> int:
-        """Bytes per Gaussian on the device."""
+        """Bytes per Gaussian that the filter takes on the device."""
         return SAMPLING_GAUSSIAN_BYTES if self.on else 0
 
     def is_due(self, step: int, views: int) -> bool:
@@ -47,27 +47,27 @@ class MipFilter(Component):
         return self.on and (self._least is None or (step - 1) % SAMPLING_LIMIT_INTERVAL_STEPS < views)
 
     def before_step(self, gaussians: AnyGaussians) -> None:
-        """Compute the limits, and apply them."""
+        """Compute the scales' lower limits, and raise scales that are below them."""
         self._least = allocate(self._device, (gaussians.count,), np.float32)
         sampling_limits(self._device, self._work, gaussians, self._cameras, self._least)
         self.after_adam(gaussians)
 
     def after_adam(self, gaussians: AnyGaussians) -> None:
-        """Raise scales that are below their limit to the limit."""
+        """Raise each scale that Adam has moved below its lower limit to the limit."""
         if self._least is not None:
             limit_scales(self._device, self._work, gaussians, self._least)
 
     def rows_moved(self, listed: DeviceArray | HostArray) -> None:  # noqa: ARG002
-        """Forget the limits."""
+        """Forget the limits, because rows have moved. The next step computes them anew."""
         self._least = None
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a checkpoint, by name."""
+        """The scales' lower limits, as an array of a checkpoint by name."""
         return {} if self._least is None else {"sampling/least": self._least.get()}
 
     def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002
         """Load the arrays of a checkpoint of `count` Gaussians. Raises ValueError for another number of Gaussians."""
         least = named("sampling/").get("least") if self.on else None
         if least is not None and least.shape != (count,):
-            raise ValueError(f"sampling/least has shape {least.shape}")
+            raise ValueError(f"sampling/least has shape {least.shape}, expected ({count},)")
         self._least = None if least is None else upload(self._device, np.ascontiguousarray(least, np.float32))

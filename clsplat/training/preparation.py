@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks and preparation of a training, before its first step."""
+"""Preparation of a training before its first step: checks, length unit, start points, known depths, settings."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None) -> S
     check_refinable(config, scene.train_views)
     start = config.start_points
     is_prepared = bool(start) and scene.start == start
-    if not len(scene.points) and not start.sky:  # then photographs look at the points of a file, if there is one
+    if not len(scene.points) and not start.sky:  # the length unit follows from the points of --points too
         scene = with_points(scene, start)
     unit = _length_unit(scene, resumed, is_prepared=is_prepared)
     if unit != scene.unit:
@@ -64,13 +64,13 @@ def _length_unit(scene: Scene, resumed: Run | None, *, is_prepared: bool) -> flo
 
 
 def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:
-    """Raise InputError, with the setting's `name`, if a run is past its last step."""
+    """Raise InputError if a run has a checkpoint after the last step of `config`. name: the setting in the message."""
     if (done := max((step for step, _ in run.checkpoints()), default=0)) > config.iterations:
-        raise InputError(f"{name} {config.iterations}: {run.path} is already at step {done}; expected more")
+        raise InputError(f"{name} {config.iterations}: {run.path} is already at step {done}; expected more steps")
 
 
 def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:
-    """Scene to train on, with coloured points. It is recorded in the run. Warns of each finding of the sanity checks.
+    """Record the scene in the run. Returns the scene to train on, whose points have colours. Warns of bad findings.
 
     Raises InputError if the run has already been trained, or trained on another scene.
     """
@@ -120,7 +120,7 @@ def settings_of(config: TrainConfig | None, run: Run | None, *, resume: bool) ->
 
 
 def late_settings(config: TrainConfig) -> Iterator[str]:
-    """Describe each non-default setting that takes effect after the last step, or starts before the first."""
+    """Yield a warning for each non-default setting that takes effect after the last step, or before the first."""
     last, expected = config.iterations, f"expected at most --iterations {config.iterations}"
     ends = f"training ends at step {last}"
     density = config.density
@@ -140,6 +140,6 @@ def late_settings(config: TrainConfig) -> Iterator[str]:
     late = [step for step in config.warmup if step >= max(last, 2)]
     if late and tuple(config.warmup) != TrainConfig.warmup:
         yield (
-            f"--warmup {','.join(map(str, late))}: the training resolution does not double then, because {ends} at "
-            f"1/{2 ** len(late)} of the size; expected less than --iterations {last}"
+            f"--warmup {','.join(map(str, late))}: the training resolution does not double after these steps, because "
+            f"{ends} at 1/{2 ** len(late)} of the size; expected steps below --iterations {last}"
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bundle of a training that stopped because of non-finite numbers, and the replay of its one training step.
+"""Bundle (trouble-step-*.npz) of a training step with non-finite values that ended a training, and its replay.
 
     python -m clsplat.training.repro_bundle RUN/trouble-step-0001234.npz [--device DEVICE] [--json]
 
@@ -61,7 +61,7 @@ _MODEL_KINDS = ("parameters", "first", "second")
 
 
 class RecordedCamera(TypedDict):
-    """A camera in a bundle, except for its pose."""
+    """Camera of a bundle, without its pose."""
 
     width: int
     height: int
@@ -76,12 +76,13 @@ class RecordedCamera(TypedDict):
 
 
 class StepRecord(TypedDict):
-    """The step of a bundle.
+    """Training step that a bundle replays.
 
     view: name of its photograph.
+    stage, message: the first stage with non-finite values, and the error message of the training.
     settings: text of config.toml.
     versions, device: of the machine that trained.
-    depth_factor: factor of the known depths, if they are compared.
+    depth_factor: factor of the depth loss (`DepthTerm`), if there is one.
     of: numbers of Gaussians in the bundle and in the training.
     reproduced: True if the bundle reproduces the non-finite values.
     """
@@ -102,9 +103,9 @@ class StepRecord(TypedDict):
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """A training step with everything that a replay needs.
+    """Training step with everything that a replay needs.
 
-    models: parameters and moments by group.
+    models: parameters and moments, with the keys "parameters", "first" and "second".
     """
 
     record: StepRecord
@@ -114,7 +115,7 @@ class Bundle:
 
 
 def recorded_camera(camera: Camera) -> RecordedCamera:
-    """The record of a camera."""
+    """Camera as it is recorded in a bundle."""
     return {
         "width": camera.width,
         "height": camera.height,
@@ -130,7 +131,7 @@ def recorded_camera(camera: Camera) -> RecordedCamera:
 
 
 def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
-    """Write `folder`/trouble-step-STEP.npz for the incident, and return its path."""
+    """Write the bundle `folder`/trouble-step-STEP.npz for the incident, and return its path."""
     photograph = trainer.photographs.load(incident.view, trainer.sizes.factor(incident.step))
     camera = trainer.loader.camera(incident.view, photograph.shape[1], photograph.shape[0])
     device = trainer.device
@@ -177,8 +178,7 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
 
 
 def _unmarked(models: dict[str, HostGaussians]) -> dict[str, HostGaussians]:
-    """The models with zeros in place of moments that are not finite. Such a moment may mark a step that `adam`
-    refused."""
+    """The models with zeros in place of moments that are not finite, which may mark steps that `adam` refused."""
     for kind in ("first", "second"):
         arrays = {g: HostArray(finite_or_zero(array.get())) for g, array in models[kind].arrays.items()}
         models[kind] = replace(models[kind], arrays=arrays)
@@ -186,20 +186,20 @@ def _unmarked(models: dict[str, HostGaussians]) -> dict[str, HostGaussians]:
 
 
 def read_bundle(path: Path) -> Bundle:
-    """Read a bundle. Raises InputError for other files."""
+    """Read a bundle. Raises InputError for a file that is not an intact bundle."""
     try:
         return _bundle_of(read_checkpoint(path), path)
-    except Exception as error:  # zipfile raises nearly anything for a flipped bit, as in a checkpoint
+    except Exception as error:  # zipfile raises nearly any exception for a flipped bit
         if isinstance(error, InputError) and str(path) in str(error):
             raise
         why = f"{type(error).__name__}: {error}"[:300]
-        raise InputError(f"{path}: not a bundle of a training that gave up ({why})") from None
+        raise InputError(f"{path}: is not a bundle ({why}), expected a file trouble-step-*.npz of a run") from None
 
 
 def _bundle_of(saved: Checkpoint, path: Path) -> Bundle:
-    """The bundle in a checkpoint. It may raise any exception if the arrays and values do not make a step.
+    """Make a bundle from the content of its file. May raise any exception if arrays and state do not make a step.
 
-    All sizes follow from the photograph's.
+    All array sizes have to follow from the photograph's.
     """
     record, arrays = cast("StepRecord", {**saved.state, "step": saved.step}), saved.arrays
     record["rates"] = {group: float(record["rates"][group]) for group in PARAMETER_GROUPS}
@@ -216,7 +216,9 @@ def _bundle_of(saved: Checkpoint, path: Path) -> Bundle:
         by_rays=bool(lens["by_rays"]),
     )
     if photograph.dtype not in (np.uint8, np.float32) or channels not in (3, 4, 5):
-        raise ValueError(f"the photograph has shape {photograph.shape} of {photograph.dtype}")
+        raise ValueError(
+            f"photograph is {photograph.dtype} of shape {photograph.shape}, expected uint8 or float32 of (H, W, 3 to 5)"
+        )
     camera.check()
     aims = None
     if "depth" in arrays:
@@ -228,7 +230,7 @@ def _bundle_of(saved: Checkpoint, path: Path) -> Bundle:
 
 
 class _Counts(StepProbe):
-    """Counts of non-finite numbers after each stage of a step."""
+    """Probe that counts the non-finite values after each stage of a step."""
 
     def __init__(self, camera: Camera) -> None:
         self.seen = (slice(None), slice(camera.height), slice(camera.width))
@@ -256,8 +258,8 @@ class _Counts(StepProbe):
 
 
 def replay(bundle: Bundle, device: Device) -> dict[str, int]:
-    """Repeat the step. Returns the number of non-finite values after each stage, and of array elements that
-    `adam` refuses to step."""
+    """Repeat the step. Returns the number of non-finite values after each stage, and for "adam" the number of array
+    elements that `adam` refuses to update."""
     config, record = bundle.config, bundle.record
     rasterizer = Rasterizer(device, config.rasterizer, antialiased=config.antialiased)
     probe = _Counts(bundle.inputs.camera)
@@ -271,7 +273,7 @@ def replay(bundle: Bundle, device: Device) -> dict[str, int]:
 
 
 def first_trouble(counts: dict[str, int]) -> str | None:
-    """First stage after which a value is not finite."""
+    """First stage after which a value is not finite; None if all values are finite."""
     return next((stage for stage, count in counts.items() if count), None)
 
 
@@ -284,7 +286,7 @@ def _wrong_in(gaussians: DeviceGaussians) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line of the module's docstring."""
+    """Run the command `python -m clsplat.training.repro_bundle`. Returns its exit status."""
     parser = argparse.ArgumentParser(
         prog="python -m clsplat.training.repro_bundle", description=(__doc__ or "").splitlines()[0]
     )
@@ -304,10 +306,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0 if stage else 1
     print(bundle.record["message"])
     (kept, count), camera = bundle.record["of"], bundle.inputs.camera
-    print(f"{kept:,} of {count:,} Gaussians, {camera.width}x{camera.height}; not finite after")
+    print(f"{kept:,} of {count:,} Gaussians, {camera.width}x{camera.height} pixels; values that are not finite after")
     for name, count in counts.items():
         print(f"  {name:13}{count:>12,}")
-    print(f"first in {stage}" if stage else "all is well on this device")
+    print(f"first in {stage}" if stage else "all is well on this device: every value is finite")
     return 0 if stage else 1
 
 

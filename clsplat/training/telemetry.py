@@ -29,13 +29,16 @@ T = TypeVar("T")
 
 REPORTED_PACKAGES = ("numpy", "pyopencl", "OpenImageIO", "scipy", "scikit-image")
 CONTRIBUTION_SECONDS = 1.0
-"""Seconds for sampling training views for contributions, counted from the end of the first view."""
+"""Time limit, in seconds after the first view, for measuring the Gaussians' contributions to training views."""
 CONTRIBUTION_BIN_EDGES = tuple(float(edge) for edge in np.round(np.arange(-3.0, 5.01, 0.2), 1))
-"""Edges of the bins of contributions, as base-10 logarithms of pixels."""
+"""Edges of the bins of the histogram of contributions, as base-10 logarithms of pixels."""
 
 
 def session(device: Device, step: int) -> dict[str, Any]:
-    """Record of the machine that trains from `step`. Reports are shared, so it names no user, host or folder."""
+    """Record of the device, driver and versions that train from `step` on.
+
+    It names no user, host or folder, because reports are shared.
+    """
     versions = {"clsplat": package_version(), "Python": platform.python_version()}
     for package in REPORTED_PACKAGES:
         with suppress(PackageNotFoundError):
@@ -54,10 +57,11 @@ def session(device: Device, step: int) -> dict[str, Any]:
 
 
 def timed(device: Device, work: Callable[[], T]) -> tuple[T, dict[str, float]]:
-    """Result of `work`, and milliseconds of each stage; "other" for time outside the stages, "all" for the total.
+    """Run `work`. Returns its result, and the wall time of each stage in milliseconds.
 
-    It measures wall time from an idle device to an idle device. So the times include launches, and the queue needs no
-    profiling. Use it rarely: as it waits after every stage, host and device do not work at the same time.
+    The key "other" is for time outside the stages, "all" for the total. The device is idle before and after each stage,
+    so that times include launches, and the queue needs no profiling. Use it rarely: it keeps host and device from
+    working at the same time.
     """
     with device.recorder.recording(wait=True) as stages:
         result, total = device.timed(work)
@@ -66,11 +70,12 @@ def timed(device: Device, work: Callable[[], T]) -> tuple[T, dict[str, float]]:
 
 
 def contributions(trainer: Trainer, seconds: float = CONTRIBUTION_SECONDS) -> dict[str, Any] | None:
-    """Histogram of `largest_contributions`.
+    """Histogram of the Gaussians' largest contributions to a training view (`largest_contributions`), for the report.
 
-    `none` is the number of Gaussians that no view shows. `counts` are the numbers of other Gaussians in the bins
-    between `edges`, base-10 logarithms of pixels. The first and last bin include all values beyond their outer edge.
-    Returns None if memory is limited, because the plan covers training alone.
+    `views` of the `of` training views are sampled. `none` is the number of Gaussians that none of them shows. `counts`
+    are the numbers of the other Gaussians in the bins between `edges`, base-10 logarithms of pixels. The outer bins
+    include all values beyond their outer edge. Returns None if device memory is limited, because the memory plan
+    reserves none for this measurement.
     """
     if trainer.device.memory.limit is not None or isinstance(trainer.parameters, HostGaussians):
         return None
@@ -91,10 +96,9 @@ def contributions(trainer: Trainer, seconds: float = CONTRIBUTION_SECONDS) -> di
 
 
 def largest_contributions(trainer: Trainer, seconds: float = CONTRIBUTION_SECONDS) -> tuple[NDArray[np.float32], int]:
-    """Largest contribution of each Gaussian (n,) to a sampled view (`sums_of_weights`), and the number of sampled
-    views.
+    """Largest contribution of each Gaussian (n,) to a sampled view (`sums_of_weights`), and the number of these views.
 
-    It samples as many training views, evenly spaced, as `seconds` allow. The training state does not change. Raises
+    As many training views are sampled, evenly spaced, as `seconds` allow. The training state does not change. Raises
     CapacityError.
     """
     rasterizer, views, looked = trainer.rasterizer, trainer.views, 0
@@ -106,14 +110,14 @@ def largest_contributions(trainer: Trainer, seconds: float = CONTRIBUTION_SECOND
         np.maximum(largest, sums_of_weights(rasterizer, frame), out=largest)
         looked += 1
         if looked == 1:
-            start = time.perf_counter()  # the first view may have built kernels
+            start = time.perf_counter()  # without the first view, which may have built kernels
         elif time.perf_counter() - start > seconds:
             break
     return largest, looked
 
 
 def _spread(count: int) -> list[int]:
-    """0 to count - 1 in bit-reversed order, so that any first few are far apart."""
+    """Indices 0 to count - 1 in bit-reversed order, so that the first few, however many, are far apart."""
     bits = max(count - 1, 1).bit_length()
     turned = (int(f"{index:0{bits}b}"[::-1], 2) for index in range(1 << bits))
     return [index for index in turned if index < count]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The model in training: its step, and the state that a checkpoint contains."""
+"""The trainer: a model in training, its training step, and the state that a checkpoint saves and restores."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ if TYPE_CHECKING:
 
 
 class Trainer:
-    """A model in training: parameters, moments, statistics and the random state, which a checkpoint holds.
+    """A model in training: parameters, moments, statistics and random state, all of which a checkpoint contains.
 
     position: step, random state and views left in the epoch.
     monitor: monitor of non-finite values in the model.
-    pending: steps that have been launched but may have to be repeated.
-    mark: state that `step_back` restores; None once the arrays no longer have that state.
+    pending: launched steps that may have to be repeated, because their counts are not read yet.
+    mark: position that `step_back` returns to; None once the model has changed since.
     further: devices in addition to the model's.
     loader: loader of the steps' photographs and cameras.
     order: order of the views in each pass.
@@ -94,11 +94,11 @@ class Trainer:
         self.given = initial
         self.monitor = NonFiniteMonitor(self.rasterizer.readback)
         self.pending = SpeculativeSteps(device, self.monitor, self._begin_again)
-        self.pending.on &= self.batch is None and not config.refines  # batches read losses, refinement reads gradients
+        self.pending.on &= self.batch is None and not config.refines  # these wait for the device in each step
         self._start()
 
     def _start(self) -> None:
-        """Set up the model and the state of step 0."""
+        """Set up the model, the components and the position of step 0."""
         self.position = Position(np.random.default_rng(self.config.seed))
         self.mark: Mark | None = None
         self.tried: set[tuple[object, ...]] = set()
@@ -131,7 +131,7 @@ class Trainer:
 
     @property
     def step(self) -> int:
-        """Number of views done."""
+        """Number of views that training has used so far."""
         return self.position.step
 
     @property
@@ -202,7 +202,7 @@ class Trainer:
         return result
 
     def _prepare_components(self, views: int) -> None:
-        """Let the components do the work that is due before a step of `views` views."""
+        """Let components do the work that is due before the current step, which has `views` views."""
         if due := [component for component in self._active if component.is_due(self.step, views)]:
             (self.catch_up if any(component.reads_all_rows for component in due) else self.settle)()
             for component in due:
@@ -216,7 +216,7 @@ class Trainer:
         return inputs
 
     def _gradient_step(self, needs: StatisticsNeeds) -> StepMaker:
-        """Maker of the step; without `turn` and `room` it has an exact count of pairs."""
+        """Function that makes a `GradientStep` from `turn` and `room`; without `room` it counts its pairs first."""
         rates, count, unit = self.rates(), self.parameters.count, self.scene.length_unit
         fields = slot_fields(needs, nearness=self.depths.on)
         explore = exploration_of(self.config, self.step, rates["means"], count, unit)
@@ -232,7 +232,7 @@ class Trainer:
         turn: int,
         room: PairCapacity | None,
     ) -> Loss:
-        """Make a step of one view."""
+        """Run a step of one view, by capacity if `room` is given."""
         step = make(turn=turn, room=room)
         model, probe = self.model.with_moments, self._watched(needs, inputs, step, step.step)
         result = step.run(model, inputs, probe, self._view_gradients(inputs), reads_loss=reads_loss)
@@ -251,20 +251,20 @@ class Trainer:
         self.pending.settle()
 
     def catch_up(self) -> None:
-        """Make all changes to Gaussians that components have postponed, after all launched steps are done."""
+        """Wait for all launched steps. Then make all changes to Gaussians that components have postponed."""
         self.settle()
         for component in self.components:
             component.complete(*self.model.with_moments)
 
     def catch_up_exactly(self) -> None:
-        """Make the postponed changes to Gaussians that change no bit of a result, after all launched steps are done."""
+        """Wait for all launched steps. Then make the postponed changes that give the same bits at any time."""
         self.settle()
         for component in self.components:
             component.complete_exactly(*self.model.with_moments)
 
     @property
     def complete_parameters(self) -> AnyGaussians:
-        """Parameters as `catch_up` would leave them. They may be a copy, so that looking changes no bit."""
+        """Parameters with all postponed changes. They may be a copy: reading them changes no bit of the training."""
         self.catch_up_exactly()
         parameters = self.parameters
         for component in self.components:
@@ -276,14 +276,14 @@ class Trainer:
         return self.photographs.load(view, self.sizes.factor(self.step))
 
     def _view_inputs(self, place: int) -> ViewInputs:
-        """Inputs of the next view."""
+        """Inputs of the next view. place: its position in the step."""
         begins, view = not self.position.queue, self._next_view()
         inputs = self.loader.inputs(view, self.position, place, begins=begins)
         self.background = inputs.background
         return inputs
 
     def _view_gradients(self, inputs: ViewInputs) -> DeviceGaussians | None:
-        """Arrays for the rows' gradients; None if no component reads them."""
+        """Arrays for the gradients of a view with respect to parameters; None if no component reads them."""
         if not inputs.parts or not any(part.wants_gradients for part in inputs.parts):
             return None
         return view_gradients(self.rasterizer.work, self.parameters, zero=True)
@@ -293,7 +293,7 @@ class Trainer:
             component.after_adam(self.parameters)
 
     def _watched(self, needs: StatisticsNeeds, inputs: ViewInputs, step: GradientStep, number: int) -> StepMonitor:
-        """The probe that watches a view's step. number: number of views so far, this one included."""
+        """Probe of a view's step. number: number of views that training has used so far, this one included."""
         return StepMonitor(
             step, number, inputs, needs, self.statistics.on_device, self.monitor, self.pending, self.tried, self._unmark
         )
@@ -302,7 +302,7 @@ class Trainer:
         self.mark = None
 
     def _watched_in_batch(self, needs: StatisticsNeeds, inputs: ViewInputs, step: GradientStep) -> StepProbe:
-        """Probe of a view in a batch. It may begin an epoch, so the statistics of earlier views must be complete."""
+        """Probe of a view in a batch. Call it in the order of the views, because a view may begin an epoch."""
         if inputs.begins:
             self._turn_epoch()
         return self._watched(needs, inputs, step, self.step)
@@ -313,7 +313,7 @@ class Trainer:
         return self.renderer.render(self.complete_parameters, self.local(camera), background)
 
     def validate(self) -> bool:
-        """Validate the refined cameras, if that is due. Returns True if they were measured."""
+        """Validate the refined cameras, if that is due. Returns True if they were validated."""
         if not self.cameras.gate.is_due(self.step):
             return False
         self.settle()
@@ -322,7 +322,7 @@ class Trainer:
         return True
 
     def _note(self, *, begun: bool = False) -> None:
-        """Mark the current state. Until it changes, `step_back` returns to it.
+        """Mark the current position. `step_back` returns to it, until the model changes.
 
         begun: True if the step number has already been increased for the current step, which has one view.
         """
@@ -332,7 +332,7 @@ class Trainer:
         """After an error, return to the last point at which a checkpoint was possible.
 
         That point is before the current step, or after the step's density control if that is done. Returns False if the
-        state there is lost.
+        model has changed since.
         """
         if self.mark is None:
             return False
@@ -344,7 +344,7 @@ class Trainer:
     def repair(self, *, look: bool = False) -> None:
         """Repair Gaussians with non-finite values, if any were noticed.
 
-        look: True to read `adam`'s counts first.
+        look: True to read first from the device how many elements `adam` refused.
         """
         if look or self.monitor.noticed:
             self.catch_up_exactly()
@@ -360,19 +360,19 @@ class Trainer:
         self._rearrange(RowPlan(repair.rows))
 
     def rates(self) -> dict[str, float]:
-        """Learning rate of each group at this step."""
+        """Learning rate of each parameter group at this step."""
         return rates_at(self.config, self.step, self.scene.length_unit, self.monitor.retries.rate_factor)
 
     def _next_view(self) -> int:
         if not self.position.queue:
             self.position.queue = self.order.next_pass(self.position.rng)
-            if self.batch is None:  # a batch may still have to count views of the last epoch
+            if self.batch is None:  # a batch may not have counted the last epoch's views yet
                 self._turn_epoch()
                 self._note(begun=True)
         return self.position.queue.pop()
 
     def _turn_epoch(self) -> None:
-        """Begin a pass through all views."""
+        """Begin a pass through all views, with new totals of the contributions."""
         if self.statistics.whole_totals is not None:
             self.settle()
         self.mark = None
@@ -407,7 +407,7 @@ class Trainer:
         return ModelState(model.count, step, *lengths, model.arrays, statistics, self.position.rng, self.model.marker())
 
     def _rearrange(self, plan: RowPlan | None) -> None:
-        """Carry out a plan of density control, or of a repair, for the rows of all arrays."""
+        """Carry out a plan of density control, or of a repair, on the rows of all arrays."""
         if plan is None:
             return
         moved = self.model.rearrange(plan, self._unmark)
@@ -424,27 +424,27 @@ class Trainer:
             self.strategy.rearranged(entries & ~FRESH, entries >= FRESH)
 
     def finish(self) -> None:
-        """Remove Gaussians that a finished model does not need."""
+        """Finish the model: remove Gaussians that the strategy drops at the end."""
         self.catch_up()
         self._rearrange(self.strategy.at_end(self._state()))
 
     def close(self) -> None:
-        """End the threads of a batch, and those that read photographs; close the model's file of chunks."""
+        """End the threads of a batch and those that read photographs, and close the model's scratch file."""
         self.photographs.host.close()
         self.model.close()
         if self.batch is not None:
             self.batch.close()
 
     def local(self, camera: Camera) -> Camera:
-        """Camera in the coordinates of the model in training, from a camera in the world: see `Gaussians.local`."""
+        """Camera in the coordinates of the model, from a camera in world coordinates (see `Gaussians.local`)."""
         return camera.from_origin(self.origin).before(self.near).along_rays(self.by_rays)
 
     def gaussians(self) -> Gaussians:
-        """Model so far, on the host, with room for its final SH degree."""
+        """Current model on the host, with the coefficients of the final SH degree; those not reached yet are zeros."""
         return self._of_rows(self.complete_parameters, 0, self.parameters.count)
 
     def rows(self) -> Callable[[int, int], Gaussians]:
-        """Function that returns Gaussians [start, stop) of the model so far, as `gaussians` does."""
+        """Function that returns the rows [start, stop) of the model that `gaussians` returns."""
         return partial(self._of_rows, self.complete_parameters)
 
     def _of_rows(self, parameters: AnyGaussians, start: int, stop: int) -> Gaussians:
@@ -456,13 +456,13 @@ class Trainer:
         return model
 
     def checkpoint(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        """All state that the remaining steps depend on: arrays and JSON state.
+        """All state that the remaining steps depend on: arrays by name, and JSON values.
 
         The whole model is finite, unless `monitor.retries.lost`.
         """
         self.repair(look=True)
         arrays, state = self._arrays()
-        if not self.model.changes_are_finite():  # there may be non-finite values in Gaussians that no step has visited
+        if not self.model.changes_are_finite():  # also in Gaussians that no step has updated
             repair = self.monitor.examine_all(self.model.by_kind(arrays))
             if repair is not None:
                 self._apply(repair)
@@ -484,7 +484,7 @@ class Trainer:
         self._start()
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Continue from a checkpoint."""
+        """Continue from a checkpoint. Raises InputError for a checkpoint of another training."""
         with self.model.saved(checkpoint) as (models, saved):
             self.monitor.retries, self.mark = self.position.load(checkpoint, len(self.views)), None
             self.monitor.forget()

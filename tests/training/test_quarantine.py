@@ -336,9 +336,9 @@ def test_what_is_no_bundle_is_named(tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "some.npz"
     assert f"{path}: no such file" in ran(capsys, repro_bundle.main, [str(path)], status=2).err
     np.savez(path, a=np.zeros(3))
-    refuses("not a bundle", repro_bundle.read_bundle, path)
+    refuses("is not a bundle", repro_bundle.read_bundle, path)
     path.write_bytes(b"PK")
-    refuses("not a bundle", repro_bundle.read_bundle, path)
+    refuses("is not a bundle", repro_bundle.read_bundle, path)
 
 
 def test_without_a_run_it_says_how_to_get_a_bundle(scene: Scene, default_device: Device) -> None:

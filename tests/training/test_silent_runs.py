@@ -199,8 +199,8 @@ LATE = {
     "warmup": (
         {"warmup": (1, 3, 9)},
         (
-            "--warmup 3,9: the training resolution does not double then, because training ends at step 3 at 1/4 of the "
-            "size; expected less than --iterations 3"
+            "--warmup 3,9: the training resolution does not double after these steps, because training ends at step 3 "
+            "at 1/4 of the size; expected steps below --iterations 3"
         ),
     ),
 }

@@ -15,11 +15,11 @@ from clsplat.training.step.inputs import ViewInputs, ViewPart
 
 
 class Appearance(Component):
-    """Appearances of all training views. The base class learns nothing and leaves the model's colours unchanged."""
+    """Appearance model of the training photographs. This base class learns nothing and leaves colours unchanged."""
 
     @property
     def on(self) -> bool:
-        """False for the base class."""
+        """True if appearance is learnt: for every subclass."""
         return type(self) is not Appearance
 
     def of_views(self, views: Sequence[int], step: int) -> Sequence[ViewPart]:  # noqa: ARG002
@@ -30,7 +30,7 @@ class Appearance(Component):
         return ()
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
-        """The views, each with its appearance as a part."""
+        """Return the views, each with its appearance among its parts."""
         shares = self.of_views([each.view for each in inputs], step)
         if not shares:
             return inputs
@@ -49,9 +49,9 @@ class Appearance(Component):
         self.take(named("appearance/"))
 
     def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load the arrays of a checkpoint. Their names come without the prefix."""
+        """Load the arrays of a checkpoint, by name without "appearance/"."""
 
     def write(self, run: Run) -> None:
-        """Write appearance.json and appearance.npz."""
+        """Write appearance.json and appearance.npz into the run's folder, as far as there is content for them."""
         if (record := self.record()) is not None:
             run.write_appearance(record, self.tables())

@@ -26,16 +26,16 @@ VARIATION_WEIGHT = 10.0
 """Weight of a grid's total variation in the loss."""
 
 GRID_RATE_END_FRACTION = 0.01
-"""Fraction of the learning rate that is left at the last step."""
+"""Fraction of the grids' learning rate that is left at the last step."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewGrid(ViewPart):
     """Grid of one view in one step.
 
-    visit: number of this visit to the view, from 1.
-    ends: True if a pass through all views ends with this visit.
-    place: the view's place in a batch.
+    visit: number of steps that have shown this view, this one included.
+    ends: True if a pass through all training views ends with this view.
+    place: the view's position in the batch.
     """
 
     device: Device
@@ -47,16 +47,16 @@ class ViewGrid(ViewPart):
     place: int = 0
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewGrid:
-        """The same grid on another device, made from `values`, to apply it and to compute its gradient."""
+        """Copy of the grid on another device, uploaded from `values`, to apply it and to compute its gradient."""
         grids = upload(device, values)
         return replace(self, device=device, grids=Grids(grids, grids, grids), view=0)
 
     def values(self) -> NDArray[np.float32]:
-        """The photograph's grid, in the form that `on` takes."""
+        """The photograph's grid on the host, from which `on` makes a copy on another device."""
         return self.grids.grids.get_rows(self.view, self.view + 1)
 
     def compare(self, work: Workspace, image: DeviceArray, target: DeviceArray, size: tuple[int, int]) -> DeviceArray:  # noqa: ARG002
-        """The image with the photograph's grid applied."""
+        """Return the image with the photograph's grid applied."""
         return apply_grid(self.device, work, self.grids, self.view, image, *size)
 
     def gradient(
@@ -74,9 +74,9 @@ class ViewGrid(ViewPart):
         return by_grid
 
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
-        """Take Adam's step. After a pass through all views, centre all grids so that their mean is the identity.
+        """Take Adam's step for the grid. After a pass through all views, also centre all grids.
 
-        The part that all grids have in common belongs to the model.
+        Centred grids have the identity as their mean. Their common colour change belongs to the model instead.
         """
         assert own is not None, "made by `gradient`"
         step_grid(self.device, self.grids, self.view, own, self.visit, self.rate, readback)
@@ -85,7 +85,7 @@ class ViewGrid(ViewPart):
 
 
 class GridsOfAll(Appearance):
-    """Grids of all training views."""
+    """Appearance model that learns a bilateral grid for each training photograph."""
 
     def __init__(self, config: TrainConfig, device: Device, scene: Scene) -> None:
         self._config, self._device, self._scene = config, device, scene
@@ -95,7 +95,7 @@ class GridsOfAll(Appearance):
 
     @property
     def pixel_bytes(self) -> int:
-        """Bytes on the device per pixel of the largest picture. They include a share of the grids' bytes."""
+        """Bytes on the device per pixel of the largest picture; all grids' bytes are divided among its pixels."""
         return device_bytes(self._count, [(view.camera.width, view.camera.height) for view in self._scene.views])
 
     def of_views(self, views: Sequence[int], step: int) -> list[ViewGrid]:
@@ -125,15 +125,15 @@ class GridsOfAll(Appearance):
         return {"kind": self._config.appearance, "photographs": places, "held_out": {}}
 
     def tables(self) -> dict[str, NDArray[Any]]:
-        """Arrays of appearance.npz."""
+        """Arrays of appearance.npz, by name: the grids of all training photographs."""
         return {"grids": self._grids.grids.get()}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a checkpoint, by name."""
+        """Grids and Adam's moments, as arrays of a checkpoint by name."""
         held = {"grids": self._grids.grids, "first": self._grids.first, "second": self._grids.second}
         return saved(held)
 
     def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load the arrays of a checkpoint. Raises ValueError for arrays of other photographs."""
+        """Load a checkpoint's arrays, by name without "appearance/". Raises ValueError for other photographs."""
         values = loaded(self._device, arrays, ("grids", "first", "second"), self._grids.grids.shape)
         self._grids = Grids(**values)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choice of the appearance model."""
+"""Choice of the appearance model by the setting `appearance`: none, a colour model, or bilateral grids."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Entries of a colour model for each photograph and lens, learnt with the model: use in a step, and checkpoints."""
+"""Colour models (`exposure`, `ppisp`): gains and other entries of each photograph and lens, learnt with the model."""
 
 from __future__ import annotations
 
@@ -45,14 +45,15 @@ by this number.
 """
 
 START_GAIN_STEP_OCTAVES = 2.0**-10
-"""Gains from points are rounded to multiples of this, in octaves, so that they do not depend on the order of sums."""
+"""Step, in octaves, to which initial gains from colours of points are rounded. The order of summation then does not
+change them."""
 
 VIEW_PULL_WEIGHT, NEIGHBOUR_PULL_WEIGHT = 0.02, 0.7
 """Weights of two terms of the loss's gradient that pull gains towards the gains from points, per octave of distance.
 
 The first pulls the gains of each photograph. The second pulls the part that gains of neighbouring photographs have in
-common. Without it neighbours may all become slightly too bright, where no other photograph shows a dark surface. Gains
-without points are not pulled, because the pull would hold them at the mean.
+common. Without the second, neighbours may all become slightly too bright, where no other photograph shows a dark
+surface. A photograph without gains from points is not pulled, because that would hold its gains at the mean.
 """
 
 GAIN_RATE_END_FRACTION = 0.001
@@ -74,10 +75,11 @@ _COLOUR_UPDATE = GainEntries(mix_rate=MIX_RATE_FRACTION)
 
 @dataclass(frozen=True, eq=False)
 class ViewColours(ViewPart):
-    """Entries of one view and its lens in one step.
+    """Entries of one photograph and its lens in one step.
 
-    lenses: None if the model has no entries of lenses.
-    place: the view's place in a batch.
+    colours, lenses: entries of all photographs, and of all lenses; None if the colour model has none of lenses.
+    taken: the photograph's row in `colours`, and its lens's row in `lenses`.
+    place: the view's position in the batch.
     """
 
     device: Device
@@ -92,7 +94,7 @@ class ViewColours(ViewPart):
     changes_target = True
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewColours:
-        """The same colours on another device, made from `values`, to apply them and to compute their gradient."""
+        """Copy of the entries on another device, uploaded from `values`, to apply them and compute their gradient."""
         parts = (np.ascontiguousarray(part) for part in np.split(values, [self.model.entries], axis=1))
         colours, lenses = (Gains(*[upload(device, part)] * len(fields(Gains))) if part.size else None for part in parts)
         assert colours is not None, "each model has gains"
@@ -100,21 +102,21 @@ class ViewColours(ViewPart):
         return replace(self, device=device, colours=colours, lenses=lenses, taken=taken)
 
     def values(self) -> NDArray[np.float32]:
-        """The entries of the photograph and its lens, in the form that `on` takes; gains as factors."""
+        """Entries of the photograph and its lens on the host, from which `on` makes a copy; gains as factors."""
         row, lens = self.taken.photograph, self.taken.lens
         gains, logs = (array.get_rows(row, row + 1) for array in (self.colours.gains, self.colours.logs))
         of_lens = [] if self.lenses is None else [self.lenses.logs.get_rows(lens, lens + 1)]
         return np.concatenate([gains[:, :GAIN_ENTRIES], logs[:, GAIN_ENTRIES:], *of_lens], axis=1)
 
     def compare(self, work: Workspace, image: DeviceArray, target: DeviceArray, size: tuple[int, int]) -> DeviceArray:  # noqa: ARG002
-        """Remove the colours of the photograph and its lens from `target`. Returns the unchanged image."""
+        """Remove the colours of the photograph and its lens from `target`, in place. Returns the unchanged image."""
         develop(self.device, self.model, self.colours, self.lenses, self.taken, target, size)
         return image
 
     def gradient(
         self, work: Workspace, image: DeviceArray, gradient: DeviceArray, size: tuple[int, int]
     ) -> DeviceArray:
-        """Sums that `update` needs. The kernels of `update` are tried here in the sandbox, before anything changes."""
+        """Return the sums that `update` needs. The kernels of `update` are tried here, before anything changes."""
         columns = entry_gradient(self.device, work, self.model, self.taken, image, gradient, size, self.place)
         if self.step == 1:
             with only_tried(self.device):
@@ -149,15 +151,16 @@ def _from_mean(told: Sequence[float | None], of: Sequence[float | None]) -> NDAr
 
 
 def _named(sizes: Mapping[str, int], entries: NDArray[np.float64]) -> dict[str, list[float]]:
-    """Entries by name. sizes: the number of entries of each name, in order."""
+    """Split a row of entries by name. sizes: the number of entries of each name, in order."""
     parts = np.split(entries, np.cumsum(list(sizes.values()))[:-1])
     return {name: part.tolist() for name, part in zip(sizes, parts, strict=True)}
 
 
 class ColoursOfAll(Appearance):
-    """Entries of all training views and their lenses. Views of one lens share its entries.
+    """Appearance model that learns a colour model's entries for each training photograph and each lens.
 
-    Gains are pulled to where they start; other entries of photographs are pulled to 0 in the same way.
+    Photographs of one lens share the lens's entries. Gains are pulled towards their initial values, and the other
+    entries of photographs towards 0.
     """
 
     def __init__(self, config: TrainConfig, device: Device, scene: Scene) -> None:
@@ -198,11 +201,11 @@ class ColoursOfAll(Appearance):
 
     @property
     def pixel_bytes(self) -> int:
-        """Bytes per pixel on the device."""
+        """Bytes per pixel that the colour model takes on the device."""
         return self._model.pixel_bytes
 
     def of_views(self, views: Sequence[int], step: int) -> list[ViewColours]:
-        """Colours of the views of a step.
+        """Entries of each view of a step.
 
         step: number of the last view.
         """
@@ -223,7 +226,7 @@ class ColoursOfAll(Appearance):
         ]
 
     def record(self) -> dict[str, Any]:
-        """Content of appearance.json, by the names of the views.
+        """Content of appearance.json: the learnt entries by the names of the photographs.
 
         Nothing is learnt about held-out photographs. If EXIF has their exposure, their gains follow from a linear fit
         of the training photographs' gains to their exposures. They have the entries of their lens, or the mean of all
@@ -246,7 +249,7 @@ class ColoursOfAll(Appearance):
         return {"kind": self._config.appearance, "photographs": photographs, "held_out": held_out}
 
     def _expected(self, logs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Expected gains of the held-out photographs, from the training photographs' (photographs, 3)."""
+        """Expected log2 gains (held-out, 3) of held-out photographs, from those of the training photographs (n, 3)."""
         told = _from_mean(self._told, self._told)
         known = ~np.isnan(told)
         spread = np.square(told[known]).sum()
@@ -256,11 +259,11 @@ class ColoursOfAll(Appearance):
         return expected
 
     def _of_lens(self, view: View, entries: NDArray[np.float64]) -> dict[str, list[float]]:
-        """A view's record of its lens. The centre is in fractions of the picture's size."""
+        """Entries of a view's lens by name, and its centre as fractions of the picture's size, for appearance.json."""
         return _named(self._model.of_lens, entries) | {"centre": list(centre(view))}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a checkpoint, by name."""
+        """Entries and Adam's moments of photographs and lenses, as arrays of a checkpoint by name."""
         held = saved({name: getattr(self._gains, name) for name in GAIN_CHECKPOINT_ARRAYS})
         told = np.repeat(self._by_points[:, None], self._model.entries, axis=1)
         lenses = {} if self._lenses is None else vars(self._lenses)
@@ -268,7 +271,7 @@ class ColoursOfAll(Appearance):
         return {**held, "appearance/told": told.astype(np.float32), **saved(of_lenses)}
 
     def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load the arrays of a checkpoint. Raises ValueError if one is missing, or belongs to other photographs."""
+        """Load a checkpoint's arrays, by name without "appearance/". Raises ValueError for other photographs."""
         lenses = self._lenses and self._loaded_lenses(arrays)
         shape = (len(self._scene.train_views), self._model.entries)
         values = loaded(self._device, arrays, (*GAIN_CHECKPOINT_ARRAYS, "told"), shape)

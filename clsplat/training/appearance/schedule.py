@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learning rate of photographs' gains and grids, and their arrays in a checkpoint."""
+"""Learning rate of appearance (gains, grids) by step, and the appearance arrays of a checkpoint."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.context import Device
 
 APPEARANCE_WARM_UP_STEPS, WARM_UP_START_FRACTION = 500, 0.01
-"""Length of the warm-up in steps, or a tenth of all steps if that is less; fraction of the rate at its start."""
+"""Length of the warm-up in steps (at most a tenth of all steps), and the fraction of the learning rate at its start."""
 FULL_LENGTH_STEPS = 10_000
 """Number of steps below which a training counts as short. In this many steps, and at the rate of the settings, a gain
 can change by about 2 octaves."""
 
 
 def rate_at(config: TrainConfig, step: int, views: int, *, ends: float, hastens: bool = True) -> float:
-    """Learning rate of step number `step`.
+    """Learning rate of appearance in step number `step`.
 
-    views: number of photographs. A photograph has a gradient in only one of this many steps, so its Adam steps shrink
-    by the root of this number, and the rate is multiplied by the root.
+    views: number of photographs. A photograph has a gradient in only one of this many steps, which shrinks its Adam
+    steps by the root of this number. The rate is multiplied by the root to make up for it.
     ends: fraction of the rate that is left at the last step.
     hastens: True to raise the rate in a short training, so that gains can change by as much as in a long one.
     """
@@ -35,7 +35,7 @@ def rate_at(config: TrainConfig, step: int, views: int, *, ends: float, hastens:
 
 
 def saved(held: Mapping[str, DeviceArray]) -> dict[str, NDArray[Any]]:
-    """Arrays of a checkpoint, by name."""
+    """Download appearance arrays for a checkpoint, with "appearance/" before their names."""
     return {f"appearance/{name}": array.get() for name, array in held.items()}
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs with nearby cameras, and the part of their gains that they have in common.
+"""Photographs with nearby cameras (neighbours), and the part of their gains that they have in common.
 
-The pictures hardly determine the common part, so `exposure` pulls it to its initial value.
+The pictures hardly determine the common part, so `--appearance exposure` pulls it to its initial value.
 """
 
 from __future__ import annotations
@@ -24,10 +24,9 @@ directions. A neighbour at a quarter of the limit has about half of the weight. 
 the direction over about that distance.
 """
 MAX_MEAN_NEIGHBOURS = 256
-"""Maximum mean number of neighbours of a camera, including itself. The distance limit is reduced if there would be
-more."""
+"""Maximum mean number of neighbours of a camera, itself included. With more, the distance limit is reduced."""
 NEIGHBOUR_WEIGHT_STEP = 2.0**-20
-"""Weights are rounded to multiples of this, so that they are equal on processors that round differently."""
+"""Weights of neighbours are rounded to multiples of this, to be equal on processors that round differently."""
 
 
 def places(cameras: Sequence[Camera]) -> Float64:

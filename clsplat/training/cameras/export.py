@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Refined cameras at the end of a training: their COLMAP model, and warnings about large changes."""
+"""Refined cameras at the end of a training: written as a COLMAP model, with warnings about large changes."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from clsplat.training.cameras.validation_gate import Drift
 POSE_WARNING_DEGREES, POSE_WARNING_UNITS = 5.0, 0.1
 """Rotation in degrees, and movement relative to the length unit, above which a refined pose causes a warning."""
 LENS_WARNING_FOCAL_LENGTHS = 0.1
-"""Change of a lens, in focal lengths, above which it causes a warning."""
+"""Change of a focal length or principal point, as a fraction of the focal length, above which there is a warning."""
 
 
 def keep_cameras(run: Run, scene: Scene, poses: Poses, lenses: RefinedLenses, along: Drift | None) -> None:
     """Write the refined cameras, and warn of any camera with a large change.
 
-    along: common motion of the refined poses, which held-out poses and points follow; None without refined poses.
+    along: drift of the refined poses, by which held-out poses and points are moved too; None without refined poses.
     """
     cameras, points = {view.name: view.camera for view in scene.views}, scene.points
     if along is not None:
@@ -37,8 +37,8 @@ def keep_cameras(run: Run, scene: Scene, poses: Poses, lenses: RefinedLenses, al
     if far.any():
         names = [view.name for view, one in zip(scene.train_views, far, strict=True) if one]
         warnings.warn(
-            f"--refine-poses: {examples(names)}: moved by up to {degrees.max():.1f} degrees and {shifts.max():.3g} "
-            "world units; check their renders, or leave them out"
+            f"--refine-poses: the cameras of {examples(names)} have moved by up to {degrees.max():.1f} degrees and "
+            f"{shifts.max():.3g} world units; check the renders of these photographs, or leave them out"
         )
     if (most := lenses.largest) > LENS_WARNING_FOCAL_LENGTHS:
         warnings.warn(
@@ -48,7 +48,11 @@ def keep_cameras(run: Run, scene: Scene, poses: Poses, lenses: RefinedLenses, al
 
 
 def doubt_poses(mean: Mapping[str, float], most: float) -> None:
-    """Warn if aligned poses score over `most` dB better: the model's world has moved away from the given cameras."""
+    """Warn if held-out views score over `most` dB better at aligned poses than at their given poses.
+
+    Then the model has moved away from the given cameras.
+    mean: mean scores of eval.json.
+    """
     lost = mean.get("psnr_aligned", 0.0) - mean["psnr"]
     if 0 < most < lost:
         warnings.warn(

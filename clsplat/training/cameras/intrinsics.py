@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Focal lengths and principal points of a scene's lenses, learnt with the model."""
+"""Refinement of lenses (--refine-lenses): focal lengths and principal points, learnt with the model."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LENS_PARAMETERS = 3
 
 
 class RefinedLenses:
-    """Lenses of the training views, which change if they are refined. Views of one lens share its change."""
+    """Refined lenses of the training views. Views of one lens share its change. Without refinement no lens changes."""
 
     def __init__(self, config: TrainConfig, views: Sequence[View]) -> None:
         self.on, self._config = config.refine_lenses, config
@@ -34,16 +34,16 @@ class RefinedLenses:
         self._start, count = first_step(config), len(self._rows)
         self._shares = np.bincount(self._of_view) / len(views)
         self.changes = np.zeros((count, LENS_PARAMETERS))
-        # six parameters, as `descend` takes; the last three stay 0
+        # `descend` takes six parameters; the last three of a lens stay 0
         self._first, self._second = np.zeros((count, 6)), np.zeros((count, 6, 6))
         self._visits = np.zeros(count, np.int64)
 
     def moves(self, step: int) -> bool:
-        """True if this step refines the view's lens."""
+        """True if step number `step` refines lenses."""
         return self.on and step > self._start
 
     def move(self, view: int, step: int, camera: Camera, gradient: Float64) -> None:
-        """Take Adam's step for a view's lens. A gradient that is not finite causes no step.
+        """Take Adam's step for the lens of training view `view`. A gradient that is not finite causes no step.
 
         camera: the camera with which the gradient was computed.
         gradient: (4,), with respect to ln fx, ln fy, cx and cy.
@@ -60,34 +60,34 @@ class RefinedLenses:
         self.changes[lens] += rate * down
 
     def _change(self, lens: Lens) -> tuple[float, float, float] | None:
-        """Change of a lens, in the form that `refocused` takes; None if it is not refined."""
+        """Change of a lens (`LENS_PARAMETERS`), as arguments of `Camera.refocused`; None if the lens is not refined."""
         row = self._rows.get(lens)
         return None if row is None else tuple(self.changes[row].tolist())
 
     def seen(self, lens: Lens, camera: Camera) -> Camera:
-        """Camera of a view through its refined lens; the same object if the lens is not refined."""
+        """`camera` with the refined intrinsics of its lens; the same object if the lens is not refined."""
         change = self._change(lens)
         return camera if change is None else camera.refocused(*change)
 
     def refined(self, lens: Lens) -> Lens:
-        """Refined lens of a view."""
+        """The lens with its refined intrinsics; the same object if it is not refined."""
         change = self._change(lens)
         return lens if change is None else lens.refocused(*change)
 
     @property
     def largest(self) -> float:
-        """The largest change, in focal lengths."""
+        """Largest change of a focal length or principal point, as a fraction of the focal length."""
         return float(np.abs(self.changes).max()) if self.on else 0.0
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a checkpoint, by name."""
+        """Changes of the lenses and Adam's moments, as arrays of a checkpoint by name."""
         if not self.on:
             return {}
         moments = {"lenses/first": self._first, "lenses/second": self._second, "lenses/visits": self._visits}
         return {"lenses/changes": self.changes, **moments}
 
     def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load the arrays of a checkpoint. Raises ValueError for arrays of other lenses."""
+        """Load the lenses from a checkpoint's arrays, by name without "lenses/". Raises ValueError for other lenses."""
         if not self.on:
             return
         values = checked_arrays(self.arrays(), arrays, "lenses/")
@@ -95,5 +95,5 @@ class RefinedLenses:
         self._first, self._second = values["first"], values["second"]
 
     def of_views(self, views: Sequence[View]) -> list[View]:
-        """Held-out views through their refined lenses, for rendering."""
+        """Copies of held-out views whose cameras have the refined lenses, for rendering."""
         return [replace(view, camera=self.seen(view.lens, view.camera)) for view in views] if self.on else list(views)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses of training views, learnt with the model."""
+"""Refinement of poses (--refine-poses): poses of the training views, learnt with the model by Adam."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ from clsplat.scenes.outliers import stray_cameras
 from clsplat.scenes.scene import View
 
 POSE_BETA1, POSE_BETA2 = 0.9, 0.99
+"""Decay rates per step of Adam's first and second moment, for poses and lenses."""
 MIN_AXIS_MOMENT_RATIO, MIN_AXIS_MOMENT = 1e-2, 1e-30
-"""Lower bounds of the second moment along an axis: relative to the largest second moment, and absolute."""
+"""Lower bounds of the second moment along an axis: as a fraction of the largest second moment, and absolute."""
 JACOBI_PAIRS = [
     np.array(pairs)
     for pairs in (
@@ -28,30 +29,36 @@ JACOBI_PAIRS = [
         ((0, 1, 3), (5, 2, 4)),
     )
 ]
-"""The 15 pairs of six axes, as five sets of three disjoint pairs."""
+"""Pairs of axes that Jacobi rotations of a 6x6 matrix treat: all 15, as five sets of three disjoint pairs."""
 JACOBI_SWEEPS, JACOBI_TOLERANCE = 6, 1e-16
 """Number of passes of Jacobi rotations over all pairs, and relative size of off-diagonals that counts as zero."""
 CAMERA_RATE_END_FRACTION = 0.01
-"""Fraction of the learning rate that is left at the last step."""
+"""Learning rate of cameras at the last step, as a fraction of the rate at the first."""
 
 
 def fallen(reach: float, part: float, visits: float) -> float:
-    """Rate at fraction `part` of the training. It falls exponentially, and the rates of all `visits` sum to `reach`."""
+    """Learning rate of a camera at fraction `part` of its refinement. It falls exponentially.
+
+    reach: sum of the rates of all of the camera's steps, and so about the limit of its motion.
+    visits: number of these steps.
+    """
     mean = (1 - CAMERA_RATE_END_FRACTION) / -np.log(CAMERA_RATE_END_FRACTION)
     return float(reach / max(visits * mean, 1.0) * CAMERA_RATE_END_FRACTION**part)
 
 
 def first_step(config: TrainConfig) -> int:
-    """Step after which cameras are refined. Before it the model is not recognisable enough."""
+    """Last step before cameras are refined. Until then the model is too coarse to align cameras with."""
     return min(500, config.iterations // 10)
 
 
 def checked_arrays(
     own: Mapping[str, NDArray[Any]], arrays: Mapping[str, NDArray[Any]], folder: str
 ) -> dict[str, NDArray[Any]]:
-    """Copies of a checkpoint's arrays with the names and shapes of `own`, keyed by name without the prefix `folder`.
+    """Copies of a checkpoint's arrays, keyed by name without the prefix `folder`, checked against the current arrays.
 
-    Raises ValueError if one is missing, or belongs to other views.
+    own: the current arrays, by name with the prefix.
+    arrays: the checkpoint's arrays, by name without it.
+    Raises ValueError if an array is missing, or belongs to other views.
     """
     values = {}
     for name, like in own.items():
@@ -65,8 +72,8 @@ def checked_arrays(
 def axes_of(matrix: Float64) -> tuple[Float64, Float64]:
     """Eigenvalues (6,) of a symmetric matrix (6, 6), and its eigenvectors as rows.
 
-    Found by Jacobi rotations of three pairs at a time (Golub and Van Loan, section 8.5). LAPACK's bits depend on the
-    processor.
+    Jacobi rotations find them, of three pairs of axes at a time (Golub and Van Loan, section 8.5). LAPACK is not used,
+    because its bits depend on the processor.
     """
     a, axes = matrix.copy(), np.eye(6)
     for p, q in JACOBI_SWEEPS * JACOBI_PAIRS:
@@ -86,7 +93,7 @@ def descend(first: Float64, second: Float64, by: Float64, visit: int) -> Float64
 
     first, second: moments (6,) and (6, 6), updated in place.
     by: the gradient (6,).
-    visit: number of the visit, from 1.
+    visit: number of steps that the camera has taken, this one included.
     """
     first += (1 - POSE_BETA1) * (by - first)
     second += (1 - POSE_BETA2) * (by[:, None] * by - second)
@@ -102,7 +109,9 @@ class Poses:
     """Cameras of the training views, which move if poses are refined.
 
     Adam has moments for each view. Two views do not move, so that the model keeps its place and size: the first view,
-    and the view farthest from it. Outlier cameras are not chosen.
+    and the view farthest from it. Outlier cameras are neither of them.
+
+    held: indices of these two views.
     """
 
     def __init__(self, config: TrainConfig, views: Sequence[View], length_unit: float) -> None:
@@ -122,17 +131,20 @@ class Poses:
         self._visits = np.zeros(len(views), np.int64)
 
     def moves(self, view: int, step: int) -> bool:
-        """True if this step refines the view's pose."""
+        """True if step number `step` refines the pose of training view `view`."""
         return self.on and step > self._start and view not in self.held
 
     def rate(self, step: int) -> float:
-        """Learning rate of a step, in radians. It falls exponentially; over a view's visits it sums to `pose_reach`."""
+        """Learning rate of step number `step`, in radians. The rates of all steps of a view sum to `pose_reach`."""
         steps = self._config.iterations - self._start
         reach, part = np.radians(self._config.pose_reach), (step - self._start) / steps
         return fallen(reach, part, steps / len(self.cameras))
 
     def move(self, view: int, step: int, gradient: Float64) -> None:
-        """Take Adam's step for a view's pose. A gradient that is not finite causes no step."""
+        """Take Adam's step for the pose of training view `view`. A gradient that is not finite causes no step.
+
+        gradient: (6,), with respect to the motion of `Camera.moved`.
+        """
         by = gradient * self._scale  # translations relative to the length unit
         if not np.isfinite(by).all():
             return
@@ -141,14 +153,14 @@ class Poses:
         self.cameras[view] = self.cameras[view].moved(self.rate(step) * self._scale * down)
 
     def motions(self) -> tuple[Float64, Float64]:
-        """Rotation of each view in degrees, and its movement in world units."""
+        """Rotation of each camera from its given pose in degrees (n,), and its movement in world units (n,)."""
         pairs = list(zip(self._given, self.cameras, strict=True))
         cosines = [(np.trace(a.rotation @ b.rotation.T) - 1) / 2 for a, b in pairs]
         degrees: Float64 = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
         return degrees, np.array([np.linalg.norm(a.position - b.position) for a, b in pairs])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a checkpoint, by name."""
+        """Poses and Adam's moments, as arrays of a checkpoint by name."""
         if not self.on:
             return {}
         rotations = np.array([camera.rotation for camera in self.cameras])
@@ -157,7 +169,7 @@ class Poses:
         return {"poses/rotations": rotations, "poses/translations": translations, **moments}
 
     def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load the arrays of a checkpoint. Raises ValueError for arrays of other views."""
+        """Load the poses from a checkpoint's arrays, by name without "poses/". Raises ValueError for other views."""
         if not self.on:
             return
         values = checked_arrays(self.arrays(), arrays, "poses/")

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of training views, refined with the model: their gradients, which also align held-out views, and their
-validation with held-out photographs."""
+"""Camera refinement: gradients with respect to poses and lenses, and validation of cameras on held-out views."""
 
 from __future__ import annotations
 
@@ -36,13 +35,13 @@ from clsplat.training.supervision.host_photographs import HostPhotographs
 from clsplat.training.supervision.image_cache import ImageCache
 
 REFINEMENT_ARRAYS_PER_PARAMETER = 4
-"""Arrays on the device for each parameter: the parameter, two moments, and a view's gradient."""
+"""Number of arrays on the device for each parameter of the model: the parameter, two moments, and a view's gradient."""
 
 
 def check_refinable(config: TrainConfig, views: Sequence[View]) -> None:
     """Raise InputError if the settings refine cameras of too few views, or lenses other than pinholes."""
     if config.refine_poses and len(views) < 3:
-        raise InputError(f"--refine-poses: {len(views)} training views, expected 3 or more, as two are not refined")
+        raise InputError(f"--refine-poses: {len(views)} training views, expected 3 or more, as two poses stay fixed")
     for view in views if config.refine_lenses else ():
         if not view.lens.is_pinhole or not view.camera.model.flat:
             raise InputError(
@@ -53,11 +52,11 @@ def check_refinable(config: TrainConfig, views: Sequence[View]) -> None:
 
 @dataclass(eq=False)
 class CameraSums(ViewPart):
-    """Gradients with respect to the pose and the lens of a step's view, summed over the `count` rows of the model.
+    """Gradients with respect to the pose and the lens of a view, summed over the `count` Gaussians of the model.
 
-    `add_rows` receives all rows, in order.
-    pose, lens: True for each gradient to sum.
-    move: function that is called with the sums after Adam's step.
+    The step calls `add_rows` for all rows of the model, in order.
+    pose, lens: True to sum the gradient with respect to the pose, and to the lens.
+    move: function that is called with the sums after Adam's step, to move the camera.
     """
 
     wants_gradients = True
@@ -71,11 +70,11 @@ class CameraSums(ViewPart):
     _sums: dict[int, DeviceArray] = field(default_factory=dict, init=False)
 
     def lens_gradients(self, rows: int) -> DeviceArray | None:
-        """Array (rows, 4) for the rows' gradients with respect to the lens; None if they are not needed."""
+        """Array (rows, 4) for each Gaussian's gradient with respect to the lens; None if lenses are not refined."""
         return self.work.array("by_lens", (rows, LENS_NUMBERS)) if self.lens else None
 
     def add_rows(self, rows: StepRows) -> None:
-        """Sum the rows' gradients. Kernels that follow are tried here in the sandbox, before anything changes."""
+        """Add the rows' gradients to the sums. Kernels that read the sums are tried here, before the model changes."""
         assert rows.gradients is not None, "asked for where cameras are refined"
         counts = rows.projected.tile_counts
         if self._device is None:
@@ -117,7 +116,7 @@ Draw = Callable[[Camera], NDArray[Any]]
 
 
 class ValidationViews:
-    """Held-out views for the gate, at most MAX_GATE_VIEWS. Their pixels are decoded once."""
+    """Held-out views by which the gate validates cameras, at most MAX_GATE_VIEWS. Their pixels are decoded once."""
 
     def __init__(self, scene: Scene, device: Device, config: TrainConfig) -> None:
         self.views = spread(scene.test_views, MAX_GATE_VIEWS)
@@ -126,7 +125,7 @@ class ValidationViews:
         self._measure = metrics.psnr if config.appearance == "none" else metrics.psnr_corrected
 
     def psnr(self, draw: Draw, look: Look, cameras: Sequence[Camera]) -> float:
-        """Mean PSNR in dB of the views, rendered from these cameras; 0 if no photograph counts.
+        """Mean PSNR in dB of the views, rendered with `cameras`, one for each; 0 if no photograph counts.
 
         A photograph counts if its mask keeps a pixel. If appearance is learnt, colours are fitted before the
         comparison.
@@ -148,7 +147,7 @@ class ValidationViews:
 class Cameras(Component):
     """Cameras of the training views. Refined poses and lenses change until the validation gate ends the refinement.
 
-    work: memory for sums over the model's rows.
+    work: scratch arrays, for sums over the model's rows.
     """
 
     def __init__(self, config: TrainConfig, scene: Scene, work: Workspace) -> None:
@@ -165,17 +164,16 @@ class Cameras(Component):
 
     @property
     def models(self) -> int:
-        """The number of arrays on the device for each parameter, if cameras are refined: the parameter, two moments,
-        and a view's gradient."""
+        """Number of arrays on the device for each parameter of the model (see `Component.models`)."""
         return REFINEMENT_ARRAYS_PER_PARAMETER if self._config.refines else 0
 
     @property
     def row_bytes(self) -> int:
-        """Bytes per Gaussian for gradients with respect to the lens."""
+        """Bytes per Gaussian on the device, for gradients with respect to the lens."""
         return 4 * LENS_NUMBERS * self._config.refine_lenses
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:
-        """The views. If this step refines a view's pose or lens, the view gets a `CameraSums` for that gradient."""
+        """Return the views. Each view whose pose or lens this step refines has a `CameraSums` among its parts."""
         if self.gate.ended is not None or not self._config.refines:
             return inputs
         return [self._joined(each, step, count) for each in inputs]
@@ -195,7 +193,7 @@ class Cameras(Component):
             self.lenses.move(inputs.view, step, inputs.camera, sums.by_lens())
 
     def of(self, view: int) -> Camera:
-        """Camera of a training view; the same object if lenses are not refined and its pose has not moved."""
+        """Refined camera of training view `view`; the same object while neither its pose nor its lens changes."""
         camera = self.poses.cameras[view]
         return self.lenses.seen(self._views[view].lens, camera) if self._config.refine_lenses else camera
 
@@ -223,16 +221,16 @@ class Cameras(Component):
             warn(warning)
 
     def refined_arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a checkpoint, by name, without the gate's."""
+        """Refined poses and lenses, as arrays of a checkpoint by name."""
         return self.poses.arrays() | self.lenses.arrays()
 
     def go_back(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load the cameras from `refined_arrays`. Raises ValueError for arrays of other views."""
+        """Restore poses and lenses from arrays of `refined_arrays`. Raises ValueError for arrays of other views."""
         for part, name in ((self.poses, "poses/"), (self.lenses, "lenses/")):
             part.load({key.removeprefix(name): array for key, array in arrays.items() if key.startswith(name)})
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a checkpoint, by name."""
+        """Refined cameras and the gate's measurements, as arrays of a checkpoint by name."""
         return self.refined_arrays() | self.gate.arrays()
 
     def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002
@@ -242,6 +240,6 @@ class Cameras(Component):
         self.gate.load(named("gate/"), self.refined_arrays())
 
     def write(self, run: Run) -> None:
-        """Write the refined cameras."""
+        """Write the refined cameras into the run's folder, if cameras are refined."""
         if self._config.refines:
             keep_cameras(run, self._scene, self.poses, self.lenses, self.drift())

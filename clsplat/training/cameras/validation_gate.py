@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Validation gate: returns to earlier cameras if refinement makes held-out views worse. Policy only, no OpenCL."""
+"""Validation gate of refined cameras: return to earlier cameras if held-out views get worse. Policy only, no OpenCL."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from clsplat.training.cameras.poses import checked_arrays, first_step
 from clsplat.training.density.adaptive import is_due, is_reset_due
 
 MAX_GATE_VIEWS = 8
-"""Maximum number of held-out views that are measured."""
+"""Maximum number of held-out views whose PSNR validates refined cameras."""
 GATE_MEASUREMENTS = 10
-"""Number of measurements in a training, after the measurement at the beginning of refinement."""
+"""Number of times that cameras are validated in a training, besides the first time, when refinement begins."""
 LOW_MEASUREMENTS_IN_A_ROW = 2
-"""Number of consecutive low measurements that end refinement. A densification can make a single one low."""
+"""Number of consecutive low PSNRs that end refinement. A single one may be low because of a densification."""
 RESET_SETTLING_DIVISOR = 3
 """Divisor of the interval between opacity resets. The quotient is the number of steps in which a model recovers from a
-reset; until then its cameras cannot be validated."""
+reset. In these steps, cameras cannot be validated."""
 DRIFT_ITERATIONS, MIN_DRIFT_RESIDUAL = 10, 1e-12
-"""Number of reweighted fits of a drift, and the limit below which a residual or spread counts as zero."""
+"""Number of iterations in which `drift` reweights and fits, and the limit below which a residual counts as zero."""
 
 
 def steps_of(config: TrainConfig) -> tuple[int, ...]:
@@ -98,9 +98,9 @@ def drift(given: Sequence[Camera], refined: Sequence[Camera], length_unit: float
 
 
 class CameraGate:
-    """Held-out PSNR of a training that refines its cameras, and its best cameras.
+    """Record of the held-out PSNR while cameras are refined, and of the cameras with the best PSNR.
 
-    measured: step and dB of each measurement.
+    measured: step and PSNR in dB of each measurement.
     ended: step after which refinement ended, None while it continues.
     """
 
@@ -112,23 +112,23 @@ class CameraGate:
         self._best: dict[str, NDArray[Any]] = {}
 
     def is_due(self, step: int) -> bool:
-        """True if the cameras have to be validated after this step, or should have been after an earlier step."""
+        """True if the cameras have to be validated after step number `step`, or an earlier validation was skipped."""
         last = self.measured[-1][0] if self.measured else -1
         return any(last < due <= step for due in self._steps)
 
     @property
     def best(self) -> tuple[int, float]:
-        """Step and dB of the best measurement before refinement ended; the first one if several are equal."""
+        """Step and PSNR of the best measurement before refinement ended; the first one if several are equal."""
         known = [each for each in self.measured if self.ended is None or each[0] <= self.ended]
         return max(known, key=lambda each: each[1])
 
     def validate(
         self, step: int, psnr: float, cameras: Mapping[str, NDArray[Any]]
     ) -> tuple[dict[str, NDArray[Any]] | None, str]:
-        """Record a measurement in dB.
+        """Record the held-out PSNR after a step, in dB, and decide if refinement goes back to earlier cameras.
 
-        cameras: the cameras' arrays of a checkpoint.
-        Returns the arrays of the cameras to go back to, or None to keep the current ones, and a warning, or "".
+        cameras: the current cameras, as arrays of a checkpoint.
+        Returns the arrays of the cameras to go back to, or None to keep the current ones. Then a warning, or "".
         """
         self.measured.append((step, psnr))
         if self.ended is not None:
@@ -153,12 +153,12 @@ class CameraGate:
         return self._best, f"{found}: the cameras of step {at} are restored, and refinement ends; {advice}"
 
     def record(self) -> dict[str, Any]:
-        """Measurements so far, for metrics.jsonl. Requires at least one."""
+        """Measurements so far, as `gate` of metrics.jsonl. At least one must have been made."""
         measured = [{"step": step, "psnr": psnr} for step, psnr in self.measured]
         return {"measured": measured, "best": self.best[0], "ended": self.ended}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a checkpoint, by name."""
+        """Measurements and the best cameras, as arrays of a checkpoint by name."""
         if not self.measured:
             return {}
         ended = np.array([-1 if self.ended is None else self.ended], np.int64)
@@ -166,7 +166,7 @@ class CameraGate:
         return {f"gate/{name}": array for name, array in own.items()}
 
     def load(self, arrays: Mapping[str, NDArray[Any]], cameras: Mapping[str, NDArray[Any]]) -> None:
-        """Load the arrays of a checkpoint, by name without the prefix. There are none before the first measurement.
+        """Load a checkpoint's arrays, by name without "gate/". There are none before the first measurement.
 
         cameras: arrays of the current cameras; the loaded arrays must have the same shapes.
         Raises ValueError for arrays of other views.
@@ -176,7 +176,7 @@ class CameraGate:
             return
         measured = arrays.get("measured", np.zeros(0))
         if measured.ndim != 2 or measured.shape[1] != 2 or not len(measured) or not np.isfinite(measured).all():
-            raise ValueError(f"has no gate/measured of steps and dB (shape {measured.shape})")
+            raise ValueError(f"has no gate/measured of steps and dB (shape {measured.shape}, expected finite (n, 2))")
         like = {"gate/ended": np.zeros(1, np.int64), **{f"gate/{name}": array for name, array in cameras.items()}}
         self._best = checked_arrays(like, arrays, "gate/")
         ended = int(self._best.pop("ended")[0])

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Non-finite values: detection, repair, and return to a checkpoint where they come again."""
+"""Non-finite values in a training: detection, repair, and return to a checkpoint if they recur."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Policy for non-finite numbers in Gaussians, steps and runs. No OpenCL.
+"""Policy for non-finite values: which Gaussians are removed, when training returns to a checkpoint. No OpenCL.
 
 docs/decisions/0016-never-a-nan.md gives the reasons.
 """
@@ -19,31 +19,32 @@ MAX_TROUBLED_STEPS = 5
 """Number of steps with non-finite values, among the last TROUBLE_WINDOW_STEPS, at which training goes back to a
 checkpoint."""
 TROUBLE_WINDOW_STEPS = 100
+"""Number of latest steps in which steps with non-finite values are counted."""
 MAX_CHECKPOINT_RETURNS = 3
 """Maximum number of returns to a checkpoint. If one more would be needed, training ends with an error."""
 RETURN_RATE_FACTOR = 0.5
-"""Factor on the learning rates at each return, for the rest of the run."""
+"""Factor on the learning rates at each return to a checkpoint, for the rest of the run."""
 MAX_BROKEN_FRACTION = 0.5
 """Fraction of broken Gaussians above which a model is not repaired: training goes back at once."""
 EXAMINED_ROWS = 1 << 16
-"""Number of Gaussians that are examined at a time. All at once would take a copy of their largest parameters."""
+"""Number of Gaussians that are examined at a time, which limits the size of copies."""
 MAX_INCIDENT_GAUSSIANS = 1000
-"""Maximum number of Gaussians that are copied for an incident."""
+"""Maximum number of Gaussians that are copied into an incident, to reproduce it."""
 
 
 class Rows(Protocol):
-    """An array whose first axis is the Gaussians, wherever it is."""
+    """An array with a row for each Gaussian, on the device or the host."""
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Its shape."""
+        """Shape of the array."""
 
     def get_rows(self, start: int, stop: int) -> NDArray[np.float32]:
-        """A copy of the rows [start, stop)."""
+        """Copy of the rows [start, stop)."""
 
 
 Model = Mapping[str, Rows]
-"""Arrays by parameter group."""
+"""Arrays of the parameters, or of one of their moments, by parameter group."""
 
 
 def examine(parameters: Model, first: Model, second: Model) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -69,7 +70,7 @@ def _over(values: NDArray[np.float32], limit: float) -> NDArray[np.bool_]:
 
 
 def _any_in_row(marks: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Rows (n,) with a mark, of marks (n, ...)."""
+    """Rows (n,) in which any of the marks (n, ...) is True."""
     return np.asarray(marks.any(axis=tuple(range(1, marks.ndim))))
 
 
@@ -79,18 +80,20 @@ def lost(stage: str, broken: NDArray[np.bool_], refused: NDArray[np.bool_]) -> N
 
 
 def finite_or_zero(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Copy with zeros in place of non-finite values. It repairs moments, because zero is their initial value."""
+    """Copy with zeros in place of non-finite values, to repair moments: zero is their initial value."""
     return np.where(np.isfinite(values), values, np.float32(0))
 
 
 @dataclass(frozen=True, eq=False)
 class Incident:
-    """An occurrence of non-finite numbers, and the response to it.
+    """Occurrence of non-finite values in a step, and the response to it.
 
-    step, view: step and view in which the numbers arose.
-    stage: first stage that contained the numbers: "loss", "project_grad", "parameters" or "adam".
+    step, view: number of the step, and index of the view, in which the values arose.
+    name: name of the view.
+    stage: first stage with non-finite values: "loss", "project_grad", "parameters" or "adam".
     count: number of Gaussians concerned, or of array elements if no Gaussian is.
-    done: the response in words.
+    done: the response in words, for messages.
+    background: background of the view.
     gaussians: up to MAX_INCIDENT_GAUSSIANS of the Gaussians concerned, by "parameters/means" and so on.
     """
 
@@ -117,9 +120,11 @@ class Incident:
 
 @dataclass
 class RetryBudget:
-    """Recent steps with non-finite values, and the effects of returns to checkpoints on the training.
+    """Recent steps with non-finite values, and the returns to a checkpoint so far. Checkpoints contain it.
 
-    Checkpoints contain it.
+    troubled: numbers of the steps with non-finite values, among the last TROUBLE_WINDOW_STEPS.
+    rate_factor: factor on the learning rates because of these returns.
+    lost: True if too much of the model is broken to continue with it.
     """
 
     troubled: list[int] = field(default_factory=list)
@@ -128,10 +133,7 @@ class RetryBudget:
     lost: bool = False
 
     def note(self, step: int, *, lost: bool = False) -> None:
-        """Record a step with non-finite values.
-
-        lost: True if too much of the model is broken to continue with it.
-        """
+        """Record a step with non-finite values. lost: as in `RetryBudget`."""
         self.troubled = [*(earlier for earlier in self.troubled if step - TROUBLE_WINDOW_STEPS < earlier < step), step]
         self.lost = self.lost or lost
 
@@ -146,5 +148,5 @@ class RetryBudget:
         return self.returns >= MAX_CHECKPOINT_RETURNS
 
     def after_return(self) -> RetryBudget:
-        """State after the return to a checkpoint."""
+        """Budget after one more return to a checkpoint."""
         return RetryBudget(rate_factor=RETURN_RATE_FACTOR * self.rate_factor, returns=self.returns + 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitor of a training: it notices that `adam` has refused steps, finds the stage at fault, and returns a repair."""
+"""Monitor of non-finite values: notices elements that `adam` refused, finds the stage at fault and the repair."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from clsplat.training.stability.health import Incident, RetryBudget
 
 @dataclass(eq=False)
 class LastStep:
-    """A step that is kept, to inspect it if non-finite values are found after it.
+    """Record of a step, to be inspected if non-finite values are found later.
 
-    view, name: index and name of its view.
-    sums: function that returns the sums of its loss, valid until the next step has a loss.
-    others: further views of the same step.
+    view, name: index and name of the step's view.
+    sums: function that returns the sums of the view's loss. Call it before the next step has a loss.
+    others: records of further views of the same step, in a batch.
     """
 
     step: int
@@ -34,16 +34,16 @@ class LastStep:
     others: tuple[LastStep, ...] = ()
 
     def with_bad_loss(self) -> LastStep | None:
-        """The first view of the step whose loss is not finite; None if there is none."""
+        """The first view of the step whose loss is not finite; None if all losses are finite."""
         return next((one for one in (self, *self.others) if not np.isfinite(one.sums()).all()), None)
 
 
 @dataclass(frozen=True, eq=False)
 class Repair:
-    """Repair of a model.
+    """Repair of a model with non-finite values.
 
-    rows: rows to keep, or None for all.
-    moments: True if non-finite moments become zero (`health.finite_or_zero`).
+    rows: rows (Gaussians) to keep; None to keep all.
+    moments: True to set non-finite moments to zero (`health.finite_or_zero`).
     """
 
     rows: NDArray[np.uint32] | None
@@ -51,11 +51,12 @@ class Repair:
 
 
 class NonFiniteMonitor:
-    """State of the monitor.
+    """Monitor of non-finite values in a training.
 
-    readback: the values that a pass reads back; the last four are `adam`'s counts (`Rasterizer.readback`).
+    readback: device array of `Rasterizer.readback`, whose last values are the numbers of elements that `adam` refused.
     last: the current step, once it has its loss.
-    incidents: incidents not reported yet.
+    incidents: incidents that the training has not reported yet.
+    latest: the latest incident.
     retries: counts of steps with non-finite values, and of returns to a checkpoint.
     """
 
@@ -69,7 +70,7 @@ class NonFiniteMonitor:
 
     @property
     def noticed(self) -> bool:
-        """True if non-finite values have been reported that `examine` has not seen yet."""
+        """True if non-finite values have been recorded that `examine` has not handled yet."""
         return self._noticed is not None
 
     def forget(self) -> None:
@@ -78,13 +79,13 @@ class NonFiniteMonitor:
         self.readback.fill(0)
 
     def begin(self, view: LastStep) -> None:
-        """Remember a view of the current step, after its loss."""
+        """Remember a view of the current step, once its loss is launched."""
         last = self.last
         same = last is not None and last.step == view.step
         self.last = replace(last, others=(*last.others, view)) if last is not None and same else view
 
     def notice(self, refused: Sequence[int]) -> None:
-        """Record `adam`'s counts (`REFUSED`) of the last step, whose loss must still be available."""
+        """Record how many elements `adam` refused in the last step, by reason (`REFUSED`). Reads its loss."""
         if not any(refused) or self._noticed is not None or self.last is None:
             return
         counts = dict(zip(REFUSED, refused, strict=True))
@@ -93,7 +94,7 @@ class NonFiniteMonitor:
         self._noticed = (culprit or self.last, "loss" if culprit else stage, sum(refused))
 
     def look(self) -> None:
-        """Read the counts now instead of waiting for the next pass."""
+        """Read from the device how many elements `adam` refused, instead of waiting for the next pass to do so."""
         self.notice([int(value) for value in self.readback.get()[-len(REFUSED) :]])
 
     def loss_failed(self) -> None:
@@ -102,7 +103,7 @@ class NonFiniteMonitor:
             self._noticed = (self.last.with_bad_loss() or self.last, "loss", 0)
 
     def examine(self, models: Mapping[str, AnyGaussians]) -> Repair | None:
-        """The repair of the non-finite values that `notice` recorded; None if there are none.
+        """Find the repair of the non-finite values that `notice` recorded; None if nothing has to be repaired.
 
         models: arrays by kind: parameters, first and second moments.
         """
@@ -113,7 +114,7 @@ class NonFiniteMonitor:
         return self._judge(last, stage, elements, {kind: model.arrays for kind, model in models.items()})
 
     def examine_all(self, models: Mapping[str, Mapping[str, AnyArray]]) -> Repair | None:
-        """Check every number, also of Gaussians that `adam` has not visited. Returns the repair, or None.
+        """Check all values of a model, also of Gaussians that no step has updated. Returns the repair, or None.
 
         models: arrays by kind and group.
         """
@@ -155,4 +156,4 @@ def _done(stage: str, lost: int, count: int, *, hopeless: bool) -> str:
         return f"{lost:,} of {count:,} are too many to remove"
     if lost:
         return f"{lost:,} removed"
-    return "the Gaussians concerned learn nothing" if stage == "loss" else "moments begin again from zero"
+    return "the Gaussians concerned are not updated" if stage == "loss" else "their moments begin again from zero"

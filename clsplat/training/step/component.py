@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Components of a training in addition to the Gaussians: appearance, refined cameras, mip filter, known depths, late
-Adam, chunks in view.
+"""Base class of the components of a training, its parts in addition to the Gaussians.
+
+Components are appearance, refined cameras, the mip filter, known depths, late Adam, and chunks in view.
 
 `Trainer` loops over a list of components. A new one is a subclass of `Component` and a line in `Trainer._start`.
 """
@@ -18,8 +19,10 @@ from clsplat.stages.device_gaussians import AnyGaussians, HostArray
 from clsplat.training.step.inputs import ViewInputs
 
 Named = Callable[[str], Mapping[str, Any]]
-"""Arrays of a checkpoint by the rest of their names. Those of the Gaussians may be files that are read by slices."""
-"""Arrays of a checkpoint whose names have a prefix, by name without the prefix."""
+"""Function of a prefix. It returns the arrays of a checkpoint whose names have the prefix, by name without it.
+
+Arrays of the Gaussians may be files that are read by slices.
+"""
 
 
 class Component:
@@ -27,27 +30,27 @@ class Component:
 
     @property
     def on(self) -> bool:
-        """False if the settings do without it: no step asks it for anything."""
+        """True if the settings use the component. Otherwise no step calls it."""
         return True
 
     @property
     def models(self) -> int:
-        """Number of arrays that the device needs for each parameter; 0 if the usual number is enough."""
+        """Number of arrays that the device needs for each parameter of the model; 0 if the usual number is enough."""
         return 0
 
     @property
     def row_bytes(self) -> int:
-        """Bytes per Gaussian on the device."""
+        """Bytes per Gaussian that the component takes on the device."""
         return 0
 
     @property
     def pixel_bytes(self) -> int:
-        """Bytes per pixel on the device."""
+        """Bytes per pixel that the component takes on the device."""
         return 0
 
     @property
     def reads_all_rows(self) -> bool:
-        """True if `before_step` wants every postponed change to the Gaussians made."""
+        """True if all postponed changes to Gaussians must be made before `before_step`."""
         return True
 
     def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002
@@ -55,10 +58,10 @@ class Component:
         return False
 
     def before_step(self, gaussians: AnyGaussians) -> None:
-        """Do the work that is due. A second call must not change anything more."""
+        """Do the work that is due before a step. A second call before the same step must change nothing more."""
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
-        """Views of a step, each with the component's part in it (`ViewPart`).
+        """Return the views of a step, each with the component's part in it (`ViewPart`).
 
         step: number of the last view.
         count: number of Gaussians.
@@ -69,30 +72,30 @@ class Component:
         """Change the parameters after Adam's step."""
 
     def step_back(self, step: int) -> None:
-        """Return to the state after step number `step`: later ones have failed before they changed a Gaussian."""
+        """Return to the state after step number `step`. Later steps failed before they changed a Gaussian."""
 
     def complete_exactly(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
-        """Make the postponed changes that may be made at any time, because they give the same bits."""
+        """Make the postponed changes to parameters and moments that give the same bits whenever they are made."""
 
     def complete(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
-        """Make all changes to the parameters and their moments that are postponed, because all rows are now needed."""
+        """Make all postponed changes to parameters and moments. Called when every row is needed."""
         self.complete_exactly(parameters, first, second)
 
     def completed(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> AnyGaussians:  # noqa: ARG002
-        """The parameters as `complete` would leave them, without changing any array."""
+        """Return the parameters with all postponed changes, but leave the arrays unchanged."""
         return parameters
 
     def rows_changed(self) -> None:
-        """Forget data about the values of Gaussians, which have changed between two steps."""
+        """Forget data that depends on Gaussians' values. Called if density control or a repair has changed values."""
 
     def rows_moved(self, listed: DeviceArray | HostArray) -> None:
-        """Follow rows that have moved, or forget data about individual rows.
+        """Move data of individual Gaussians along with their rows, or forget it.
 
-        listed: the old row of each row, or FRESH (`DeviceRowList`).
+        listed: (m,), for each new row the row that it is copied from, with the bit FRESH if its Gaussian is new.
         """
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a checkpoint, by name."""
+        """State of the component, as arrays of a checkpoint by name."""
         return {}
 
     def load(self, named: Named, step: int, count: int) -> None:
@@ -100,4 +103,4 @@ class Component:
         other views."""
 
     def write(self, run: Run) -> None:
-        """Write the files of a finished training."""
+        """Write the component's files of a finished training into the run's folder."""

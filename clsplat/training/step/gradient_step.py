@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The gradient of one view and Adam's step along it: the work of a training step, which `repro_bundle` can replay."""
+"""Training step of one view: forward, loss, backward and Adam."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ R = TypeVar("R")
 
 
 class StepProbe:
-    """Observer of a step. The step calls each method after it has launched a stage; the device may still be at work.
+    """Observer of a training step. The step calls its methods as it launches stages; by default they do nothing.
 
-    The methods do nothing by default. Where launches are replayed from a command buffer, `before_rows` and `after_rows`
-    are not called: the observer's own launches are replayed too.
+    The device may still be computing a stage when its method is called. Where launches are replayed from a command
+    buffer, `before_rows` and `after_rows` are not called, because their own launches are replayed too.
     """
 
     @property
     def key(self) -> tuple[object, ...]:
-        """Everything that the observer's own launches depend on, except `numbers`."""
+        """Key of the observer's own launches in a command buffer: all that they depend on, except `numbers`."""
         return ()
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """Values that the observer's own launches pass as `LaunchParameter`, in order."""
+        """Numbers that change from step to step in the observer's own launches (`LaunchParameter`), in order."""
         return ()
 
     def forward(self, frame: ForwardPass) -> None:
@@ -59,7 +59,7 @@ class StepProbe:
         """Called after the launch of the gradient of blending."""
 
     def before_replay(self) -> None:
-        """Called before Adam changes the model by launches that are replayed."""
+        """Called before a replay of launches in which Adam changes the model."""
 
     def before_rows(self, rows: StepRows) -> None:
         """Called before Adam on these rows is launched."""
@@ -74,11 +74,12 @@ NO_PROBE = StepProbe()
 
 @dataclass(eq=False)
 class GradientStep:
-    """Forward, loss, backward and Adam of one view, on a device and in a rasterizer's memory.
+    """Step of one view on one device: forward, loss, backward and Adam.
 
-    fields: the slot fields that the step fills.
-    turn: number of the array for the loss's sums (`stages.loss.loss`).
-    room: capacity in pairs (`Rasterizer.forward`).
+    step: number of the step, for learning rates and Adam.
+    fields: fields of a pair's gradient that the step computes.
+    turn: which array receives the loss's sums (`stages.loss.loss`), so that an earlier step's sums can still be read.
+    room: capacity in pairs, if the step is launched by capacity; None to count the pairs first.
     explore: noise and penalties of the step.
     """
 
@@ -95,12 +96,12 @@ class GradientStep:
 
     @cached_property
     def thinning(self) -> Thinning | None:
-        """Thinning of the model in the step's pass."""
+        """Random choice of Gaussians that the step drops; None without --thinning."""
         return thinning_of(self.config, self.step)
 
     @property
     def adam_step(self) -> AdamStep:
-        """Constants, number and learning rates of Adam's step."""
+        """Adam's constants, step number and learning rates."""
         return AdamStep(self.config.optimiser, self.step, self.rates)
 
     def run(
@@ -112,11 +113,11 @@ class GradientStep:
         *,
         reads_loss: bool = False,
     ) -> Loss:
-        """Update the model (parameters, first and second moments) with a view.
+        """Update the model (parameters, first and second moments) with a view. Returns the loss.
 
-        gradients: arrays for gradients of the rows that are on the device at the same time, if a probe or a part reads
-        them. They are zero before and after. The model has the same bits with and without them.
-        reads_loss: True if the loss will be read.
+        gradients: arrays for the gradients of rows, as `view_gradients` makes them, if a probe or a part of the view
+        reads gradients. They contain zeros before and after. With or without them the model has the same bits.
+        reads_loss: True if the loss will be read. Reading then does not wait for the rest of the step.
         """
         camera = inputs.camera
         place = self.rasterizer.send if self.room is None else self.rasterizer.keep
@@ -132,7 +133,7 @@ class GradientStep:
         else:
             numbers, given = thinning_numbers(self.thinning), (source, sent[0])
             frame, result, slots, own = self.replayed(model[0], key, gradient, numbers, given)
-            self.device.under_way.append(source.buffer)  # as in `target`
+            self.device.under_way.append(source.buffer)  # alive until it is read, as in `target`
             frame = frame.by(camera, sent[0])
             probe.forward(frame)
             probe.loss(result)
@@ -153,7 +154,7 @@ class GradientStep:
         *,
         reads_loss: bool = False,
     ) -> tuple[ForwardPass, Loss, Slots, Sequence[DeviceArray | None]]:
-        """The view's forward pass, its loss, the gradients of its pairs, and those for its parts' own parameters."""
+        """Run forward and backward. Returns forward pass, loss, gradients of the pairs, and the parts' gradients."""
         camera = inputs.camera
         forward = partial(self.rasterizer.forward, of, camera, sent, room=self.room, thinning=self.thinning)
         frame = forward(nearness=self.fields.nearness, chunks=chunks)
@@ -180,8 +181,11 @@ class GradientStep:
         terms: Sequence[LossTerm],
         chunks: ChunkList | ChunkNumbers | None,
     ) -> tuple[object, ...] | None:
-        """All that the launches of a view's gradient depend on, except the model; None if they cannot be replayed in
-        one: with exact counts, with parts or depths, or if a mask gives each photograph a divisor of its own."""
+        """Key of the command buffer with all launches of the view's gradient; None if they cannot be in one buffer.
+
+        They cannot with exact counts, with parts, or with depths. Nor can they with a mask, because each photograph
+        then has its own divisor of the loss.
+        """
         keys, camera, room, fields = tuple(term.key for term in terms), inputs.camera, self.room, self.fields
         if room is None or inputs.parts or inputs.kept is not None or None in keys:
             return None
@@ -199,7 +203,7 @@ class GradientStep:
         frame: ForwardPass,
         terms: Sequence[LossTerm],
     ) -> Loss:
-        """Loss of a frame, compared with the photograph `source`."""
+        """Loss between a frame and the photograph `source`."""
         work, size = self.rasterizer.work, (inputs.camera.width, inputs.camera.height)
         alpha = any(term.wants_alpha for term in terms)
         changed = any(part.changes_target for part in inputs.parts)
@@ -240,7 +244,7 @@ class GradientStep:
         probe: StepProbe,
         placed: PlacedChunks | None,
     ) -> None:
-        """Take Adam's step for the model, part by part, or for some of its chunks."""
+        """Take Adam's step for the model, in parts that the device has memory for, or for some of its chunks."""
         chunks = None if placed is None else placed.in_model
 
         def change() -> None:
@@ -262,8 +266,8 @@ class GradientStep:
     def _parts(
         self, model: tuple[AnyGaussians, ...], projected: Projected, chunks: ChunkList | ChunkNumbers | None
     ) -> Iterator[tuple[int, tuple[DeviceGaussians, ...], Projected]]:
-        """Yield, for each part of the model that is on the device at once, its first row, the part, and its
-        projection."""
+        """Yield the parts of the model that are on the device at a time. Each is its first row, its rows of all arrays,
+        and their projection."""
         work = self.rasterizer.work
         if isinstance(chunks, ChunkNumbers):
             for start, stop, part, slots in chunk_parts(work, chunks, *model, changes=True):
@@ -282,7 +286,8 @@ class GradientStep:
         slots: Slots,
         gradients: DeviceGaussians | None,
     ) -> StepRows:
-        """Rows of the model, or of the chunks in `projected`, from `start` on, with arrays for their gradients."""
+        """Make a record of rows of the model, or of the chunks in `projected`, from `start` on, with arrays for their
+        gradients."""
         count = projected.tile_counts.shape[0]
         by_lens = (part.lens_gradients(count) for part in inputs.parts)
         return StepRows(
@@ -299,7 +304,7 @@ class GradientStep:
         )
 
     def _change_rows(self, rows: StepRows, inputs: ViewInputs, probe: StepProbe) -> None:
-        """Take Adam's step for some rows."""
+        """Take Adam's step for some rows, between the two calls of the probe."""
         if rows.gradients is not None:
             project_grad(
                 rows.device,
@@ -320,7 +325,7 @@ class GradientStep:
         probe.after_rows(rows)
 
     def change(self, rows: StepRows, inputs: ViewInputs) -> None:
-        """Take Adam's step for some rows, after the changes of the view's parts."""
+        """Take Adam's step for some rows, after the changes that the view's parts make to them."""
         for part in inputs.parts:
             part.before_adam(rows, self.adam_step)
         self.update(rows)
@@ -334,7 +339,7 @@ class GradientStep:
         given: tuple[DeviceArray, ...] = (),
         before: Callable[[], None] | None = None,
     ) -> R:
-        """The result of `make`, from a command buffer (`Workspace.replayed`) if the step is launched by capacity.
+        """Result of `make`, from a command buffer (`Workspace.replayed`) if the step is launched by capacity.
 
         A step with exact counts has new arrays each time, so its command buffer would never be reused.
         """
@@ -343,12 +348,12 @@ class GradientStep:
         return self.rasterizer.work.replayed(of, key, make, numbers, given, before)
 
     def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
-        """Take Adam's step for the view's parts, along the gradients `own`."""
+        """Take Adam's step for the parameters of the view's parts. own: the gradient of each part."""
         for part, gradient in zip(inputs.parts, own, strict=True):
             part.update(gradient, self.rasterizer.readback)
 
     def update(self, rows: StepRows) -> None:
-        """Take Adam's step for some rows; compute the gradient of projection if that is not done yet."""
+        """Take Adam's step for some rows, and before it compute the gradient of projection if that is not done yet."""
         step, readback = self.adam_step, self.rasterizer.readback
         if rows.gradients is not None:
             parameters, first, second = rows.model
@@ -361,7 +366,7 @@ class GradientStep:
 
 
 StepMaker = Callable[..., GradientStep]
-"""Makes a step, from `turn` and `room`."""
+"""Function that makes a step from `turn` and `room`."""
 
 
 def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = False) -> DeviceGaussians:
@@ -378,8 +383,8 @@ def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = Fa
 
 
 def slot_fields(needs: StatisticsNeeds, *, nearness: bool = False) -> SlotFields:
-    """Slot fields that these statistics need.
+    """Fields of a pair's gradient that a step computes for these density statistics.
 
-    nearness: True if depths are compared.
+    nearness: True if there is a depth loss.
     """
     return SlotFields(needs.absolute, needs.contributions, nearness)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs of a view in a training step, its parts, and the rows of the model that it changes."""
+"""Inputs of a view in a training step, the parts of components in it, and the rows of the model that it changes."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from clsplat.stages.project import Projected, Screen, Slots
 
 @dataclass(frozen=True, eq=False)
 class PlacedChunks:
-    """Chunks that are ready for a step.
+    """Chunks that a step runs over, ready for its kernels.
 
-    model: the model that the kernels get: the whole model, or, if it is streamed, the rows of the pool's slots.
-    in_model: the chunks for kernels that read `model`. ChunkNumbers come to the pool one after the other; `model` is
-        the streamed model then.
+    model: the arrays that the kernels get: the whole model, or the pool's rows for chunks of a streamed model.
+    in_model: the chunks by their numbers in `model`. They are ChunkNumbers if they come to the pool one after the
+        other; then `model` is the streamed model.
     """
 
     model: tuple[AnyGaussians, ...]
@@ -33,32 +33,32 @@ class PlacedChunks:
 
 
 class ChunksInView(Protocol):
-    """The chunks of the model over which a step runs."""
+    """Chunks of the model that a step runs over."""
 
     @property
     def one_by_one(self) -> bool:
-        """True if not all of them have room on the device at once."""
+        """True if the device has no memory for all of these chunks at once."""
         return False
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> PlacedChunks | None:
-        """Make the chunks ready for the step. None if the step runs over the whole model."""
+        """Make the chunks ready for the step. Returns None if the step runs over the whole model instead."""
 
 
 @dataclass(eq=False)
 class ViewInputs:
-    """A view of a step. It is not frozen, as one is made in each step (docs/decisions/0025-launch-by-capacity.md).
+    """Inputs of a view in a step. Not frozen, because frozen ones take longer to make, and each step makes one.
 
     view: the view's index among the training views.
     photograph: (H, W, 3 to 5): colours, then alpha and mask.
     camera: the view's camera, of the photograph's size.
-    begins: True if an epoch begins with it.
-    kept: number of pixels that its mask keeps, None without a mask.
-    depth: known depths, if they are compared.
-    area: number of full-resolution pixels per pixel.
-    place: the view's number in the step.
-    parts: the components' parts in it.
+    begins: True if an epoch begins with this view.
+    kept: number of pixels that the view's mask keeps; None without a mask.
+    depth: depth loss with the view's known depths; None without.
+    area: number of pixels at full resolution per pixel of `photograph`.
+    place: the view's position in the step.
+    parts: the parts that components have in the view.
     name: the view's name, for messages.
-    chunks: the only chunks of the model that the view may show; None for the whole model.
+    chunks: the chunks of the model that the view may show; None if the step runs over the whole model.
     """
 
     view: int
@@ -79,9 +79,8 @@ class ViewInputs:
 class ViewRows:
     """Rows [start, stop) of the model, or of the chunks that were projected, that are on the device at once.
 
-    projected: projection of these rows in the step's view.
-    screen: their screen-space gradients. The kernel that changes the rows may write them, so that they are undefined
-        before it.
+    projected: projection of these rows into the step's view.
+    screen: screen-space gradients of these rows. They may be undefined until the kernel has run that changes the rows.
     """
 
     start: int
@@ -92,9 +91,9 @@ class ViewRows:
 
 @dataclass(frozen=True, eq=False)
 class StepRows(ViewRows):
-    """Rows with all data that a step has for them.
+    """Rows of the model, with all that a step needs to change them.
 
-    model: their parameters, then the arrays that the step changes with these: moments, or sums of gradients.
+    model: parameters of the rows, then the arrays that the step changes too: moments, or sums of gradients.
     device: the device with the switches of the view's projection.
     camera_array, slots: the step's camera, and the gradients of the rows' pairs.
     gradients: gradients with respect to the rows' parameters, if requested.
@@ -115,21 +114,21 @@ class StepRows(ViewRows):
 
 
 class ViewPart:
-    """A component's part in one view of a step. By default no method does anything."""
+    """Part that a component has in one view of a step. By default no method does anything."""
 
     wants_gradients = False
     """True if `add_rows` reads the rows' gradients."""
     changes_rows = False
     """True if `before_adam` changes rows."""
     changes_target = False
-    """True if `compare` changes the photograph in `target`."""
+    """True if `compare` changes the photograph."""
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewPart:  # noqa: ARG002
-        """The same part on another device, made from `values`, for `compare` and `gradient` there."""
+        """Copy of the part on another device, made from `values`, for `compare` and `gradient` there."""
         return self
 
     def values(self) -> NDArray[np.float32]:
-        """Values that `on` takes."""
+        """The part's parameters on the host, from which `on` makes a copy."""
         return np.zeros(0, np.float32)
 
     def compare(self, work: Workspace, image: DeviceArray, target: DeviceArray, size: tuple[int, int]) -> DeviceArray:  # noqa: ARG002
@@ -151,14 +150,17 @@ class ViewPart:
         return None
 
     def lens_gradients(self, rows: int) -> DeviceArray | None:  # noqa: ARG002
-        """Array (rows, 4) for the rows' gradients with respect to the lens; None if they are not needed."""
+        """Array (rows, 4) for each Gaussian's gradient with respect to the lens; None if the part does not need it."""
         return None
 
     def add_rows(self, rows: StepRows) -> None:
-        """Sum the gradients of these rows, before the rows change."""
+        """Sum the gradients of these rows. Called before the rows change."""
 
     def before_adam(self, rows: StepRows, step: AdamStep) -> None:
-        """Change these rows just before Adam's step does. It is called twice if the sandbox tries the step first."""
+        """Change these rows just before Adam does. It is called twice if the sandbox tries the step first."""
 
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
-        """Take Adam's step along the part's own gradient. It changes nothing if the step's pass has stopped."""
+        """Take Adam's step for the part's own parameters. It changes nothing if the step's pass has stopped.
+
+        own: gradient of these parameters.
+        """

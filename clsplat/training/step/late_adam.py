@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Late Adam: Gaussians that no view shows are left as they are, and take their missed steps when they are next shown
+"""Late Adam (--optimiser.late): Gaussians that no view shows miss steps of Adam, and take them when they are next shown
 (docs/decisions/0049-late-adam.md)."""
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _GROUPS = tuple(PARAMETER_GROUPS)
 
 
 class LateAdam(Component):
-    """The last step that each Gaussian of a training took, and the factors of the steps since.
+    """Component for late Adam: the last step that each Gaussian took, and the factors of the steps that it missed.
 
-    step: the last step launched.
+    step: number of the last step launched.
     """
 
     def __init__(self, config: OptimiserConfig, rasterizer: Rasterizer, count: int) -> None:
@@ -39,12 +39,12 @@ class LateAdam(Component):
 
     def _begin(self, last: NDArray[np.uint32], missed: MissedSteps, step: int) -> None:
         self._last, self._missed, self.step = upload(self._device, last), missed, step
-        self._tables: dict[int, Float32] = {step: missed.rounded()}  # also tables of steps that may be repeated
+        self._tables: dict[int, Float32] = {step: missed.rounded()}  # by step, also of steps that may be repeated
         self._table = allocate(self._device, self._tables[step].shape, np.float32)
 
     @property
     def row_bytes(self) -> int:
-        """Bytes per Gaussian: the last step that it took."""
+        """Bytes per Gaussian on the device, for the last step that it took."""
         return 4
 
     def is_due(self, step: int, views: int) -> bool:
@@ -52,11 +52,11 @@ class LateAdam(Component):
         return (step - views) % MOST_MISSED == 0
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
-        """The views, each with a part that settles the rows that it shows."""
+        """Return the views, each with a part that settles the Gaussians that the view shows."""
         return [replace(each, parts=(*each.parts, _ShownRows(self))) for each in inputs]
 
     def settle_shown(self, rows: StepRows, step: AdamStep) -> None:
-        """Settle the rows that a step's view shows, before Adam's step. A step that is repeated is the same again."""
+        """Settle the rows that a step's view shows, before Adam's step. Repeating the step gives the same bits."""
         if step.number > self.step:
             self._missed.add(step.scales)
             self.step = step.number
@@ -82,8 +82,8 @@ class LateAdam(Component):
         settle(self._device, self._config, model, step, last, self._table, readback, tile_counts)
 
     def completed(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> AnyGaussians:
-        """The parameters with all rows settled. They are a copy if rows have missed steps, so that a look at a model in
-        training changes no bit."""
+        """Return the parameters with all rows settled. If rows have missed steps it is a copy, so that the training
+        keeps its bits."""
         missed = self.step - self._last.get()
         if not missed.any():
             return parameters
@@ -101,12 +101,12 @@ class LateAdam(Component):
     def rows_moved(self, listed: DeviceArray | HostArray) -> None:
         """Move each row's last step along with the row.
 
-        A fresh row keeps the last step of its source: its moments are zero, so that missed steps do not move it.
+        A fresh row has the last step of its source. Its moments are zero, so that missed steps do not move it.
         """
         self._last = upload(self._device, self._last.get()[listed.get() & ~np.uint32(FRESH)])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a checkpoint."""
+        """Last steps of the Gaussians, and factors of missed steps, as arrays of a checkpoint by name."""
         return {"late/last": self._last.get(), "late/missed": self._missed.factors.copy()}
 
     def load(self, named: Named, step: int, count: int) -> None:
@@ -129,12 +129,12 @@ class LateAdam(Component):
 
 @dataclass(frozen=True, eq=False)
 class _ShownRows(ViewPart):
-    """The part of a view in which the rows that it shows take their missed steps."""
+    """Part of a view that settles the rows that the view shows."""
 
     late: LateAdam
 
     changes_rows = True
 
     def before_adam(self, rows: StepRows, step: AdamStep) -> None:
-        """Settle the rows."""
+        """Settle those of the rows that the view shows."""
         self.late.settle_shown(rows, step)

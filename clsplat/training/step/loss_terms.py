@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loss terms that a training's settings ask for: a new term is a row of `LOSS_TERMS`."""
+"""Loss terms beyond L1 and D-SSIM, as the settings ask for them: the alpha loss and the depth loss."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def depth_term(config: TrainConfig, inputs: ViewInputs) -> LossTerm | None:  # n
 
 
 LOSS_TERMS: tuple[Callable[[TrainConfig, ViewInputs], LossTerm | None], ...] = (alpha_term, depth_term)
-"""Terms in addition to L1 and D-SSIM, in the order of their gradients' planes."""
+"""Functions that return a term of a view's loss in addition to L1 and D-SSIM, or None if it is not wanted."""
 
 
 def loss_terms(config: TrainConfig, inputs: ViewInputs) -> tuple[LossTerm, ...]:
-    """The terms of a view's loss."""
+    """Terms of a view's loss in addition to L1 and D-SSIM."""
     return tuple(term for make in LOSS_TERMS if (term := make(config, inputs)) is not None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The trainer's probe of a training step: non-finite values, trials of kernels, statistics."""
+"""Probe of a training step: non-finite values, trials of kernels in the sandbox, statistics for density control."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class StepMonitor(StepProbe):
     """Probe that notices non-finite values, tries the kernels that change the state, and adds statistics for density
     control.
 
-    number: number of views so far, including this one.
+    number: number of views that training has used so far, this one included.
     tried: keys of the steps whose kernels were tried; this step's key is added.
     changes: function that is called before the model changes.
     """
@@ -38,36 +38,36 @@ class StepMonitor(StepProbe):
     changes: Callable[[], None]
 
     def forward(self, frame: ForwardPass) -> None:
-        """Record the counts of the previous step, which this pass has read back."""
+        """Record how many elements `adam` refused in the previous step, which this pass has read back."""
         self.monitor.notice(frame.refused)
         self.pending.seen(frame)
 
     def loss(self, result: Loss) -> None:
-        """Remember the step, to inspect it if non-finite values are found after it."""
+        """Remember the step, to inspect it if non-finite values are found later."""
         sums = result.copy or result.sums.get
         inputs = self.inputs
         self.monitor.begin(LastStep(self.number, inputs.view, inputs.name, inputs.background, sums))
 
     @property
     def key(self) -> tuple[object, ...]:
-        """Everything that the launches of `add_statistics` depend on, except `numbers`."""
+        """Key of the launches of `add_statistics` in a command buffer: all that they depend on, except `numbers`."""
         camera = self.inputs.camera
         return (*self.statistics.named().values(), self.needs.gradients, camera.width, camera.height)
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """Values that the launches of `add_statistics` pass as `LaunchParameter`."""
+        """Numbers that change from step to step in the launches of `add_statistics` (`LaunchParameter`)."""
         counted = self.step.fields.contributions and self.statistics.current_totals is not None
         of_view = statistics_numbers(self.inputs.camera) if self.needs.gradients else ()
         return (*of_view, self.inputs.area) if counted else of_view
 
     def before_replay(self) -> None:
-        """The model is about to change."""
+        """Tell the trainer that the model is about to change."""
         self.changes()
 
     def before_rows(self, rows: StepRows) -> None:
-        """Try in the sandbox every kernel that changes the state, before the first row changes: a driver may fail in
-        any of them."""
+        """Try in the sandbox every kernel that changes the state, because a driver may fail in any of them. Then tell
+        the trainer that the model is about to change."""
         step, parameters = self.step, rows.parameters
         size = (rows.stop - rows.start, parameters.coefficients)
         build = (step.adam_step.updates_sh_rest, step.fields, rows.slots.first_slots is None, self.needs.gradients)
@@ -80,11 +80,11 @@ class StepMonitor(StepProbe):
         self.changes()
 
     def after_rows(self, rows: ViewRows) -> None:
-        """Add the rows to the statistics."""
+        """Add the rows' gradients and contributions to the density statistics."""
         self._add_rows(rows)
 
     def _add_rows(self, rows: ViewRows) -> None:
-        """Add the view to the statistics that density control needs of these rows."""
+        """Add these rows' gradients and contributions to the statistics that density control needs."""
         device, camera, screen = self.step.device, self.inputs.camera, rows.screen
         statistics, projected = self.statistics, rows.projected
         if projected.chunks is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The position of a training in its views, which is the JSON state of a checkpoint."""
+"""Position of a training: step, random state and views left in the epoch. It is the JSON state of a checkpoint."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from clsplat.training.stability.health import RetryBudget
 
 @dataclass
 class Mark:
-    """A position at which a checkpoint is possible, with the state of the random generator."""
+    """Copy of a `Position` at which a checkpoint is possible, with the state of the random generator."""
 
     step: int
     rng: Mapping[str, Any]
@@ -25,10 +25,10 @@ class Mark:
 
 @dataclass
 class Position:
-    """Position of a training in its views.
+    """Position of a training: step, random generator, and views left in the epoch.
 
-    step: number of views done.
-    queue: views that are left in the epoch, the next one last.
+    step: number of views that training has used so far.
+    queue: indices of the views left in the epoch, the next one last.
     controlled: True if the density control before the next step has been done.
     last_views: number of views of the last step.
     """
@@ -42,12 +42,12 @@ class Position:
 
     @property
     def rng(self) -> np.random.Generator:
-        """Random generator of the training. Whoever asks for it may draw from it."""
+        """Random generator. Reading it drops the saved copy of its state, because the caller may draw numbers."""
         self._rng_state = None
         return self._rng
 
     def mark(self, *, begun: bool = False) -> Mark:
-        """Mark this position.
+        """Return a copy of this position, with the state of the random generator.
 
         begun: True if the step number has already been increased for the current step, which has one view.
         """
@@ -55,18 +55,18 @@ class Position:
         return Mark(self.step - begun, self._rng_state, list(self.queue), self.controlled)
 
     def go_back(self, mark: Mark) -> None:
-        """Return to a mark."""
+        """Return to the position that `mark` copied, with its random state."""
         self.step, self.queue, self.controlled = mark.step, list(mark.queue), mark.controlled
         self.rng.bit_generator.state = mark.rng
 
     def state(self, retries: RetryBudget) -> dict[str, Any]:
-        """JSON state of a checkpoint, with the retries that are left."""
+        """Position and `retries` as JSON state of a checkpoint."""
         state = {"rng": self.rng.bit_generator.state, "queue": self.queue, "patience": asdict(retries)}
         views = {"views": self.last_views} if self.last_views > 1 else {}
         return {**state, **views, **({"controlled": True} if self.controlled else {})}
 
     def load(self, checkpoint: Checkpoint, views: int) -> RetryBudget:
-        """Continue from a checkpoint, in a scene with this number of views. Returns the retries that are left.
+        """Continue from a checkpoint, in a scene with `views` training views. Returns the checkpoint's retries.
 
         Raises InputError.
         """
@@ -74,15 +74,15 @@ class Position:
             self.rng.bit_generator.state = checkpoint.state["rng"]
             queue = list(checkpoint.state["queue"])
             if not all(type(index) is int and index >= 0 for index in queue):
-                raise ValueError(f"the queue of views begins with {queue[:3]}")
+                raise ValueError(f"the queue of views begins with {queue[:3]}, expected indices")
             retries = RetryBudget(**checkpoint.state.get("patience", {}))
             last_views = checkpoint.state.get("views", 1)
             if type(last_views) is not int or not 1 <= last_views <= max(checkpoint.step, 1):
-                raise ValueError(f"the last step had {last_views!r:.20} views")
+                raise ValueError(f"the last step had {last_views!r:.20} views, expected 1 to {max(checkpoint.step, 1)}")
         except (KeyError, TypeError, ValueError, IndexError) as error:
             why = f"{type(error).__name__}: {error}"
             raise unusable(checkpoint, f"its state is not as this version writes it ({why})") from None
         self.step, self.last_views = checkpoint.step, last_views
-        self.queue = queue if max(queue, default=0) < views else []  # the scene had more views before
+        self.queue = queue if max(queue, default=0) < views else []  # the scene has fewer views now
         self.controlled = bool(checkpoint.state.get("controlled", False))
         return retries

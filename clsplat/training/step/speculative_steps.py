@@ -23,20 +23,23 @@ from clsplat.stages.loss import Loss
 from clsplat.training.stability.non_finite import LastStep, NonFiniteMonitor
 
 BY_CAPACITY_VARIABLE = "CLSPLAT_BY_CAPACITY"
-"""Environment variable that decides if steps are launched by capacity. By default they are, except on CPUs."""
+"""Environment variable that switches launches by capacity on or off. By default they are on, except on CPUs."""
 
 _STOPPED, _PAIRS, _LONGEST = (READBACK.index(name) for name in ("STOPPED", "PAIRS", "LONGEST"))
 
 Run = Callable[[int, PairCapacity | None], Loss]
-"""Runs one step. It takes the number of the loss's array of sums, and a capacity, or None to count the pairs first."""
+"""Function that runs one step. It takes the number of the array for the loss's sums, and a capacity or None."""
 
 
 @dataclass(eq=False)
 class _Step:
-    """A step whose counts the host has not read.
+    """Launched step whose number of pairs the host has not read yet.
 
-    readback, counts: the counts on the device, and a function that waits for their copy.
-    number: number of its last view.
+    run: function that runs the step again.
+    turn: number of the array for the loss's sums.
+    number: number of the step's last view.
+    readback: the step's counts on the device.
+    counts: function that waits for these counts, and returns them.
     before: the monitor's `last` before this step.
     kept: host memory that the device may still have to read.
     """
@@ -52,16 +55,16 @@ class _Step:
 
 
 def by_capacity(device: Device) -> bool:
-    """True if this device launches steps by capacity if possible. Raises InputError."""
+    """True if steps on this device are launched by capacity where possible. Raises InputError."""
     return switched_on(BY_CAPACITY_VARIABLE) if os.environ.get(BY_CAPACITY_VARIABLE) else device.kind != "cpu"
 
 
 class SpeculativeSteps:
-    """A training's steps launched by capacity, at most two at a time, and the capacity of the next step.
+    """Steps that were launched by capacity, at most two at a time, and the capacity of the next step.
 
     begin: function that is called before a step is repeated, with the step's number. It repairs the non-finite values
         that `monitor` has found.
-    redone: number of repeated steps.
+    redone: number of steps repeated so far.
     """
 
     def __init__(self, device: Device, monitor: NonFiniteMonitor, begin: Callable[[int], None]) -> None:
@@ -78,7 +81,7 @@ class SpeculativeSteps:
 
     @property
     def turns(self) -> int:
-        """Number of losses whose sums are kept at a time."""
+        """Number of arrays for losses' sums, which steps use in turn."""
         return MAX_COUNTED_PASSES if self.on else 1
 
     def forget(self) -> None:
@@ -87,7 +90,7 @@ class SpeculativeSteps:
         self._most = None
 
     def seen(self, frame: ForwardPass) -> None:
-        """Record a step's frame, right after the step's launch."""
+        """Record the forward pass of a step that has just been launched."""
         self._frame = frame
         if frame.listed.counted.arriving is None:
             self._count(frame.listed.counted.pairs if len(frame.bands) == 1 else None)
@@ -96,10 +99,11 @@ class SpeculativeSteps:
         self._most = None if pairs is None else max(pairs, self._most or 0)
 
     def room(self, rasterizer: Rasterizer, size: object, gaussians: int) -> int:
-        """Number of pairs to reserve: a quarter more than the most seen at this photograph size, scaled by the growth
-        in Gaussians.
+        """Capacity in pairs of the next step; 0 to count its pairs first.
 
-        0 if steps are not launched by capacity, if no number is known yet, or if it exceeds the rasterizer's capacity.
+        It is a quarter more than the most pairs of a step with photographs of this `size`, scaled by the growth in
+        Gaussians. It is 0 if steps are not launched by capacity, if no number is known yet, or if the rasterizer's
+        capacity is less.
         """
         if not self.on or not rasterizer.takes_room:
             return 0
@@ -110,12 +114,12 @@ class SpeculativeSteps:
         if self._most is None:
             return 0
         wanted = max(self._most + self._most // 4, 1024)
-        step = 1 << (wanted.bit_length() - 4)  # rounded to few sizes, so that arrays are seldom resized
+        step = 1 << (wanted.bit_length() - 4)  # rounded up to few sizes, so that arrays are seldom resized
         wanted = -(-wanted // step) * step
         return wanted if wanted <= rasterizer.capacity else 0
 
     def launch(self, run: Run, room: int, *, number: int, reads_loss: bool) -> Loss:
-        """Run a step, by capacity unless `room` is 0, and then check the step before.
+        """Run a step with capacity `room`, or with an exact count if that is 0. Then check the step before.
 
         number: number of the step's last view.
         reads_loss: True to check this step too, because its loss will be read.
@@ -124,9 +128,8 @@ class SpeculativeSteps:
             return run(0, None)
         if not room:
             self.settle()
-        turn = self._turn = (
-            self._turn + 1
-        ) % self.turns  # exact steps take turns too, because their loss is read a step later
+        # also for steps with exact counts, because their loss is read a step later
+        turn = self._turn = (self._turn + 1) % self.turns
         before, result = self._monitor.last, run(turn, PairCapacity(room, turn, self._appends) if room else None)
         if not room:
             return result
@@ -141,7 +144,7 @@ class SpeculativeSteps:
         return step.result if reads_loss else result.copied(lambda: self._sums(step))
 
     def _sums(self, step: _Step) -> NDArray[Any]:
-        """Sums of a step's loss, once the step is known to be complete."""
+        """Sums of a step's loss. The step is checked before, and repeated if it is incomplete."""
         self.settle()
         copy = step.result.copy
         return copy() if copy is not None else step.result.sums.get()
@@ -154,7 +157,7 @@ class SpeculativeSteps:
         self._look(0)
 
     def _look(self, left: int) -> None:
-        """Check all steps except the last `left`."""
+        """Read the counts of all launched steps except the last `left`, and repeat steps that had too many pairs."""
         while len(self._steps) > left:
             counts = self._steps[0].counts().tolist()
             if counts[_STOPPED]:
@@ -162,12 +165,10 @@ class SpeculativeSteps:
                 return
             self._count(counts[_PAIRS])
             self._appends &= counts[_LONGEST] <= MAX_LIST_PAIRS
-            self._kept = self._steps.pop(
-                0
-            ).kept  # the device may still be reading memory for copies launched after the counts
+            self._kept = self._steps.pop(0).kept  # copies launched after the counts may still be reading this memory
 
     def _again(self) -> None:
-        """Repeat the steps that the device has skipped, with exact counts."""
+        """Repeat, with exact counts, the step that had too many pairs, and later steps, which the device skipped."""
         steps, self._steps = self._steps, []
         values = steps[0].readback.get()
         values[_STOPPED] = 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Order of the views in a pass through the training photographs. Policy only: no device.
+"""Order of the views in an epoch, a pass through the training photographs (--view-order). Policy only: no device.
 
 A pass shows each view once. Its order is random, or it goes through four clusters of near views at a time.
 """
@@ -16,8 +16,8 @@ from clsplat.camera import Camera
 CLUSTER_VIEWS = 16
 """Maximum number of views in a cluster."""
 CLUSTERS_AT_ONCE = 4
-"""Number of clusters whose views take turns. One after another would be nearer, but costs 0.3 dB on bonsai: the model
-then fits the cluster of the last steps at the expense of the others (docs/decisions/0050)."""
+"""Number of clusters whose views alternate. One cluster after the other would show nearer views, but costs 0.3 dB on
+bonsai: the model fits the last cluster at the expense of the others (docs/decisions/0050)."""
 GAZE_UNITS = 1.5
 """Distance, in length units, from a camera to the point on its viewing axis that stands for the view.
 
@@ -30,7 +30,7 @@ other, however their coordinates were rounded."""
 
 
 class ViewOrder:
-    """Order of the views of each pass.
+    """Order of the training views in each epoch, a pass through all of them.
 
     cameras: cameras of the training views, as given. The order does not follow refined poses.
     unit: length unit of the scene, in world units.
@@ -66,7 +66,7 @@ def gaze_points(cameras: Sequence[Camera], unit: float) -> Int64:
 
 
 def clusters_of(points: Int64) -> list[Int64]:
-    """Views of near points (n, d), in clusters of at most `CLUSTER_VIEWS` and nearly the same size.
+    """Clusters of views with near points (n, d), each of at most `CLUSTER_VIEWS` views and nearly the same size.
 
     They are the leaves of a k-d tree, which divides along the coordinate of the widest range. Views with equal
     coordinates are divided by their index.

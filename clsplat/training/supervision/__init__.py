@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs and depths that a step compares with, at the current resolution."""
+"""Photographs and known depths that a training step compares its render with: decoding, caches, resolution."""

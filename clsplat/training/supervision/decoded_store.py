@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder of decoded photographs: a file for each photograph and size, read back to the same pixels.
+"""Cache of decoded photographs on the disk (--cache): a file for each photograph and size, with the same pixels.
 
 A file has a header and the pixels. The header has the shape, the type, a key and a checksum of header and pixels. The
 key is a digest of everything that the pixels depend on, and also names the file. Files are read and not mapped, because
@@ -40,14 +40,14 @@ _HEADER_BYTES = _HEADER.size + _CHECKSUM.size
 
 
 def key_of(parts: Sequence[object]) -> bytes:
-    """Digest of `parts`, of this package's version, and of the versions of the format and the decoder."""
+    """Key of decoded pixels: digest of `parts`, and of the versions of this package, the format and the decoder."""
     versions = [FORMAT_VERSION, package_version(), oiio.VERSION_STRING]
     text = json.dumps([versions, *parts], default=repr)
     return hashlib.blake2b(text.encode("utf-8", "surrogatepass"), digest_size=KEY_BYTES).digest()
 
 
 class DecodedStore:
-    """A folder of decoded photographs, which several threads and processes may use at a time.
+    """Folder of decoded photographs, which several threads and processes may use at the same time.
 
     A damaged file counts as missing. If writing a file fails, no further files are written. Each kind of failure is
     reported once, by `notes`.
@@ -67,11 +67,11 @@ class DecodedStore:
             self._give_up(reason_of(error))
 
     def path(self, key: bytes) -> Path:
-        """File of the pixels with this key."""
+        """Path of the file for the pixels with this key."""
         return self.folder / f"{key.hex()}{SUFFIX}"
 
     def read(self, key: bytes) -> NDArray[Any] | None:
-        """Pixels (H, W, C) with this key; None if there are none, or if they are damaged."""
+        """Pixels (H, W, C) of the file with this key; None if there is no such file, or if it is damaged."""
         path, start = self.path(key), time.perf_counter()
         try:
             pixels = _read(path, key)
@@ -84,14 +84,14 @@ class DecodedStore:
         return pixels
 
     def write(self, key: bytes, pixels: NDArray[Any]) -> None:
-        """Write pixels (H, W, C), uint8 or float32. A failure is noted, and ends the writing."""
+        """Write pixels (H, W, C), uint8 or float32. After a failure the store writes nothing more."""
         if not self.writable:
             return
         path, start = self.path(key), time.perf_counter()
         pixels = np.ascontiguousarray(pixels)
         header = _HEADER.pack(_MAGIC, FORMAT_VERSION, _TYPES.index(pixels.dtype.type), *pixels.shape, key)
         try:
-            # not flushed to the disk, which takes long: a file that a power cut damages fails its checksum
+            # no flush to the disk, which takes long: the checksum tells if a power cut has damaged the file
             with atomic_name(path, _HEADER_BYTES + pixels.nbytes) as temporary, open(temporary, "xb") as file:
                 file.write(header + _CHECKSUM.pack(_checksum(header, pixels)))
                 file.write(pixels.data)
@@ -101,7 +101,7 @@ class DecodedStore:
         self._count(pixels.nbytes, time.perf_counter() - start)
 
     def notes(self) -> list[str]:
-        """Lines for the user that have not been returned yet."""
+        """Return the warnings for the user that have not been returned yet."""
         if not self._notes:
             return []
         with self._lock:
@@ -120,8 +120,8 @@ class DecodedStore:
             if self.writable:
                 self.writable = False
                 self._notes.append(
-                    f"{self.folder}: no decoded photographs can be written there ({reason}): photographs that are not "
-                    "in it are decoded each time"
+                    f"{self.folder}: no decoded photographs can be written there ({reason}); a photograph that this "
+                    "cache lacks is decoded each time it is used"
                 )
 
     def _damaged(self, path: Path, reason: str) -> None:
@@ -129,19 +129,19 @@ class DecodedStore:
             if not self._told_damage:
                 self._told_damage = True
                 self._notes.append(
-                    f"{path}: is no intact file of decoded pixels ({reason}): the photograph is decoded again (further "
-                    "files like this are not reported)"
+                    f"{path}: is no intact file of decoded pixels ({reason}); the photograph is decoded again (further "
+                    "damaged files are not reported)"
                 )
 
     def _count(self, nbytes: int, seconds: float) -> None:
-        """Count bytes that were read or written, and note the rate of a network disk."""
+        """Count bytes that were read or written, and add a warning if the folder is on a slow network disk."""
         with self._lock:
             if note := self._rate.count(nbytes, seconds):
                 self._notes.append(note)
 
 
 def remove_decoded(folder: Path) -> None:
-    """Remove the files of decoded photographs in a folder, and the folder if nothing else is in it.
+    """Remove all decoded photographs from a folder, and the folder if nothing else is in it.
 
     A file that another process is writing stays.
     """
@@ -153,18 +153,18 @@ def remove_decoded(folder: Path) -> None:
 
 
 def _is_abandoned(path: Path) -> bool:
-    """True for the temporary file of a process that has ended. Raises OSError."""
+    """True if `path` is a temporary file of this cache whose process has ended. Raises OSError."""
     match = TEMPORARY_NAME.fullmatch(path.name)
     return match is not None and match[1].endswith(SUFFIX) and is_abandoned(path, match[2])
 
 
 def _read(path: Path, key: bytes) -> NDArray[Any]:
-    """Pixels of a file. Raises OSError, and ValueError for a file that is incomplete or has another key."""
+    """Pixels (H, W, C) of a file. Raises OSError, and ValueError for a damaged file or another key."""
     with open(path, "rb", buffering=0) as file:
         size = os.fstat(file.fileno()).st_size
         head = file.read(_HEADER_BYTES)
         if len(head) < _HEADER_BYTES:
-            raise ValueError(f"it has only {len(head)} bytes")
+            raise ValueError(f"it has only {len(head)} bytes, expected a header of {_HEADER_BYTES}")
         magic, version, kind, height, width, channels, own = _HEADER.unpack(head[: _HEADER.size])
         if (magic, version, own) != (_MAGIC, FORMAT_VERSION, key) or kind >= len(_TYPES):
             raise ValueError("its header has another format, version or key")
@@ -176,7 +176,7 @@ def _read(path: Path, key: bytes) -> NDArray[Any]:
         while rest and (count := file.readinto(rest)):
             rest = rest[count:]
     if rest:
-        raise ValueError("it ended while it was read")
+        raise ValueError("it was cut short while it was read")
     if _CHECKSUM.unpack(head[_HEADER.size :])[0] != _checksum(head[: _HEADER.size], pixels):
         raise ValueError("its checksum is wrong")
     return pixels

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels of a training view at the sizes that the warm-up needs: decoded once, or read from a cache. Policy only: no
-device."""
+"""Decoding of photographs to the sizes that the warm-up needs, or reading of decoded ones from the cache on the disk.
+Policy only: no device."""
 
 from __future__ import annotations
 
@@ -20,34 +20,34 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import View
 
 HDR_SUFFIXES = (".exr", ".hdr", ".tif", ".tiff")
-"""Endings of files whose values may be outside 0 to 1, so that 8 bits may not hold them."""
+"""Endings of picture files whose values may be outside 0 to 1, which 8 bits cannot hold."""
 DECODING_PIXEL_BYTES, UNDISTORTING_PIXEL_BYTES = 40, 120
-"""Approximate peak of memory, in bytes per pixel of the file: to decode and resize a photograph, and to undistort it
-too."""
+"""Approximate peak of memory, in bytes per pixel of the file: to decode and resize a photograph; to undistort it as
+well."""
 
 
 class PhotographError(InputError):
-    """Error about a photograph that cannot be decoded, or has changed, while training runs."""
+    """Error for a photograph that cannot be decoded, or whose file has changed, while training runs."""
 
 
 def stored(image: Float32, *, rounds: bool) -> NDArray[Any]:
     """Pixels (H, W, C) as uint8 if that is exact, else as float32.
 
-    rounds: also store them as uint8 if that rounds them, unless values are outside 0 to 1.
+    rounds: True to round them to uint8 even if that is not exact. An image with a value outside 0 to 1 stays float32.
     """
     levels = np.rint(image * 255)
     fits = 0 <= levels.min() <= levels.max() <= 255
-    if fits and (rounds or np.array_equal(levels * np.float32(1 / 255), image)):  # as in target.cl
+    if fits and (rounds or np.array_equal(levels * np.float32(1 / 255), image)):  # as in target.cl, to float
         return levels.astype(np.uint8)
     return np.ascontiguousarray(image, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class Decoder:
-    """Decoding of the training views.
+    """Decoder of the training views' photographs.
 
-    rounds: True if pixels are rounded to 8 bits.
-    factors: divisors of the size that the training uses, largest first.
+    rounds: True to round pixels to 8 bits.
+    factors: divisors of the photographs' width and height in the course of the training, largest first.
     store: cache of decoded pixels on the disk, if there is one.
     """
 
@@ -62,9 +62,9 @@ class Decoder:
         return max(int(camera.width / factor), 1), max(int(camera.height / factor), 1)
 
     def pixels(self, index: int, factor: float, *, keeps: bool) -> dict[float, NDArray[Any]]:
-        """Map from `factor`, a divisor of the view's size, to the pixels (H, W, C) of view `index` at that size.
+        """Pixels (H, W, C) of view `index` at 1/factor of its size, by factor.
 
-        keeps: also return the sizes that the training needs later, if the file has to be decoded.
+        keeps: True to return the larger sizes as well, which the training needs later, if the file has to be decoded.
         Raises PhotographError.
         """
         store = self.store
@@ -86,7 +86,7 @@ class Decoder:
                 sizes = [self.size(index, factor) for factor in factors]
                 images = view.load_sizes(sizes, reduce=self.rounds)
             finally:
-                view.check_unchanged()  # a file that was replaced may cause any error
+                view.check_unchanged()  # a file that was replaced meanwhile may cause any error
         except InputError as error:
             raise PhotographError(str(error)) from None
         except OSError as error:
@@ -106,7 +106,7 @@ class Decoder:
         return key_of((files, stamps, asdict(view.lens), intrinsics, bent, view.upright, mask, self.rounds, size))
 
     def largest(self) -> int:
-        """Upper limit of the bytes of the largest view at full size."""
+        """Upper limit of the bytes that any view's pixels take at full size."""
         return max(
             view.camera.width
             * view.camera.height
@@ -116,7 +116,7 @@ class Decoder:
         )
 
     def working(self) -> int:
-        """Approximate upper limit of the bytes that decoding a photograph needs in addition to the result."""
+        """Approximate upper limit of the bytes that decoding any photograph needs in addition to its pixels."""
         return max(
             view.lens.width
             * view.lens.height

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Known depths of the training views, which a step compares with rendered depths."""
+"""Known depths of the training views, which the depth loss compares with rendered depths."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from clsplat.training.step.component import Component
 from clsplat.training.step.inputs import ViewInputs
 
 MAX_TARGET_NEARNESS = 1e6
-"""Exclusive upper limit of inverse depth times the length unit. Depths nearer than that come from damaged maps."""
+"""Exclusive upper limit of inverse depth times the length unit. Nearer depths come from damaged depth maps."""
 
 
 def weight_at(config: TrainConfig, step: int) -> float:
-    """Weight of the depth loss in step number `step`."""
+    """Weight of the depth loss in step number `step`. It falls exponentially."""
     fall: float = DEPTH_WEIGHT_END_FRACTION ** (step / config.iterations)
     return config.depth_weight * fall
 
@@ -61,18 +61,18 @@ class DepthTargets(Component):
 
     @property
     def pixel_bytes(self) -> int:
-        """Bytes per pixel on the device."""
+        """Bytes per pixel that known depths take on the device."""
         return DEPTH_PIXEL_BYTES if self._config.depth_use else 0
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
-        """The views, with their known depths."""
+        """Return the views, with their known depths."""
         if not self._config.depth_use or self._pixels is None:
             return inputs
         aims = [self.aims(each.view, each.camera, step, self._pixels(each.view)) for each in inputs]
         return [replace(each, depth=depth) for each, depth in zip(inputs, aims, strict=True)]
 
     def aims(self, view: int, camera: Camera, step: int, photograph: NDArray[Any] | None = None) -> DepthTerm | None:
-        """Depths to compare with a view's render, of the size of the step's camera; None without depths.
+        """Depth loss of a view, with its known depths at the size of `camera`; None if the settings ask for no depths.
 
         photograph: the view's photograph (H, W, 3 to 5). Its fifth channel is a mask; depths of masked-out pixels do
         not count.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels of the training views in main memory, within a limit, and read ahead of the steps. Policy only: no device."""
+"""Photographs in main memory, within a limit (--max-host-mem), and read ahead of the steps. Policy only: no device."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from clsplat.errors import warn
 from clsplat.training.supervision.decoding import Decoder
 
 MAX_READING_THREADS = 8
+"""Maximum number of threads that read photographs ahead."""
 Key = tuple[int, float]
-"""A view's index, and the divisor of its size."""
+"""A view's index, and the divisor of its width and height."""
 
 
-@cache  # the system takes longer to count its processors than `read_ahead` takes for all else
+@cache  # counting processors takes longer than the rest of `read_ahead`
 def reading_threads() -> int:
-    """Number of threads that read ahead, which is also the number of views that are read ahead."""
+    """Number of threads that read photographs ahead, one for each photograph that is read ahead."""
     return min(2 * (os.cpu_count() or 1), MAX_READING_THREADS)
 
 
 class HostPhotographs:
-    """Decoded photographs in main memory. Several threads may use it.
+    """Decoded photographs in main memory, for several threads.
 
-    Without a limit, every view that was used stays, with the sizes that the training needs later. With a limit, only
-    the current size is kept, of as many views as fit. The most recently used views are evicted first, because an epoch
-    needs them again last.
+    Without a limit, every photograph that was used stays, also in the sizes that the training needs later. With a
+    limit, only the current size is kept, of as many photographs as fit. The most recently used ones are evicted first,
+    because the next epoch needs them last.
 
     at_once: number of views that a step uses.
     """
@@ -58,8 +59,7 @@ class HostPhotographs:
 
     @cached_property
     def least(self) -> int:
-        """The smallest limit in bytes that suffices for the views of a step, one view that is read ahead, and its
-        decoding."""
+        """Smallest possible limit in bytes: for the views of a step, one view that is read ahead, and its decoding."""
         return self._needed(1)
 
     @cached_property
@@ -71,7 +71,7 @@ class HostPhotographs:
         return ahead * (working + largest) + (self._at_once + 1 + ahead) * largest
 
     def follow(self, allowed: int) -> None:
-        """Set the maximum number of bytes, which is at least `least`."""
+        """Limit the photographs to `allowed` bytes, or to `least` if that is more."""
         allowed, largest, working = max(allowed, self.least), *self._sizes
         with self._lock:
             ahead = reading_threads()
@@ -81,7 +81,7 @@ class HostPhotographs:
             self._evict()
 
     def get(self, index: int, factor: float) -> NDArray[Any]:
-        """Pixels of view `index` at 1/factor of its size; do not write to them. Raises PhotographError."""
+        """Pixels (H, W, C) of view `index` at 1/factor of its size; do not write to them. Raises PhotographError."""
         key = index, factor
         with self._lock:
             self._enter(factor)
@@ -91,7 +91,7 @@ class HostPhotographs:
                 self._held.move_to_end(key)
                 return image
             future = self._pending.pop(key, None)
-        # a read that has not begun is done here instead
+        # if no thread has begun to read the view, read it here
         made = future.result() if future is not None and not future.cancel() else self._made(key)
         self._tell()
         return made[factor]
@@ -102,7 +102,7 @@ class HostPhotographs:
             self._keep((index, factor), image)
 
     def has_all(self, factor: float) -> bool:
-        """True if all views are held at 1/factor of their size, so that there is nothing to read ahead."""
+        """True if all photographs are in memory at 1/factor of their size, so that nothing has to be read ahead."""
         if self._room is not None or factor == self._complete:
             return self._room is None
         with self._lock:
@@ -111,7 +111,7 @@ class HostPhotographs:
         return factor == self._complete
 
     def read_ahead(self, keys: Sequence[Key]) -> None:
-        """Begin to read the views of the next steps, in the order of their use. Errors are raised by `get`."""
+        """Begin to read the photographs of the next steps, in the order of their use. `get` raises their errors."""
         with self._lock:
             keys = keys[: self._ahead]
             self._wanted = set(keys)
@@ -125,7 +125,7 @@ class HostPhotographs:
                 self._pending[key] = self._pool.submit(self._made, key)
 
     def close(self) -> None:
-        """End the threads. Photographs can still be read."""
+        """End the threads that read ahead. `get` still works."""
         with self._lock:
             self._closed, pool, self._pool = True, self._pool, None
             self._pending.clear()
@@ -134,12 +134,12 @@ class HostPhotographs:
         self._tell()
 
     def _made(self, key: Key) -> dict[float, NDArray[Any]]:
-        """Read or decode a view, and keep it."""
+        """Read or decode a photograph, and keep it."""
         index, factor = key
         images = self.decoder.pixels(index, factor, keeps=not self.bounded)
         with self._lock:
             for each, image in images.items():
-                if each <= self._factor or not self._factor:  # else the training no longer uses this size
+                if each <= self._factor or not self._factor:  # larger factors are of sizes that are no longer used
                     self._keep((index, each), image)
             self._pending.pop(key, None)
         return images
@@ -151,7 +151,7 @@ class HostPhotographs:
         self._evict()
 
     def _evict(self) -> None:
-        """Evict views beyond the limit, the most recently used first, but no view that is used now or next."""
+        """Evict photographs beyond the limit, most recently used first, but none of the current or the next steps."""
         if self._room is None or self._bytes <= self._room:
             return
         for key in [key for key in reversed(self._held) if key not in self._wanted and key not in self._in_use]:
@@ -160,7 +160,7 @@ class HostPhotographs:
             self._bytes -= self._held.pop(key).nbytes
 
     def _enter(self, factor: float) -> None:
-        """When the size changes, evict the sizes used before, and with a limit all other sizes."""
+        """When the size changes, evict photographs of the sizes used before, and with a limit of all other sizes."""
         if factor == self._factor:
             return
         self._factor = factor
@@ -170,7 +170,7 @@ class HostPhotographs:
             self._pending.pop(key).cancel()
 
     def _tell(self) -> None:
-        """Warn of failures of the cache. Threads that read ahead only record them."""
+        """Warn of failures of the disk cache. The threads that read ahead only record them."""
         if self.decoder.store is not None:
             for text in self.decoder.store.notes():
                 warn(text)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels of the training views, on the host and on the device."""
+"""Photographs on the device: kept there as far as memory allows, otherwise uploaded step by step."""
 
 from __future__ import annotations
 
@@ -22,12 +22,10 @@ def kept_pixels(image: NDArray[Any]) -> int | None:
 
 
 class ImageCache:
-    """Pixels of the training views at one resolution, on the device as far as there is room.
+    """Photographs of the training views at one resolution, on the device as far as its memory allows.
 
-    Only device memory is bounded here; `host` bounds the host's.
-
-    host: the photographs on the host, which the caches of several devices share.
-    allowed: maximum number of bytes on the device.
+    host: the photographs in main memory, which the caches of several devices share.
+    allowed: maximum number of bytes on the device. `host` limits main memory.
     """
 
     def __init__(self, device: Device, host: HostPhotographs) -> None:
@@ -39,29 +37,29 @@ class ImageCache:
         self._uploads: UploadRing | None = None
 
     def follow(self, allowed: int) -> None:
-        """Set the maximum number of bytes on the device."""
+        """Set the maximum number of bytes on the device. If the photographs there have more, free them all."""
         self.allowed = allowed
         if self._taken > allowed:
             self._leave_device()
 
     def load(self, index: int, factor: float) -> NDArray[Any]:
-        """View `index` at 1/factor of its size; do not write to it.
+        """Photograph of view `index` at 1/factor of its size, on the host; do not write to it.
 
-        The shape is (H, W, 3), or 4 channels with straight alpha, or 5 with a mask that is 0 for pixels that do not
-        count. Raises PhotographError.
+        It is (H, W, 3), or has a fourth channel of straight alpha, and with a mask a fifth. The mask is 0 for pixels
+        that do not count. Raises PhotographError.
         """
         self._enter(factor)
         return self.host.get(index, factor)
 
     def kept(self, index: int, factor: float) -> int | None:
-        """Number of pixels that count in the image that `load` returns; None without a mask."""
+        """Number of pixels that the mask of the image of `load` keeps; None without a mask."""
         key = index, factor
         if key not in self._kept:
             self._kept[key] = kept_pixels(self.load(index, factor))
         return self._kept[key]
 
     def bring(self, index: int, factor: float) -> NDArray[Any] | DeviceArray:
-        """The image that `load` returns: a device array if the device has room for it, else the host's array.
+        """The image of `load`: a device array if the device has memory for it, else the host's array.
 
         An image is uploaded once and stays, unless `ahead` has already sent it to the upload ring. A device that shares
         the host's memory reads the host's array.
@@ -72,7 +70,7 @@ class ImageCache:
         image = self.load(index, factor)
         if self._device.shares_memory:
             array = shared(self._device, image)
-            if not self.host.bounded:  # else the host may drop the image
+            if not self.host.bounded:  # a bounded host may evict the image
                 self._on_device[index] = array
             return array
         if self._uploads is not None and (sent := self._uploads.take((index, factor))) is not None:
@@ -81,7 +79,7 @@ class ImageCache:
             return image
         try:
             array = allocate(self._device, image.shape, image.dtype)
-        except CapacityError:  # another program may have taken memory that the plan counted on
+        except CapacityError:  # another program has taken memory that the plan counted on
             self.allowed = self._taken
             return image
         array.send(image)
@@ -90,7 +88,7 @@ class ImageCache:
         return array
 
     def ahead(self, index: int, factor: float) -> None:
-        """Begin to send an image to the upload ring, for the next `bring`, if the device has no room to keep it.
+        """Begin to upload an image for the next `bring`, if the device has no memory to keep it (`UploadRing`).
 
         Call it after launching a step: the upload then runs while the device computes.
         """
@@ -103,7 +101,7 @@ class ImageCache:
         if self._taken + image.nbytes <= self.allowed:
             return
         if self._uploads is None and UPLOAD_RING_SLOTS * image.nbytes <= self.allowed:
-            while self._taken + UPLOAD_RING_SLOTS * image.nbytes > self.allowed:  # evict the latest uploads
+            while self._taken + UPLOAD_RING_SLOTS * image.nbytes > self.allowed:  # free the images uploaded last
                 self._taken -= self._on_device.popitem()[1].nbytes
             try:
                 self._uploads = UploadRing(self._device, image.nbytes)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Size of the pictures in each training step: small at first, because there is no fine detail to fit yet. Policy only:
-no device."""
+"""Resolution of the pictures in each training step (--warmup): small at first, as there is no fine detail to fit yet.
+Policy only: no device."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of the pictures by step.
+    """Schedule of the pictures' size: the divisor of width and height in each step.
 
     until: pairs (last step, factor), with increasing steps and decreasing factors. After the last of these steps the
         size is full.
@@ -31,5 +31,5 @@ class Sizes:
 
 
 def by_doubling(warmup: tuple[int, ...]) -> Sizes:
-    """Sizes that double after each of these steps (Kerbl et al. 2023, section 7.1)."""
+    """Schedule in which the size doubles after each step of `warmup`, up to full size (Kerbl et al. 2023, 7.1)."""
     return Sizes(tuple((last, float(2 ** (len(warmup) - index))) for index, last in enumerate(warmup)))

@@ -20,7 +20,7 @@ from clsplat.training.supervision.resolution import Sizes
 
 
 class ViewLoader:
-    """Loader of the training views for steps.
+    """Loader of the inputs of a step's views.
 
     refined: function that returns the current camera of a view.
     local: function that moves a camera to the coordinates of the model.
@@ -52,7 +52,12 @@ class ViewLoader:
         return camera
 
     def inputs(self, view: int, position: Position, place: int, *, begins: bool) -> ViewInputs:
-        """Inputs of a view. Without a batch its photograph is on the device."""
+        """Inputs of a view, at the size of the current step.
+
+        place: the view's position in the step.
+        begins: True if an epoch begins with the view.
+        In a batch the photograph stays on the host, because any device may take the view.
+        """
         factor = self._sizes.factor(position.step)
         bring = self._photographs.bring if self._config.batch == 1 else self._photographs.load
         image = bring(view, factor)
