@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat doctor`: installed and missing parts, and advice on installing them."""
+"""`clsplat doctor`: list of installed and missing packages and OpenCL drivers, with advice on installing them."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from clsplat.device.drivers.diagnostics import Diagnostic
 
 _REQUIREMENT = re.compile(r"([A-Za-z0-9_.-]+).*?(?:extra == ['\"](\w+)['\"])?$")
+"""Package name, and the extra that needs it, in a requirement of the installed metadata."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ def _version(name: str) -> str:
 
 
 def _variables() -> list[Diagnostic]:
-    """Environment variables that change the choice or the behaviour of a driver."""
+    """Findings about environment variables that choose a driver or change its behaviour."""
     from clsplat.device.drivers.diagnostics import Diagnostic
     from clsplat.device.drivers.quirks import DRIVER_VARIABLES
 

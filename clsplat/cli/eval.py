@@ -145,7 +145,11 @@ def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | N
 def _warn_of_doubts(
     trained: Run | None, draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: list[View]
 ) -> None:
-    """Warn of views whose scores are not held-out scores for the run's scene, and of pictures that look wrong."""
+    """Warn of views that the run was trained on, that changed or are of another scene, and of renders that look wrong.
+
+    trained: the run of the model, or None.
+    draw: function that renders a camera to (image, alpha).
+    """
     from clsplat.runs import scene_record
     from clsplat.scenes.analysis import sanity_checks
 
@@ -166,7 +170,7 @@ def _print_result(result: Evaluation, *, as_json: bool) -> None:
 
 
 def tell_of_lpips() -> None:
-    """Print the reason if LPIPS will be missing. Called before the work begins."""
+    """Print the reason if LPIPS cannot be measured. Call this before training or rendering begins."""
     from clsplat.evaluation.metrics import prepare_lpips
 
     if reason := prepare_lpips():
@@ -174,7 +178,7 @@ def tell_of_lpips() -> None:
 
 
 def print_summary(result: Evaluation) -> None:
-    """Print the mean scores of eval.json, if it has any."""
+    """Print the mean scores of an evaluation, if any view was measured."""
     if result["views"]:
         print(f"{len(result['views'])} held-out views  {_scores(result['mean'])}  {result['gaussians']:,} Gaussians")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat stmaps`: lenses of photographs as STMaps, for compositing."""
+"""`clsplat stmaps`: STMaps of the lens distortion of photographs, for compositing."""
 
 from __future__ import annotations
 

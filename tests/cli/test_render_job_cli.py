@@ -387,9 +387,9 @@ def test_pictures_of_others_are_left(extension: str, shot: list[str], tmp_path: 
 def test_flags_that_the_files_have_no_use_for(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     flags = ("--frames", "1", "--exr", "half", "--compression", "piz", "--quality", "50")
     said = ran(capsys, render, shot, tmp_path, *flags, pattern="a.####.png").err
-    assert "warning: not used for .png: --exr, --compression, --quality\n" in said
+    assert "warning: flags without effect on .png files: --exr, --compression, --quality\n" in said
     assert render(shot, tmp_path, "--frames", "1", "--channels", "depth", "--background", "white", "--bits", "16") == 0
-    assert "warning: not used for .exr of these channels: --bits, --background\n" in capsys.readouterr().err
+    assert "warning: flags without effect on .exr files of these channels: --bits, --background\n" in capsys.readouterr().err
 
 
 def test_a_frame_with_a_hole_is_not_whole(shot: list[str], tmp_path: Path) -> None:
