@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of the rasterizer, with each default defined once."""
+"""Settings of the rasterizer: approximations that save time, and switches that benchmarks measure."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ class RasterizerConfig:
         check_rules(self, "--rasterizer.", rules)
 
     def switches(self) -> BenchSwitches:
-        """These settings as BenchSwitches. Switches that this class lacks are at their defaults."""
+        """Return these settings as BenchSwitches, with all further switches at their defaults."""
         return BenchSwitches(**vars(self))
 
 
 @dataclass(frozen=True)
 class BenchSwitches(RasterizerConfig):
-    """Settings of the rasterizer, and switches that change no bit of a frame and exist for measurements.
+    """Settings of the rasterizer, and switches for measurements, which change no bit of a frame.
 
     docs/performance.md has the error of each setting, and the time that it saves.
     """
@@ -79,8 +79,8 @@ class BenchSwitches(RasterizerConfig):
     """Leave a tile when all its pixels are opaque. If off, continue to its last Gaussian, which changes no pixel."""
     record_cells: bool = True
     """In a tile's gradient, visit only the cells of pixels to which a Gaussian contributes, as recorded by blending.
-    If off, find the cells that the ellipse reaches once more."""
+    If off, compute again which cells the Gaussian's ellipse reaches."""
     frustum_cull: bool = True
-    """Before computing a Gaussian's colour, leave it out if it reaches no tile of the image. If off, it gets a colour
+    """Leave out Gaussians that reach no tile of the image, before computing their colours. If off, they get a colour
     and a place in the depth order, without effect. Gaussians that are not in front of the near plane have no
     projection, and are always left out."""

@@ -125,7 +125,7 @@ def _video(flags: RenderVerb, fps: float | None, path: Path, sizes: Collection[t
         return flags.video
     if len(sizes) > 1:
         texts = sorted(f"{width}x{height}" for width, height in sizes)
-        raise InputError(f"{path}: frames have sizes {examples(texts)}, expected a single one; give --width and --height")
+        raise InputError(f"{path}: frames have sizes {examples(texts)}, expected a single one; give --width, --height")
     check_size(path, *next(iter(sizes)))
     if path.exists() or path.is_symlink():
         ours = flags.skip_existing and bool(video_record(path))

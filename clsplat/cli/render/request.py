@@ -196,7 +196,7 @@ def _devices(flags: RenderVerb) -> tuple[str | None, ...]:
     if flags.workers is not None and flags.workers < 1:
         raise InputError(f"--workers {flags.workers}: expected at least 1")
     if flags.workers is not None and flags.scheduler is not None:
-        raise InputError("--workers starts a cluster and --scheduler uses a running one, expected only one of them")
+        raise InputError("--workers and --scheduler exclude each other: a new cluster, or one that runs already")
     words = [word.strip() for word in flags.device.split(",")] if flags.device else []
     if not words:
         return (None,)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The settings of a town, and their checks."""
+"""Settings of the demo's town (`clsplat demo --town`), and their checks."""
 
 from __future__ import annotations
 
@@ -51,16 +51,16 @@ class TownConfig:
 
     @property
     def is_fisheye(self) -> bool:
-        """True for fisheyes in the streets."""
+        """True if the cameras in the streets are fisheyes."""
         return self.rig == "fisheye"
 
     @property
     def is_panorama(self) -> bool:
-        """True for panoramas in the streets."""
+        """True if the cameras in the streets take panoramas."""
         return self.rig == "panorama"
 
     def check(self) -> None:
-        """Raise InputError, which names the flag, for an invalid value."""
+        """Raise InputError naming the flag of the first invalid value."""
         sides = f"1 to {MAX_TOWN_SIDE} blocks a side, such as 3x2"
         size = f"{MIN_TOWN_PHOTO_SIDE} to {MAX_TOWN_PHOTO_SIDE} pixels a side, such as 640x400"
         shorter, longer = min(self.width, self.height), max(self.width, self.height)
@@ -92,7 +92,7 @@ class TownConfig:
 
 
 def two_numbers(flag: str, text: str, example: str) -> tuple[int, int]:
-    """Parse two numbers from a text such as 3x2. Raises InputError, which names the flag."""
+    """Parse two numbers from a text such as 3x2. Raises InputError naming the flag."""
     match = re.fullmatch(r"\s*(\d{1,9})\s*[xX]\s*(\d{1,9})\s*", text)
     if match is None:
         raise InputError(f"--{flag} {text}: expected two whole numbers, such as {example}")
@@ -100,7 +100,7 @@ def two_numbers(flag: str, text: str, example: str) -> tuple[int, int]:
 
 
 def three_numbers(flag: str, text: str) -> tuple[float, float, float]:
-    """Parse coordinates from a text such as 500000,4650000,0. Raises InputError, which names the flag."""
+    """Parse coordinates from a text such as 500000,4650000,0. Raises InputError naming the flag."""
     try:
         x, y, z = map(float, text.split(","))
     except ValueError:
