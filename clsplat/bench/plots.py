@@ -157,7 +157,7 @@ def _draw_error(result: Mapping[str, Any], title: str) -> Any:
             label=label,
             zorder=3,
         )
-    axes.set_xlim(_around([point["frame_ms"] for point in rivals], 0.3))  # room for labels on the left
+    axes.set_xlim(_around([point["frame_ms"] for point in rivals], 0.3))  # leave room for labels on the left
     axes.set_ylim(_around([point["psnr"] for point in drawn], 0.1))
     top = axes.get_ylim()[1]
     edges = [(point["frame_ms"], point["psnr"]) for point, is_best in zip(rivals, best, strict=True) if is_best]
@@ -170,7 +170,7 @@ def _draw_error(result: Mapping[str, Any], title: str) -> Any:
         lines.append(((ms, axes.get_ylim()[0]), (ms, top)))
     texts = [f"{point['name']} ({point['max_abs']:.2g})" for point in drawn]
     axes.legend(**LEGEND_ABOVE_AXES)
-    figure.draw_without_rendering()  # computes the final position of the axes
+    figure.draw_without_rendering()  # compute the final position of the axes
     _label_points(figure, axes, [(point["frame_ms"], point["psnr"]) for point in drawn], texts, lines)
     return figure
 

@@ -59,7 +59,7 @@ def bench(
     say("frame", None)
     trainer = trainer_of(subject, device, config)
     rasterizer, gaussians = trainer.rasterizer, trainer.parameters
-    if held_kind(config) != held_kind(RasterizerConfig()):  # the frame needs a model of its own, unlike the step
+    if held_kind(config) != held_kind(RasterizerConfig()):  # reduced SH needs a model of its own for the frame
         gaussians = upload_gaussians(device, subject.gaussians, held_sh(subject.gaussians, config))
 
     def draw() -> ForwardPass:
@@ -201,7 +201,7 @@ def trainer_of(subject: Subject, device: Device, config: RasterizerConfig) -> Tr
     """Make a trainer whose steps do all the work of training. Learning rates are zero, so the model does not change."""
     camera = subject.camera
     photograph = subject.photograph
-    if photograph is None:  # the mirrored frame, which is similar and gives a gradient everywhere
+    if photograph is None:  # use the mirrored frame: similar, with a gradient everywhere
         mirrored = Renderer(device, config=config).render(subject.gaussians, camera).image[:, ::-1]
         photograph = np.rint(255 * np.clip(mirrored, 0, 1)).astype(np.uint8)
     lens = Lens("PINHOLE", camera.width, camera.height, (camera.fx, camera.fy, camera.cx, camera.cy))

@@ -38,7 +38,7 @@ NEAR_PLANE_RELATIVE_TOLERANCE = 0.05
 """Largest relative change of the near plane without a warning. Readers of a format that does not store the near plane
 derive it from positions, which the format may round."""
 MAX_MATRIX_FILE_BYTES = 1 << 16
-"""Size limit in bytes of a matrix file."""
+"""Maximum size in bytes of a file for --transform."""
 
 
 class ModelFile(TypedDict):
@@ -71,7 +71,7 @@ class SceneComparison(TypedDict):
 
 
 class ConversionReport(TypedDict):
-    """The report that --json prints.
+    """The report that `clsplat convert --json` prints.
 
     errors: largest and mean error of each attribute (`difference.errors`).
     scene: comparison on the scene, if --scene is specified.
@@ -115,8 +115,8 @@ class ConvertVerb(Verb):
     cameras: Annotated[Path | None, arg(metavar="PATH")] = None
     """Cameras for --prune-contribution, in any format that `clsplat render` reads."""
     transform: Annotated[str | None, arg(metavar="FILE|M00,M01,...")] = None
-    """Transform the model by a 4 x 4 matrix: rotation, uniform scale, translation, and a mirror if wanted. 16 numbers
-    row by row, separated by commas, or a text file with them. Spherical harmonics are rotated too."""
+    """Transform the model by a 4 x 4 matrix: rotation, uniform scale, translation, and a mirror if wanted. Give 16
+    numbers row by row, separated by commas, or a text file with them. Spherical harmonics are rotated too."""
     rotate: Annotated[str | None, arg(metavar="X,Y,Z")] = None
     """Rotate the model by these angles in degrees about the world's x axis, then y, then z, by the right-hand rule.
     Spherical harmonics are rotated too. Write --rotate=-90,0,0 if it begins with a negative number."""

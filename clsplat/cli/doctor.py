@@ -38,7 +38,7 @@ class DoctorVerb(Verb):
 
 
 def run(verb: DoctorVerb, _: Services) -> int:
-    """Print the findings. Returns 1 if anything essential is missing."""
+    """Print the findings about the installation. Returns 1 if anything essential is missing."""
     everything = lines()
     missing = [line for line in everything if line.state == "missing"]
     if verb.json:
@@ -88,7 +88,7 @@ def _packages() -> list[Diagnostic]:
         match = _REQUIREMENT.match(text)
         assert match is not None, text
         name, extra = match[1], match[2]
-        if name == "clsplat" or (";" in text and not extra):  # clsplat itself, or a package that only some systems need
+        if name == "clsplat" or (";" in text and not extra):  # skip clsplat itself, and packages for some systems
             continue
         version = _version(name)
         if extra:

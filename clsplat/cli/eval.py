@@ -127,7 +127,10 @@ def _evaluate(verb: EvalVerb, services: Services) -> int:
 
 
 def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | None) -> tuple[Scene, list[View]]:
-    """The scene and its held-out views. Flags override the run's settings. Raises InputError."""
+    """Load the scene and find its held-out views. Flags override the run's settings. Raises InputError.
+
+    trained: the run of the model, or None.
+    """
     from clsplat.runs.refined_lenses import through_refined
 
     config = trained.config if trained else TrainConfig()
@@ -138,7 +141,7 @@ def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | N
     scene = load_scene(services, source, resolution, (test_every, test_most), config.mask_use, config.lenses, missing)
     views = through_refined([view for view in scene.views if view.split == "test"], trained)
     if not views:
-        raise InputError(f"{source}: no view is held out with --test-every {test_every}")
+        raise InputError(f"{source}: no view is held out with --test-every {test_every}, expected at least one")
     return scene, views
 
 

@@ -81,7 +81,7 @@ def load_scene(
 
 
 def chosen_devices(selector: str | None) -> list[DeviceInfo]:
-    """The device that `selector` names, or all devices. Raises DeviceError if there is none."""
+    """Find the device that `selector` names, or list all devices for None. Raises DeviceError if there is none."""
     from clsplat.device.drivers.quirks import no_device
     from clsplat.device.selection import find_device, list_devices
 

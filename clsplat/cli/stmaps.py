@@ -33,7 +33,7 @@ class StmapsVerb(Verb):
 
 
 def run(verb: StmapsVerb, _: Services) -> int:
-    """Write a pair of maps for each lens with distortion."""
+    """Write the two STMaps of each lens that has distortion."""
     import numpy as np
 
     from clsplat.frame.lens import distorted_places, undistorted_places

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat train`: training of a run on a scene."""
+"""`clsplat train`: flags, checks and progress of a training, new or resumed."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     scene, config = _looked_at(verb, services, source, earlier)
     if earlier is not None:
         check_steps_left(earlier, config, "--iterations")
-    if len(scene.points) == 1:  # a Gaussian's initial size is derived from its neighbours
+    if len(scene.points) == 1:  # initial sizes are distances between points
         warn(f"{source}: has a single point, so that training starts with one Gaussian of almost no size")
     changed = earlier is not None and scene_record.check(
         earlier, scene, source, config.resolution, accept=verb.accept_changes
@@ -243,7 +243,7 @@ def _stages(config: TrainConfig) -> tuple[str, ...]:
 def _tell_of(scene: Scene, config: TrainConfig, devices: Sequence[Device]) -> None:
     """Print the numbers of pictures and points, the devices, and the reason if LPIPS cannot be measured."""
     order = " in near order" if config.view_order == "near" else ""
-    unit = f", lengths relative to {scene.length_unit:.4g} (extent {scene.extent:.4g})" if scene.unit_differs else ""
+    unit = f", length unit {scene.length_unit:.4g} (extent {scene.extent:.4g})" if scene.unit_differs else ""
     on = "; ".join(f"{device.name}, {device.driver.split('  ')[0].strip()}" for device in devices)
     print(
         f"{scene.name}: {len(scene.train_views)} training pictures{order}, {len(scene.test_views)} held out, "

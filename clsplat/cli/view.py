@@ -87,7 +87,7 @@ def run(verb: ViewVerb, services: Services) -> int:
     box = (low + gaussians.origin, high + gaussians.origin)
     start = start_of([view.camera for view in views], gaussians.means + gaussians.origin)
     world = World(file.name, start, gaussians.origin, box, gaussians.sh_degree, views)
-    for exact in (False, True):  # the first pictures build the kernels
+    for exact in (False, True):  # render two pictures now, to build the kernels
         model.picture(looking(start, WARM_UP_PICTURE_SIZE_PX).camera(), Look(), exact=exact)
     viewing = Viewing(model)
     stopped = threading.Event()

@@ -65,7 +65,7 @@ def misfit(kind: Any, value: object) -> str | None:
 
 
 def _is_truth(value: object) -> bool:
-    return type(value).__name__ in ("bool", "bool_")  # NumPy's type has had both names
+    return type(value).__name__ in ("bool", "bool_")  # NumPy's Boolean type is bool or bool_, by version
 
 
 def _is_whole(value: object) -> bool:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 TEST_EVERY = 8
-"""Every view of this number in the order of names is held out."""
+"""Distance between held-out views in the order of names, starting with the first view."""
 TEST_MOST = 200
 """Maximum number of held-out views."""
 VIEWER_HOST, VIEWER_PORT = "127.0.0.1", 8080

@@ -88,7 +88,7 @@ class OptimiserConfig:
         check_rules(self, "--optimiser.", rules)
         if self.late and self.sparse:
             raise InputError("--optimiser.late: excludes --optimiser.sparse, which drops the missed steps")
-        if self.late and self.beta1**2 >= self.beta2:  # the sum of missed steps would grow without limit
+        if self.late and self.beta1**2 >= self.beta2:  # else the sum over missed steps diverges
             raise InputError(
                 f"--optimiser.late: expected beta1^2 < beta2, but beta1 is {self.beta1} and beta2 {self.beta2}"
             )
@@ -145,15 +145,15 @@ class DensityConfig:
     """With growth mcmc: random distance of a moved Gaussian from its target's mean, in standard deviations. 0 puts it
     at the mean, as published. Applies only if there are more Gaussians to move than Gaussians with a gradient."""
     noise_rate: float = 5e5
-    """With growth mcmc: noise added to the means in each step, in multiples of their learning rate, for Gaussians of
-    scale 1 in a scene of length unit 1. 0 adds none. The cooldown has no noise."""
+    """With growth mcmc: noise added to the means in each step, in multiples of the means' learning rate. The value is
+    for Gaussians of scale 1 in a scene of length unit 1. 0 adds none. The cooldown has no noise."""
     opacity_weight: float = 0.01
     """With growth mcmc: weight of the opacities in the loss. They are summed over the Gaussians in the step's view, and
     divided by the number of all Gaussians."""
     scale_weight: float = 0.01
     """With growth mcmc: like opacity-weight, but for scales relative to the scene's length unit."""
     min_contribution: float = 0.0
-    """Prune Gaussians that contribute less than this to every training view of an epoch (a pass through all of them). A
+    """Prune Gaussians whose contribution to each training view in an epoch (a pass through all) is less than this. A
     contribution is alpha times transmittance, summed over the picture, in pixels. 0 prunes none."""
     prune_every: int = 0
     """Steps between prunings by opacity and contribution alone, which continue after density.stop; 0 for none."""
@@ -438,7 +438,7 @@ class TrainConfig:
         return MaskUse(self.masks, self.alpha, self.invert_masks)
 
     def rounds_photos(self, photographs: int) -> bool:
-        """True if the pixels of the photographs are rounded to 8 bits, if `photographs` is the number to train on."""
+        """True if pixels are rounded to 8 bits. photographs: number of training photographs."""
         return self.photos == "8bit" or (self.photos == "auto" and photographs >= MANY_PHOTOGRAPHS)
 
     @property

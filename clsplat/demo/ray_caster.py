@@ -178,7 +178,7 @@ class Wall(Surface):
         b = origin[..., 0] * direction[:, 0] + origin[..., 1] * direction[:, 1]
         c = origin[..., 0] ** 2 + origin[..., 1] ** 2 - np.float32(WALL_RADIUS_METRES**2)
         with np.errstate(divide="ignore", invalid="ignore"):
-            t = (-b + np.sqrt(np.maximum(b * b - a * c, 0))) / a  # inside the wall, the larger root is in front
+            t = (-b + np.sqrt(np.maximum(b * b - a * c, 0))) / a  # from inside, the larger root is the hit in front
             z = origin[..., 2] + t * direction[:, 2]
         return np.where((t > 1e-3) & (z < WALL_HEIGHT_METRES) & (z > 0), t, np.inf).astype(np.float32)
 

@@ -41,7 +41,7 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
     Complete photos and cameras of an interrupted demo are reused.
     device: name of the device, as for `clsplat devices`.
     iterations: number of training steps.
-    Raises InputError if the folder has other files. Errors of the steps are passed on.
+    Raises InputError if the folder has other files. Errors of COLMAP, training and rendering are passed on.
     """
     output.mkdir(parents=True, exist_ok=True)
     with locked(output, "demo"):

@@ -64,7 +64,7 @@ def ssim(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) ->
 
     Raises InputError for images smaller than the window, ValueError for images of different shapes.
     """
-    structural_similarity: Any = import_module("skimage.metrics").structural_similarity  # slow to import, untyped
+    structural_similarity: Any = import_module("skimage.metrics").structural_similarity  # slow to import
     a, b = _pair(image, truth)
     height, width = a.shape[:2]
     if min(height, width) < SSIM_WINDOW_PX:
@@ -118,7 +118,7 @@ def _lpips_model() -> Callable[[Image, Image], float] | str:
     if reason := prepare_lpips():
         return reason
     try:
-        with contextlib.redirect_stdout(sys.stderr):  # standard output is for results
+        with contextlib.redirect_stdout(sys.stderr):  # keep standard output for results
             package: Any = import_module("lpips")
             torch: Any = import_module("torch")
             network = package.LPIPS(net="vgg", verbose=False).eval()

@@ -215,7 +215,7 @@ def _telling_of_no_workers(client: Any, scheduler: str | None) -> Iterator[None]
         while not stop.is_set():
             try:
                 there = bool(client.nthreads())
-            except (OSError, RuntimeError, TimeoutError):  # the loop over the frames reports a lost scheduler
+            except (OSError, RuntimeError, TimeoutError):  # the loop over frames reports the loss
                 return
             now = time.monotonic()
             since = None if there else since or now

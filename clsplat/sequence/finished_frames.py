@@ -33,7 +33,10 @@ IDENTITY_ATTRIBUTES = (MODEL_DIGEST_ATTRIBUTE, "clsplat:colorspace")
 
 
 def check_folders(tasks: Sequence[Task]) -> None:
-    """Raise InputError if a file's folder is a file, cannot be created or is not writable. Creates nothing."""
+    """Raise InputError if frames cannot be written to their folders, or if a frame's file is a folder.
+
+    Nothing is created.
+    """
     for folder in sorted({task.path.parent for task in tasks}):
         nearest = next(path for path in (folder, *folder.parents) if path.exists())
         if not nearest.is_dir():
@@ -46,7 +49,7 @@ def check_folders(tasks: Sequence[Task]) -> None:
 
 
 def make_folders(tasks: Sequence[Task]) -> None:
-    """Create the files' folders. Raises InputError."""
+    """Create the folders of the frames' files. Raises InputError."""
     for folder in sorted({task.path.parent for task in tasks}):
         try:
             folder.mkdir(parents=True, exist_ok=True)

@@ -60,7 +60,7 @@ class Sharing:
             with self._changing:
                 for claimed in self._claims.values():
                     with suppress(OSError):
-                        os.utime(claimed)  # not Path.touch, which would create a missing file again
+                        os.utime(claimed)  # Path.touch would create a missing file again
 
     def end(self, task: Task) -> None:
         """Give up the claim of a frame, whether the frame's file has been completed or not."""

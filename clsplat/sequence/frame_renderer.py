@@ -60,7 +60,7 @@ class RenderedFrame:
 
     planes: None for a frame that was written strip by strip.
     seconds: rendering time.
-    finish: function by which the encoding thread completes the planes.
+    finish: function that the encoding thread applies to the planes before it writes them.
     right: planes of the right eye, if one file has both eyes.
     """
 
@@ -238,7 +238,7 @@ class FrameRenderer:
             return
 
         device = self._renderer.device
-        if require(device, RAY_STAGES) is not device:  # too late to change the kernel shape
+        if require(device, RAY_STAGES) is not device:  # the job cannot change the kernel shape
             raise DriverError(
                 f"{device.name}: the driver failed in the kernel shape {device.shape.label}, but another shape works; "
                 "run the command again"

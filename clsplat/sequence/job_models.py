@@ -133,7 +133,7 @@ class JobModels:
         names, owners = list(self.names), []
         for index, model in enumerate(self.still):
             own = np.full(len(model), index, np.int32)
-            for volume in reversed(self.volumes[index] if self.volumes else ()):  # the first volume wins
+            for volume in reversed(self.volumes[index] if self.volumes else ()):  # so that the first wins
                 own[volume.holds(model)] = len(names)
                 names.append(volume.name)
             owners.append(own)

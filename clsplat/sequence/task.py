@@ -106,7 +106,7 @@ class Record:
         return key_of(self.frame, self.eye or "")
 
     def document(self) -> dict[str, Any]:
-        """The record for JSON, without values that were not measured."""
+        """Return the record as a JSON object, without values that were not measured."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -408,7 +408,7 @@ def header(task: Task, options: RenderOptions, whole: Task | None = None) -> Fra
     camera = picture_camera(task, options.pictures)
     matrices = camera_matrices(camera)
     if warp_of(task, options.pictures) is not None:
-        matrices.pop("worldToNDC", None)  # no matrix describes a warp
+        matrices.pop("worldToNDC", None)  # no matrix describes a distorted picture
     attributes = {
         **options.attributes,
         "clsplat:frame": task.number,

@@ -125,7 +125,7 @@ class Share:
         self._end, self._seconds = -math.inf, 0.0
 
     def ready(self, now: float, *, moving: bool) -> bool:
-        """True if another picture may be rendered."""
+        """True if another picture may be rendered now. moving: True if a viewer's camera moves."""
         share = self._moving if moving else self._still
         return now - self._end >= self._seconds * (1 - share) / share
 

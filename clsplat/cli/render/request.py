@@ -57,7 +57,7 @@ def checked(flags: RenderVerb) -> Request:
     Raises InputError, and DeviceError for a device that is not there.
     """
     if flags.cameras is None:
-        check_around(flags.path, among_own=True)  # the cameras of a run's photographs are read later
+        check_around(flags.path, among_own=True)  # a run's own cameras are read later
     channels = parse_channels(f"{flags.channels},alpha" if flags.alpha or flags.deep else flags.channels)
     check_format(flags.output, channels, video=True)
     flags.video.check()
@@ -213,7 +213,7 @@ def _devices(flags: RenderVerb) -> tuple[str | None, ...]:
 
 
 def _warn_of_unused(flags: RenderVerb, channels: Collection[str]) -> None:
-    """Warn of flags that have no effect on these files, or on a farm."""
+    """Warn of flags that have no effect on files of this format and channels, or on a Dask cluster."""
     if flags.profile and flags.on_farm:
         warn("--profile has no effect: it measures devices of this process, and a Dask cluster renders")
     defaults = {field.name: field.default for field in fields(RenderVerb)}

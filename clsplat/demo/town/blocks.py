@@ -287,7 +287,7 @@ def _on_roofs(
     half: (n, 3), half sizes of each point's solid.
     local, normals: (n, 3), points and normals in the solid's own axes, to be changed.
     """
-    share = (b + 1) / 2  # fraction of the roof's height
+    share = (b + 1) / 2  # height of each point, as a fraction of the roof's
     gable = roof & (face < 2)
     local[gable, 1] = (a * (1 - share) * half[:, 1])[gable]
     local[gable, 2] = (share * half[:, 2])[gable]

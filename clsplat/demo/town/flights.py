@@ -66,7 +66,7 @@ def lenses(config: TownConfig) -> tuple[Lens, Lens]:
         focal = 0.5 * max(width, height) / math.tan(0.5 * angle)
         return Lens("PINHOLE", width, height, (focal, focal, *centre))
 
-    if config.is_fisheye:  # 180 degrees across the longer side
+    if config.is_fisheye:  # the lens covers 180 degrees across the longer side
         k1, k2, *_ = TOWN_FISHEYE_COEFFICIENTS
         angle = math.pi / 2
         focal = 0.5 * max(width, height) / (angle * (1 + k1 * angle**2 + k2 * angle**4))

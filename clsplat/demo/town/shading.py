@@ -29,7 +29,7 @@ from clsplat.demo.town.visibility import SIGHT_METRES
 HAZE_METRES = 150.0
 """Distance from the camera at which haze begins, in metres."""
 SLANT_BLUR = np.float32(0.7)
-"""Factor of log2(1 / cosine of the slant) by which the mip level of a surface seen at a slant is coarser."""
+"""Blur of surfaces seen at a slant: this times log2(1 / cosine of the slant) is added to their mip level."""
 LOT_COVERS: Final = np.array([paint.GRASS] * 9 + [paint.SOIL] * 3 + [paint.GRAVEL] * 2 + [paint.PAVING] * 2, np.int32)
 """Textures from which the ground of a lot is drawn."""
 GROUND_DENSITY = np.float32(np.log2(TEXTURE_SIDE / GROUND_METRES))

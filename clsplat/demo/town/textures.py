@@ -148,7 +148,7 @@ def _facade(kind: int, brush: Brush) -> Pixels:
                 _paint(image, (left, top + 12, right, bottom), generator.uniform(0.12, 0.45, 3))
                 _paint(image, (right - 12, top + 60, right - 7, top + 66), (0.8, 0.7, 0.4))
                 continue
-            drawn = generator.uniform(0.0, 0.7)  # a curtain or a blind
+            drawn = generator.uniform(0.0, 0.7)  # height of a curtain, as a fraction of the window's
             _paint(
                 image,
                 (left, top, right, top + drawn * tall * cell),

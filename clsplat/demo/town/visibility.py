@@ -154,7 +154,7 @@ class _Rays:
         self.distance = np.where(falls, ground, np.float32(np.inf))
         self.surfaces = np.where(falls, np.int32(GROUND_FACE), np.int32(SKY_FACE))
         x, y, z = (axis[:, :: max(axis.shape[1] - 1, 1), :: max(axis.shape[2] - 1, 1)] for axis in directions)
-        self._longest = float(np.sqrt((x**2 + y**2 + z**2).max()))  # the longest ray is at a corner
+        self._longest = float(np.sqrt((x**2 + y**2 + z**2).max()))  # a corner has the longest direction
 
     def slices(self, part: _Part) -> Slices:
         """Index (samples, rows, columns) of the rays that fall into a part of the picture."""
@@ -168,7 +168,12 @@ class _Rays:
         return bool(self.distance[self.slices(part)].max() * self._longest > part.near)
 
     def cast(self, block: CityBlock, solid: int, number: int, part: Slices) -> None:
-        """Cast the rays of a part against a solid. number: number of the solid across all blocks."""
+        """Cast the rays of a part of the picture against a solid, and keep the hits that are nearest so far.
+
+        solid: index of the solid in its block.
+        number: number of the solid across all blocks.
+        part: index of the rays, by `slices`.
+        """
         solids = block.solids
         centre = (self.position - block.corner - solids.centres[solid]).astype(np.float32)
         half, kind = solids.halves[solid].astype(np.float32), int(solids.kinds[solid])

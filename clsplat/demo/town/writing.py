@@ -120,7 +120,7 @@ def _take_all(
     progress("painting the town", 0.0)
     textures(config.seed)
     seen: list[Observations] = []
-    pool = ThreadPoolExecutor(workers, "clsplat-town")  # NumPy releases the interpreter lock in its loops
+    pool = ThreadPoolExecutor(workers, "clsplat-town")  # parallel, as NumPy releases the interpreter lock
     try:
         for done, observations in enumerate(pool.map(partial(_take_and_write, result, config), planned), 1):
             seen.append(observations)
