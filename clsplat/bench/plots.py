@@ -61,7 +61,7 @@ def check_plot(path: Path) -> None:
 
 
 def plot_files(path: Path) -> tuple[Path, Path]:
-    """Paths of two plots in the folder of `path`: exact switches, and approximate settings."""
+    """Return the paths of the two plots, next to `path`: exact switches, and approximate settings."""
     switches, error = (path.with_name(f"{path.stem}-{kind}{path.suffix}") for kind in ("switches", "error"))
     return switches, error
 

@@ -73,7 +73,7 @@ def tune(device: cl.Device, index: int, progress: Callable[[Shape], None]) -> tu
 
 
 def choose(trials: list[Trial]) -> Shape:
-    """The fastest shape if it is clearly faster than the default shape, which is the first trial; else the default."""
+    """Choose the fastest shape if it is clearly faster than the default shape, the first trial; else the default."""
     default = trials[0]
     timed = [(trial.ms, trial.shape) for trial in trials if trial.ms is not None]
     if not timed:

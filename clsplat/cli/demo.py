@@ -66,7 +66,7 @@ class DemoVerb(Verb):
     """Replace an earlier town in the output folder."""
 
     def completed(self, given: Collection[str]) -> DemoVerb:
-        """The arguments. Raises InputError for a town's flag without --town, and for a training's flag with --town."""
+        """Return the arguments. Raises InputError for a town's flag without --town, or a training's with --town."""
         others = ("iterations", "device") if self.town is not None else ("town_", "seed", "overwrite")
         if wrong := sorted(name for name in given if name.startswith(others)):
             flag = wrong[0].replace("_", "-")

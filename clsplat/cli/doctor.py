@@ -56,7 +56,7 @@ def run(verb: DoctorVerb, _: Services) -> int:
 
 
 def lines() -> list[Diagnostic]:
-    """All findings about the installation."""
+    """Return all findings about the installation: system, packages, drivers and environment variables."""
     from clsplat.device.drivers.diagnostics import findings
 
     return [*_system(), *_packages(), *findings(), *_variables()]

@@ -117,7 +117,7 @@ def grouped_help(kind: type, prog: str, groups: Groups, width: int | None = None
 
 
 def unknown_flags(arguments: Sequence[str], kind: type, prog: str) -> str:
-    """One-line message about unknown flags in `arguments`, with similar names; empty if all flags are known."""
+    """Return a one-line message about unknown flags, with similar names; empty if all flags are known."""
     known = ["--help", "--help-verbose"]
     for option in options(kind):
         known += [*option.names, option.off] if option.off else option.names
@@ -132,7 +132,7 @@ def unknown_flags(arguments: Sequence[str], kind: type, prog: str) -> str:
 
 
 def near(word: str, known: Sequence[str]) -> str:
-    """The known name that is most similar to the word; empty if none is similar enough."""
+    """Find the known name that is most similar to a word; empty if none is similar enough."""
     plain = {name.lower().replace("_", "-").replace("colour", "color"): name for name in known}
     meant = word.lower().replace("_", "-").replace("colour", "color")
     # the word may be the beginning of a name, such as --shutter, or the part after a dot, such as --fps

@@ -195,8 +195,8 @@ def _unboxed(report: str) -> str:
 
 
 def report(message: str, status: int, arguments: Sequence[str]) -> None:
-    """Print an error to standard error. If the command line has --json, also print it as an object to standard
-    output."""
+    """Print an error to standard error. If the command line has --json, also print it as a JSON object to
+    standard output."""
     tell(f"clsplat: error: {message}")
     if "--json" in arguments:
         print(as_json(message, status), flush=True)

@@ -17,7 +17,8 @@ WHOLE_NUMBER_LIMIT = 1 << 62
 _BYTE_SIZE_PATTERN = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([kmgt]?)(i?b)?\s*", re.IGNORECASE)
 """Memory size such as 1.5GiB, in groups: number, prefix, ending."""
 Rule = tuple[tuple[str, ...], Callable[[float], bool], str]
-"""Names of settings, a predicate that is True for valid values and False for NaN, and the expectation in words."""
+"""Rule for settings: names of the settings, a predicate that is True for valid values and False for NaN, and the
+expectation in words."""
 
 
 def check_rules(config: object, prefix: str, rules: tuple[Rule, ...]) -> None:

@@ -25,8 +25,8 @@ class RasterizerConfig:
     sh_tolerance: float = 0.0
     """Leave out a Gaussian's highest SH bands if no channel of its colour, 0 to 1, changes by more than this from any
     direction. 0 leaves out only bands that are zero (approximate above 0). Bands that no Gaussian needs are always left
-    out. Bands that only some need are left out if that removes at least half of all coefficients; otherwise it saves no
-    time."""
+    out. Bands that only some need are left out if that removes at least half of all coefficients; otherwise that would
+    save no time."""
     sh_storage: Literal["float", "half"] = "float"
     """Store the SH bands above 0 in 32 or in 16 bits. half takes half of the memory, and is approximate."""
     alpha_min: float = 1 / 255

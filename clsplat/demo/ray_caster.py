@@ -296,7 +296,7 @@ class Box(Surface):
 
 
 def still_life() -> list[Surface]:
-    """Objects of the scene, before their textures are computed."""
+    """Return the objects of the still life, before `bake` computes their textures."""
     marble = ((0.10, 0.16, 0.34), (0.30, 0.46, 0.70), (0.80, 0.86, 0.90), (0.95, 0.94, 0.88))
     amber = ((0.45, 0.16, 0.05), (0.86, 0.46, 0.12), (0.98, 0.84, 0.48))
     red = ((0.26, 0.06, 0.07), (0.64, 0.18, 0.14), (0.90, 0.50, 0.34))

@@ -77,7 +77,7 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
 
 
 def claim(output: Path) -> None:
-    """Mark a folder as the demo's. Raises InputError if it is unmarked and has folders that the demo would replace."""
+    """Mark a folder as written by the demo. Raises InputError if an unmarked folder has what the demo would replace."""
     if is_file(output / DEMO_MARKER_FILE_NAME):
         return
     existing = [name for name in DEMO_FOLDERS if (output / name).exists() or (output / name).is_symlink()]

@@ -137,7 +137,7 @@ def templates() -> Environment:
 
 
 def short(value: float) -> str:
-    """Short text of a number: 235k, 1.2M, 0.025."""
+    """Format a number as a short text: 235k, 1.2M, 0.025."""
     size = abs(value)
     for limit, factor, unit in ((1e9, 1e-9, "G"), (1e6, 1e-6, "M"), (1e4, 1e-3, "k")):
         if size >= limit:
@@ -146,7 +146,7 @@ def short(value: float) -> str:
 
 
 def thinned(points: Points, limit: int = MAX_LINE_POINTS) -> Points:
-    """About `limit` of the points: the lowest and highest of each interval, so that peaks are kept."""
+    """Reduce points to about `limit`: the lowest and highest of each interval, so that peaks are kept."""
     if len(points) <= limit:
         return points
     stretch = math.ceil(2 * len(points) / limit)

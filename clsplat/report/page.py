@@ -43,7 +43,7 @@ MAX_EMBEDDED_RECORDS = 2000
 MAX_TABLE_VIEWS = 200
 """Maximum number of views in the table of held-out views."""
 MAX_COLOURED_STAGES = 7
-"""Maximum number of stages with a colour each. Smaller stages are drawn together."""
+"""Maximum number of stages with a colour of their own in the chart. Smaller stages are drawn together."""
 SCORE_TITLES = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS (VGG)"}
 """Title of each score in the tables."""
 

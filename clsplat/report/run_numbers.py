@@ -61,7 +61,7 @@ class RunNumbers:
 
     @property
     def step(self) -> int:
-        """The last known step."""
+        """The last step in metrics.jsonl or of an evaluation."""
         steps = [self.curves["step"][-1]] if self.curves["step"] else []
         return int(max([*steps, *(record["step"] for record in self.evaluations)], default=0))
 
@@ -137,7 +137,7 @@ def read_run_numbers(run: Run, model: Gaussians | None = None, *, describe: bool
 
 
 def number(value: object) -> float | None:
-    """The value as a float if charts can show it, otherwise None."""
+    """Return `value` as a float if it is a number that charts can show, otherwise None."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     return float(value) if -MAX_DRAWN_VALUE <= value <= MAX_DRAWN_VALUE else None

@@ -163,7 +163,7 @@ def _at_once(tasks: Sequence[Task], look: Callable[[Task], T]) -> list[T]:
 
 
 def stamp(path: Path) -> tuple[int, ...] | None:
-    """Inode, modification time and size of a file, by which a replacement is noticed; None if there is no file."""
+    """Inode, modification time and size of a file, which differ after a replacement; None if there is no file."""
     try:
         status = path.stat()
     except OSError:

@@ -233,7 +233,7 @@ class FrameRenderer:
         return lambda time: ensemble.at(placed[time]), (moved("motion", middle + 1), moved("backward", middle - 1))
 
     def _trust(self, camera: Camera) -> None:
-        """Run the self-test for panoramas and fisheyes before the first such frame."""
+        """Before the first frame of a panorama or fisheye, run the self-test of projection along rays."""
         if not camera.model.along_rays or self._rays_tested:
             return
 

@@ -84,7 +84,7 @@ class Record:
 
     seconds: time for rendering and writing, without waiting.
     skipped: True if the file was there already.
-    eye: eye of a stereo pair in two files.
+    eye: left or right, if the eyes of a stereo pair have files of their own.
     blank, kernel_ms, transfer_ms: as in `Measured`.
     """
 

@@ -44,7 +44,7 @@ def draft(config: RasterizerConfig) -> RasterizerConfig:
 
 
 class HeldModel:
-    """Model from a file. The device holds the unchanged model, and the model with the edits of the last look."""
+    """Model from a file. The device holds the unchanged model, and one with the edits of the last `Look`."""
 
     version = 0
     """Version number of the model. It is constant, as the model does not change."""

@@ -46,7 +46,7 @@ class CameraFile(CameraFileHead):
 
 
 def add_key(keys: list[Pose], pose: Pose) -> None:
-    """Append a key frame. Raises InputError if there are too many."""
+    """Append a key frame. Raises InputError if the path has MAX_KEY_FRAMES already."""
     if len(keys) >= MAX_KEY_FRAMES:
         raise InputError(f"there are {MAX_KEY_FRAMES:,} key frames already")
     keys.append(pose)

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 
 SETTLE_SECONDS_RANGE = (0.2, 1.0)
-"""Seconds without a change before refinement begins: the minimum, and the maximum, for browsers with slow updates."""
+"""Minimum and maximum of the seconds without a change after which refinement begins. Slow browsers need more."""
 FIRST_SETTLE_SECONDS = 0.5
 """Seconds before the first refinement. In this time the browser gets ready to show pictures."""
 REST_INTERVAL_RATIO = 3.0
@@ -71,7 +71,7 @@ class Refinement:
 
     @property
     def moving(self) -> bool:
-        """True if the displayed picture is older than the last change."""
+        """True if the displayed picture is older than the last change of camera or look."""
         return self._shown != self.changes
 
     def changed(self, now: float) -> None:
@@ -118,7 +118,10 @@ class Refinement:
 
 
 class Share:
-    """Limit on the fraction of a training's time that pictures take."""
+    """Limit on the fraction of a training's time that pictures take.
+
+    shares: the fractions while a viewer moves, and while all are at rest.
+    """
 
     def __init__(self, shares: tuple[float, float] = VIEWER_TIME_FRACTIONS) -> None:
         self._moving, self._still = shares

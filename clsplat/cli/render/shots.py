@@ -74,7 +74,7 @@ def _cameras_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[s
 
 
 def _stage_cameras(stereo: StereoConfig, cameras: Path | None, usd_camera: str | None) -> dict[str, str]:
-    """Path of each eye's camera in the USD stage, for --stereo stage. Raises InputError."""
+    """Find the path of each eye's camera in the USD stage, for --stereo stage. Raises InputError."""
     if cameras is None or cameras.suffix.lower() not in USD_SUFFIXES:
         raise InputError(f"--stereo stage: expected a USD stage in --cameras, not {cameras or 'none'}")
     pair = dict(zip(EYES, pair_of_stage(cameras, usd_camera), strict=True))

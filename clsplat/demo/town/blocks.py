@@ -30,7 +30,7 @@ POINTS_PER_BLOCK = 1200
 GROUND_POINTS = 400
 """Number of a block's points that lie on the ground."""
 MAX_HEIGHT_METRES, BLOCK_REACH_METRES = 20.0, 12.0
-"""Bounds of every block: its height, and how far its trees and cars may reach beyond its edges."""
+"""Maximum height of a block, and maximum reach of trees and cars beyond a block's edges."""
 GROUND_FACE, SKY_FACE = -1, -2
 """Surface numbers of the ground and the sky, which belong to no solid."""
 CAR_PAINTS: Final = np.array(

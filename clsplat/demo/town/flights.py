@@ -22,7 +22,7 @@ from clsplat.scenes.dataset import Lens
 from clsplat.shots.viewpoints import look_at
 
 AIR_VIEW_RADIANS, STREET_VIEW_RADIANS = math.radians(62.0), math.radians(78.0)
-"""Angles of view across the longer side, of the flights and in the streets."""
+"""Angles of view across the picture's longer side, of the flights' cameras and of the street cameras."""
 STRAIGHT_FLIGHT_METRES, SLANTED_FLIGHT_METRES, CAR_CAMERA_METRES = 55.0, 48.0, 2.4
 """Heights above the ground of cameras that look straight down, of oblique cameras, and of cameras on a car."""
 SLANT_RADIANS = math.radians(40.0)

@@ -196,6 +196,6 @@ class _Candidates:
 
 
 def _away(block: CityBlock, position: Float64) -> Float64:
-    """Horizontal vector (2,) to a position from the nearest point of a block's ground."""
+    """Horizontal vector (2,) from the nearest point of a block's ground to a position."""
     low = block.corner[:2]
     return np.asarray(position[:2] - np.clip(position[:2], low, low + BLOCK_METRES))

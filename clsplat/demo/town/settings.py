@@ -12,7 +12,7 @@ from clsplat.errors import InputError
 
 TownRig = Literal["perspective", "fisheye", "panorama"]
 MAX_TOWN_SIDE = 1000
-"""Largest number of blocks along a side."""
+"""Largest number of blocks along a side of the town."""
 MAX_PHOTOS_PER_BLOCK = 1000
 MIN_TOWN_PHOTO_SIDE, MAX_TOWN_PHOTO_SIDE = 16, 8192
 """Limits of a photograph's width and height in pixels."""
@@ -87,7 +87,7 @@ class TownConfig:
                 raise InputError(f"--{flag} {value}: expected {expected}")
 
     def record(self) -> dict[str, Any]:
-        """The settings as a JSON object."""
+        """Return the settings as a JSON object, for town.json."""
         return asdict(self) | {"origin": list(self.origin)}
 
 

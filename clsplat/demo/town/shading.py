@@ -150,7 +150,7 @@ class Shader:
         return _hazy(colours * light_on(np.array([[0, 0, 1]], np.float32)), depth * length)
 
     def _ground_cover(self, px: Float32, py: Float32, first: NDArray[np.int64]) -> tuple[NDArray[np.int32], Float32]:
-        """Texture (n,) and tint (n, 3) of the ground at px, py (n,), in metres from the corner of block `first`."""
+        """Choose texture (n,) and tint (n, 3) of the ground at px, py (n,), in metres from block `first`'s corner."""
         column, row = np.floor(px / BLOCK_METRES), np.floor(py / BLOCK_METRES)
         fx, fy = px - column * BLOCK_METRES, py - row * BLOCK_METRES
         inner = np.minimum(_to_street(fx), _to_street(fy))
@@ -174,7 +174,7 @@ class Shader:
         return texture.astype(np.int32), tint
 
     def near_ground_seam(self, directions: Float32) -> Bool:
-        """True (n,) for rays to the ground that meet it within a pixel of a seam between two materials."""
+        """Find the rays that meet the ground within a pixel of a seam between two materials. Returns a mask (n,)."""
         x, y, z = directions.T
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             depth = np.float32(-self.position[2]) / z

@@ -70,7 +70,8 @@ class Solids:
 
     kinds: (n,), SOLID_BOX, SOLID_ROOF or SOLID_BALL.
     centres: (n, 3) float64. A roof's centre is in the middle of its base.
-    halves: (n, 3) float64, half sizes along its own axes. A roof's third value is its height; its ridge is along x.
+    halves: (n, 3) float64, half sizes along the solid's own axes. A roof's third value is its height. The ridge is
+    along x.
     turns: (n, 2) float64, cosine and sine of the turn about z.
     faces: (n, FACES_PER_SOLID, FACE_VALUES) float64.
     """
