@@ -234,7 +234,7 @@ def test_calls_that_make_no_sense(folder: Path, tmp_path: Path, capsys: Capture)
         (f"{held} --width 20", f"z.0001.exr: holds a frame of {WIDTH}x{HEIGHT}, expected 20x"),
         (f"{held} --holdout.channel depth.Z", "has the channels Z, expected depth.Z; name its depths with"),
         ("--holdout.channel Z", "--holdout.channel Z: is for holdouts, expected --holdout with it"),
-        (f"{held} --deep", "--deep and --holdout exclude each other: a deep picture is held out where"),
+        (f"{held} --deep", "--deep and --holdout exclude each other: compositing applies holdouts"),
         ("--holdout.depths ray", "--holdout.depths ray: is for holdouts, expected --holdout with it"),
         (f"--holdout {folder}/z.$X.exr --frames 1", "z.$X.exr: no such holdout"),
         (f"--holdout {folder}/z.{{shot}}.exr", "{shot} is not known, expected {name}"),
