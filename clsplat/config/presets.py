@@ -23,7 +23,7 @@ RASTERIZER_PRESETS: dict[Preset, RasterizerConfig] = {
 """Rasterizer settings by preset.
 
 exact: no approximations.
-default: the default settings, equal to exact as long as every default has an error of zero.
+default: the default settings. They equal exact, because no default approximates anything.
 fast: approximations that are worth their error (docs/performance.md).
 """
 

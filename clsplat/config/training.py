@@ -29,7 +29,7 @@ Photos = Literal["auto", "exact", "8bit"]
 ViewOrderKind = Literal["random", "near"]
 
 MANY_PHOTOGRAPHS = 300
-"""Number of training photographs from which `photos` auto keeps 8 bits of them, and decodes them during training."""
+"""With this many training photographs or more, --photos auto stores 8 bits a channel, and decodes during training."""
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ def _cameras_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[s
         if flags.usd_camera is not None:
             raise InputError(f"--usd-camera {flags.usd_camera}: expected the USD stage in --cameras with it")
         own = own_cameras(None if flags.transform else run_of(flags.model))
-        check_around(flags.path, among_own=bool(own) and flags.up is None)  # check this before models are loaded
+        check_around(flags.path, among_own=bool(own) and flags.up is None)  # report errors before models are loaded
         shots = [shot_around(models().at(1), flags.path, count=flags.count, size=size, up=flags.up, own=own)]
     elif flags.up is not None:
         raise InputError(f"--up {flags.up}: is for paths around the model, expected no --cameras with it")

@@ -176,7 +176,7 @@ class _Candidates:
         self._seen = np.zeros(len(rows), np.bool_)
 
     def see(self, surfaces: NDArray[np.int32], first: int, last: int) -> None:
-        """Mark the visible points in the rows from `first` to `last`: their own surface is what their ray meets.
+        """Mark points in the rows from `first` to `last` as visible if their pixel's ray meets the surface they lie on.
 
         surfaces: (4, rows, columns), the surfaces that the rays meet, as in `Sight`.
         """
