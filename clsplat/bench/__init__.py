@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Benchmarks of kernel stages, rasterizer settings and kernel shapes."""
+"""Benchmarks of kernel stages and rasterizer settings (`clsplat bench`), and of kernel shapes (`clsplat tune`)."""

@@ -20,18 +20,20 @@ LABEL_GAP_PX = 9.0
 RING_SPACING_PX = 8.0
 """Distance in pixels between rings of candidate boxes."""
 RING_COUNT, DIRECTIONS_PER_RING = 50, 24
+"""Number of rings of candidate boxes around a point, and of boxes in a ring."""
 MARKER_RADIUS_PX = 6.0
+"""Half the side in pixels of the square that a point's marker covers."""
 LEADER_LINE_DISTANCE_PX = 12.0
 """Distance in pixels beyond which a label has a leader line."""
 CROSSING_COST_PX = 60.0
-"""Cost of a crossing with a line, as an additional distance in pixels between point and label."""
+"""Cost of a label or leader line that crosses a line, as an additional distance in pixels between point and label."""
 AMBIGUOUS_POINT_COST_PX = 40.0
-"""Cost in pixels for each other point that is about as near to the label as its own point."""
+"""Cost, as a distance in pixels, for each other point that is about as near to a label as the label's own point."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelBox:
-    """Box (4,) of a label, and the leader line (2, 2) to its point; the line is None if the label is near the point."""
+    """Box (4,) of a label, and the leader line (2, 2) to the label's point, or None for a label near its point."""
 
     box: Float64
     leader: Float64 | None
@@ -74,7 +76,7 @@ def place_labels(points: Float64, sizes: Float64, frame: Float64, lines: Float64
 
 
 def _candidates(point: Float64, size: Float64) -> Float64:
-    """Candidate boxes (candidates, 4) around a point, ring by ring. Each ring begins on the right.
+    """Return candidate boxes (candidates, 4) for a label of this size around a point, ring by ring from the inside.
 
     Each box lies outside its ring and touches it, in one of DIRECTIONS_PER_RING directions.
     """
@@ -86,12 +88,12 @@ def _candidates(point: Float64, size: Float64) -> Float64:
 
 
 def _nearest(boxes: Float64, points: Float64) -> Float64:
-    """Position in each box that is nearest to the point."""
+    """Return the position in each box that is nearest to the point."""
     return points.clip(boxes[..., :2], boxes[..., 2:])
 
 
 def shared(boxes: Float64, others: Float64) -> Float64:
-    """Areas, (m, n), of the intersections of boxes (m, 4) with boxes (n, 4)."""
+    """Return the areas (m, n) of the intersections of boxes (m, 4) with boxes (n, 4)."""
     low = np.maximum(boxes[:, None, :2], others[:, :2])
     areas: Float64 = (np.minimum(boxes[:, None, 2:], others[:, 2:]) - low).clip(0).prod(axis=2)
     return areas

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two plots of `clsplat bench --plot`. They need matplotlib, the optional extra `plot`.
+"""The two plots of `clsplat bench --plot`: gain of each exact switch, and time against error of approximate settings.
+
+They need matplotlib, the optional extra `plot`.
 
 The file name's ending selects SVG or PNG.
 Plots are legible at a width of 800 pixels: fonts have at least 10 points, at a width of 8 inches.
@@ -59,7 +61,7 @@ def check_plot(path: Path) -> None:
 
 
 def plot_files(path: Path) -> tuple[Path, Path]:
-    """Paths of two plots in the folder of `path`: exact switches, and approximate settings."""
+    """Return the paths of the two plots, next to `path`: exact switches, and approximate settings."""
     switches, error = (path.with_name(f"{path.stem}-{kind}{path.suffix}") for kind in ("switches", "error"))
     return switches, error
 
@@ -73,7 +75,7 @@ def plot_settings(path: Path, result: Mapping[str, Any], title: str) -> tuple[Pa
 
 
 def _draw_switches(result: Mapping[str, Any], title: str) -> Any:
-    """Bar chart of the slowdown of a frame and a step if one exact switch is off, relative to all switches on."""
+    """Draw a bar chart of the times of a frame and a step without one exact switch, relative to all switches."""
     exact = _exact_point(result)
     rows = []
     if exact is not None:
@@ -114,7 +116,7 @@ def _draw_switches(result: Mapping[str, Any], title: str) -> Any:
 
 
 def _draw_error(result: Mapping[str, Any], title: str) -> Any:
-    """Plot of frame time against PSNR for the approximate settings, with the exact preset as reference."""
+    """Plot the frame time against PSNR for the approximate settings, with the exact preset as reference."""
     exact = _exact_point(result)
     tried = [point for point in result["points"] if point["approximate"]]
     drawn = [point for point in tried if point["against_exact"]["max_abs"] > 0]
@@ -155,7 +157,7 @@ def _draw_error(result: Mapping[str, Any], title: str) -> Any:
             label=label,
             zorder=3,
         )
-    axes.set_xlim(_around([point["frame_ms"] for point in rivals], 0.3))  # room for labels on the left
+    axes.set_xlim(_around([point["frame_ms"] for point in rivals], 0.3))  # leave room for labels on the left
     axes.set_ylim(_around([point["psnr"] for point in drawn], 0.1))
     top = axes.get_ylim()[1]
     edges = [(point["frame_ms"], point["psnr"]) for point, is_best in zip(rivals, best, strict=True) if is_best]
@@ -168,7 +170,7 @@ def _draw_error(result: Mapping[str, Any], title: str) -> Any:
         lines.append(((ms, axes.get_ylim()[0]), (ms, top)))
     texts = [f"{point['name']} ({point['max_abs']:.2g})" for point in drawn]
     axes.legend(**LEGEND_ABOVE_AXES)
-    figure.draw_without_rendering()  # computes the final position of the axes
+    figure.draw_without_rendering()  # compute the final position of the axes
     _label_points(figure, axes, [(point["frame_ms"], point["psnr"]) for point in drawn], texts, lines)
     return figure
 
@@ -178,13 +180,13 @@ def _exact_point(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 
 def _around(values: Sequence[float], below: float) -> tuple[float, float]:
-    """Axis limits: the range of the values, extended above by a tenth of its length and below by `below` lengths."""
+    """Return axis limits: the range of the values, extended by a tenth above, and by the fraction `below` below."""
     span = max(values) - min(values) or 1.0
     return min(values) - below * span, max(values) + 0.1 * span
 
 
 def _steps(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Corners of the Pareto front as a staircase: horizontal to the next cost, then vertical."""
+    """Turn the points of a Pareto front into a staircase: horizontal to the next cost, then vertical."""
     path = list(corners[:1])
     for (_, quality), (cost, better) in pairwise(corners):
         path += [(cost, quality), (cost, better)]
@@ -219,7 +221,10 @@ def _label_points(
 
 
 def _sheet(titles: Sequence[str], notes: Sequence[str], inches: float) -> tuple[Any, Any]:
-    """Figure with one pair of axes, `inches` high. Titles are above, the first in bold, and notes below."""
+    """Make a figure with axes `inches` high. The titles are above, the first in bold, and the notes below.
+
+    Returns the figure and the axes.
+    """
     head, below = (
         [line for text in texts for line in wrap(text, CHARACTERS_PER_LINE)] for texts in (titles[1:], notes)
     )
@@ -235,7 +240,7 @@ def _sheet(titles: Sequence[str], notes: Sequence[str], inches: float) -> tuple[
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Write the figure. SVG files have no date and no random ids, so that equal plots give equal files."""
+    """Write a figure to a file. SVG files have no date and no random ids, so that equal plots give equal files."""
     with import_module("matplotlib").rc_context({"svg.hashsalt": "clsplat"}):
         kind = path.suffix.lower()[1:]
         with atomic_writer(path) as file:

@@ -35,11 +35,11 @@ from clsplat.stages.device_gaussians import AnyGaussians, upload_gaussians
 REFERENCE_CROP_SIDE_PX = 192
 """Side in pixels of the central crop that is compared with the float64 reference. Smaller images are compared whole."""
 ALL_EXACT_SWITCHES_OFF = "all exact switches off"
-"""Setting in which all exact switches are off. A switch of several values has the one that skips least."""
+"""Name of the setting with all exact switches off. A switch with several values has the value that skips least."""
 MAX_PSNR_DB = 160.0
-"""PSNR in dB that is reported for equal images, whose PSNR is infinite."""
+"""PSNR in dB that is reported for equal images instead of infinity."""
 APPROXIMATING_SETTINGS = ("sh_degree_limit", "sh_tolerance", "sh_storage", "alpha_min", "transmittance_min")
-"""Settings that are approximations unless they have the value of the `exact` preset; `extent` only if it is 3sigma."""
+"""Settings that are approximate unless they have the value of `exact`. Of `extent`, only 3sigma is approximate."""
 
 
 def error_of(picture: NDArray[Any], wanted: NDArray[Any]) -> dict[str, float]:
@@ -54,7 +54,10 @@ def error_of(picture: NDArray[Any], wanted: NDArray[Any]) -> dict[str, float]:
 
 
 def settings() -> dict[str, BenchSwitches]:
-    """Settings to measure: presets, settings with a single switch changed, and one with all exact switches off."""
+    """Return the settings to measure, by name: presets, single switches changed, and all exact switches off.
+
+    Equal settings are joined, with both names.
+    """
     named = {f"preset {name}": config.switches() for name, config in RASTERIZER_PRESETS.items()}
     flags = [switch.name for switch in fields(BenchSwitches) if switch.default is True]
     changes: dict[str, dict[str, Any]] = {
@@ -80,7 +83,7 @@ def settings() -> dict[str, BenchSwitches]:
 
 
 def approximate(config: RasterizerConfig) -> bool:
-    """True if a setting that may change bits differs from the `exact` preset."""
+    """True if a setting that may change bits of a frame differs from the `exact` preset."""
     exact = RASTERIZER_PRESETS["exact"]
     return config.extent == "3sigma" or any(
         getattr(config, key) != getattr(exact, key) for key in APPROXIMATING_SETTINGS
@@ -174,7 +177,10 @@ class _Comparison:
         self._trainer.train_step()
 
     def times(self, repeat: int, say: Progress) -> dict[str, list[tuple[float, float]]]:
-        """Milliseconds of a frame and a step for each setting, in `repeat` rounds that measure all settings in turn."""
+        """Measure milliseconds of a frame and of a training step for each setting.
+
+        Each of `repeat` rounds measures all settings in turn.
+        """
         times: dict[str, list[tuple[float, float]]] = {name: [] for name in self.rasterizers}
         for done in range(repeat):
             say("times", done / repeat)
@@ -191,9 +197,11 @@ def _points(
     differences: Mapping[str, Mapping[str, Mapping[str, float]]],
     against: str,
 ) -> dict[str, dict[str, Any]]:
-    """Record of each setting: median times, errors, and True or False for the Pareto front.
+    """Return a record for each setting: median times, errors, and `on_front`, True on the Pareto front.
 
-    against: name of the reference whose difference is used as the setting's error.
+    times: milliseconds of a frame and of a step, in each round.
+    differences: results of `error_of` for each setting and reference.
+    against: reference whose difference is used as the setting's error, a key of the differences.
     """
     points: dict[str, dict[str, Any]] = {}
     for name, config in tried.items():
@@ -224,16 +232,16 @@ def _exact_switches_faster(points: Mapping[str, Mapping[str, Any]], exact: str |
 
 
 def front(points: list[tuple[float, float]]) -> list[bool]:
-    """The Pareto front: True for each pair (cost, quality) that no other pair dominates."""
+    """Find the Pareto front: True for each pair (cost, quality) that no other pair dominates."""
     return [
         not any(c <= cost and q >= quality and (c < cost or q > quality) for c, q in points) for cost, quality in points
     ]
 
 
 def reference_crop(gaussians: Gaussians, camera: Camera, crop: tuple[int, int, int, int]) -> Float64:
-    """Crop (height, width, 3) of the frame that the float64 reference renders over black.
+    """Render a crop (height, width, 3) of the frame over black with the float64 reference.
 
-    Gaussians that do not reach the crop are skipped.
+    crop: x, y, width and height in pixels. Gaussians that do not reach the crop are skipped.
     """
     x, y, width, height = crop
     degree, antialiased = gaussians.sh_degree, gaussians.antialiased
@@ -246,7 +254,7 @@ def reference_crop(gaussians: Gaussians, camera: Camera, crop: tuple[int, int, i
 
 
 def settings_table(result: dict[str, Any]) -> str:
-    """Text table of a result of `compare`."""
+    """Format a result of `compare` as a text table."""
     rows: list[tuple[str, ...]] = [("setting", "ms", "step ms", "PSNR dB", "largest", "front")]
     for point in result["points"]:
         psnr = "same bits" if point["max_abs"] == 0 else f"{point['psnr']:.1f}"

@@ -35,14 +35,14 @@ from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 
 TRIAL_WORKLOAD = (50_000, 640, 480)
-"""Number of Gaussians, and width and height of the frame, in a trial."""
+"""Number of Gaussians, and width and height of the frame in pixels, in a trial of a shape."""
 REPLACEMENT_TIME_RATIO = 0.97
-"""A shape is preferred if its time divided by the default's is at most this. Smaller gains may be noise."""
+"""A shape replaces the default if the ratio of their times is at most this. Smaller gains may be noise."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Result of a candidate shape.
+    """Result of a candidate shape's trial.
 
     ms: milliseconds of a frame and its gradient; None if the driver failed or took too long.
     """
@@ -52,7 +52,7 @@ class Trial:
 
 
 def tune(device: cl.Device, index: int, progress: Callable[[Shape], None]) -> tuple[list[Trial], Shape]:
-    """Try the candidates on a device and save the fastest. Returns all trials, and the fastest shape.
+    """Try the candidate shapes on a device and save the fastest. Returns all trials, and the fastest shape.
 
     index: the device's index among all devices.
     Raises DriverError if no candidate works, and OSError.
@@ -73,7 +73,7 @@ def tune(device: cl.Device, index: int, progress: Callable[[Shape], None]) -> tu
 
 
 def choose(trials: list[Trial]) -> Shape:
-    """The fastest shape if it is clearly faster than the default shape, which is the first trial; else the default."""
+    """Choose the fastest shape if it is clearly faster than the default shape, the first trial; else the default."""
     default = trials[0]
     timed = [(trial.ms, trial.shape) for trial in trials if trial.ms is not None]
     if not timed:
@@ -91,7 +91,10 @@ def _in_a_process(index: int, shape: Shape) -> float | None:
 
 
 def measure(device: Device, workload: tuple[int, int, int] = TRIAL_WORKLOAD, repeat: int = 7) -> float:
-    """Median milliseconds of a frame and its gradient, for a synthetic scene."""
+    """Measure the median milliseconds of a frame and its gradient, for a synthetic scene.
+
+    workload: number of Gaussians, and width and height of the frame in pixels.
+    """
     subject = synthetic(*workload)
     rasterizer = Rasterizer(device)
     gaussians = upload_gaussians(device, subject.gaussians)

@@ -48,7 +48,7 @@ def bench(
     limits: Limits | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Measure every stage and return the document of `clsplat bench --json`.
+    """Measure every stage. Returns the object that `clsplat bench --json` prints.
 
     The device's queue should have been created with profiling.
     """
@@ -59,7 +59,7 @@ def bench(
     say("frame", None)
     trainer = trainer_of(subject, device, config)
     rasterizer, gaussians = trainer.rasterizer, trainer.parameters
-    if held_kind(config) != held_kind(RasterizerConfig()):  # for the frame; the step uses the trainer's model
+    if held_kind(config) != held_kind(RasterizerConfig()):  # reduced SH needs a model of its own for the frame
         gaussians = upload_gaussians(device, subject.gaussians, held_sh(subject.gaussians, config))
 
     def draw() -> ForwardPass:
@@ -101,7 +101,7 @@ def bench(
 
 
 def _pairs_of(rasterizer: Rasterizer, frame: ForwardPass) -> dict[str, int]:
-    """Numbers of (tile, Gaussian) pairs of a frame, and of contributing and evaluated (pixel, Gaussian) pairs."""
+    """Count the (tile, Gaussian) pairs of a frame, and the (pixel, Gaussian) pairs that contribute or are evaluated."""
     pairs = contributing = evaluated = 0
     for band in frame.bands:
         listed = rasterizer.listed(frame, band)
@@ -113,7 +113,7 @@ def _pairs_of(rasterizer: Rasterizer, frame: ForwardPass) -> dict[str, int]:
 
 
 def _table(stages: Mapping[str, StageRecord], limits: Limits, contributing: int) -> dict[str, dict[str, Any]]:
-    """Record of each stage: its rates, also as fractions of the device's limits.
+    """Return a record for each stage, with its rates, also as fractions of the device's limits.
 
     contributing: number of (pixel, Gaussian) pairs that change a pixel.
     """
@@ -130,7 +130,7 @@ def _table(stages: Mapping[str, StageRecord], limits: Limits, contributing: int)
 
 
 def calls_of(device: Device, work: Callable[[], object]) -> Calls:
-    """Numbers of queue calls of `work`, which must have run before: kernels are then built, and memory allocated."""
+    """Count the queue calls of `work`. Run `work` before, so that kernels are built and memory is allocated."""
     before = replace(device.calls)
     work()
     return device.calls.since(before)
@@ -142,7 +142,7 @@ class _Cost:
 
     wall_ms, host_ms: elapsed time, and processor time of this thread.
     calls: numbers of queue calls.
-    by_wall: True if times of stages are elapsed times, because the driver's events have no times.
+    by_wall: True if the stages' times are elapsed times, because the driver's events have no times.
     """
 
     wall_ms: float
@@ -189,20 +189,19 @@ def _measure(device: Device, work: Callable[[], object], repeat: int) -> _Cost:
 
 @dataclass(frozen=True, eq=False)
 class _Picture(View):
-    """View whose pixels are in memory."""
+    """View whose photograph is in memory, in a single size."""
 
     pixels: Float32 = field(kw_only=True)
 
-    # the picture has a single size
     def load_sizes(self, sizes: Sequence[tuple[int, int]], *, reduce: bool = False) -> list[Float32]:  # noqa: ARG002
         return [self.pixels for _ in sizes]
 
 
 def trainer_of(subject: Subject, device: Device, config: RasterizerConfig) -> Trainer:
-    """Trainer whose steps do all the work of training. The model does not change, as all learning rates are zero."""
+    """Make a trainer whose steps do all the work of training. Learning rates are zero, so the model does not change."""
     camera = subject.camera
     photograph = subject.photograph
-    if photograph is None:  # the mirrored frame, which is similar and gives a gradient everywhere
+    if photograph is None:  # use the mirrored frame: similar, with a gradient everywhere
         mirrored = Renderer(device, config=config).render(subject.gaussians, camera).image[:, ::-1]
         photograph = np.rint(255 * np.clip(mirrored, 0, 1)).astype(np.uint8)
     lens = Lens("PINHOLE", camera.width, camera.height, (camera.fx, camera.fy, camera.cx, camera.cy))
@@ -223,19 +222,19 @@ def trainer_of(subject: Subject, device: Device, config: RasterizerConfig) -> Tr
 
 
 def picture_of(frame: ForwardPass) -> Float32:
-    """The frame's image on the host, (H, W, 3)."""
+    """Copy the frame's image (H, W, 3) to the host."""
     camera = frame.camera
     planes: Float32 = frame.blended.image.get()[:, : camera.height, : camera.width]
     return np.ascontiguousarray(planes.transpose(1, 2, 0))
 
 
 def held_kind(config: RasterizerConfig) -> tuple[object, ...]:
-    """Values of the switches that determine how a model is stored on the device."""
+    """Return the values of the switches that determine how SH coefficients are stored on the device."""
     return config.sh_tolerance, config.sh_storage
 
 
 def table(result: dict[str, Any]) -> str:
-    """Text table of a result of `bench`."""
+    """Format a result of `bench` as text tables."""
     stages, limit, pairs = result["stages"], result["limit"], result["pairs"]
     driver, size = result["driver"].split("  ")[0], f"{result['width']}x{result['height']}"
     arithmetic, gradient, copying = (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Subjects of a measurement: a synthetic scene, a model, a run or a scene."""
+"""Workloads of benchmarks: Gaussians, camera and photograph of a synthetic scene, a model, a run or a scene."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from clsplat.scenes.start.initialise import from_scene
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """Subject of a measurement.
+    """Workload of a benchmark: what is rendered and trained on.
 
-    camera: camera for which frames are rendered.
+    camera: camera from which frames are rendered.
     photograph: (H, W, 3) uint8, the target of a training step; None makes a target from the frame.
     masks: use of masks. With masks, the photograph is (H, W, 5) as from `View.load_masked`.
     """
@@ -38,7 +38,10 @@ class Subject:
 
 
 def synthetic(count: int = 200_000, width: int = 1024, height: int = 768) -> Subject:
-    """Synthetic scene. Every call returns the same scene.
+    """Make a synthetic scene, the same in every call.
+
+    count: number of Gaussians.
+    width, height: size of the frame in pixels.
 
     The default has 1.0 M (tile, Gaussian) pairs and 56 M (Gaussian, pixel) pairs.
     """
@@ -60,12 +63,11 @@ def synthetic(count: int = 200_000, width: int = 1024, height: int = 768) -> Sub
 
 
 def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Progress | None = None) -> Subject:
-    """Load the subject at a path.
+    """Load the workload at a path: a run, a model file or a scene. Raises InputError.
 
-    A run: its model and the camera of the first view of its scene.
-    A model file: the same if it is a run's model, otherwise the model and a camera in front of it.
-    A scene: the initial Gaussians of a training and the camera of the first view.
-    Raises InputError.
+    Of a run, or a run's model file, it has the model and the first view of the run's scene. Of another model file it
+    has the model and a camera in front of the model. Of a scene it has the initial Gaussians and the first view.
+    size: width and height of the frame in pixels; None for the camera's.
     """
     run = run_of(path)
     if run is not None and not path.is_dir() and path != run.model_path:
@@ -99,7 +101,7 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
 
 
 def facing(gaussians: Gaussians, width: int, height: int) -> tuple[Gaussians, Camera]:
-    """Copy of the Gaussians with origin zero, and a camera, not rotated, in whose view are nine tenths of them."""
+    """Return a copy of the Gaussians with origin zero, and a camera without rotation that sees nine tenths of them."""
     low, middle, high = np.quantile(gaussians.means.astype(np.float64), (0.05, 0.5, 0.95), axis=0)
     focal = 0.9 * width
     half = np.maximum(high - middle, middle - low)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat bench`: time of each stage."""
+"""`clsplat bench`: times of the stages of a frame and of a training step on a device."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class BenchVerb(Verb):
 
 
 def run(verb: BenchVerb, services: Services) -> int:
-    """Measure and print. Errors in the command line are reported before the first measurement."""
+    """Measure the stages and print their times. Errors in the command line are reported before any measurement."""
     from clsplat.bench import settings as tradeoff
     from clsplat.bench import stages as bench_stages
     from clsplat.bench import workload as bench_subject

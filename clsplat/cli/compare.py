@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat compare`: comparison of runs."""
+"""`clsplat compare`: table and HTML page that compare the results of several runs."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class CompareVerb(Verb):
 
 
 def run(verb: CompareVerb, _: Services) -> int:
-    """Print the comparison, and write its page."""
+    """Print the comparison of the runs, and with --output write it as an HTML page."""
     from clsplat.files.atomic import atomic_write
     from clsplat.report import check_page
     from clsplat.report.compare import compare_runs, comparison_page, comparison_table

@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 SILENT_WRITE_SECONDS = 2.0
 """Seconds that writing a file may take before progress is shown."""
 NEAR_PLANE_RELATIVE_TOLERANCE = 0.05
-"""Relative tolerance of near planes. If a format does not store the near plane, readers derive it from positions,
-which the format may round."""
+"""Largest relative change of the near plane without a warning. Readers of a format that does not store the near plane
+derive it from positions, which the format may round."""
 MAX_MATRIX_FILE_BYTES = 1 << 16
-"""Size limit in bytes of a matrix file."""
+"""Maximum size in bytes of a file for --transform."""
 
 
 class ModelFile(TypedDict):
-    """A model file in the report of --json."""
+    """Description of a model file in the report of --json, with its size in bytes."""
 
     path: str
     format: str
@@ -52,7 +52,7 @@ class ModelFile(TypedDict):
 
 
 class ViewComparison(TypedDict):
-    """PSNR in dB of a view before and after conversion, and between the two renders."""
+    """PSNR in dB of a view's renders before and after conversion, and between the two renders."""
 
     name: str
     before: float
@@ -61,7 +61,7 @@ class ViewComparison(TypedDict):
 
 
 class SceneComparison(TypedDict):
-    """Means over the views of --scene, and the lowest PSNR between the two renders of a view."""
+    """Mean PSNR in dB over the views of --scene, and the lowest PSNR between the two renders of a view."""
 
     before: float
     after: float
@@ -71,7 +71,7 @@ class SceneComparison(TypedDict):
 
 
 class ConversionReport(TypedDict):
-    """The report that --json prints.
+    """The report that `clsplat convert --json` prints.
 
     errors: largest and mean error of each attribute (`difference.errors`).
     scene: comparison on the scene, if --scene is specified.
@@ -115,8 +115,8 @@ class ConvertVerb(Verb):
     cameras: Annotated[Path | None, arg(metavar="PATH")] = None
     """Cameras for --prune-contribution, in any format that `clsplat render` reads."""
     transform: Annotated[str | None, arg(metavar="FILE|M00,M01,...")] = None
-    """Transform the model by a 4 x 4 matrix: rotation, uniform scale, translation, and a mirror if wanted. 16 numbers
-    row by row, separated by commas, or a text file with them. Spherical harmonics are rotated too."""
+    """Transform the model by a 4 x 4 matrix: rotation, uniform scale, translation, and a mirror if wanted. Give 16
+    numbers row by row, separated by commas, or a text file with them. Spherical harmonics are rotated too."""
     rotate: Annotated[str | None, arg(metavar="X,Y,Z")] = None
     """Rotate the model by these angles in degrees about the world's x axis, then y, then z, by the right-hand rule.
     Spherical harmonics are rotated too. Write --rotate=-90,0,0 if it begins with a negative number."""
@@ -149,7 +149,7 @@ class ConvertVerb(Verb):
 
 
 def run(verb: ConvertVerb, services: Services) -> int:
-    """Convert the model, and compare it with the result. Errors in the command line are reported before any writing."""
+    """Convert the model, and print the loss. Errors in the command line are reported before anything is written."""
     from clsplat.images import colour
     from clsplat.models import difference, edit
     from clsplat.models.formats import colour_space, format_of, format_of_name, load, save
@@ -171,7 +171,7 @@ def run(verb: ConvertVerb, services: Services) -> int:
     save(verb.target, edited, comments=comments, progress=StageProgress(after=SILENT_WRITE_SECONDS), **options)
     if space != colour_space(verb.target):
         warn(f"{verb.target}: {target_format.name} cannot store the colour space, which is {space}")
-    read = load(verb.target, check_encoding=False)  # no warnings: they were printed for the source already
+    read = load(verb.target, check_encoding=False)  # warnings about encodings were printed for the source already
     if not isclose(read.near, edited.near, rel_tol=NEAR_PLANE_RELATIVE_TOLERANCE):
         warn(
             f"{verb.target}: {target_format.name} cannot store the near plane, which is {edited.near:.4g}; readers "
@@ -227,7 +227,7 @@ def _check(verb: ConvertVerb) -> None:
     names = [name for name in ("test_every", "resolution", "background") if getattr(verb, name) != defaults[name]]
     if verb.scene is None and names:
         flags = ", ".join(f"--{name.replace('_', '-')}" for name in names)
-        raise InputError(f"{flags}: has an effect only with --scene, expected that flag too")
+        raise InputError(f"{flags}: has an effect only with --scene, expected --scene too")
 
 
 def _described(path: Path, form: Format, gaussians: Gaussians) -> ModelFile:
@@ -260,7 +260,7 @@ def _edited(
 
 
 def _of_format(verb: ConvertVerb, target: Format) -> dict[str, Any]:
-    """Options for the target's format from the flags. Raises InputError for a flag that is for another format."""
+    """Return the flags for the target's format as options of `save`. Raises InputError for a flag of another format."""
     flags = (
         ("up", verb.up and verb.up.upper(), "up_axis", "OpenUSD"),
         ("spz-version", verb.spz_version, "version", "SPZ"),
@@ -284,7 +284,7 @@ def _sh_bits(text: str | None) -> tuple[int, int] | None:
 
 
 def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:
-    """Warn if a merged model has another colour space, or is far from the source."""
+    """Warn if a merged model has another colour space than the source, or is far from it."""
     import numpy as np
 
     from clsplat.models import edit
@@ -347,7 +347,7 @@ def _numbers(flag: str, text: str, count: int) -> list[float]:
 
 
 def _thinned(verb: ConvertVerb, services: Services, gaussians: Gaussians) -> Gaussians:
-    """Crop and prune. Raises InputError if no Gaussian remains."""
+    """Crop and prune the Gaussians by the flags. Raises InputError if no Gaussian remains."""
     from clsplat.models import edit
     from clsplat.rendering.contributions import largest_contributions
     from clsplat.shots import choose_shot
@@ -380,9 +380,11 @@ def _thinned(verb: ConvertVerb, services: Services, gaussians: Gaussians) -> Gau
 def _measured(
     verb: ConvertVerb, services: Services, original: Gaussians, read: Gaussians, matrix: Float64 | None
 ) -> SceneComparison:
-    """PSNR in dB of the renders before and after conversion, with respect to the photographs and to each other.
+    """Measure PSNR in dB of the renders before and after conversion, against the photographs and between the two.
 
-    The result has the values of each view and their means. The converted model is rendered with transformed cameras.
+    original: the source model.
+    read: the converted model, read from the target file. It is rendered from cameras transformed by `matrix`.
+    matrix: (4, 4), the transform of the edits, or None.
     """
     import numpy as np
 

@@ -58,15 +58,15 @@ class DemoVerb(Verb):
     town_origin: Annotated[str, arg(metavar="X,Y,Z")] = "0,0,0"
     """World coordinates of the town's corner in metres, such as 500000,4650000,0, as in a survey."""
     town_pose_noise: Annotated[float, arg(metavar="METRES")] = TownConfig.pose_noise
-    """Standard deviation of the written camera positions along each axis. The exact cameras are written to the
-    sub-folder exact."""
+    """Standard deviation of errors in the written camera positions, along each axis. The exact cameras are written to
+    the sub-folder exact."""
     seed: int = TownConfig.seed
     """Seed of the town, its cameras and all noise."""
     overwrite: Flag = False
     """Replace an earlier town in the output folder."""
 
     def completed(self, given: Collection[str]) -> DemoVerb:
-        """The arguments. Raises InputError for a town's flag without --town, and for a training's flag with --town."""
+        """Return the arguments. Raises InputError for a town's flag without --town, or a training's with --town."""
         others = ("iterations", "device") if self.town is not None else ("town_", "seed", "overwrite")
         if wrong := sorted(name for name in given if name.startswith(others)):
             flag = wrong[0].replace("_", "-")

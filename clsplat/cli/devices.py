@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat devices`: the OpenCL devices of this machine."""
+"""`clsplat devices`: table of this machine's OpenCL devices."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat doctor`: installed and missing parts, and advice on installing them."""
+"""`clsplat doctor`: list of installed and missing packages and OpenCL drivers, with advice on installing them."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from clsplat.device.drivers.diagnostics import Diagnostic
 
 _REQUIREMENT = re.compile(r"([A-Za-z0-9_.-]+).*?(?:extra == ['\"](\w+)['\"])?$")
+"""Package name, and the extra that needs it, in a requirement of the installed metadata."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class DoctorVerb(Verb):
 
 
 def run(verb: DoctorVerb, _: Services) -> int:
-    """Print the findings. Returns 1 if anything essential is missing."""
+    """Print the findings about the installation. Returns 1 if anything essential is missing."""
     everything = lines()
     missing = [line for line in everything if line.state == "missing"]
     if verb.json:
@@ -55,7 +56,7 @@ def run(verb: DoctorVerb, _: Services) -> int:
 
 
 def lines() -> list[Diagnostic]:
-    """All findings about the installation."""
+    """Return all findings about the installation: system, packages, drivers and environment variables."""
     from clsplat.device.drivers.diagnostics import findings
 
     return [*_system(), *_packages(), *findings(), *_variables()]
@@ -87,7 +88,7 @@ def _packages() -> list[Diagnostic]:
         match = _REQUIREMENT.match(text)
         assert match is not None, text
         name, extra = match[1], match[2]
-        if name == "clsplat" or (";" in text and not extra):  # clsplat itself, or a package that only some systems need
+        if name == "clsplat" or (";" in text and not extra):  # skip clsplat itself, and packages for some systems
             continue
         version = _version(name)
         if extra:
@@ -114,7 +115,7 @@ def _version(name: str) -> str:
 
 
 def _variables() -> list[Diagnostic]:
-    """Environment variables that change the choice or the behaviour of a driver."""
+    """Findings about environment variables that choose a driver or change its behaviour."""
     from clsplat.device.drivers.diagnostics import Diagnostic
     from clsplat.device.drivers.quirks import DRIVER_VARIABLES
 

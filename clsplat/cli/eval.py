@@ -127,7 +127,10 @@ def _evaluate(verb: EvalVerb, services: Services) -> int:
 
 
 def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | None) -> tuple[Scene, list[View]]:
-    """The scene and its held-out views. Flags override the run's settings. Raises InputError."""
+    """Load the scene and find its held-out views. Flags override the run's settings. Raises InputError.
+
+    trained: the run of the model, or None.
+    """
     from clsplat.runs.refined_lenses import through_refined
 
     config = trained.config if trained else TrainConfig()
@@ -138,14 +141,18 @@ def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | N
     scene = load_scene(services, source, resolution, (test_every, test_most), config.mask_use, config.lenses, missing)
     views = through_refined([view for view in scene.views if view.split == "test"], trained)
     if not views:
-        raise InputError(f"{source}: no view is held out with --test-every {test_every}")
+        raise InputError(f"{source}: no view is held out with --test-every {test_every}, expected at least one")
     return scene, views
 
 
 def _warn_of_doubts(
     trained: Run | None, draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: list[View]
 ) -> None:
-    """Warn of views whose scores are not held-out scores for the run's scene, and of pictures that look wrong."""
+    """Warn of views that the run was trained on, that changed or are of another scene, and of renders that look wrong.
+
+    trained: the run of the model, or None.
+    draw: function that renders a camera to (image, alpha).
+    """
     from clsplat.runs import scene_record
     from clsplat.scenes.analysis import sanity_checks
 
@@ -166,7 +173,7 @@ def _print_result(result: Evaluation, *, as_json: bool) -> None:
 
 
 def tell_of_lpips() -> None:
-    """Print the reason if LPIPS will be missing. Called before the work begins."""
+    """Print the reason if LPIPS cannot be measured. Call this before training or rendering begins."""
     from clsplat.evaluation.metrics import prepare_lpips
 
     if reason := prepare_lpips():
@@ -174,7 +181,7 @@ def tell_of_lpips() -> None:
 
 
 def print_summary(result: Evaluation) -> None:
-    """Print the mean scores of eval.json, if it has any."""
+    """Print the mean scores of an evaluation, if any view was measured."""
     if result["views"]:
         print(f"{len(result['views'])} held-out views  {_scores(result['mean'])}  {result['gaussians']:,} Gaussians")
 

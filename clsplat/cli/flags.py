@@ -18,14 +18,16 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from tyro.conf import FlagCreatePairsOff, Positional, Suppress
 
 Groups = tuple[tuple[str, tuple[str, ...]], ...]
-"""Title of each group, and the names of its flags, or patterns that end in `*`. A flag is listed in the first group
-that matches it."""
+"""Groups of flags in a verb's help. Each has a title and the names of its flags, or patterns that end in `*`. A flag is
+listed in the first group that matches it."""
 OTHER_FLAGS_TITLE = "Others"
+"""Title of the group for flags that match no other group."""
 HELP_TEXT_COLUMN = 24
 """Column at which help texts begin. If a flag's name is longer, its text begins on the next line."""
 MIN_FLAG_SIMILARITY = 0.75
 """Smallest similarity, from 0 to 1, at which a known flag is suggested for an unknown one."""
 _METAVARS = {int: "INT", float: "FLOAT", str: "STR"}
+"""Placeholder of a flag's value in the help, by the value's type."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +48,12 @@ class Option:
 
     @property
     def key(self) -> str:
-        """The long name without hyphens; the metavar of a positional argument."""
+        """The flag's long name without its leading hyphens; for a positional argument, its metavar."""
         return self.names[-1].removeprefix("--") if self.names else self.metavar
 
     @property
     def told(self) -> str:
-        """Help text with the default value, unless that is None, False or empty."""
+        """Help text, followed by the default value unless the default is None, False or empty."""
         silent = self.default is None or self.default is False or self.default in ("", ())
         if self.required:
             return f"{self.text} (required)"
@@ -59,7 +61,10 @@ class Option:
 
 
 def options(kind: type, prefix: str = "") -> Iterator[Option]:
-    """Flags of a dataclass and its nested dataclasses, in the order of the fields."""
+    """Yield the flags of a dataclass and its nested dataclasses, in the order of the fields.
+
+    prefix: beginning of the flags' names, such as "rasterizer."; "" for a verb.
+    """
     hints, texts = get_type_hints(kind, include_extras=True), _docstrings(kind)
     for field in dataclasses.fields(kind):
         hint, conf = hints[field.name], _conf(hints[field.name])
@@ -84,9 +89,11 @@ def options(kind: type, prefix: str = "") -> Iterator[Option]:
 
 
 def grouped_help(kind: type, prog: str, groups: Groups, width: int | None = None) -> str:
-    """Help of a verb, with its flags in groups.
+    """Return the help text of a verb, with its flags in groups.
 
-    width: width of the lines; by default the terminal's.
+    kind: dataclass of the verb's arguments.
+    prog: the call that usage shows, such as "clsplat render".
+    width: characters in a line; by default the terminal's width, at most 100.
     """
     width = min(width or shutil.get_terminal_size().columns, 100)
     every = list(options(kind))
@@ -110,7 +117,7 @@ def grouped_help(kind: type, prog: str, groups: Groups, width: int | None = None
 
 
 def unknown_flags(arguments: Sequence[str], kind: type, prog: str) -> str:
-    """One-line message about unknown flags in `arguments`, with similar names; empty if all flags are known."""
+    """Return a one-line message about unknown flags, with similar names; empty if all flags are known."""
     known = ["--help", "--help-verbose"]
     for option in options(kind):
         known += [*option.names, option.off] if option.off else option.names
@@ -125,7 +132,7 @@ def unknown_flags(arguments: Sequence[str], kind: type, prog: str) -> str:
 
 
 def near(word: str, known: Sequence[str]) -> str:
-    """The known name that is most similar to the word; empty if none is similar enough."""
+    """Find the known name that is most similar to a word; empty if none is similar enough."""
     plain = {name.lower().replace("_", "-").replace("colour", "color"): name for name in known}
     meant = word.lower().replace("_", "-").replace("colour", "color")
     # the word may be the beginning of a name, such as --shutter, or the part after a dot, such as --fps
@@ -165,12 +172,12 @@ def _metadata(hint: Any) -> tuple[Any, ...]:
 
 
 def _conf(hint: Any) -> Any:
-    """Settings of a flag from tyro's `arg`; None if it has none."""
+    """The settings that tyro's `arg` adds to a field's annotation, or None if it has no `arg`."""
     return next((each for each in _metadata(hint) if hasattr(each, "metavar")), None)
 
 
 def _bare(hint: Any) -> Any:
-    """The type without annotations and without None."""
+    """The type of a field's values, without tyro's annotations and without None."""
     while get_origin(hint) is Annotated:
         hint = get_args(hint)[0]
     if get_origin(hint) in (Union, UnionType):
@@ -186,7 +193,10 @@ def _metavar(bare: Any, name: str) -> str:
 
 
 def _docstrings(kind: type) -> dict[str, str]:
-    """Docstring of each field, from the class or its nearest base class; empty if there is no source code."""
+    """Return the docstring of each field of a dataclass, from the source of the class or its nearest base class.
+
+    The result is empty if the source code is not available.
+    """
     texts: dict[str, str] = {}
     for each in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(each):

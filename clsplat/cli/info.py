@@ -22,7 +22,7 @@ class InfoVerb(Verb):
 
 
 def run(verb: InfoVerb, _: Services) -> int:
-    """Print the description."""
+    """Print the description of the model file."""
     from clsplat.models.info import model_info, text
     from clsplat.runs.run import model_file
 

@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None, services: Services | None = Non
         status = _run(list(sys.argv[1:] if arguments is None else arguments), services or Services())
         sys.stdout.flush()  # flush here: at exit the interpreter would print a traceback for a closed pipe
     except OSError as error:
-        if not reader_has_gone(error):  # a closed pipe is no error, but a file that cannot be written is one
+        if not reader_has_gone(error):  # report an unwritable file, but not a pipe that its reader has closed
             tell(f"clsplat: error: standard output: {system_trouble(error)}")
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
@@ -55,14 +55,14 @@ def _run(arguments: list[str], services: Services) -> int:
             with terminable():
                 verb = parse(arguments)
                 return int(verb_module(type(verb).__name__.removesuffix("Verb").lower()).run(verb, services))
-        except SystemExit as error:  # after --help, or after a wrong call was reported
+        except SystemExit as error:  # raised after --help, and after the report of a wrong call
             return error.code if isinstance(error.code, int) else 1
         except KeyboardInterrupt as error:
             if debug:
                 traceback.print_exc()
             status = status_of(error)
             interrupted = " ".join(("interrupted", *map(str, error.args)))
-            with contextlib.suppress(OSError):  # the terminal may be gone
+            with contextlib.suppress(OSError):  # the terminal may be closed already
                 print(f"clsplat: {interrupted}", file=sys.stderr)
                 if "--json" in arguments:
                     print(as_json(interrupted, status), flush=True)
@@ -83,7 +83,7 @@ def _run(arguments: list[str], services: Services) -> int:
 
 
 def one_line(error: BaseException) -> str:
-    """The error's message on one line."""
+    """Return the message of an error, joined to one line."""
     if isinstance(error, OSError) and not isinstance(error, ClsplatError):
         return system_trouble(error)
     if isinstance(error, MemoryError) and not isinstance(error, ClsplatError):
@@ -92,5 +92,5 @@ def one_line(error: BaseException) -> str:
 
 
 def _show_warning(message: Warning | str, *_: Any) -> None:
-    """Print a warning in one line. This replaces `warnings.showwarning`, which also prints the source line."""
+    """Print a warning in one line, instead of `warnings.showwarning`, which adds the line of source code."""
     print(f"clsplat: warning: {' '.join(str(message).split())}", file=sys.stderr)

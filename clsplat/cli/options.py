@@ -29,7 +29,7 @@ Settings = TypeVar("Settings")
 
 
 class Verb:
-    """Arguments of a verb (subcommand). The module in `clsplat.cli` with the verb's name has a function `run`.
+    """Base class of the arguments of a verb (subcommand), whose module also has a function `run`.
 
     groups: groups of flags for the help, if the verb has too many flags for one list.
     """
@@ -37,7 +37,7 @@ class Verb:
     groups: ClassVar[Groups] = ()
 
     def completed(self, given: Collection[str]) -> Verb:
-        """The arguments. Flags that are not in `given` get the settings of a run or a preset. Raises InputError."""
+        """Return the arguments, with flags that are not in `given` set from a run or a preset. Raises InputError."""
         del given
         return self
 
@@ -55,7 +55,7 @@ class DeviceChoice:
         return services.open_device(self.selector)
 
     def trusted(self, services: Services, *stages: Sequence[str]) -> Device:
-        """Open the device and run the short self-test. Raises InputError, DeviceError and DriverError."""
+        """Open the device and run the short self-test of `stages`. Raises InputError, DeviceError and DriverError."""
         return services.require(self.open(services), *stages)
 
 
@@ -110,7 +110,11 @@ class PageOptions:
 
 
 def with_given(settings: Settings, parsed: Settings, given: Collection[str], prefix: str = "") -> Settings:
-    """The settings of a run or a preset, changed to the command line's values for the flags in `given`."""
+    """Return `parsed` from the command line, with flags that are not in `given` set from `settings`.
+
+    settings: settings of a run or a preset, of the same dataclass as `parsed`.
+    prefix: beginning of the flags' names, such as "rasterizer.".
+    """
     changes: dict[str, Any] = {}
     for field in fields(settings):  # type: ignore[arg-type]
         value, flag = getattr(settings, field.name), prefix + field.name

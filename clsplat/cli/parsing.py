@@ -51,16 +51,16 @@ Each verb is a module of `clsplat.cli`, with a class NAMEVerb and a function `ru
 verb is called.
 """
 _VERB_MODULES = {"render": "render.verb"}
-"""Modules of the verbs that are in sub-folders."""
+"""Module, relative to `clsplat.cli`, of each verb that has a folder of its own."""
 
 
 def verb_module(name: str) -> Any:
-    """The module of a verb, with its arguments and its function."""
+    """Import the module of a verb, which has the verb's dataclass of arguments and its function `run`."""
     return import_module(f"clsplat.cli.{_VERB_MODULES.get(name, name)}")
 
 
 def verb_class(name: str) -> type[Verb]:
-    """The dataclass of a verb's arguments."""
+    """Import the dataclass of a verb's arguments, such as `TrainVerb` for "train"."""
     kind: type[Verb] = getattr(verb_module(name), f"{name.capitalize()}Verb")
     return kind
 
@@ -99,11 +99,15 @@ def parse(arguments: Sequence[str]) -> Verb:
 _TYRO_UNION_ERROR = re.compile(
     r"no type matching \{None\}\|.* could be instantiated from .*\. Got errors: .*- <class '\w+'>: "
 )
-"""Beginning of tyro's message about an optional number, before the actual error."""
+"""Text that tyro puts before the actual error in its message about a wrong optional number."""
 
 
 def _trouble(arguments: Sequence[str], called: type[Verb] | None, said: str) -> str:
-    """Message about a wrong call: unknown flags or verbs with suggestions, or else tyro's message `said`."""
+    """Return the message about a wrong call: unknown flags or verbs with suggestions, else tyro's message.
+
+    called: dataclass of the verb that was called, or None.
+    said: tyro's message.
+    """
     said = _TYRO_UNION_ERROR.sub("", said)
     if called is not None:
         return unknown_flags(arguments[1:], called, f"clsplat {arguments[0]}") or said
@@ -115,10 +119,10 @@ def _trouble(arguments: Sequence[str], called: type[Verb] | None, said: str) -> 
 
 
 def _text_rules() -> tyro.constructors.ConstructorRegistry:
-    """Parsing rules for flags whose value is one word.
+    """Return the rules by which tyro parses a path or a list of steps from one word.
 
     Lists of steps are written as 500,1000,2000, whereas tyro expects spaces.
-    An empty path is an error: it comes from an unset shell variable, and does not mean the working directory.
+    An empty path is an error, as it comes from an unset shell variable: tyro would use the working directory.
     """
     registry = tyro.constructors.ConstructorRegistry()
 
@@ -172,7 +176,7 @@ def _wide() -> Iterator[None]:
 
 
 def _unboxed(report: str) -> str:
-    """Text of a message that tyro has drawn in a box, in one line, without the frame and the advice below a rule."""
+    """Extract tyro's message from the box that it has drawn: on one line, without the advice below the box's rule."""
     words: list[str] = []
     # if standard output is not UTF-8, the box is drawn without box characters, and its first rule is below the title
     titled = "╭" in report
@@ -191,21 +195,21 @@ def _unboxed(report: str) -> str:
 
 
 def report(message: str, status: int, arguments: Sequence[str]) -> None:
-    """Print an error to standard error. If the command line has --json, also print it as an object to standard
-    output."""
+    """Print an error to standard error. If the command line has --json, also print it as a JSON object to
+    standard output."""
     tell(f"clsplat: error: {message}")
     if "--json" in arguments:
         print(as_json(message, status), flush=True)
 
 
 def as_json(message: str, status: int) -> str:
-    """An error as JSON."""
+    """Return the JSON object that --json prints for an error."""
     return json.dumps({"error": message, "status": status})
 
 
 def tell(line: str) -> None:
-    """Print a line to standard error, if possible. If not, the exit status still reports the error."""
+    """Print a line to standard error. If it cannot be written, the exit status still reports the error."""
     try:
         print(line, file=sys.stderr, flush=True)
-    except OSError:  # text that stays in the stream would change the interpreter's exit status
+    except OSError:  # discard the text: flushed by the interpreter at exit, it would change the exit status
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())

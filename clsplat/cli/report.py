@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat report`: report page of a run."""
+"""`clsplat report`: HTML report of a run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ReportVerb(Verb):
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """A run's folder."""
     output: OutputFile = None
-    """Output file; report.html in the run's folder if not given."""
+    """Output file. If not given: report.html in the run's folder."""
     overwrite: Flag = False
     """Replace an existing file of --output."""
     views: int = 8
@@ -37,7 +37,7 @@ class ReportVerb(Verb):
 
 
 def run(verb: ReportVerb, _: Services) -> int:
-    """Write the page."""
+    """Write the run's report, and print its figures with --json."""
     from clsplat.report import check_page
     from clsplat.report.page import write_report
     from clsplat.runs.locks import locked

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat selftest`: table, messages and exit status."""
+"""`clsplat selftest`: test of every OpenCL driver, its table of results, and the file for a bug report."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from clsplat.selftest.result import Result
 
 SELFTEST_TABLE_HEADER = ("stage", "worst error", "ulp", "allowed", "bits", "ms", "worst in")
+"""Column titles of the printed table."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,8 @@ class SelftestVerb(Verb):
     json: Flag = False
     """Print the result as JSON."""
     report: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    """Write the result to a file for a bug report, with system, packages, limits of each device, digests, the shapes
-    and kernels with which drivers failed, and times of a frame's and a training step's stages."""
+    """Write a file for a bug report. It holds the result, the system, its packages, the limits of each device, digests,
+    the kernel shapes and kernels that failed with a driver, and the times of a frame's and a training step's stages."""
     overwrite: Flag = False
     """Replace an existing file."""
 
@@ -63,7 +64,7 @@ def run(verb: SelftestVerb, _: Services) -> int:
             print(table(report))
             print(f"This driver {report.verdict}.", flush=True)
             if report.remembered:
-                print(f"Its kernel shape is still not used: {report.remembered}.", flush=True)
+                print(f"The driver's kernel shape is still not used: {report.remembered}.", flush=True)
     records = [record(info, report) for info, report in zip(devices, reports, strict=True)]
     if verb.json:
         print(json.dumps(records, indent=2))
@@ -80,12 +81,12 @@ def run(verb: SelftestVerb, _: Services) -> int:
 
 
 def name_of(info: DeviceInfo) -> str:
-    """Text with the names of a device and its driver."""
+    """Return the name of a device and the version of its driver, as one text."""
     return f"{info.name}, {info.version.split('  ')[0].strip()}"
 
 
 def record(info: DeviceInfo, report: DriverReport) -> dict[str, object]:
-    """Entry of a device in the output of --json."""
+    """Return the object that --json prints for a device."""
     stages = [{**asdict(result), "passed": result.passed} for result in report.results]
     return {
         **asdict(info),
@@ -99,7 +100,10 @@ def record(info: DeviceInfo, report: DriverReport) -> dict[str, object]:
 
 
 def _bug_report(records: list[dict[str, object]]) -> dict[str, object]:
-    """Content of a bug report: the results, times of devices that can be trusted, and facts about the installation."""
+    """Return the content of --report: facts about the installation, and `records` with limits, failures and times.
+
+    Times are measured only on devices that can be trusted.
+    """
     from clsplat.cli.doctor import lines
     from clsplat.device.context import all_devices
     from clsplat.device.drivers.shapes import failures
@@ -117,7 +121,11 @@ def _bug_report(records: list[dict[str, object]]) -> dict[str, object]:
 
 
 def times(device: str) -> dict[str, object]:
-    """Times by `clsplat bench` of a view of the demo's scene on a device; if it fails, `failed` with the reason."""
+    """Return the times that `clsplat bench` measures on a view of the demo's scene.
+
+    device: index of the device, as text.
+    If the benchmark fails, the result is {"failed": reason}.
+    """
     from clsplat.bench.stages import bench
     from clsplat.bench.workload import Subject
     from clsplat.demo.measured_view import measured_view
@@ -131,7 +139,7 @@ def times(device: str) -> dict[str, object]:
 
 
 def table(report: DriverReport) -> str:
-    """Table of all stages, each with its worst error or with a note that it was not run."""
+    """Return the printed table: a row for each stage, with its worst error or the note "not run"."""
     rows: list[tuple[str, ...]] = [SELFTEST_TABLE_HEADER]
     if report.build_seconds is not None:
         rows.append(("build", "", "", "", "", f"{1e3 * report.build_seconds:.0f}", ""))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Functions that several verbs use: services of the package, loading of the scene, and choice of devices."""
+"""Functions that several verbs share: the services that tests replace, loading of a scene, and choice of devices."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def imported(name: str) -> Callable[..., Any]:
-    """Function that imports the function with this dotted name when it is called, so that --help is fast."""
+    """Return a stand-in for the function of this dotted name. Importing it only when called keeps --help fast."""
     module, _, member = name.rpartition(".")
 
     def call(*arguments: Any, **named: Any) -> Any:
@@ -63,7 +63,7 @@ def load_scene(
 ) -> Scene:
     """Load the scene and print its warnings.
 
-    test_views: test_every and test_most.
+    test_views: (test_every, test_most), which choose the held-out views.
     """
     scene = services.load_scene(
         path,
@@ -81,7 +81,7 @@ def load_scene(
 
 
 def chosen_devices(selector: str | None) -> list[DeviceInfo]:
-    """The device that `selector` names, or all devices. Raises DeviceError if there is none."""
+    """Find the device that `selector` names, or list all devices for None. Raises DeviceError if there is none."""
     from clsplat.device.drivers.quirks import no_device
     from clsplat.device.selection import find_device, list_devices
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat sfm`: reconstruction of a COLMAP scene from photos."""
+"""`clsplat sfm`: structure from motion, which makes a COLMAP scene from a folder of photos."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class SfmVerb(Verb):
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Match every pair of photos, or only neighbours in name order (for video). auto: every pair up to 100 photos."""
     camera_model: Annotated[str, arg(metavar="MODEL")] = "auto"
-    """COLMAP's name of the lens model to fit, with which the scene's images are undistorted. auto is OPENCV for a
-    camera with 20 photos or more, else SIMPLE_RADIAL."""
+    """Lens model to fit, by COLMAP's name. The scene's images are undistorted with it. auto: OPENCV for a camera with
+    20 photos or more, else SIMPLE_RADIAL."""
     threads: OptionalInt = None
     """Number of CPU threads. If not given: one per core."""
     seed: int = 0
@@ -48,7 +48,7 @@ class SfmVerb(Verb):
 
 
 def run(verb: SfmVerb, services: Services) -> int:
-    """Recover the cameras."""
+    """Run structure from motion on the folder of photos, and write the scene."""
     if not verb.photos.is_dir():
         raise InputError(f"{verb.photos}: no such folder, expected one with photos")
     if verb.threads is not None and verb.threads < 1:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat stmaps`: lenses of photographs as STMaps, for compositing."""
+"""`clsplat stmaps`: STMaps of the lens distortion of photographs, for compositing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class StmapsVerb(Verb):
 
 
 def run(verb: StmapsVerb, _: Services) -> int:
-    """Write a pair of maps for each lens with distortion."""
+    """Write the two STMaps of each lens that has distortion."""
     import numpy as np
 
     from clsplat.frame.lens import distorted_places, undistorted_places

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat thumbnail`: a picture of a model, for lists and galleries."""
+"""`clsplat thumbnail`: a small picture of a model, for lists and galleries."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class ThumbnailVerb(Verb):
     size: int = 512
     """Width and height in pixels."""
     up: Annotated[str | None, arg(metavar="AXIS|X,Y,Z")] = None
-    """Up direction: x, y, z, -x, -y, -z or three numbers; -y if not given, as in a COLMAP scene. A run is drawn from
-    among its own cameras; with this flag it is drawn from outside, like a model file. Write --up=-z if the value begins
+    """Up direction: x, y, z, -x, -y, -z or three numbers; -y if not given, as in a COLMAP scene. Without this flag a
+    run is drawn from among its own cameras; with it, from outside, like a model file. Write --up=-z if the value begins
     with a minus."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
     """Colour behind the Gaussians: black, white or three numbers from 0 to 1; black if not given."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat train`: training of a run on a scene."""
+"""`clsplat train`: flags, checks and progress of a training, new or resumed."""
 
 from __future__ import annotations
 
@@ -60,10 +60,10 @@ class TrainVerb(Verb):
     the cache (--cache), or decoded again. The result is the same. If not given: all photographs stay in memory."""
     cache: Annotated[str | None, arg(metavar="DIR|none")] = None
     """Folder for decoded photographs. It stays after the training, and several trainings may share it. none: no cache.
-    If not given: with --max-host-mem cache/ in the run's folder until the training has finished, else none."""
+    If not given: with --max-host-mem, cache/ in the run's folder until the training has finished; otherwise none."""
     scratch: Annotated[str | None, arg(metavar="DIR")] = None
-    """Folder, on a local disk, for the Gaussians that --max-host-mem leaves no room for. The file that checkpoints name
-    stays there, at most 2.2 times the size of parameters and moments. If not given: scratch/ in the run's folder."""
+    """Folder, on a local disk, for Gaussians that do not fit in --max-host-mem. Checkpoints need a file in it, at most
+    2.2 times as large as parameters and moments, which stays. If not given: scratch/ in the run's folder."""
     auto: Flag = False
     """Adapt settings to findings on the scene, such as --appearance exposure if the photographs' exposures differ.
     Settings given as flags stay. The findings are printed even without --auto."""
@@ -96,7 +96,7 @@ class TrainVerb(Verb):
 
     def _with_settings(self, given: Collection[str]) -> TrainVerb:
         if self.passes is not None:
-            by_passes(self.config, self.passes, photographs=1)  # an invalid number is reported before the scene is read
+            by_passes(self.config, self.passes, photographs=1)  # report an invalid number before the scene is read
             if "iterations" in given:
                 raise InputError(
                     f"--passes {self.passes} and --iterations {self.config.iterations} exclude each other: both set "
@@ -118,7 +118,7 @@ class TrainVerb(Verb):
 
 
 def _check_used(config: TrainConfig, given: Collection[str]) -> None:
-    """Raise InputError for a flag whose feature is off."""
+    """Raise InputError for a flag whose feature is off, such as --pose-reach without --refine-poses."""
     for name, used, why, wanted in (
         ("depth_unit", config.depth == "maps", "no depth maps are used", "depth maps"),
         ("depth_weight", config.depth != "none", "no depths are used", "depth"),
@@ -132,7 +132,7 @@ def _check_used(config: TrainConfig, given: Collection[str]) -> None:
 
 
 def run(verb: TrainVerb, services: Services) -> int:
-    """Train. Errors in the command line are reported before the run's folder is changed."""
+    """Train a new run or resume one. Errors in the command line are reported before the run's folder is changed."""
     from clsplat.runs.locks import locked
     from clsplat.runs.run import check_output, is_run
 
@@ -148,9 +148,9 @@ def run(verb: TrainVerb, services: Services) -> int:
 
 
 def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
-    """Do the work of `run`.
+    """Check the flags, load the scene, and train or resume the run.
 
-    locks: stack to which the lock of a new folder is added.
+    locks: locks that are held until training ends. The lock of a new run folder is added.
     """
     from clsplat.runs import scene_record
     from clsplat.runs.locks import locked
@@ -180,7 +180,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     scene, config = _looked_at(verb, services, source, earlier)
     if earlier is not None:
         check_steps_left(earlier, config, "--iterations")
-    if len(scene.points) == 1:  # a Gaussian's initial size is derived from its neighbours
+    if len(scene.points) == 1:  # initial sizes are distances between points
         warn(f"{source}: has a single point, so that training starts with one Gaussian of almost no size")
     changed = earlier is not None and scene_record.check(
         earlier, scene, source, config.resolution, accept=verb.accept_changes
@@ -206,7 +206,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
 
 
 def _flags_of_machine(verb: TrainVerb) -> str:
-    """Given flags about the machine. --resume needs them again, because the run does not keep them."""
+    """Return the given flags about devices and memory, as text. To resume they are needed again: no file keeps them."""
     given = {
         "--device": verb.device.selector,
         "--max-device-mem": verb.device.max_device_mem,
@@ -218,7 +218,7 @@ def _flags_of_machine(verb: TrainVerb) -> str:
 
 
 def _stages(config: TrainConfig) -> tuple[str, ...]:
-    """Stages of the self-test that training with these settings needs."""
+    """Names of the self-test's stages that training with these settings uses."""
     from clsplat.selftest.result import (
         APPEARANCE_STAGES,
         CHUNK_STAGES,
@@ -241,9 +241,9 @@ def _stages(config: TrainConfig) -> tuple[str, ...]:
 
 
 def _tell_of(scene: Scene, config: TrainConfig, devices: Sequence[Device]) -> None:
-    """Print the numbers of pictures and points, the devices, and the reason if LPIPS will be missing."""
+    """Print the numbers of pictures and points, the devices, and the reason if LPIPS cannot be measured."""
     order = " in near order" if config.view_order == "near" else ""
-    unit = f", lengths relative to {scene.length_unit:.4g} (extent {scene.extent:.4g})" if scene.unit_differs else ""
+    unit = f", length unit {scene.length_unit:.4g} (extent {scene.extent:.4g})" if scene.unit_differs else ""
     on = "; ".join(f"{device.name}, {device.driver.split('  ')[0].strip()}" for device in devices)
     print(
         f"{scene.name}: {len(scene.train_views)} training pictures{order}, {len(scene.test_views)} held out, "
@@ -262,8 +262,10 @@ def _train_run(
     devices: Sequence[Device],
     page: Callable[[Scene, TrainConfig], AbstractContextManager[TrainingView]] | None,
 ) -> None:
-    """Train the run with a progress bar, and with the viewer's page if there is one. If training is interrupted, the
-    message says how to resume."""
+    """Train the run with a progress bar. If training is interrupted, the error's message says how to resume.
+
+    page: context manager that serves the viewer's page, or None.
+    """
     from clsplat.training.forecast import Forecast
 
     views = scene.train_views
@@ -299,9 +301,9 @@ def _train_run(
 
 
 def _looked_at(verb: TrainVerb, services: Services, source: Path, earlier: Run | None) -> tuple[Scene, TrainConfig]:
-    """Load and check the scene, and print the findings about it. Returns the scene and the settings for it.
+    """Load the scene, and print the findings about it. Returns the scene and the settings to train with.
 
-    earlier: the run to continue.
+    earlier: the run to continue, or None.
     With --auto the settings are adapted to the findings.
     """
     from clsplat.scenes.analysis.recommendations import answered, paragraph
@@ -327,11 +329,11 @@ def _looked_at(verb: TrainVerb, services: Services, source: Path, earlier: Run |
 def _scene(services: Services, source: Path, config: TrainConfig, earlier: Run | None = None) -> Scene:
     """Load the training scene with its initial points. Raises InputError if training on it would fail.
 
-    earlier: the run to continue.
+    earlier: the run to continue, or None.
     """
     from clsplat.training.preparation import prepared
 
-    if config.points:  # checked early, since structure from motion may follow and take long
+    if config.points:  # check the file before the scene is loaded: structure from motion may take hours
         with open_input(Path(config.points), "a cloud of points"):
             pass
     scene = load_scene(
@@ -343,10 +345,7 @@ def _scene(services: Services, source: Path, config: TrainConfig, earlier: Run |
 
 
 def _check_scene(scene: Scene) -> None:
-    """Raise InputError for a scene on which training would fail later.
-
-    Such a scene has a held-out view that is too small to measure, or a picture that does not decode.
-    """
+    """Raise InputError for a held-out view that is too small for SSIM, or for a picture that does not decode."""
     from clsplat.evaluation.metrics import SSIM_WINDOW_PX
 
     for view in scene.test_views:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat tune`: the quickest kernel shape for a device."""
+"""`clsplat tune`: trial of the kernel shapes on a device, and choice of the quickest."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ class TuneVerb(Verb):
     """Find a device's quickest kernel shape by a short trial, and save it for later runs.
 
     A shape sets how many pixels a work-item computes at once, and how many work-items share a tile. It also sets
-    whether they divide the tile's pixels or its Gaussians for the gradient. To resume a run, or to reproduce its bytes,
-    the shape must be the original one. CLSPLAT_SHAPE=LANESxITEMS overrides the saved shape.
+    whether these work-items divide the tile's pixels or its Gaussians among them in the gradient's kernel. A run is
+    resumed, or reproduced to the byte, only with the shape it was trained with. CLSPLAT_SHAPE=LANESxITEMS overrides
+    the saved shape.
     """
 
     device: Annotated[DeviceChoice, arg(name="")] = field(default_factory=DeviceChoice)
     forget: Flag = False
-    """Return to the default shape, without measuring."""
+    """Delete the saved shape and return to the default one, without a trial."""
     json: Flag = False
     """Print the result as JSON."""
 

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat view`, and the page of `clsplat train --view`: both start a viewer (`clsplat.viewer`) from the command
-line."""
+"""`clsplat view`, and the page of `clsplat train --view`: start of the viewer (`clsplat.viewer`)."""
 
 from __future__ import annotations
 
@@ -88,14 +87,14 @@ def run(verb: ViewVerb, services: Services) -> int:
     box = (low + gaussians.origin, high + gaussians.origin)
     start = start_of([view.camera for view in views], gaussians.means + gaussians.origin)
     world = World(file.name, start, gaussians.origin, box, gaussians.sh_degree, views)
-    for exact in (False, True):  # the first pictures build the kernels
+    for exact in (False, True):  # render two pictures now, to build the kernels
         model.picture(looking(start, WARM_UP_PICTURE_SIZE_PX).camera(), Look(), exact=exact)
     viewing = Viewing(model)
     stopped = threading.Event()
     signals = handled((signal.SIGINT, *endings()), lambda *_: stopped.set())
     with signals, closing(Server(viewing, world, address)) as server:
         _print_address(server)
-        with suppress(TrialInterrupted):  # raised if a driver hung at the interruption
+        with suppress(TrialInterrupted):  # raised if Ctrl-C comes while a driver builds or tries a kernel
             while not stopped.is_set():
                 if not viewing.work():
                     viewing.wait(MAX_SIGNAL_WAIT_SECONDS)
@@ -103,7 +102,7 @@ def run(verb: ViewVerb, services: Services) -> int:
 
 
 def training_view(options: PageOptions) -> Callable[[Scene, TrainConfig], AbstractContextManager[TrainingView]]:
-    """Function that opens the page of a training as a context manager.
+    """Return a context manager that serves the viewer's page while a scene is trained.
 
     Raises InputError at once if the page cannot be served, before anything is trained or written.
     """
@@ -132,9 +131,9 @@ def training_view(options: PageOptions) -> Callable[[Scene, TrainConfig], Abstra
 
 
 def _scene(services: Services, path: Path | None, config: TrainConfig, *, given: bool) -> Scene | None:
-    """Load the scene for its cameras and photos. Warns and returns None if the scene that the run names is unreadable.
+    """Load the scene for its cameras and photos, or return None if there is no scene to show.
 
-    given: True if --scene names the scene. An unreadable scene then is an error.
+    given: True if --scene names the scene. An unreadable scene is an error then, and otherwise a warning.
     """
     if path is None:
         return None

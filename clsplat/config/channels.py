@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of channels. Each row describes a channel, except for its kernel's arithmetic (docs/channels.md)."""
+"""Table of a frame's channels (rgb, alpha, depth, normals and so on): names and types in files, and their kernels.
+
+docs/channels.md defines the values.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +22,14 @@ class Channel:
 
     names: names in a file, one for each float. EXR names follow the OpenEXR documentation ("Technical introduction",
     layers).
-    kind: type of its values in a file. "colour" is half or float, as requested. "exact" is always float, as a half has
+    kind: type of the values in a file. "colour" is half or float, as requested. "exact" is always float, as a half has
     only 11 bits. "whole" is uint32 if the channel has an EXR part of its own, else float.
-    part: name of its part in a multi-part EXR file.
-    source: the device arrays that hold its values. "image": from blend.cl. "features": from features.cl, blended by
-    channels.cl. "depths": in the same array, after the features. "whole": in another array. "shares": blended like
-    features, one for each object.
-    kernel: its name in the kernels, which get a feature's offset as FEATURE_NAME.
-    signs: factors from the kernel's values to the file's; empty if they are equal.
+    part: name of the channel's part in a multi-part EXR file.
+    source: the kernel that computes the values. "image": blend.cl. "features": features.cl, for channels.cl to blend.
+    "depths": channels.cl, into planes after the features. "whole": channels.cl, into an array of integers. "shares":
+    coverages of a Cryptomatte, blended like features, one for each object.
+    kernel: the channel's name in the kernels, which get a feature's offset as FEATURE_NAME.
+    signs: factors from the kernel's values to the file's, one for each float; empty if all are 1.
     note: explanation for --help. Consecutive channels with the same note are listed together.
     """
 
@@ -40,7 +43,7 @@ class Channel:
 
     @property
     def is_light(self) -> bool:
-        """True if the values of several samples are summed. Other channels come from a frame's middle sample."""
+        """True if motion blur and depth of field average the channel. Others come from a frame's middle sample."""
         return self.source in ("image", "shares")
 
 
@@ -61,8 +64,8 @@ FRAME_CHANNELS: dict[str, Channel] = {
     "count": Channel(("count",), "whole", "count", "whole", "count", note="of Gaussians"),
     "id": Channel(("id",), "whole", "id", "whole", "index", note="of Gaussians"),
 }
-"""Every channel that `--channels` takes, in the order of a file and of the kernels' planes. In files v of both motion
-channels points up; in docs/channels.md y points down."""
+"""Channels of `--channels` except Cryptomattes, in the order of a file and of the kernels' planes. The v of motion and
+backward points up in files, whereas y points down in docs/channels.md."""
 
 CRYPTOMATTE_LAYERS = 3
 """Layers of a Cryptomatte, with two objects each."""
@@ -74,16 +77,16 @@ def _matte(name: str) -> Channel:
 
 
 CRYPTOMATTE_CHANNELS: dict[str, Channel] = {"objects": _matte("cryptoobject"), "semantic": _matte("cryptosemantic")}
-"""Cryptomattes, which `--channels` takes too. During rendering they have one float for each object."""
+"""Cryptomatte channels of `--channels`. While rendering, each has a plane of floats for every object."""
 WRITABLE_CHANNELS = ChainMap(CRYPTOMATTE_CHANNELS, FRAME_CHANNELS)
 """Every channel that a file may have, in file order: FRAME_CHANNELS come first."""
 
 DEEP_CHANNELS = ("R", "G", "B", "A", "Z", "ZBack")
-"""Channels of a deep picture."""
+"""EXR channels of a deep picture, in the order of the file."""
 
 
 def in_words(*sources: Source) -> str:
-    """Names of the channels of these sources, with their notes, for --help."""
+    """Join the names and notes of all channels of these sources to English text, for --help."""
     rows = [(name, row.note) for name, row in WRITABLE_CHANNELS.items() if row.source in sources]
     groups = [[*group] for _, group in groupby(rows, lambda row: row[1] or row[0])]
     return _and([_and([name for name, _ in group]) + (f" ({group[0][1]})" if group[0][1] else "") for group in groups])
@@ -94,18 +97,18 @@ def _and(words: Sequence[str]) -> str:
 
 
 def floats_of(source: Source) -> dict[str, int]:
-    """The number of floats of each channel with this source, keyed by kernel name, in the order of the planes."""
+    """Number of floats of each channel with this source, by the channel's kernel name, in the order of the planes."""
     return {channel.kernel: len(channel.names) for channel in FRAME_CHANNELS.values() if channel.source == source}
 
 
 def feature_names(names: Iterable[str]) -> tuple[str, ...]:
-    """The names in the kernels of those channels that are features."""
+    """Kernel names of the channels in `names` that are features, in the order of the planes."""
     asked = set(names)
     return tuple(row.kernel for name, row in FRAME_CHANNELS.items() if name in asked and row.source == "features")
 
 
 def light_and_rest(names: Iterable[str]) -> tuple[list[str], list[str]]:
-    """The channels that accumulate light, and the others."""
+    """Split channels into those averaged over a frame's samples (`Channel.is_light`), and the others."""
     asked = list(names)
     return [name for name in asked if WRITABLE_CHANNELS[name].is_light], [
         name for name in asked if not WRITABLE_CHANNELS[name].is_light

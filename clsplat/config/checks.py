@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rules for settings, the error message for a broken rule, and parsing of memory sizes."""
+"""Checks of settings' ranges and types, with the error message for the flag, and parsing of memory sizes."""
 
 from __future__ import annotations
 
@@ -13,14 +13,19 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from clsplat.errors import InputError
 
 WHOLE_NUMBER_LIMIT = 1 << 62
-"""Exclusive limit of whole numbers, which TOML can hold."""
+"""Whole numbers must be smaller than this in magnitude, so that config.toml can hold them."""
 _BYTE_SIZE_PATTERN = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([kmgt]?)(i?b)?\s*", re.IGNORECASE)
+"""Memory size such as 1.5GiB, in groups: number, prefix, ending."""
 Rule = tuple[tuple[str, ...], Callable[[float], bool], str]
-"""Names of settings, a predicate that is True for valid values and False for NaN, and the expectation in words."""
+"""Rule for settings: names of the settings, a predicate that is True for valid values and False for NaN, and the
+expectation in words."""
 
 
 def check_rules(config: object, prefix: str, rules: tuple[Rule, ...]) -> None:
-    """Raise InputError naming the flag of the first setting that breaks its rule."""
+    """Raise InputError for the first setting that breaks its rule, naming its flag.
+
+    prefix: beginning of the settings' flags, such as "--density.".
+    """
     for names, makes_sense, expected in rules:
         for name in names:
             value = getattr(config, name)
@@ -29,7 +34,10 @@ def check_rules(config: object, prefix: str, rules: tuple[Rule, ...]) -> None:
 
 
 def check_kinds(config: object, prefix: str) -> None:
-    """Raise InputError naming the flag of the first setting that has the wrong type or is too large for config.toml."""
+    """Raise InputError for the first setting that has the wrong type or is too large for config.toml.
+
+    prefix: beginning of the settings' flags, such as "--density.".
+    """
     for name, kind in get_type_hints(type(config)).items():
         value = getattr(config, name)
         if expected := misfit(kind, value):
@@ -58,7 +66,7 @@ def misfit(kind: Any, value: object) -> str | None:
 
 
 def _is_truth(value: object) -> bool:
-    return type(value).__name__ in ("bool", "bool_")  # NumPy's type has had both names
+    return type(value).__name__ in ("bool", "bool_")  # NumPy's Boolean type is bool or bool_, by version
 
 
 def _is_whole(value: object) -> bool:
@@ -72,8 +80,7 @@ def check_steps(flag: str, steps: tuple[int, ...]) -> None:
 
 
 def parse_bytes(text: str | int | None, flag: str = "--max-device-mem") -> int | None:
-    """Bytes of "256MiB", "2GiB", "1.5G" (the same as GiB), "500MB" (decimal) or a number. Raises InputError that names
-    the flag."""
+    """Parse "256MiB", "2GiB", "1.5G" (the same as GiB), "500MB" (decimal) or a number to bytes. Raises InputError."""
     if text is None:
         return None
     match = _BYTE_SIZE_PATTERN.fullmatch(str(text))
@@ -88,7 +95,6 @@ def parse_bytes(text: str | int | None, flag: str = "--max-device-mem") -> int |
 
 
 def device_names(selector: str | None) -> list[str]:
-    """Device names in `selector`, or else in CLSPLAT_DEVICE, separated by commas. One empty name if neither is
-    given."""
+    """Split `selector`, or else CLSPLAT_DEVICE, into device names at its commas. Returns [""] if neither is given."""
     text = selector or os.environ.get("CLSPLAT_DEVICE") or ""
     return [name.strip() for name in text.split(",") if name.strip()] or [text]

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of colour models: appearance models that remove a photograph's own colours pixel by pixel."""
+"""Table of colour models (exposure, ppisp): appearance models that remove a photograph's own exposure, white balance
+and vignette pixel by pixel."""
 
 from __future__ import annotations
 
@@ -7,18 +8,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 GAIN_ENTRIES = 3
-"""Number of gains of a photograph, its first entries."""
+"""Number of gains of a photograph, one for each colour channel. They are the photograph's first entries."""
 
 
 @dataclass(frozen=True)
 class ColourModel:
     """An appearance model that removes a photograph's own colours pixel by pixel.
 
-    kernels/STEM.cl has its formulas, and clsplat/reference/STEM.py is their twin.
-
-    of_photograph: the number of a photograph's entries by their name in appearance.json. The first three are base-2
-    logarithms of gains; the others are coefficients from -0.2 to 0.2.
-    of_lens: the same for a lens; three base-2 logarithms, or none.
+    stem: value of the setting `appearance`, and name of the formulas: kernels/STEM.cl and clsplat/reference/STEM.py.
+    of_photograph: number of learnt entries of a photograph, by their name in appearance.json. The first three are
+    base-2 logarithms of gains; the others are coefficients from -0.2 to 0.2.
+    of_lens: number of learnt entries of a lens, by their name: three base-2 logarithms, or none.
     """
 
     stem: str
@@ -27,22 +27,22 @@ class ColourModel:
 
     @property
     def entries(self) -> int:
-        """Number of entries of a photograph."""
+        """Number of learnt entries of a photograph."""
         return sum(self.of_photograph.values())
 
     @property
     def lens_entries(self) -> int:
-        """Number of entries of a lens; 0 if nothing is learnt of lenses."""
+        """Number of learnt entries of a lens; 0 if the model has none."""
         return sum(self.of_lens.values())
 
     @property
     def sums(self) -> int:
-        """Number of sums of the gradient."""
+        """Number of sums over pixels that make up the gradient: one for each entry of photograph and lens."""
         return self.entries + self.lens_entries
 
     @property
     def pixel_bytes(self) -> int:
-        """Bytes of the partial sums per pixel, padding included."""
+        """Bytes of the gradient's partial sums per pixel of a photograph, padding included."""
         return -(-2 * self.sums // 3)
 
 
@@ -53,4 +53,4 @@ COLOUR_MODELS = {
         ColourModel("ppisp", {"log2_gains": GAIN_ENTRIES, "mixes": 6}, {"vignette": 3}),
     )
 }
-"""Colour models by value of the setting `appearance`. The self-test has a stage for each."""
+"""Colour models by value of the setting `appearance`. Each is a stage of the self-test."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Known depths that training compares with the render."""
+"""Settings of depth supervision: known depths that training compares with the render."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ DEPTH_WEIGHT_END_FRACTION = 0.01
 
 @dataclass(frozen=True)
 class DepthUse:
-    """Source of the known depths.
+    """Source of the known depths, and the units of depth maps.
 
-    source: the scene's points, or depth maps next to the photographs.
-    maps: kind of the values in the depth maps.
-    unit: world units per step of an integer map.
+    source: the scene's points, depth maps next to the photographs, or none.
+    maps: meaning of the values in depth maps.
+    unit: world units per step of an integer depth map.
     """
 
     source: DepthSource = "none"

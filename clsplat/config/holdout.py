@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of holdouts (docs/pictures.md), and the layout of their surfaces."""
+"""Settings of --holdout (docs/pictures.md), and the fields of a holdout surface."""
 
 from __future__ import annotations
 
@@ -9,11 +9,8 @@ from typing import Literal
 Depths = Literal["z", "inverse", "ray"]
 
 HOLDOUT_SURFACE_FIELDS = ("Z", "BACK", "KEEP", "RATE")
-"""Values of a surface, in order.
-
-The depths of its front and back, the fraction of light that it transmits, and the binary logarithm of this fraction per
-unit of depth. The last value is 0 for a surface without thickness.
-"""
+"""Fields of a holdout surface: depths of the front and back, transmittance, and log2 of the transmittance per unit of
+depth. RATE is 0 for a surface without thickness."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Meanings of masks and of alpha channels."""
+"""Settings for the meaning of photographs' masks and alpha channels."""
 
 from __future__ import annotations
 

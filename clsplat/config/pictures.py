@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of pictures (docs/pictures.md), each default defined once, as in `training`.
+"""Settings of rendered pictures (docs/pictures.md): colour space, overscan and region, supersampling, distortion,
+shutter, lens, deep EXR, video and file encoding.
 
-The command line is built from them, so this module imports nothing slow.
+The flags of `clsplat render` are built from these dataclasses, so this module imports nothing slow.
 """
 
 from __future__ import annotations
@@ -21,11 +22,12 @@ if TYPE_CHECKING:
 Filter = Literal["box", "blackman-harris"]
 
 STRIP_PIXELS = 1 << 24
-"""Maximum number of pixels that a strip of a picture has before filtering: about a gigabyte with every layer."""
+"""Maximum number of pixels in a strip of a picture, before --supersample's filter. With every channel, a strip takes
+about a gigabyte."""
 DEEP_STRIP_FLOATS = 1 << 24
-"""Maximum number of floats in a strip of a deep picture, with all slices: 64 MiB."""
+"""Maximum number of floats in all slices of a deep picture's strip. They take 64 MiB."""
 DEEP_MERGE_FLOATS = 1 << 26
-"""Maximum number of floats in memory at once while deep pictures are merged: 256 MiB."""
+"""Maximum number of floats in memory at once while deep pictures are merged. They take 256 MiB."""
 SENSOR_WIDTH_MM = 36.0
 """Default width of the picture on the sensor, in millimetres."""
 _MAX_SUPERSAMPLES = 64
@@ -51,8 +53,8 @@ class FramingConfig:
     """The pixels to render: overscan, region, supersampling."""
 
     overscan: str = "0"
-    """Pixels beyond each edge of the frame, or a share of its width and height such as 5%. EXR files keep the frame as
-    their display window. Other files contain the larger picture."""
+    """Pixels to render beyond each edge of the frame, or a share of its width and height such as 5%. EXR files keep the
+    frame as their display window. Other files contain the larger picture."""
     region: str = ""
     """Part of the frame to render alone, X,Y,WIDTH,HEIGHT in pixels from its top left corner; '' renders all of it. In
     EXR files it is the data window."""
@@ -80,7 +82,7 @@ class FramingConfig:
 
 
 def parse_overscan(text: str) -> tuple[int, float]:
-    """(pixels, 0) or (0, share) from "32" or "5%". Raises InputError."""
+    """Parse "32" to (32, 0.0), or "5%" to (0, 0.05): pixels, or a fraction of the frame's size. Raises InputError."""
     word = text.strip()
     try:
         pixels, share = (0, float(word[:-1]) / 100) if word.endswith("%") else (int(word), 0.0)
@@ -92,7 +94,7 @@ def parse_overscan(text: str) -> tuple[int, float]:
 
 
 def parse_region(text: str) -> tuple[int, int, int, int]:
-    """x, y, width, height from "100,50,640,480". Raises InputError."""
+    """Parse "100,50,640,480" to x, y, width and height in pixels. Raises InputError."""
     words = [word.strip() for word in text.split(",")]
     if len(words) != 4 or not all(word.isdecimal() for word in words) or "0" in words[2:]:
         raise InputError(f"--region {text}: expected X,Y,WIDTH,HEIGHT in pixels such as 100,50,640,480")
@@ -102,7 +104,7 @@ def parse_region(text: str) -> tuple[int, int, int, int]:
 
 @dataclass(frozen=True)
 class WarpConfig:
-    """Distortion of the rendered picture."""
+    """Lens distortion of rendered pictures, by an STMap or by the photographs' lenses."""
 
     stmap: str = ""
     """STMap, an EXR file, to warp the picture with. R and G give the source of each pixel, as fractions of the frame
@@ -124,7 +126,7 @@ class WarpConfig:
 
 @dataclass(frozen=True)
 class SamplingConfig:
-    """Shutter and lens."""
+    """Shutter and lens, for motion blur and depth of field."""
 
     samples: int = 16
     """Pictures that are rendered and averaged for each frame with motion blur or depth of field. More are smoother, and
@@ -201,8 +203,10 @@ class SamplingConfig:
 
     @property
     def sample_times(self) -> list[float]:
-        """The time of each sample, in frames from the frame: spread over the open shutter, or its middle without motion
-        blur."""
+        """Time of each sample, in frames relative to the frame.
+
+        The times are spread over the open shutter. Without motion blur all are its middle.
+        """
         if not self.on or self.samples == 1:
             return [self.middle]
         if not self.moves:
@@ -212,7 +216,7 @@ class SamplingConfig:
 
     @property
     def has_lens(self) -> bool:
-        """True if the lens has a size, so that there is depth of field."""
+        """True if the lens has a radius above 0, so that there is depth of field."""
         return bool(self.aperture) or self.f_stop is not None
 
     @property
@@ -228,9 +232,9 @@ class SamplingConfig:
 
 @cache
 def stratified_times(count: int) -> tuple[float, ...]:
-    """`count` times in (0, 1), one per interval of equal length.
+    """Stratified samples of the time in (0, 1): `count` times, one in each of as many equal intervals.
 
-    Their order, the ranks of van der Corput's sequence, is uncorrelated with the lens samples.
+    The times are in the order of the ranks of van der Corput's sequence, uncorrelated with the lens samples.
     """
     times = [0.0] * count
     by_mirrored_digits = sorted(range(count), key=lambda index: f"{index:b}"[::-1])
@@ -290,7 +294,7 @@ class VideoConfig:
     """Frames per second. If not given: the rate of the cameras' file, or 24 if it has none. 23.976, 29.97 and the like
     are 24000/1001, 30000/1001 and so on."""
     crf: int = 18
-    """Quality of an .mp4: 0 is the best, 51 the worst. 18 is about the lowest quality that shows no loss."""
+    """Quality of an .mp4: 0 is the best, 51 the worst. 18 is about the lowest quality without a visible loss."""
     preset: str = "medium"
     """Encoder preset, from ultrafast to veryslow. Slower presets make smaller files."""
     prores: ProRes = "hq"
@@ -314,10 +318,13 @@ Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwa
 
 @dataclass(frozen=True)
 class Encoding:
-    """Encoding of pictures.
+    """Encoding of picture files and videos.
 
-    bits: 8 or 16 for PNG and TIFF, 10 or 16 for DPX.
-    quality: quality of JPEG files.
+    depth: type of the floats in EXR files.
+    parts: "one" part for all channels of an EXR file, or "several".
+    compression: compression of EXR files.
+    bits: bits per channel, 8 or 16 for PNG and TIFF, 10 or 16 for DPX.
+    quality: quality of JPEG files, 1 to 100.
     prores: ProRes profile of MOV files.
     """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points that training starts from, in addition to or instead of the scene's own."""
+"""Settings of the points that training starts from: a point cloud's file, a limit of their number, and sky points."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from typing import Literal
 
 PointsUse = Literal["replace", "join"]
 DEFAULT_MAX_FILE_POINTS = 200_000
-"""Default maximum number of points from a file: scanners write tens of millions."""
+"""Default maximum number of points from a file. Scanners write tens of millions."""
 SKY_RADIUS_RATIO = 10.0
-"""Radius of the sky's sphere, relative to the distance of the scene's farthest points from its middle.
+"""Radius of the sphere of sky points, divided by the distance of the scene's farthest points from its middle.
 
-With a sky, density control's size limit for pruning is this many times as large.
+With sky points, density control multiplies its limit of a Gaussian's size by this too.
 """
 
 
 @dataclass(frozen=True)
 class StartPoints:
-    """Points in addition to or instead of the scene's own.
+    """Points that training starts from, in addition to or instead of the scene's own.
 
-    file: a point cloud, empty for none.
-    use: "replace" or "join" the scene's points.
+    file: path of a point cloud; empty for none.
+    use: "replace": the file's points replace the scene's. "join": they are added.
     limit: maximum number of points to keep, of the file or else of the scene; 0 for all.
-    sky: number of points on a sphere around the scene, 0 for none.
+    sky: maximum number of points on a sphere around the scene; 0 for none.
     """
 
     file: str = ""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bundles of settings: presets of the rasterizer, schedules of a training."""
+"""Bundles of settings: --preset (exact, default, fast), --schedule (paper, short, high-rates), and --passes."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ RASTERIZER_PRESETS: dict[Preset, RasterizerConfig] = {
 """Rasterizer settings by preset.
 
 exact: no approximations.
-default: the default settings, equal to exact as long as every default has an error of zero.
+default: the default settings. They equal exact, because no default approximates anything.
 fast: approximations that are worth their error (docs/performance.md).
 """
 
 
 def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
-    """Settings that `clsplat train --schedule` starts from.
+    """Return the training settings of a schedule, which flags of `clsplat train` may override.
 
     paper: the default settings, whatever `iterations` is. They are meant for 30,000 steps.
     short: for runs of about 7000 steps, which the paper's rates leave unfinished. Colours, opacities and rotations
@@ -73,7 +73,7 @@ def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
 
 
 STEPS_MADE_FOR: dict[Schedule, int] = {"paper": 30_000, "short": 7000, "high-rates": 7000}
-"""Training steps that each schedule is made for."""
+"""Number of training steps that each schedule is made for."""
 STEP_SETTINGS = (
     "iterations",
     "sh_degree_every",
@@ -90,12 +90,12 @@ STEP_SETTINGS = (
 
 
 def steps_made_for(preset: Preset, schedule: Schedule | None) -> int:
-    """Training steps for which the settings of a preset and a schedule are made."""
+    """Number of training steps for which the settings of a preset and a schedule are made."""
     return STEPS_MADE_FOR[schedule or ("short" if preset == "fast" else "paper")]
 
 
 def by_passes(config: TrainConfig, passes: int, photographs: int, given: Collection[str] = ()) -> TrainConfig:
-    """The same schedule, stretched or shortened to `passes` passes through the training photographs.
+    """Stretch or shorten a schedule to `passes` passes through the training photographs.
 
     All STEP_SETTINGS are multiplied by the same factor, so that a densification sees the same fraction of the
     photographs, whatever their number. A setting of at least 1 stays at least 1.
@@ -119,7 +119,7 @@ def by_passes(config: TrainConfig, passes: int, photographs: int, given: Collect
 
 
 def bundled(preset: Preset, schedule: Schedule | None, iterations: int) -> TrainConfig:
-    """Settings that `clsplat train --preset --schedule --iterations` start from.
+    """Return the training settings of a preset and a schedule, which flags of `clsplat train` may override.
 
     fast trains less. Pictures have a quarter of their size for the first 1/14 of the steps, and half of it until 2/7 of
     the steps. There are fewer Gaussians: splits are along the longest axis, and Gaussians that add less than a tenth of

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of the rasterizer, with each default defined once."""
+"""Settings of the rasterizer: approximations that save time, and switches that benchmarks measure."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class RasterizerConfig:
     sh_tolerance: float = 0.0
     """Leave out a Gaussian's highest SH bands if no channel of its colour, 0 to 1, changes by more than this from any
     direction. 0 leaves out only bands that are zero (approximate above 0). Bands that no Gaussian needs are always left
-    out. Bands that only some need are left out if that removes at least half of all coefficients; otherwise it saves no
-    time."""
+    out. Bands that only some need are left out if that removes at least half of all coefficients; otherwise that would
+    save no time."""
     sh_storage: Literal["float", "half"] = "float"
     """Store the SH bands above 0 in 32 or in 16 bits. half takes half of the memory, and is approximate."""
     alpha_min: float = 1 / 255
@@ -48,13 +48,13 @@ class RasterizerConfig:
         check_rules(self, "--rasterizer.", rules)
 
     def switches(self) -> BenchSwitches:
-        """These settings as BenchSwitches. Switches that this class lacks are at their defaults."""
+        """Return these settings as BenchSwitches, with all further switches at their defaults."""
         return BenchSwitches(**vars(self))
 
 
 @dataclass(frozen=True)
 class BenchSwitches(RasterizerConfig):
-    """Settings of the rasterizer, and switches that change no bit of a frame and exist for measurements.
+    """Settings of the rasterizer, and switches for measurements, which change no bit of a frame.
 
     docs/performance.md has the error of each setting, and the time that it saves.
     """
@@ -79,8 +79,8 @@ class BenchSwitches(RasterizerConfig):
     """Leave a tile when all its pixels are opaque. If off, continue to its last Gaussian, which changes no pixel."""
     record_cells: bool = True
     """In a tile's gradient, visit only the cells of pixels to which a Gaussian contributes, as recorded by blending.
-    If off, find the cells that the ellipse reaches once more."""
+    If off, compute again which cells the Gaussian's ellipse reaches."""
     frustum_cull: bool = True
-    """Before computing a Gaussian's colour, leave it out if it reaches no tile of the image. If off, it gets a colour
+    """Leave out Gaussians that reach no tile of the image, before computing their colours. If off, they get a colour
     and a place in the depth order, without effect. Gaussians that are not in front of the near plane have no
     projection, and are always left out."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of stereo pairs (docs/render.md)."""
+"""Settings of stereo pairs (docs/render.md): distance of the eyes, convergence, and the eyes to render."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class StereoConfig:
     def check(self, *, distort: bool = False) -> None:
         """Raise InputError naming the first setting whose value is invalid.
 
-        distort: True if pictures are distorted like photographs.
+        distort: True if --distort is given.
         """
         if not self.stereo:
             for flag, given in (("--convergence", self.convergence is not None), ("--eye", self.eye != "both")):

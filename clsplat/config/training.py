@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of training, with each default defined once: command line, `config.toml` and help come from these
-dataclasses.
+"""Settings of training: learning rates and Adam, density control, loss, photographs, points and refinement.
 
-The training defaults follow the paper authors' 2024 code, with the paper's resolution warm-up.
+Flags, help and `config.toml` come from these dataclasses. The defaults follow the 3DGS authors' code of 2024, with the
+paper's resolution warm-up.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Photos = Literal["auto", "exact", "8bit"]
 ViewOrderKind = Literal["random", "near"]
 
 MANY_PHOTOGRAPHS = 300
-"""With this many training photographs or more, auto keeps them with 8 bits, and decodes them while training runs."""
+"""With this many training photographs or more, --photos auto stores 8 bits a channel, and decodes during training."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +54,11 @@ class OptimiserConfig:
     quaternions_rate: float = 1e-3
     """Learning rate of the rotations, as quaternions."""
     sparse: bool = False
-    """Do not update parameters whose gradient is zero, nor their Adam moments (approximate). Gaussians out of view,
-    masked, or behind others have such gradients."""
+    """Do not update parameters whose gradient is zero, nor their Adam moments (approximate). The gradient is zero for
+    Gaussians out of view, masked, or behind others."""
     late: bool = False
-    """Leave Gaussians that a step's view does not show, and update them for the missed steps when a view shows them
-    again (approximate: that view shows them as they were). Not with batches."""
+    """Do not update Gaussians that a step's view does not show. After a view shows them again, update them for the
+    missed steps too (approximate: this view is rendered before the update). Not with batches."""
     sh_rest_every: int = 1
     """Steps between updates of the higher SH bands (approximate above 1)."""
     cooldown: int = 0
@@ -88,11 +88,11 @@ class OptimiserConfig:
         check_rules(self, "--optimiser.", rules)
         if self.late and self.sparse:
             raise InputError("--optimiser.late: excludes --optimiser.sparse, which drops the missed steps")
-        if self.late and self.beta1**2 >= self.beta2:  # the sum of missed steps would grow without limit
+        if self.late and self.beta1**2 >= self.beta2:  # else the sum over missed steps diverges
             raise InputError(
                 f"--optimiser.late: expected beta1^2 < beta2, but beta1 is {self.beta1} and beta2 {self.beta2}"
             )
-        if self.means_rate > 0 and self.means_rate_end == 0:  # a log-linear rate would be 0 from the first step
+        if self.means_rate > 0 and self.means_rate_end == 0:  # a rate falling log-linearly to 0 is 0 at every step
             raise InputError("--optimiser.means-rate-end 0.0: expected more than 0; the rate falls to it log-linearly")
 
 
@@ -125,7 +125,7 @@ class DensityConfig:
     """Prune Gaussians that covered a larger radius than this on the screen, in pixels, after the first opacity reset; 0
     prunes none."""
     opacity_reset_every: int = 3000
-    """Steps between opacity resets, 0 for none. A white background adds one at density.start."""
+    """Steps between opacity resets; 0 for none. A white background adds a reset at density.start."""
     opacity_reset_to: float = 0.01
     """Maximum opacity after a reset."""
     max_gaussians: int = 10_000_000
@@ -145,15 +145,15 @@ class DensityConfig:
     """With growth mcmc: random distance of a moved Gaussian from its target's mean, in standard deviations. 0 puts it
     at the mean, as published. Applies only if there are more Gaussians to move than Gaussians with a gradient."""
     noise_rate: float = 5e5
-    """With growth mcmc: noise added to the means in each step, in multiples of their learning rate, for Gaussians of
-    scale 1 in a scene of length unit 1. 0 adds none. The cooldown has no noise."""
+    """With growth mcmc: noise added to the means in each step, in multiples of the means' learning rate. The value is
+    for Gaussians of scale 1 in a scene of length unit 1. 0 adds none. The cooldown has no noise."""
     opacity_weight: float = 0.01
     """With growth mcmc: weight of the opacities in the loss. They are summed over the Gaussians in the step's view, and
     divided by the number of all Gaussians."""
     scale_weight: float = 0.01
     """With growth mcmc: like opacity-weight, but for scales relative to the scene's length unit."""
     min_contribution: float = 0.0
-    """Prune Gaussians that contribute less than this to every training view of an epoch (a pass through all of them). A
+    """Prune Gaussians whose contribution to each training view in an epoch (a pass through all) is less than this. A
     contribution is alpha times transmittance, summed over the picture, in pixels. 0 prunes none."""
     prune_every: int = 0
     """Steps between prunings by opacity and contribution alone, which continue after density.stop; 0 for none."""
@@ -196,13 +196,13 @@ class DensityConfig:
 
     @property
     def fills(self) -> bool:
-        """True if the number of Gaussians rises to max-gaussians, whatever their gradients."""
+        """True if the strategy raises the number of Gaussians to max-gaussians, whatever their gradients."""
         return self.growth in ("budget", "mcmc")
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """One training run."""
+    """Settings of a training."""
 
     iterations: int = 30_000
     """Number of training steps, each of one view. Learning rates and density control do not depend on it, except for
@@ -224,7 +224,7 @@ class TrainConfig:
     evaluations."""
     thinning: float = 0.0
     """Dropout for few photographs (DropGaussian): fraction of the Gaussians to leave out at random, 0 to 0.9. It rises
-    from 0 at the first step to this value at the last. In that step the other Gaussians are more opaque. 0.2 is as
+    from 0 at the first step to this value at the last. The others are more opaque in the same step. 0.2 is as
     published; 0 leaves none out."""
     penalty: float = 0.0
     """Weight of two penalties in the loss: the mean opacity, and the mean scale relative to the scene's length unit.
@@ -251,8 +251,8 @@ class TrainConfig:
     Used if masks or alpha mean transparent. Training's background is then random, and --background applies only to
     evaluations."""
     warmup: tuple[int, ...] = (250, 500)
-    """Training steps after which the resolution doubles. Training starts at a quarter of the size with a list of two,
-    at the full size with ''."""
+    """Training steps after which the resolution doubles. With two steps, training starts at a quarter of the size; with
+    '', at the full size."""
     resolution: int = 0
     """Longest image side in pixels, in training and evaluation; 0 keeps the images' size up to 1600."""
     photos: Photos = "auto"
@@ -261,13 +261,13 @@ class TrainConfig:
     fewer than 300 training photographs, else 8bit."""
     view_order: ViewOrderKind = "random"
     """Order of the photographs in each pass through all of them. near: clusters of photographs that show the same
-    things, by their positions and viewing directions; four clusters take turns. Then more Gaussians of a step were in
-    view shortly before. It may cost some PSNR."""
+    things, by their positions and viewing directions; four clusters take turns. More of a step's Gaussians were then in
+    view a few steps before. This may cost some PSNR."""
     test_every: int = TEST_EVERY
     """Every n-th view by name is held out, including the first; 0 holds out none. A data set's own split takes
     precedence."""
     test_most: int = TEST_MOST
-    """Maximum number of views that test-every holds out, which are then evenly spread; 0 for no maximum."""
+    """Maximum number of views that test-every holds out, spread evenly; 0 for no maximum."""
     missing: Missing = "few"
     """Handling of pictures that the scene lists but that are missing. few: up to a tenth of them are left out, with a
     warning, and more are an error. skip: any number is left out. error: none may be missing. The held-out views stay
@@ -298,8 +298,8 @@ class TrainConfig:
     """Weight of the depth loss at the first step. The loss is the mean difference of inverse depths, in units of one
     over the scene's length unit. The weight falls to a hundredth at the last step."""
     depth_maps: MapKind = "metric"
-    """metric: depth maps hold distances along the camera's axis, for fisheyes and panoramas distances from the camera,
-    0 if unknown. relative: numbers that grow with nearness, scaled to the scene's points."""
+    """Values in depth maps. metric: distances along the camera's axis, or from the camera for fisheyes and panoramas; 0
+    where unknown. relative: numbers that are larger for nearer things, which are scaled to the scene's points."""
     depth_unit: float = 1e-3
     """World units per step of an integer depth map (PNG). The default is for millimetres in a scene in metres."""
     checkpoint_every: int = 1000
@@ -321,14 +321,14 @@ class TrainConfig:
     """Learning rate of appearance, for base-2 logarithms of gains, or for coefficients of a grid. It is multiplied by
     the root of the number of photographs. For gains, a training of fewer than 10,000 steps raises it in proportion."""
     refine_poses: bool = False
-    """Refine the poses of the training views, except two, with the model. refined/ in the run gets the cameras as a
-    COLMAP model; eval.json gets the PSNR of held-out views after aligning them with the model. Not with batches."""
+    """Refine the poses of all training views but two while the model is trained. refined/ in the run has the cameras as
+    a COLMAP model. eval.json has the PSNR of held-out views after aligning them with the model. Not with batches."""
     pose_reach: float = 5.0
     """Approximate limit of a refined pose's rotation over a training, in degrees. The limit of its movement is this
     angle in radians, times the scene's length unit."""
     refine_lenses: bool = False
-    """Refine focal lengths and principal points with the model. Photographs with the same lens share them. refined/
-    in the run gets them. For photographs without distortion; not with batches."""
+    """Refine focal lengths and principal points while the model is trained. Photographs with the same lens share them.
+    refined/ in the run has them. Only for photographs without distortion, and not with batches."""
     lens_reach: float = 2.0
     """Approximate limit, over a training, of the change of the focal length and the principal point, in percent of the
     focal length."""
@@ -337,7 +337,7 @@ class TrainConfig:
     two measurements in a row, training goes back to the best cameras and stops refining. At most 8 views are
     measured, when refinement begins and at every tenth of the training. Their poses are as given, or moved by the mean
     motion of the refined poses, whichever fits better. A warning at the end reports if aligning the views raises the
-    PSNR by more than this. 0 turns both off. Without held-out views there is no measurement."""
+    PSNR by more than this. 0 turns the measurements and the warning off. Without held-out views there are none."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
@@ -355,7 +355,7 @@ class TrainConfig:
                 "a finite number, at least 0",
             ),
             (("pose_reach",), lambda value: 0 < value <= 30, "over 0 and at most 30 degrees"),
-            (("lens_reach",), lambda value: 0 < value <= 50, "over 0 and at most 50 hundredths"),
+            (("lens_reach",), lambda value: 0 < value <= 50, "over 0 and at most 50 percent"),
             (("depth_unit",), lambda value: 0 < value < inf, "a finite number, more than 0"),
             (("iterations", "batch", "sh_degree_every", "random_points"), lambda value: value >= 1, "at least 1"),
             (
@@ -416,13 +416,16 @@ class TrainConfig:
             raise InputError(f"--depth-maps {self.depth_maps}: no depth maps are used, expected --depth maps too")
 
     def changed(self, name: str, value: Any) -> TrainConfig:
-        """Copy with one setting changed. A name such as "density.stop" starts with its group."""
+        """Return a copy with one setting changed.
+
+        name: such as "seed", or with its group such as "density.stop".
+        """
         group, dot, setting = name.partition(".")
         return replace(self, **{group: replace(getattr(self, group), **{setting: value}) if dot else value})
 
     @property
     def refines(self) -> bool:
-        """True if cameras are refined."""
+        """True if poses or lenses are refined."""
         return self.refine_poses or self.refine_lenses
 
     @property
@@ -431,21 +434,21 @@ class TrainConfig:
 
     @property
     def mask_use(self) -> MaskUse:
-        """Use of the scene's masks and alpha channels."""
+        """Meaning of the scene's masks and alpha channels."""
         return MaskUse(self.masks, self.alpha, self.invert_masks)
 
     def rounds_photos(self, photographs: int) -> bool:
-        """True if pixels are rounded to 8 bits, in a scene with `photographs` training photographs."""
+        """True if pixels are rounded to 8 bits. photographs: number of training photographs."""
         return self.photos == "8bit" or (self.photos == "auto" and photographs >= MANY_PHOTOGRAPHS)
 
     @property
     def test_views(self) -> tuple[int, int]:
-        """test_every and test_most, which choose the held-out views."""
+        """(test_every, test_most), which choose the held-out views."""
         return self.test_every, self.test_most
 
     @property
     def depth_use(self) -> DepthUse:
-        """Known depths to compare with the render."""
+        """Source of the known depths to compare with the render, and the units of depth maps."""
         return DepthUse(self.depth, self.depth_maps, self.depth_unit) if self.depth != "none" else DepthUse()
 
     @property
@@ -456,7 +459,7 @@ class TrainConfig:
 
     @property
     def random_background(self) -> bool:
-        """True if each step has its own background."""
+        """True if each step has a background of a random colour."""
         return self.background == "random" or "transparent" in (self.masks, self.alpha)
 
     @property
@@ -465,7 +468,7 @@ class TrainConfig:
         return self.alpha_weight if "transparent" in (self.masks, self.alpha) else 0.0
 
     def on_devices(self, count: int, *, explicit: bool) -> TrainConfig:
-        """Settings for `count` devices. A batch of 1 becomes one view per device, unless `explicit`.
+        """Return the settings for `count` devices. A batch of 1 becomes one view per device, unless `explicit`.
 
         explicit: True if the batch was given on the command line.
         Raises InputError for a batch that the devices cannot share evenly.

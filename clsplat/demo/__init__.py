@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo: training on a synthetic scene."""
+"""The demo (`clsplat demo`): synthetic photographs of a still life, training on them, and a synthetic town."""

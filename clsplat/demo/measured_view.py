@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A view of the demo's scene to time a training step on: the same on every machine, without structure from motion."""
+"""A view of the demo's scene for timing a training step. It is the same on every machine, as it needs no structure from
+motion."""
 
 from __future__ import annotations
 
@@ -20,10 +21,10 @@ COEFFICIENTS = 16
 
 
 def measured_view(count: int = MEASURED_GAUSSIANS) -> tuple[Gaussians, Camera, NDArray[np.uint8]]:
-    """Gaussians on the surfaces of the demo's scene, the camera of its first photograph, and the photograph.
+    """Return Gaussians on the surfaces of the demo's scene, and the camera and pixels of its first photograph.
 
-    A training from `count` points would start with these Gaussians. They have room for all SH degrees. Each surface has
-    a share of them in proportion to its texels.
+    The Gaussians are the initial ones of a training from `count` points, with zeros for the higher SH bands. Each
+    surface has a number of them in proportion to its texels.
     """
     surfaces = still_life()
     bake(surfaces, seed=0)

@@ -50,9 +50,10 @@ class Noise:
         self._lattices = np.random.default_rng(seed).uniform(-1.0, 1.0, (6, 24, 24, 24)).astype(np.float32)
 
     def __call__(self, points: Float32, wavelength: float, octaves: int, gain: float = 0.65) -> Float32:
-        """Sum of octaves at points (n, 3). Returns values (n,) of about [-1, 1].
+        """Sum octaves of noise at points (n, 3). Returns values (n,) of about [-1, 1].
 
-        wavelength: wavelength of the first octave, in metres.
+        wavelength: wavelength of the first octave, in metres. It halves from octave to octave.
+        gain: factor of the amplitude from octave to octave.
         A B-spline without prefilter removes frequencies that the lattice cannot represent, so octaves are band limited.
         """
         total, weight = np.zeros(len(points), np.float32), 1.0
@@ -177,7 +178,7 @@ class Wall(Surface):
         b = origin[..., 0] * direction[:, 0] + origin[..., 1] * direction[:, 1]
         c = origin[..., 0] ** 2 + origin[..., 1] ** 2 - np.float32(WALL_RADIUS_METRES**2)
         with np.errstate(divide="ignore", invalid="ignore"):
-            t = (-b + np.sqrt(np.maximum(b * b - a * c, 0))) / a  # inside the wall, the larger root is in front
+            t = (-b + np.sqrt(np.maximum(b * b - a * c, 0))) / a  # from inside, the larger root is the hit in front
             z = origin[..., 2] + t * direction[:, 2]
         return np.where((t > 1e-3) & (z < WALL_HEIGHT_METRES) & (z > 0), t, np.inf).astype(np.float32)
 
@@ -256,7 +257,7 @@ class Box(Surface):
         enter = np.full(len(direction), -np.inf, np.float32)
         leave = np.full(len(direction), np.inf, np.float32)
         with np.errstate(divide="ignore", invalid="ignore"):
-            for axis in range(3):  # much faster than NumPy reductions over an axis of length three
+            for axis in range(3):  # a loop is much faster than NumPy's reductions over an axis of length 3
                 one = (-half[axis] - start[..., axis]) / step[:, axis]
                 other = (half[axis] - start[..., axis]) / step[:, axis]
                 np.maximum(enter, np.minimum(one, other), out=enter)
@@ -295,7 +296,7 @@ class Box(Surface):
 
 
 def still_life() -> list[Surface]:
-    """Objects of the scene, before their textures are computed."""
+    """Return the objects of the still life, before `bake` computes their textures."""
     marble = ((0.10, 0.16, 0.34), (0.30, 0.46, 0.70), (0.80, 0.86, 0.90), (0.95, 0.94, 0.88))
     amber = ((0.45, 0.16, 0.05), (0.86, 0.46, 0.12), (0.98, 0.84, 0.48))
     red = ((0.26, 0.06, 0.07), (0.64, 0.18, 0.14), (0.90, 0.50, 0.34))
@@ -321,9 +322,10 @@ def bake(surfaces: list[Surface], seed: int) -> None:
 
 
 def bake_surface(surface: Surface, suns: Float32, blockers: Sequence[Surface], noise: Noise) -> None:
-    """Compute one texture.
+    """Compute the texture of one surface: albedo times light.
 
     suns: (n, 3), directions to points of the sun's disc.
+    blockers: surfaces that cast shadows.
     """
     points, normals = surface.grid(surface.rows, surface.columns)
     # soft shadows vary slowly, so they are cast on a grid four times coarser, and interpolated
@@ -347,7 +349,10 @@ def bake_surface(surface: Surface, suns: Float32, blockers: Sequence[Surface], n
 
 
 def cameras(count: int, width: int, height: int, seed: int) -> list[Camera]:
-    """Hand-held cameras that look at the middle, with jitter. Three in five are on a low ring, two on a high one."""
+    """Return hand-held cameras around the scene: three fifths on a low ring, the others on a high ring.
+
+    They look at the scene's middle. Positions, targets and up directions have random errors.
+    """
     generator = np.random.default_rng(seed + 1)
     focal = 0.5 * max(width, height) / np.tan(0.5 * FIELD_OF_VIEW_RADIANS)
     low = max(1, round(count * 0.6)) if count > 1 else count
@@ -423,7 +428,7 @@ def write_photos(
     width, height: size of the picture in pixels.
     progress: function that is called with a text and the completed fraction.
     Raises ClsplatError if a photo cannot be written.
-    Poses are neither returned nor written, since the demo shows that they can be recovered.
+    Poses are neither returned nor written, because the demo recovers them by structure from motion.
     """
     folder.mkdir(parents=True, exist_ok=True)
     progress("painting the scene", 0.0)

@@ -32,21 +32,22 @@ TURNTABLE_FRAME_COUNT = 60
 DEMO_MARKER_FILE_NAME = ".clsplat-demo"
 """Marker file in a folder whose contents the demo has created."""
 DEMO_FOLDERS = ("photos", "scene", "run", "turntable")
+"""Folders that the demo writes in its output folder."""
 
 
 def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_ITERATIONS) -> Evaluation:
-    """Create photos/, scene/, run/ and turntable/ below `output`. Returns the evaluation, as in eval.json.
+    """Run the demo: write photos/, scene/, run/ and turntable/ in `output`. Returns the evaluation, as in eval.json.
 
     Complete photos and cameras of an interrupted demo are reused.
     device: name of the device, as for `clsplat devices`.
     iterations: number of training steps.
-    Raises InputError if the folder has other files. Errors of the steps are passed on.
+    Raises InputError if the folder has other files. Errors of COLMAP, training and rendering are passed on.
     """
     output.mkdir(parents=True, exist_ok=True)
     with locked(output, "demo"):
         claim(output)
         start = time.monotonic()
-        # opened now, so that a wrong device name fails before minutes of work
+        # open the device first, so that a wrong name fails before minutes of work
         opened = open_device(device)
         report = StageProgress()
         scene_folder = make_scene(output, report)
@@ -76,7 +77,7 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
 
 
 def claim(output: Path) -> None:
-    """Mark a folder as the demo's. Raises InputError if it is unmarked and has folders that the demo would replace."""
+    """Mark a folder as written by the demo. Raises InputError if an unmarked folder has what the demo would replace."""
     if is_file(output / DEMO_MARKER_FILE_NAME):
         return
     existing = [name for name in DEMO_FOLDERS if (output / name).exists() or (output / name).is_symlink()]
@@ -102,6 +103,6 @@ def make_scene(output: Path, progress: Progress = no_progress) -> Path:
         raise InputError(f"{photos}: holds files that the demo did not create, expected a new folder")
     if existing != expected:
         write_photos(photos, count=DEMO_PHOTO_COUNT, progress=progress)
-    # a model without distortion, like the ray caster's lens, so that photos are not resampled
+    # fit a lens without distortion, like the ray caster's, so that the photos are not resampled
     settings = sfm.SfmSettings(camera_model="SIMPLE_PINHOLE")
     return sfm.reconstruct(photos, scene, settings, overwrite=True, progress=progress)

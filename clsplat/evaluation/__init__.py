@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of renders with photographs."""
+"""Evaluation of models: PSNR, SSIM and LPIPS of renders against held-out photographs."""

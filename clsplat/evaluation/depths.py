@@ -31,13 +31,16 @@ FARTHEST_DEPTH_GREY = 0.15
 
 
 def worst(records: Sequence[Mapping[str, Any]]) -> list[int]:
-    """Indices of the DEPTH_PICTURE_VIEWS views in eval.json with the lowest PSNR, lowest first."""
+    """Return the indices of the DEPTH_PICTURE_VIEWS views with the lowest PSNR, lowest first.
+
+    records: records of the views in eval.json.
+    """
     scored = [(record["psnr"], place) for place, record in enumerate(records) if record.get("psnr") is not None]
     return [place for _, place in sorted(scored)[:DEPTH_PICTURE_VIEWS]]
 
 
 def depth_picture(depth: NDArray[Any], alpha: NDArray[Any]) -> Float32:
-    """A grey picture (H, W, 3) of depths (H, W): near is white, far is dark, pixels without a depth are black."""
+    """Convert depths (H, W) to a grey picture (H, W, 3): near is white, far is dark, pixels without depth are black."""
     seen = alpha > MIN_DEPTH_PICTURE_ALPHA
     grey = np.zeros(depth.shape, np.float32)
     if seen.any():
@@ -48,7 +51,7 @@ def depth_picture(depth: NDArray[Any], alpha: NDArray[Any]) -> Float32:
 
 
 def coloured(gaussians: Gaussians, camera: Camera) -> Gaussians:
-    """Copy of the model in which each Gaussian's colour is a grey that encodes its depth.
+    """Return a copy of the model in which each Gaussian's colour is a grey that encodes the Gaussian's depth.
 
     The DEPTH_GREY_QUANTILES of the depths in front of the camera map to 0 and 1. Depths are z, or distances from the
     camera for fisheyes and panoramas. A render of the copy shows depths, with the kernels of a normal frame.
@@ -69,7 +72,7 @@ def keep_depths(
     records: Sequence[Mapping[str, Any]],
     folder: Path,
 ) -> None:
-    """Write the depth pictures as PNG files with the views' names. Remove earlier depth pictures in `folder`.
+    """Write depth pictures of the worst views to `folder`, as PNG files with the views' names. Remove earlier ones.
 
     render: function that returns a model's image (H, W, 3) over black, and its alpha (H, W).
     records: records of the views in eval.json, in the order of `views`.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of held-out views with their photographs: the scores in eval.json and the pictures in test/.
+"""Evaluation on held-out views: the scores in eval.json (PSNR, SSIM, LPIPS) and the renders in test/.
 
 `load_scene` (clsplat/scenes/loading.py) decides which views are held out.
 """
@@ -29,6 +29,8 @@ class ViewScores(TypedDict):
     """Record of a held-out view in eval.json. Optional scores are present if they were measured.
 
     counted: fraction of the pixels that the view's mask keeps, if it has a mask.
+    psnr_corrected: PSNR after an affine fit of the render's colours to the photograph's.
+    psnr_aligned: PSNR after fitting the view's pose to the model.
     """
 
     name: str
@@ -128,9 +130,9 @@ def _scores(
     corrected: bool,
     aligned: Callable[[View], Image] | None,
 ) -> ViewScores:
-    """Record of one view in eval.json.
+    """Measure one view. Returns the view's record in eval.json.
 
-    image, truth: the view's render, and its photograph over the same background.
+    image, truth: the view's render, and the photograph over the same background.
     counts: mask (H, W), True for pixels that count; None for all.
     """
     try:
@@ -154,7 +156,7 @@ def _scores(
 
 
 def photograph_of(view: View) -> tuple[Image, NDArray[np.bool_] | None]:
-    """A view's pixels, and its mask (H, W): True for pixels that count. The mask is None if the view has none.
+    """Load a view's pixels, and its mask (H, W), True for pixels that count. The mask is None if the view has none.
 
     Raises InputError if the mask excludes every pixel.
     """
@@ -168,12 +170,12 @@ def photograph_of(view: View) -> tuple[Image, NDArray[np.bool_] | None]:
 
 
 def picture_names(names: Sequence[str]) -> list[str]:
-    """Relative names of the views' PNG files, with the views' sub-folders.
+    """Choose the names of the views' PNG files, relative to their folder and with the views' sub-folders.
 
     ".png" replaces the view's extension. If two names would then collide, also on a file system that ignores case,
     ".png" is appended instead.
     """
     stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
-    keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]  # the same names on all file systems
+    keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]  # choose the same names everywhere
     uses = Counter(keys)
     return [(stem if uses[key] == 1 else name) + ".png" for stem, key, name in zip(stems, keys, names, strict=True)]

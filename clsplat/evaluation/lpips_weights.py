@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Download of the network weights of LPIPS to the path where torch expects them."""
+"""Download of the VGG-16 weights that LPIPS needs, to the path where torch expects them."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ from clsplat.progress import StageProgress
 VGG16_WEIGHTS_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
 """Address of VGG-16's weights, about 530 MB. The file's name ends with the first digits of its SHA-256."""
 LPIPS_TIMEOUT_VARIABLE = "CLSPLAT_LPIPS_TIMEOUT"
+"""Environment variable with the time limit of the download in seconds. 0: no download."""
 LPIPS_DOWNLOAD_SECONDS = 300.0
-"""Default time limit of the download in seconds. The variable named by LPIPS_TIMEOUT_VARIABLE overrides it."""
+"""Default time limit of the download in seconds, which LPIPS_TIMEOUT_VARIABLE overrides."""
 LPIPS_SERVER_SILENCE_SECONDS = 20.0
 """Seconds without a byte after which a server or proxy counts as silent."""
 
@@ -32,7 +33,7 @@ def place() -> Path:
 
 
 def limit() -> float:
-    """Time limit of the download in seconds. Raises InputError if the user's limit is no number, or is negative."""
+    """Return the download's time limit in seconds. Raises InputError if the variable is no number, or is negative."""
     text = os.environ.get(LPIPS_TIMEOUT_VARIABLE) or str(LPIPS_DOWNLOAD_SECONDS)
     try:
         seconds = float(text)
@@ -54,7 +55,7 @@ def fetch() -> None:
     advice = f"curl --create-dirs -o {path} {VGG16_WEIGHTS_URL}"
     if seconds == 0:
         raise ClsplatError(f"VGG-16's weights are missing; download them: {advice}")
-    transfer = _Transfer(daemon=True)  # a thread, since name resolution has no timeout
+    transfer = _Transfer(daemon=True)  # a thread, which can be left when name resolution hangs
     progress = StageProgress()
     transfer.start()
     until = time.monotonic() + seconds

@@ -21,8 +21,9 @@ from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluation import lpips_weights
 
 MIN_SQUARED_ERROR = 1e-12
-"""Minimum of the squared error. Equal images get 120 dB: their PSNR would be infinite, which JSON cannot store."""
+"""Minimum of the mean squared error. Equal images get 120 dB: JSON cannot store their infinite PSNR."""
 SSIM_WINDOW_PX = 11
+"""Side of SSIM's Gaussian window in pixels."""
 
 Image = NDArray[Any]
 
@@ -35,7 +36,7 @@ def psnr(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) ->
 
 
 def psnr_corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> float:
-    """PSNR in dB of the image after `corrected`, with a peak of 1.
+    """PSNR in dB of the image after the affine fit of colours by `corrected`, with a peak of 1.
 
     Both images are clamped to [0, most], where `most` is the photograph's largest value, but at least 1.
     """
@@ -47,7 +48,7 @@ def psnr_corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None 
 
 
 def corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> Image:
-    """The image (H, W, 3) after an affine transform of its colours, fitted to `truth` by least squares."""
+    """Return the image (H, W, 3) after the affine transform of colours that fits `truth` best, by least squares."""
     colours, wanted = (np.asarray(each, np.float64).reshape(-1, 3) for each in (image, truth))
     known = np.hstack([colours, np.ones((len(colours), 1))])
     rows = slice(None) if counts is None else counts.ravel()
@@ -63,7 +64,7 @@ def ssim(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) ->
 
     Raises InputError for images smaller than the window, ValueError for images of different shapes.
     """
-    structural_similarity: Any = import_module("skimage.metrics").structural_similarity  # slow to import, untyped
+    structural_similarity: Any = import_module("skimage.metrics").structural_similarity  # slow to import
     a, b = _pair(image, truth)
     height, width = a.shape[:2]
     if min(height, width) < SSIM_WINDOW_PX:
@@ -113,11 +114,11 @@ def prepare_lpips() -> str | None:
 
 @functools.cache
 def _lpips_model() -> Callable[[Image, Image], float] | str:
-    """LPIPS as a function of two images, or the reason why it is not available."""
+    """Return LPIPS as a function of two images, or the reason why it is not available."""
     if reason := prepare_lpips():
         return reason
     try:
-        with contextlib.redirect_stdout(sys.stderr):  # standard output is for results
+        with contextlib.redirect_stdout(sys.stderr):  # keep standard output for results
             package: Any = import_module("lpips")
             torch: Any = import_module("torch")
             network = package.LPIPS(net="vgg", verbose=False).eval()
@@ -133,7 +134,7 @@ def _lpips_model() -> Callable[[Image, Image], float] | str:
 
 
 def _pair(image: Image, truth: Image) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Convert both images to float64 and clamp them to [0, 1]."""
+    """Convert both images to float64 and clamp them to [0, 1]. Raises ValueError for other shapes than (H, W, 3)."""
     if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"image has the shape {image.shape} and truth {truth.shape}, expected (H, W, 3) for both")
     return np.clip(image.astype(np.float64), 0, 1), np.clip(truth.astype(np.float64), 0, 1)

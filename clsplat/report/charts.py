@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Charts as inline SVG. The style sheet of the page defines their colours.
+"""Charts of the HTML reports, as inline SVG: lines, dots, stacked areas and histograms.
 
-Text is escaped. The SVG elements of lines contain their data, which the script of the page displays.
+The page's style sheet defines the colours. Text is escaped. SVG elements also contain the values of their points, which
+the page's script displays.
 """
 
 from __future__ import annotations
@@ -20,18 +21,22 @@ from markupsafe import Markup
 CHART_WIDTH_PX, CHART_HEIGHT_PX = 420, 250
 PLOT_LEFT_PX, PLOT_RIGHT_PX, PLOT_TOP_PX, PLOT_BOTTOM_PX = 52, 412, 22, 214
 MAX_LINE_POINTS = 400
+"""Maximum number of points of a line. Longer lines are thinned."""
 SERIES_COLOUR_COUNT = 8
 """Number of colour classes in the style sheet, c0 to c7."""
 
 FILLED_KINDS = ("area", "bars")
+"""Kinds of series that are drawn as filled shapes, down to zero."""
 
 Points = Sequence[tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class ChartSeries:
-    """Points sorted by x, and how they are drawn (`kind`).
+    """A series of a chart: points sorted by x, and the kind of their drawing.
 
+    color: number of the colour, from 0 to SERIES_COLOUR_COUNT - 1.
+    The kinds are:
     line: a line.
     faint: a faint line behind the others.
     dots: a line with dots.
@@ -73,10 +78,11 @@ def chart(
     powers: bool = False,
     note: str = "",
 ) -> Markup:
-    """A figure with legend, title and axis labels; "" if there are no points to draw.
+    """Draw series as an HTML figure with title, legend and axis labels; "" if there are no points to draw.
 
+    x, y: labels of the axes.
     log_y: logarithmic y axis. Values that are not positive are left out.
-    from_zero: y begins at zero.
+    from_zero: the y axis includes zero.
     powers: x values are exponents of ten.
     """
     drawn = [replace(curve, points=_kept(curve, log_y)) for curve in series]
@@ -131,7 +137,7 @@ def templates() -> Environment:
 
 
 def short(value: float) -> str:
-    """Short text of a number: 235k, 1.2M, 0.025."""
+    """Format a number as a short text: 235k, 1.2M, 0.025."""
     size = abs(value)
     for limit, factor, unit in ((1e9, 1e-9, "G"), (1e6, 1e-6, "M"), (1e4, 1e-3, "k")):
         if size >= limit:
@@ -140,7 +146,7 @@ def short(value: float) -> str:
 
 
 def thinned(points: Points, limit: int = MAX_LINE_POINTS) -> Points:
-    """About `limit` of the points: the lowest and highest of each interval, so that peaks are kept."""
+    """Reduce points to about `limit`: the lowest and highest of each interval, so that peaks are kept."""
     if len(points) <= limit:
         return points
     stretch = math.ceil(2 * len(points) / limit)
@@ -152,14 +158,14 @@ def thinned(points: Points, limit: int = MAX_LINE_POINTS) -> Points:
 
 
 def _kept(curve: ChartSeries, log_y: bool) -> Points:
-    """Points that can be drawn; of long lines, only as many as are visible."""
+    """Return the points that can be drawn. Long lines are thinned."""
     points = [point for point in curve.points if all(map(math.isfinite, point)) and (not log_y or point[1] > 0)]
     return points if curve.kind in FILLED_KINDS else thinned(points)
 
 
 def _heights(drawn: Sequence[ChartSeries], log_y: bool) -> list[list[float]]:
-    """The y values of each series, on the scale of the axis. For areas they are the sums of the stack up to the
-    series."""
+    """Return the y values of each series, as logarithms if `log_y`. Values of areas are added to those of the areas
+    below."""
     heights = [[math.log10(y) if log_y else y for _, y in curve.points] for curve in drawn]
     stacked: list[list[float]] = np.cumsum(heights, axis=0).tolist() if drawn[0].kind == "area" else heights
     return stacked
@@ -192,10 +198,11 @@ def _step(span: float, count: int) -> float:
 
 
 def _shape(curve: ChartSeries, pixels: Points, floor: float) -> dict[str, Any]:
-    """Data of a series for the template.
+    """Return the data of a series for the template chart.html.
 
-    shown: values that the script of the page displays.
-    places: pixels of the same points along x.
+    pixels: positions x, y of the series' points in the chart.
+    floor: position y of zero.
+    In the result, `shown` has the values that the page's script displays, and `places` their positions x.
     """
     step = "H{:.1f}V{:.1f}" if curve.kind == "bars" else "L{:.1f} {:.1f}"
     path = "M{:.1f} {:.1f}".format(*pixels[0]) + "".join(step.format(*pixel) for pixel in pixels[1:])

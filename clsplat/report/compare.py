@@ -19,7 +19,7 @@ from clsplat.runs.run import Run
 
 MAX_COMPARED_RUNS = 24
 MAX_COMPARED_VIEWS = 100
-"""Maximum number of views in the table."""
+"""Maximum number of views in the table of the comparison page."""
 
 
 @dataclass
@@ -45,7 +45,7 @@ class Comparison:
         return {name: listed for name, listed in values.items() if any(value != listed[0] for value in listed)}
 
     def document(self) -> dict[str, Any]:
-        """The comparison as data, for --json and the page."""
+        """Return the comparison as a JSON object, for --json and to embed in the page."""
         runs = [
             {
                 "run": label,
@@ -66,7 +66,10 @@ class Comparison:
 
 
 def compare_runs(runs: Sequence[Run]) -> Comparison:
-    """Read the runs. Raises InputError like `read_run_numbers`, and if there are too many runs."""
+    """Read the numbers of runs, with notes on what makes them hard to compare.
+
+    Raises InputError like `read_run_numbers`, and for more than MAX_COMPARED_RUNS runs.
+    """
     if len(runs) > MAX_COMPARED_RUNS:
         raise InputError(f"{len(runs)} runs: expected at most {MAX_COMPARED_RUNS} to compare")
     all_numbers = [read_run_numbers(run, describe=False) for run in runs]
@@ -91,7 +94,7 @@ def compare_runs(runs: Sequence[Run]) -> Comparison:
 
 
 def comparison_page(comparison: Comparison) -> str:
-    """HTML of the comparison page."""
+    """Build the HTML of the comparison page."""
     columns, runs = comparison.scores, comparison.runs
     views = view_rows(comparison)
     return render_page(
@@ -114,7 +117,7 @@ def comparison_page(comparison: Comparison) -> str:
 
 
 def charts(comparison: Comparison) -> list[Markup]:
-    """Charts: first PSNR against time, then the curves of a run's report against the step."""
+    """Draw held-out PSNR against time and step, then loss, PSNR, number of Gaussians and time against the step."""
     drawn = []
     for x, title, x_label in (
         ("seconds", "Time against error", "seconds of training"),
@@ -157,7 +160,7 @@ def view_rows(comparison: Comparison) -> list[tuple[str, list[float | None], flo
 
 
 def comparison_table(comparison: Comparison) -> str:
-    """Text table for the terminal."""
+    """Format the comparison as a text table for the terminal, with the settings that differ."""
     columns = comparison.scores
     rows = [["run", "steps", *(name.upper() for name in columns), "Gaussians", "training"]]
     for label, numbers in comparison.runs.items():

@@ -41,10 +41,11 @@ MAX_PICTURED_VIEWS = 8
 MAX_EMBEDDED_RECORDS = 2000
 """Maximum number of records of metrics.jsonl whose numbers are embedded in the page."""
 MAX_TABLE_VIEWS = 200
-"""Maximum number of views in the table."""
+"""Maximum number of views in the table of held-out views."""
 MAX_COLOURED_STAGES = 7
-"""Maximum number of stages with a colour each. Smaller stages are drawn together."""
+"""Maximum number of stages with a colour of their own in the chart. Smaller stages are drawn together."""
 SCORE_TITLES = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS (VGG)"}
+"""Title of each score in the tables."""
 
 
 def write_report(
@@ -55,7 +56,7 @@ def write_report(
     model: Gaussians | None = None,
     views: int = MAX_PICTURED_VIEWS,
 ) -> RunNumbers:
-    """Write the page atomically to `path`, or into the run folder. Returns the numbers of the run.
+    """Write the report of a run atomically to `path`, or into the run folder. Returns the numbers of the run.
 
     scene: the run's scene, or the reason why there is none. None loads the scene if it is needed.
     model: contents of model.ply, if already loaded.
@@ -74,11 +75,12 @@ def write_last(run: Run, scene: Scene, model: Gaussians) -> None:
         write_report(run, scene=scene, model=model)
     except Exception as error:  # noqa: BLE001
         why = " ".join(str(error).split()) or type(error).__name__
-        warnings.warn(f"no {REPORT_FILE_NAME} ({why}); try again with: clsplat report {run.path}", stacklevel=2)
+        again = f"try again with: clsplat report {run.path}"
+        warnings.warn(f"{REPORT_FILE_NAME} was not written ({why}); {again}", stacklevel=2)
 
 
 def report_page(numbers: RunNumbers, scene: Scene | str | None = None, views: int = MAX_PICTURED_VIEWS) -> str:
-    """HTML of the report page."""
+    """Build the HTML of a run's report. scene, views: as for `write_report`."""
     evaluation = numbers.evaluation
     listed = evaluation["views"] if evaluation else []
     shown: list[thumbnails.Shown] = []
@@ -138,7 +140,7 @@ def report_page(numbers: RunNumbers, scene: Scene | str | None = None, views: in
 
 
 def render_page(name: str, **values: Any) -> str:
-    """The text of a template with these values. Values that are not Markup are escaped."""
+    """Fill in the page template of this name. Returns HTML. Values that are not Markup are escaped."""
     pages = templates()
     pages.filters.update(short=short, duration=duration, score=score, count="{:,.0f}".format, amount=amount)
     folder = Path(__file__).parent / "templates"
@@ -153,8 +155,8 @@ def render_page(name: str, **values: Any) -> str:
 
 
 def charts(numbers: RunNumbers) -> list[Markup]:
-    """Charts of loss, PSNR, number of Gaussians, stage times and training time against the step, and of PSNR against
-    training time."""
+    """Draw loss, PSNR, number of Gaussians, times of stages and training time against the step, and PSNR against
+    time."""
     curves, steps = numbers.curves, numbers.curves["step"]
     around = max(len(steps) // 50, 5)
     note = f"every tenth step, for one view; the line is the mean of {around} records" if len(steps) > 20 else ""
@@ -179,8 +181,10 @@ def charts(numbers: RunNumbers) -> list[Markup]:
 
 
 def stage_chart(numbers: RunNumbers) -> Markup:
-    """Stacked chart of milliseconds per stage; small stages are added together. Empty for fewer than two
-    measurements."""
+    """Draw a stacked chart of the milliseconds of each stage. Small stages are added together.
+
+    The result is empty for fewer than two measurements.
+    """
     if len(numbers.stages) < 2:
         return Markup("")
     names = [name for name, *_ in stage_rows(numbers)]
@@ -196,7 +200,7 @@ def stage_chart(numbers: RunNumbers) -> Markup:
 
 
 def stage_rows(numbers: RunNumbers) -> list[tuple[str, float, float, float]]:
-    """Rows of the stages, largest first: name, median milliseconds, last milliseconds, fraction of the last step."""
+    """Return a row for each stage, slowest first: name, median and last milliseconds, fraction of the last step."""
     if not numbers.stages:
         return []
     last = numbers.stages[-1]["ms"]
@@ -210,7 +214,7 @@ def stage_rows(numbers: RunNumbers) -> list[tuple[str, float, float, float]]:
 
 
 def histograms(numbers: RunNumbers) -> list[Markup]:
-    """Histograms of scales, opacities and contributions."""
+    """Draw histograms of the Gaussians' scales, opacities and contributions."""
     bars = {
         name: list(zip(data["edges"], [*data["counts"], 0], strict=True)) for name, data in numbers.histograms.items()
     }
@@ -229,14 +233,14 @@ def histograms(numbers: RunNumbers) -> list[Markup]:
 
 
 def setting_text(value: object) -> str:
-    """Text of a setting's value. Lists have spaces, so that lines can wrap."""
+    """Format the value of a setting. Lists have spaces, so that lines can wrap."""
     if isinstance(value, tuple):
         return ", ".join(map(str, value)) or "none"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def duration(seconds: float | None) -> str:
-    """Duration as text: 12.3 s, 4 min 5 s, 2 h 3 min."""
+    """Format a duration: 12.3 s, 4 min 5 s, 2 h 3 min."""
     if seconds is None:
         return "not known"
     if seconds < 60:
@@ -246,7 +250,7 @@ def duration(seconds: float | None) -> str:
 
 
 def score(value: float, name: str) -> str:
-    """Text of a score: PSNR with two decimals, others with four."""
+    """Format a score: PSNR with two decimals, others with four."""
     return f"{value:.2f}" if name == "psnr" else f"{value:.4f}"
 
 
@@ -257,7 +261,7 @@ def _mask_words(use: MaskUse) -> list[str]:
 
 
 def _data(numbers: RunNumbers) -> dict[str, Any]:
-    """Numbers without rounding, for programs that read the page."""
+    """Return the run's numbers without rounding, which the page embeds for other programs."""
     length = len(numbers.curves["step"])
     every = -(-length // MAX_EMBEDDED_RECORDS) or 1
     kept: Sequence[int] = sorted({*range(0, length, every), *([length - 1] if length else [])})

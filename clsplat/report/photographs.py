@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of a report that are about photographs: their masks, and the exposures that were learnt for them."""
+"""Parts of a run's report about its photographs: pictures of their masks, and a chart of their learnt exposures."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ from clsplat.scenes.scene import Scene, View, spread
 MAX_MASKED_PHOTOGRAPHS = 6
 """Maximum number of masked photographs in a report."""
 SMALL_PICTURE_SIDE_PX = 320
-"""Longer side of small pictures in pixels."""
+"""Longer side of a report's small pictures, in pixels."""
 
 
 @dataclass(frozen=True)
 class MaskedPhotograph:
     """A photograph as a data URI, with masked areas drawn over it.
 
-    left_out: fraction of its pixels that are masked.
+    picture: the data URI.
+    left_out: fraction of the photograph's pixels that are masked.
     """
 
     name: str
@@ -40,9 +41,10 @@ class MaskedPhotograph:
 
 
 def masked_photographs(scene: Scene, *, only_files: bool) -> tuple[list[MaskedPhotograph], int]:
-    """Evenly spaced photographs with masks, and the number of all photographs with masks. Unreadable files are skipped.
+    """Draw evenly spaced photographs that have masks. Returns them, and the number of all photographs with masks.
 
     only_files: do not count alpha channels as masks.
+    Unreadable files are skipped.
     """
     views = [view for view in scene.views if view.mask is not None and (view.mask.path is not None or not only_files)]
     space = photos_space(view.path for view in scene.views)
@@ -64,7 +66,7 @@ def _shown(view: View, space: str) -> MaskedPhotograph:
 
 
 def exposure_chart(run: Run) -> Markup:
-    """Chart of the photographs' learnt gains, in the order of names; "" if there are none."""
+    """Draw a chart of the gains learnt for each photograph, in the order of names; "" if there are none."""
     path = run.appearance_path
     if not path.exists():
         return Markup("")
@@ -85,7 +87,7 @@ def exposure_chart(run: Run) -> Markup:
 
 
 def _corners(photographs: Mapping[str, Any]) -> str:
-    """Text on the light in the corners of the picture, from the learnt vignettes; "" if there are none."""
+    """Describe how dark the learnt vignettes make the corners of pictures; "" if there are no vignettes."""
     vignettes = {tuple(_three(row["vignette"])) for row in photographs.values() if "vignette" in row}
     octaves = sorted(min(sum(vignette), 16.0) for vignette in vignettes if any(vignette))
     left = dict.fromkeys(f"{2.0**value:.0%}" for value in octaves)
@@ -93,12 +95,15 @@ def _corners(photographs: Mapping[str, Any]) -> str:
 
 
 def _gains(record: Any) -> Sequence[float]:
-    """Three gains in stops. Raises ValueError, KeyError or TypeError if the record does not contain them."""
+    """Return the three gains, in stops, of a photograph's record in appearance.json.
+
+    Raises ValueError, KeyError or TypeError if the record does not contain them.
+    """
     return _three(record["log2_gains"])
 
 
 def _three(values: Any) -> list[float]:
-    """Three numbers. Raises ValueError or TypeError for anything else."""
+    """Return `values` as three numbers. Raises ValueError or TypeError if they are anything else."""
     numbers = [number(value) for value in values]
     if len(numbers) != 3 or None in numbers:
         raise ValueError("not three numbers")

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers of a run, read from its files. Nothing is measured again. Missing or damaged files are reported as notes."""
+"""Numbers of a run, read from metrics.jsonl, eval.json and model.ply, for the HTML reports.
+
+Nothing is measured again. Missing or damaged files are reported as notes.
+"""
 
 from __future__ import annotations
 
@@ -24,20 +27,21 @@ CURVE_KEYS = ("step", "loss", "psnr", "gaussians", "seconds")
 MAX_NAME_CHARACTERS = 200
 """Maximum number of characters of a displayed name of a view, stage or device."""
 MAX_EVALUATED_VIEWS, MAX_STAGES, MAX_SESSIONS, MAX_SAMPLES = 10_000, 40, 100, 2000
-"""Maximum numbers of entries that are read, for files of other origin: clsplat writes fewer. The last are kept."""
+"""Maximum numbers of entries that are read. clsplat writes fewer; the limits protect from files of other origin."""
 MAX_DRAWN_VALUE = 1e30
+"""Largest magnitude of a number in a chart."""
 
 
 @dataclass
 class RunNumbers:
     """Numbers of a run, from its files.
 
-    curves: the list of values of each key of the records; all lists have the same length.
-    stages: records of a step and the milliseconds of each of its stages.
+    curves: for each of CURVE_KEYS, the values in all records of metrics.jsonl.
+    stages: records with a step, and the milliseconds of each of the step's stages.
     evaluations: held-out scores during training and at its end, in the order of steps.
     evaluation: contents of eval.json.
     sessions: start, device, driver and versions of each training session.
-    elapsed: elapsed seconds.
+    elapsed: wall time of all training sessions in seconds; None if unknown.
     model: description of model.ply, without its Gaussians.
     histograms: edges and counts of each histogram, by name.
     notes: sentences on missing or damaged data, and other remarks.
@@ -57,7 +61,7 @@ class RunNumbers:
 
     @property
     def step(self) -> int:
-        """The last known step."""
+        """The last step in metrics.jsonl or of an evaluation."""
         steps = [self.curves["step"][-1]] if self.curves["step"] else []
         return int(max([*steps, *(record["step"] for record in self.evaluations)], default=0))
 
@@ -82,7 +86,7 @@ class RunNumbers:
         return [(float(at), psnr) for at, psnr in points if at is not None and psnr is not None]
 
     def document(self) -> Record:
-        """All numbers as data, for --json."""
+        """Return all numbers as a JSON object, for --json."""
         document = {item.name: getattr(self, item.name) for item in fields(self) if item.name != "run"}
         scene = self.run.scene.name if self.run.scene is not None else None
         return {**document, "settings": asdict(self.run.config), "scene": scene}
@@ -133,7 +137,7 @@ def read_run_numbers(run: Run, model: Gaussians | None = None, *, describe: bool
 
 
 def number(value: object) -> float | None:
-    """The value as a float if charts can show it, otherwise None."""
+    """Return `value` as a float if it is a number that charts can show, otherwise None."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     return float(value) if -MAX_DRAWN_VALUE <= value <= MAX_DRAWN_VALUE else None
@@ -169,7 +173,7 @@ def _numbers(values: Mapping[str, Any], limit: int) -> dict[str, float]:
 
 
 def _evaluation(value: object) -> Record | None:
-    """The valid parts of an evaluation in the format of eval.json; None if it is no evaluation."""
+    """Return the valid parts of an evaluation in the format of eval.json, or None if `value` is no evaluation."""
     if not isinstance(value, dict) or not isinstance(value.get("views"), list):
         return None
     views = []
@@ -205,7 +209,7 @@ def _session(value: Mapping[str, Any]) -> Record:
 
 
 def _elapsed(records: list[Record]) -> float | None:
-    """Elapsed seconds until the last record, summed over all sessions."""
+    """Sum the wall time of all training sessions until the last record, in seconds; None if a record has no time."""
     total, last = 0.0, None
     for record in records:
         if "session" in record and last is not None:
@@ -246,7 +250,7 @@ def _add_model(numbers: RunNumbers, model: Gaussians | None) -> None:
         numbers.notes.append("model.ply is missing: the model cannot be described.")
         return
     if isinstance(model, GaussiansOfFile):
-        numbers.notes.append("The model is not described, as it is larger than --max-host-mem: clsplat info does it.")
+        numbers.notes.append("model.ply is larger than --max-host-mem and is not described here: use clsplat info.")
         return
     try:
         model = model or Gaussians.load(path)
@@ -293,7 +297,7 @@ def _add_gate(numbers: RunNumbers, records: list[Record]) -> None:
 
 
 def _list(value: object) -> list[float]:
-    """The value as a list of numbers; empty if it is not one."""
+    """Return `value` if it is a list of numbers, otherwise an empty list."""
     listed = value if isinstance(value, list) else []
     numbers = [known for item in listed if (known := number(item)) is not None]
     return numbers if len(numbers) == len(listed) else []

@@ -45,8 +45,9 @@ INFERNO_RGB = np.array(
 
 @dataclass(frozen=True)
 class Shown:
-    """Pictures of a view as data URIs.
+    """Pictures of a held-out view as data URIs: render, photograph, error and depth.
 
+    width, height: size of the pictures in pixels.
     photo, error: None if there is no photograph.
     trouble: reason why the photograph cannot be read.
     depth: None if no depth picture was kept.
@@ -68,7 +69,10 @@ class Shown:
 
 
 def scene_of(run: Run) -> Scene | str:
-    """The run's scene, or the reason why there is none. A report never reconstructs a scene from photographs."""
+    """Load the run's scene, or return the reason why this is impossible.
+
+    A report never runs structure from motion on a folder of photos.
+    """
     source = run.scene
     if source is None:
         return "config.toml does not name the scene"
@@ -94,7 +98,7 @@ def scene_of(run: Run) -> Scene | str:
 
 
 def chosen(scores: Sequence[float | None], limit: int) -> list[int]:
-    """Indices of at most `limit` views to show, ascending: the worst, the best, and others at even ranks between."""
+    """Choose at most `limit` views to show: the worst, the best, and others at even ranks between. Returns indices."""
     if len(scores) <= limit:
         return list(range(len(scores)))
     order = sorted(range(len(scores)), key=lambda index: (scores[index] is None, scores[index] or 0.0, index))
@@ -110,13 +114,16 @@ def show(
     background: ArrayLike,
     side: int = MAX_PICTURE_SIDE_PX,
 ) -> list[Shown]:
-    """Pictures of the views `names[index]` for each index in `wanted`, if their renders are in test/ of the run folder.
+    """Make the pictures of held-out views whose renders are in test/ of the run folder.
 
-    side: maximum longer side in pixels.
+    names: names of all held-out views.
+    wanted: indices of the views to show.
+    scene: the run's scene, for the photographs, or None.
+    side: maximum longer side of a picture in pixels.
     """
     try:
         paths = picture_names(names)
-    except ValueError:  # no file can have this name, for example ""
+    except ValueError:  # a view's name that no file can have, such as ""
         return []
     views = {view.name: view for view in scene.views} if scene is not None else {}
     space = photos_space(view.path for view in views.values())
@@ -140,7 +147,7 @@ def show(
 
 
 def error_colors(error: Float32) -> Float32:
-    """Colours (H, W, 3) of a mean absolute error (H, W)."""
+    """Map a mean absolute error (H, W) to colours (H, W, 3)."""
     at = np.clip(error / np.float32(MAX_COLOURED_ERROR), 0, 1) * (len(INFERNO_RGB) - 1)
     low = np.minimum(at.astype(int), len(INFERNO_RGB) - 2)
     part = (at - low)[..., None]

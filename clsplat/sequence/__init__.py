@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendering of many frames as a job: tasks, workers, finished frames, clusters."""
+"""Rendering of a shot's frames as a job: tasks, threads, existing files, frames shared between jobs, Dask clusters."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames on a Dask cluster: an existing one, or one of processes on this machine. Needs `distributed`.
+"""Rendering of frames on a Dask cluster: an existing one, or one of processes on this machine. Needs `distributed`.
 
 A frame is a Dask task. Every worker loads the model once and keeps it. Files must have the same paths on all workers.
 """
@@ -40,10 +40,12 @@ NO_WORKERS_WARNING_SECONDS = 10.0
 
 @dataclass(frozen=True)
 class WorkerJob:
-    """Settings of a job, with all that a worker has to load.
+    """Settings of a job, by which a worker opens its renderer.
 
     model: absolute path of the model, or of the shot file.
-    digest: SHA-256 of its content (`JobModels.digest`).
+    digest: SHA-256 of the model's content (`JobModels.digest`).
+    device: name of the device, as for --device.
+    memory_limit: limit of device memory in bytes, or None.
     placed: True if the tasks contain placements of the models.
     version: version of clsplat.
     """
@@ -60,23 +62,30 @@ class WorkerJob:
 
 @dataclass(frozen=True)
 class Failure:
-    """An error in a worker. Not all of clsplat's exceptions can be sent between processes."""
+    """An error in a worker, as data, because not all of clsplat's exceptions can be sent between processes.
+
+    wrong_input: True for an InputError.
+    """
 
     message: str
     wrong_input: bool
 
 
 class _Held:
-    """The renderer that this process holds open, for one job, and the locks that limit its use."""
+    """The renderer that a worker holds open for one job.
+
+    rendering: lock of the thread that renders.
+    room: semaphore that limits the number of frames in memory.
+    """
 
     def __init__(self) -> None:
-        self.turn, self.room = threading.Lock(), threading.Semaphore(MAX_FRAMES_PER_WORKER)
+        self.rendering, self.room = threading.Lock(), threading.Semaphore(MAX_FRAMES_PER_WORKER)
         self.key: str | None = None
         self.renderer: FrameRenderer | None = None
 
     def renderer_for(self, job: WorkerJob) -> FrameRenderer:
         if self.renderer is None or repr(job) != self.key:
-            self.key = self.renderer = None  # frees memory before the next renderer takes some
+            self.key = self.renderer = None  # free the old renderer's memory before the new one takes some
             job_models = load_job_models(Path(job.model))
             if job_models.digest != job.digest:
                 raise InputError(
@@ -85,7 +94,7 @@ class _Held:
             model = job_models.models if job.placed else job_models.one
             mattes = job_models.mattes(job.options.channels, job.options.ids_from)
             if names_of(mattes) != job.options.mattes:
-                raise InputError(f"{job.model}: has other mattes on a worker than it had when the job began")
+                raise InputError(f"{job.model}: has other Cryptomatte objects on a worker than when the job began")
             self.renderer = open_frame_renderer(
                 model,
                 job.options,
@@ -110,7 +119,7 @@ def render_frame(task: Task, job: WorkerJob) -> Result | Failure:
         if job.version != package_version():
             raise InputError(f"a worker has clsplat {package_version()}, expected {job.version}")
         with _WORKER_RENDERER.room:
-            with _WORKER_RENDERER.turn:
+            with _WORKER_RENDERER.rendering:
                 if not task.is_video and stamp(task.path) != task.before and is_complete(task, job.options):
                     return record_of(task, job.options), None
                 frame = _WORKER_RENDERER.renderer_for(job)(task)
@@ -129,11 +138,11 @@ def render_on_farm(
     workers: int | None = None,
     video: VideoWriter | None = None,
 ) -> None:
-    """Render the frames on the cluster of the scheduler at the address `scheduler`, or on a new local cluster with
-    `workers` processes.
+    """Render the frames on a Dask cluster. Frames of a video are encoded in this process.
 
-    Frames of a video are encoded in this process.
     on_done: as in `workers.run_tasks`.
+    scheduler: address of the scheduler of an existing cluster.
+    workers: without a scheduler, the number of processes of a new cluster on this machine.
     Frames of a lost worker are rendered again by others. Raises InputError if there is no such cluster. Raises
     ClsplatError for a frame that cannot be rendered, or whose workers were lost more often than Dask allows.
     """
@@ -152,10 +161,10 @@ def render_on_farm(
 
 
 def _results(client: Any, tasks: Sequence[Task], job: WorkerJob, video: VideoWriter | None = None) -> Iterator[Result]:
-    """Results of `render_frame`, in the order in which frames finish.
+    """Yield the results of `render_frame` in the order in which frames finish.
 
     Only a window of tasks is submitted at a time, because a job may have a million. For a video the window begins with
-    the frame to encode next, since frames that finish early wait here.
+    the frame to encode next, which limits the number of finished frames that wait for it in memory.
     """
     from distributed import CancelledError, KilledWorker, as_completed
 
@@ -206,14 +215,14 @@ def _telling_of_no_workers(client: Any, scheduler: str | None) -> Iterator[None]
         while not stop.is_set():
             try:
                 there = bool(client.nthreads())
-            except (OSError, RuntimeError, TimeoutError):  # the loop over the frames reports a lost scheduler
+            except (OSError, RuntimeError, TimeoutError):  # the loop over frames reports the loss
                 return
             now = time.monotonic()
             since = None if there else since or now
             if since is not None and not stop.is_set():
                 waited = f", for {now - since:.0f} s now" if now - since >= 1 else ""
                 warn(
-                    f"--scheduler {scheduler}: has no workers{waited}; frames wait until one is there; start one with: "
+                    f"--scheduler {scheduler}: has no workers{waited}; frames wait until one connects; start one with: "
                     f"dask worker {scheduler}"
                 )
             stop.wait(NO_WORKERS_WARNING_SECONDS)

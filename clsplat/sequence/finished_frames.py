@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Existing files: frames of an earlier job, folders, temporary files."""
+"""Existing files of a job: finished frames (--skip-existing), files of other programs, folders, temporary files."""
 
 from __future__ import annotations
 
@@ -29,11 +29,14 @@ T = TypeVar("T")
 MAX_FILE_THREADS = 8
 """Largest number of threads that read or write files at once."""
 IDENTITY_ATTRIBUTES = (MODEL_DIGEST_ATTRIBUTE, "clsplat:colorspace")
-"""Attributes that identify a file's model and colour space."""
+"""Attributes of a frame's file that identify the model and the colour space."""
 
 
 def check_folders(tasks: Sequence[Task]) -> None:
-    """Raise InputError if a file's folder is a file, cannot be created or is not writable. Creates nothing."""
+    """Raise InputError if frames cannot be written to their folders, or if a frame's file is a folder.
+
+    Nothing is created.
+    """
     for folder in sorted({task.path.parent for task in tasks}):
         nearest = next(path for path in (folder, *folder.parents) if path.exists())
         if not nearest.is_dir():
@@ -46,12 +49,12 @@ def check_folders(tasks: Sequence[Task]) -> None:
 
 
 def make_folders(tasks: Sequence[Task]) -> None:
-    """Create the files' folders. Raises InputError."""
+    """Create the folders of the frames' files. Raises InputError."""
     for folder in sorted({task.path.parent for task in tasks}):
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"{folder}: cannot be made: {reason_of(error)}") from None
+            raise InputError(f"{folder}: cannot be created: {reason_of(error)}") from None
 
 
 def remove_temporaries(tasks: Sequence[Task]) -> None:
@@ -87,7 +90,7 @@ def _is_whole(task: Task, options: RenderOptions, identity: Mapping[str, str | i
 
 
 def made_of(tasks: Sequence[Task], options: RenderOptions, config: VideoConfig) -> dict[str, Any]:
-    """The provenance record of a video of these frames."""
+    """Return the record that a video of these frames holds: digests of the model, the settings and the encoding."""
     frames = [(task.number, settings_digest(task, options)) for task in tasks]
     return {
         MODEL_DIGEST_ATTRIBUTE: options.attributes.get(MODEL_DIGEST_ATTRIBUTE),
@@ -96,7 +99,7 @@ def made_of(tasks: Sequence[Task], options: RenderOptions, config: VideoConfig) 
 
 
 def frames_there(tasks: Sequence[Task], options: RenderOptions, video: VideoConfig) -> set[str]:
-    """Keys of the frames that `--skip-existing` leaves out.
+    """Return the keys of the frames that `--skip-existing` leaves out.
 
     Warns if files do not record their settings, and if existing frames have to be rendered again.
     """
@@ -110,15 +113,19 @@ def frames_there(tasks: Sequence[Task], options: RenderOptions, video: VideoConf
         )
     if changed := [task.path for task, state in states.items() if state == "changed"]:
         warn(
-            f"--skip-existing: {len(changed)} of the frames that are there were made of another model, or with other "
+            f"--skip-existing: {len(changed)} of the existing frames were made of another model, or with other "
             f"cameras or settings, such as {changed[0]}: they are rendered again"
         )
     return {task.key for task, state in states.items() if state in ("recorded", "unrecorded")}
 
 
 def _state(task: Task, options: RenderOptions) -> Literal["recorded", "unrecorded", "changed", "missing"]:
-    """State of a frame's file. recorded, unrecorded: complete, with or without a record of its settings. changed: of
-    another model or settings. missing: not there, damaged, or of another kind."""
+    """Compare a frame's file with its task. Returns the file's state.
+
+    recorded, unrecorded: complete, with or without a record of the settings.
+    changed: made of another model, or with other cameras or settings.
+    missing: not there, damaged, or with another size or other channels.
+    """
     wanted = _identity(task, options)
     if _is_whole(task, options, wanted):
         return "unrecorded" if attribute(task.path, SETTINGS_DIGEST_ATTRIBUTE) is None else "recorded"
@@ -127,14 +134,14 @@ def _state(task: Task, options: RenderOptions) -> Literal["recorded", "unrecorde
 
 
 def _video_there(tasks: Sequence[Task], options: RenderOptions, video: VideoConfig) -> set[str]:
-    """Keys of all frames, or of none: a video is complete only as a whole."""
+    """Return the keys of all frames if their video is complete, otherwise of none."""
     path = tasks[0].path
     if video_record(path, len(tasks)) == made_of(tasks, options, video):
         return {task.key for task in tasks}
     if path.exists():
         warn(
-            f"--skip-existing: {path} is not whole, or was made of another model or frames, or with other cameras or "
-            "settings: it is rendered again"
+            f"--skip-existing: {path} is incomplete, or was made of another model or frames, or with other cameras "
+            "or settings: it is rendered again"
         )
     return set()
 
@@ -156,7 +163,7 @@ def _at_once(tasks: Sequence[Task], look: Callable[[Task], T]) -> list[T]:
 
 
 def stamp(path: Path) -> tuple[int, ...] | None:
-    """Inode, modification time and size of a file, by which a replacement is noticed; None if there is no file."""
+    """Inode, modification time and size of a file, which differ after a replacement; None if there is no file."""
     try:
         status = path.stat()
     except OSError:

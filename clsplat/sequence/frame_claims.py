@@ -28,7 +28,7 @@ State = Literal["ours", "done", "theirs"]
 
 
 class Sharing:
-    """Claims of this job's frames. All methods are thread-safe."""
+    """The frames that this job has claimed, so that no other job renders them. All methods are thread-safe."""
 
     def __init__(self, options: RenderOptions) -> None:
         self.options = options
@@ -39,15 +39,15 @@ class Sharing:
     def begin(self, task: Task) -> State:
         """Claim a frame if possible.
 
-        ours: the frame is to be rendered here.
-        done: its file is complete by now.
-        theirs: another process is rendering it.
+        ours: the frame is claimed, and to be rendered by this job.
+        done: the frame's file is complete by now.
+        theirs: another process is rendering the frame.
         """
         if is_complete(task, self.options):
             return "done"
         if (claimed := claim(task.path)) is None:
             return "theirs"
-        if is_complete(task, self.options):  # completed while it was being claimed
+        if is_complete(task, self.options):  # another job has completed the frame just before the claim
             give_back(claimed)
             return "done"
         with self._changing:
@@ -55,22 +55,22 @@ class Sharing:
         return "ours"
 
     def _hold(self) -> None:
-        """Update the claims while the job runs, because a frame may take hours."""
+        """Update the claims' modification times while the job runs, because a frame may take hours."""
         while not self._closed.wait(CLAIM_HEARTBEAT_SECONDS):
             with self._changing:
                 for claimed in self._claims.values():
                     with suppress(OSError):
-                        os.utime(claimed)  # not Path.touch, which would create a missing file again
+                        os.utime(claimed)  # Path.touch would create a missing file again
 
     def end(self, task: Task) -> None:
-        """Release a frame, whether its file has been completed or not."""
+        """Give up the claim of a frame, whether the frame's file has been completed or not."""
         with self._changing:
             claimed = self._claims.pop(task.key, None)
         if claimed is not None:
             give_back(claimed)
 
     def close(self) -> None:
-        """Release all unfinished frames."""
+        """Give up the claims of all unfinished frames."""
         self._closed.set()
         with self._changing:
             claims, self._claims = list(self._claims.values()), {}
@@ -80,9 +80,10 @@ class Sharing:
 
 
 class FrameQueue:
-    """The frames of a job, which its threads take one by one.
+    """The frames of a job, which the job's threads take one by one.
 
-    Frames that no other job has claimed come first, then the others, when they are done or given up.
+    Frames that no other job has claimed come first. The others follow when the other job has completed or released
+    them.
     stop: set when no more frames are wanted.
     """
 
@@ -93,9 +94,9 @@ class FrameQueue:
         self._told = False
 
     def take(self, skip: Callable[[Task], None]) -> Task | None:
-        """The next frame to render, None if there is none. Waits for frames of other jobs.
+        """Return the next frame to render, or None if none is left. Waits for frames that other jobs have claimed.
 
-        skip: function that is called with each frame that is done already.
+        skip: function that is called with each frame whose file is complete already.
         """
         began = time.monotonic()
         while not self.stop.is_set():
@@ -113,7 +114,7 @@ class FrameQueue:
         return None
 
     def _next(self) -> tuple[Task | None, bool]:
-        """The next frame, and True if another job had claimed it before."""
+        """Return the next frame, and True if only frames are left that another job had claimed."""
         with self._turn:
             if (task := next(self._left, None)) is not None:
                 return task, False
@@ -125,11 +126,11 @@ class FrameQueue:
             warn(f"--skip-existing: another process renders {task.path}, which is still missing; waiting for it")
 
     def end(self, task: Task) -> None:
-        """Release a frame, whether its file has been completed or not."""
+        """Give up the claim of a frame, whether the frame's file has been completed or not."""
         if self._sharing is not None:
             self._sharing.end(task)
 
     def close(self) -> None:
-        """Leave unfinished frames to other jobs."""
+        """Give up the claims of unfinished frames, so that other jobs can render them."""
         if self._sharing is not None:
             self._sharing.close()

@@ -60,8 +60,8 @@ class RenderedFrame:
 
     planes: None for a frame that was written strip by strip.
     seconds: rendering time.
-    finish: the remaining work on the planes, done by the encoding thread.
-    right: planes of the right eye, if one file has both.
+    finish: function that the encoding thread applies to the planes before it writes them.
+    right: planes of the right eye, if one file has both eyes.
     """
 
     planes: Planes | None
@@ -75,7 +75,8 @@ class RenderedFrame:
 class DevicePlan:
     """Memory plan of a device for the frame that needs most memory.
 
-    strips: number of strips that a frame is rendered in.
+    device: name of the device.
+    strips: number of strips in which this frame is rendered.
     """
 
     device: str
@@ -87,8 +88,7 @@ RenderFrame = Callable[[Task], RenderedFrame]
 
 
 class FrameRenderer:
-    """Renders frames of one or several models on one device. A frame too large to be held in memory is also written
-    here."""
+    """Renders frames of one or several models on one device. Frames too large for memory are also written here."""
 
     def __init__(
         self,
@@ -100,8 +100,8 @@ class FrameRenderer:
         """Prepare the models and the pipeline of a job.
 
         renderer: a `Renderer`.
-        models: a single one used as it is, or several that the tasks place.
-        mattes: mattes by the names of their channels.
+        models: a single model used as it is, or models that each task places in its world.
+        mattes: Cryptomattes by the names of their channels.
         Raises InputError for settings and colour spaces that do not fit together.
         """
         self.options = options
@@ -122,8 +122,8 @@ class FrameRenderer:
         self._objects = sum(len(matte.names) for matte in (mattes or {}).values())
 
     def check(self, tasks: Sequence[Task]) -> None:
-        """Raise InputError for a frame that has to be rendered in strips here, but whose file has several parts or
-        views."""
+        """Raise InputError for a frame that must be rendered in strips on this device, but whose file has several
+        parts or views."""
         several = self.options.encoding.parts != "one"
         held = HELD_PIXEL_BYTES if self.options.holdout is not None else 0
         for task in (task for task in tasks if not task.is_video and (several or task.right)):
@@ -171,7 +171,7 @@ class FrameRenderer:
         return replace(frame, measured=replace(frame.measured, kernel_ms=kernels, transfer_ms=transfers))
 
     def _pair(self, task: Task) -> RenderedFrame:
-        """The frame, and the right eye's if the file has both."""
+        """Render the frame of a task, and the right eye's frame if the file has both eyes."""
         left = self._frame(task, len(task.views))
         if task.right is None:
             return left
@@ -218,10 +218,10 @@ class FrameRenderer:
         return RenderedFrame(planes, time.monotonic() - start, finish, Measured(blank))
 
     def _placed(self, task: Task) -> tuple[Callable[[float], Gaussians], tuple[Gaussians | None, Gaussians | None]]:
-        """Function that returns all models merged at a time; and the models one frame later and one frame earlier.
+        """Return a function that merges the models at a time, and the merged models one frame later and earlier.
 
-        Times are in frames from the frame. The later and earlier models serve the channels motion and backward. They
-        are None if nothing moves or the channel is not requested.
+        The function takes the time in frames relative to the task's frame. The later and earlier models serve the
+        channels motion and backward. They are None if nothing moves or the channel is not requested.
         """
         ensemble, middle = self._ensemble, sampling_of(task, self.options.pictures).middle
         if (placed := task.placed) is None:
@@ -233,21 +233,22 @@ class FrameRenderer:
         return lambda time: ensemble.at(placed[time]), (moved("motion", middle + 1), moved("backward", middle - 1))
 
     def _trust(self, camera: Camera) -> None:
-        """Run the self-test for panoramas and fisheyes before the first such frame."""
+        """Before the first frame of a panorama or fisheye, run the self-test of projection along rays."""
         if not camera.model.along_rays or self._rays_tested:
             return
 
         device = self._renderer.device
-        if require(device, RAY_STAGES) is not device:  # too late to change the kernel shape
+        if require(device, RAY_STAGES) is not device:  # the job cannot change the kernel shape
             raise DriverError(
-                f"{device.name}: the driver failed in the shape {device.shape.label}; another shape works, call again"
+                f"{device.name}: the driver failed in the kernel shape {device.shape.label}, but another shape works; "
+                "run the command again"
             )
         self._rays_tested = True
 
     def _rows(self, camera: Camera, planes: int) -> int:
-        """Number of rows of a strip of the camera's picture; the picture's height if it needs no strips.
+        """Return the number of rows of a strip of the camera's picture, or its height if it needs no strips.
 
-        planes: bytes per pixel for a holdout.
+        planes: bytes per pixel that a holdout takes.
         """
         framing = self.options.pictures.framing
         rows = strip_rows(self._renderer.device, camera, self.options.channels, framing, planes)
@@ -257,9 +258,9 @@ class FrameRenderer:
 
 
 def cut_of(task: Task, options: RenderOptions) -> Cut | None:
-    """The surfaces of a frame's holdout, None if it has none. Raises InputError.
+    """Read the surfaces of a frame's holdout; None if the frame has no holdout. Raises InputError.
 
-    Warns about surfaces that end at the frame's edge if the picture extends beyond it.
+    Warns if the picture extends beyond the frame, but the surfaces end at the frame's edge.
     """
     if task.holdout is None or options.holdout is None:
         return None
@@ -272,7 +273,7 @@ def cut_of(task: Task, options: RenderOptions) -> Cut | None:
     cut, bent = Cut(holdout), warp_of(task, pictures) is not None
     if _reaches_out(straight_camera(task, pictures), INTERPOLATION_MARGIN_PX + 1 if bent else 0) and cut.goes_on:
         where = "where the warped picture extends beyond it" if bent else "in the overscan"
-        warn(f"{task.holdout}: ends with the frame, and nothing is held out {where}; render the CG with overscan")
+        warn(f"{task.holdout}: ends at the frame's edge; nothing is held out {where}; render the CG with overscan")
     return cut
 
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models of a job: one file, one file per frame, the models of a shot file, or those placed by a USD stage. Needs no
-device."""
+"""Models of a render job: one file, one file per frame, the models of a shot file, or the models that a USD stage
+places. Needs no device."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ from clsplat.shots.usd_models import read_stage
 Known = dict[Placement | State, Placement | State]
 """Cache of placements, each under itself as the key, so that equal placements are stored once."""
 MAX_MATTE_OBJECTS = 256
-"""Limit of objects in a matte. Each takes a plane of floats while a frame is rendered."""
+"""Maximum number of objects in a Cryptomatte. Each takes a plane of floats while a frame is rendered."""
 
 
 @dataclass(frozen=True, eq=False)
 class JobModels:
-    """The models of a job.
+    """The models of a job, and their placements over time.
 
-    path: path of the file that defines them.
-    models: each in its own world.
-    names: one per model.
-    digest: SHA-256 of their sources; for a single model file, of that file.
+    path: the model file, shot file, USD stage or pattern of files that defines the models.
+    models: the models, each in its own world.
+    names: name of each model, for Cryptomattes.
+    digest: SHA-256 of the model file, or of the digests of several sources.
     space: the colour space that all models have.
     tracks: placements of the models over time; None for a single model that is not placed.
     files: files of the models; empty for a USD stage.
-    volumes: regions with mattes, for each model.
+    volumes: for each model, regions that are Cryptomatte objects of their own.
     numbered: files by frame number for each model, empty for a model that does not change.
     """
 
@@ -68,7 +68,7 @@ class JobModels:
 
     @property
     def one(self) -> Gaussians:
-        """The single model, if models are not placed."""
+        """The single model of a job whose model is not placed."""
         return self.still[0]
 
     @property
@@ -92,16 +92,19 @@ class JobModels:
         return tuple(sorted({number for files in self.numbered for number in files}))
 
     def state(self, frame: float) -> State | None:
-        """Placements at a frame, None if there are none. Raises InputError for an invalid one."""
+        """Return the placements of the models at a frame; None if they are not placed.
+
+        Raises InputError for an invalid placement.
+        """
         return None if self.tracks is None else tuple(track.at(frame) for track in self.tracks)
 
     def at(self, frame: float) -> Gaussians:
-        """All models at a frame, merged into one."""
+        """Merge all models into one, as they are at a frame."""
         state = self.state(frame)
         return self.one if state is None else Ensemble(self.models).at(state)
 
     def mattes(self, channels: Collection[str], ids_from: str = "") -> dict[str, Matte]:
-        """Mattes among the channels, by name.
+        """Make the Cryptomattes among the channels, by the channel's name.
 
         ids_from: property of the model files that holds semantic ids.
         Raises InputError.
@@ -123,21 +126,21 @@ class JobModels:
         return made
 
     def _objects(self) -> Matte:
-        """A matte with one object for each model, and one for each volume of a model.
+        """Make a Cryptomatte with one object for each model, and one for each volume of a model.
 
         A Gaussian in a volume belongs to the volume and not to the model; in several volumes, to the first.
         """
         names, owners = list(self.names), []
         for index, model in enumerate(self.still):
             own = np.full(len(model), index, np.int32)
-            for volume in reversed(self.volumes[index] if self.volumes else ()):  # the first volume wins
+            for volume in reversed(self.volumes[index] if self.volumes else ()):  # so that the first wins
                 own[volume.holds(model)] = len(names)
                 names.append(volume.name)
             owners.append(own)
         return Matte(tuple(names), np.concatenate(owners))
 
     def _semantic(self, ids_from: str) -> Matte:
-        """A matte with one object for each value of the property."""
+        """Make a Cryptomatte with one object for each value of the property `ids_from` of the model files."""
         if not self.files:
             raise InputError(f"--ids-from {ids_from}: {self.path} is a USD stage, expected PLY files with the property")
         columns: list[NDArray[np.int64]] = []
@@ -152,7 +155,7 @@ class JobModels:
         return Matte(tuple(str(number) for number in numbers.tolist()), owners.astype(np.int32))
 
     def seen(self, tasks: Sequence[Task], pictures: PictureConfig, channels: Collection[str]) -> list[Task]:
-        """The tasks with placements of the models, and cameras adapted to these. Raises InputError."""
+        """Return the tasks with the models' placements, near planes and ray settings. Raises InputError."""
         known: Known = {}
         self._check_numbers([task.number for task in tasks])
         placed = []
@@ -162,7 +165,11 @@ class JobModels:
         return placed
 
     def _seen(self, task: Task, pictures: PictureConfig, times: Sequence[float], known: Known) -> Task:
-        """The task of one view, with placements of the models."""
+        """Return the task of one view, with the placements of the models at `times`.
+
+        times: in frames relative to the task's frame, the shutter's middle first.
+        known: cache of placements.
+        """
         model = kind_of(self.models[0])
         if self.tracks is None:
             return task.seen_by(model, dict.fromkeys(times, model.near))
@@ -180,7 +187,7 @@ class JobModels:
         return replace(seen, placed=states, files=self._files_of(states.values()))
 
     def _files_of(self, states: Iterable[State]) -> tuple[Path, ...]:
-        """Files of the changing models that these states need. Announces the states' samples to the models."""
+        """Return the files of changing models that these states need, and tell the models which samples to expect."""
         found: dict[Path, None] = {}
         for state in states:
             for index, placement in enumerate(state):
@@ -191,7 +198,7 @@ class JobModels:
         return tuple(found)
 
     def _check_numbers(self, numbers: Sequence[int]) -> None:
-        """Raise InputError for frames beyond a sequence of files. Warns about frames inside it that have no file."""
+        """Raise InputError for frames before the first or after the last file of a sequence. Warns of missing files."""
         for path, files in zip(self.files, self.numbered, strict=False):
             if not files:
                 continue
@@ -206,7 +213,7 @@ class JobModels:
 
 
 def names_of(mattes: Mapping[str, Matte]) -> tuple[MatteNames, ...]:
-    """Names and digests of the mattes, for the options of a job."""
+    """Return the object names and a digest of each Cryptomatte, for the options of a job."""
     return tuple(
         MatteNames(name, mattes[name].names, hashlib.sha256(mattes[name].owners.tobytes()).hexdigest()[:32])
         for name in CRYPTOMATTE_CHANNELS
@@ -217,7 +224,7 @@ def names_of(mattes: Mapping[str, Matte]) -> tuple[MatteNames, ...]:
 def load_job_models(path: Path, transform: KeyedTrack | None = None) -> JobModels:
     """Load the models that MODEL names: a run, a model file, one file per frame, a shot file or a USD stage.
 
-    transform: applied to all models.
+    transform: transform over time to apply to all models, or None.
     Raises InputError for an unreadable file, and for models that differ in colour space or rendering method.
     """
     if is_layout(path):
@@ -244,9 +251,12 @@ def load_job_models(path: Path, transform: KeyedTrack | None = None) -> JobModel
 
 @dataclass(frozen=True)
 class _Opened:
-    """A loaded model of a shot.
+    """A loaded model of a shot file.
 
-    file: file of the model, or the pattern of its files.
+    digest: SHA-256 of the file, or of the pattern.
+    space: colour space of the model.
+    file: file of the model, or the pattern of the model's files.
+    numbered: files by frame number; empty for a model that does not change.
     """
 
     model: Gaussians | ModelSeries
@@ -261,13 +271,13 @@ def _opened(path: Path) -> _Opened:
         series, files = open_sequence(path)
         return _Opened(series, digest_of_name(path), colour_space(next(iter(files.values()))), path, files)
     if is_layout(path):
-        raise InputError(f"{path}: is no model file, expected one")
+        raise InputError(f"{path}: is a shot file, expected a model file")
     file = model_file(path)
     return _Opened(Gaussians.load(file), digest(file), colour_space(file), file, {})
 
 
 def _of_layout(path: Path) -> JobModels:
-    """The models of a shot file. Models that share a file are read once."""
+    """Load the models of a shot file. A file that several models share is read once."""
     entries = read_layout(path)
     known: dict[Path, _Opened] = {}
     sums = hashlib.sha256()

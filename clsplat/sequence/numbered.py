@@ -15,12 +15,15 @@ from clsplat.shots.frame_numbers import has_number, numbered_files, path_of
 
 
 def is_sequence(path: Path) -> bool:
-    """True if a path has a field for the frame's number and no file has literally that name."""
+    """True if a path has a field for the frame's number, such as ####, and no file has the path itself as its name."""
     return has_number(str(path)) and not path.exists()
 
 
 def open_sequence(pattern: Path) -> tuple[ModelSeries, dict[int, Path]]:
-    """The model, and its files by frame number. Only the first file is read. Raises InputError if there is none."""
+    """Open a model with one file per frame. Returns the model, and its files by frame number.
+
+    Only the first file is read. Raises InputError if no file matches the pattern.
+    """
     found = {number: model_file(path).absolute() for number, path in numbered_files(str(pattern)).items()}
     if not found:
         first = path_of(str(pattern), 1, "")
@@ -31,11 +34,11 @@ def open_sequence(pattern: Path) -> tuple[ModelSeries, dict[int, Path]]:
         own = colour_space(files[index])
         if own != space:
             raise InputError(f"{files[index]}: is of the colour space {own}, expected {space} as {files[0]} is")
-        return load(files[index], check_encoding=index == 0)  # warnings about one file apply to all
+        return load(files[index], check_encoding=index == 0)  # warn of the first file only
 
     return ModelSeries([float(number) for number in found], read, str(pattern)), found
 
 
 def digest_of_name(pattern: Path) -> str:
-    """SHA-256 of the pattern. The files' content is part of each frame's own digest (`task.settings_digest`)."""
+    """SHA-256 of the pattern's text. Each frame's digest (`task.settings_digest`) includes the content of the files."""
     return hashlib.sha256(str(pattern).encode()).hexdigest()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tasks of a shot: one for each frame and eye, with its files."""
+"""Render tasks of a shot: one for each frame and eye, with cameras, shutter, lens, holdout and file name."""
 
 from __future__ import annotations
 
@@ -29,23 +29,26 @@ def make_views(
     channels: Sequence[str],
     sampling: SamplingConfig | None = None,
 ) -> tuple[list[Task], Shot]:
-    """Tasks from `make_tasks` for each eye, and the chosen frames of the first shot.
+    """Make the tasks of all eyes by `make_tasks`. Returns them, and the chosen frames of the first shot.
 
-    shots: shots by eye; a shot without a pair is under "".
-    The two eyes' frames alternate. If the pattern has no field for the eye, they become views of one file. Raises
-    InputError in the cases of `make_tasks` and `Shot.only`.
+    shots: shots by eye; without stereo a single shot, under "".
+    frames: numbers of the frames to render, as in --frames; None for all.
+    pattern: pattern of the file names.
+    resize: function that resizes a camera.
+    The tasks of the two eyes alternate. If the pattern has no field for the eye, they become views of one file. Raises
+    InputError like `make_tasks` and `Shot.only`.
     """
     chosen = {eye: shot if frames is None else shot.only(frames) for eye, shot in shots.items()}
     first = next(iter(chosen.values()))
     if not any(shots) and EYE_FIELD_PATTERN.search(pattern.replace("%v", "")):
-        raise InputError(f"{pattern}: has an eye's name in it, expected --stereo DISTANCE with it")
+        raise InputError(f"{pattern}: has a field for the eye, expected --stereo DISTANCE with it")
     if len(shots) == 2 and Path(pattern).suffix.lower() in VIDEO_SUFFIXES:
         raise InputError(f"{pattern}: a video holds one eye, expected --eye left or right with it")
     one_file = len(shots) == 2 and not EYE_FIELD_PATTERN.search(pattern)
     if one_file and Path(pattern).suffix.lower() != ".exr":
         raise InputError(
-            f"{pattern}: has no {{eye}} in it, expected one to tell left from right, the name of an .exr, which holds "
-            "both, or --eye left or right"
+            f"{pattern}: has no {{eye}} in it, expected {{eye}} to tell left from right, the name of an .exr file, "
+            "which holds both, or --eye left or right"
         )
     made = [
         [
@@ -68,7 +71,7 @@ def make_tasks(
     channels: Sequence[str],
     sampling: SamplingConfig | None = None,
 ) -> list[Task]:
-    """Tasks for the frames of `chosen`, which are part of the shot `whole`.
+    """Make the tasks for the frames of `chosen`, which are part of the shot `whole`.
 
     Raises InputError if two frames share a file that is not a video, and if the channels or the lens are not defined
     for a camera.
@@ -102,9 +105,9 @@ def make_tasks(
 
 
 def settled(flags: SamplingConfig, optics: Optics | None, camera: Camera) -> SamplingConfig:
-    """Shutter and lens of a frame: the flags' settings, and the USD stage's settings where no flag is given.
+    """Return the shutter and lens of a frame: the flags' settings, or the USD stage's settings where no flag is given.
 
-    The lens size becomes an aperture radius, unless flags give the sensor width or the metres per unit.
+    An f-stop becomes an aperture radius, unless flags give the sensor width or the metres per unit.
     """
     if optics is None:
         return flags
@@ -128,10 +131,11 @@ def settled(flags: SamplingConfig, optics: Optics | None, camera: Camera) -> Sam
 
 
 def held_out(tasks: Sequence[Task], pattern: str, config: HoldoutConfig) -> list[Task]:
-    """The tasks with their holdouts.
+    """Return the tasks with the paths of their holdout files.
 
-    A pattern without a field for the number serves all frames, and one without a field for the eye both eyes. Warns
-    about depths in half floats. Raises InputError for a missing file, and for one whose header is not a holdout's.
+    pattern: pattern of --holdout. Without a field for the number, a file serves all frames; without a field for the
+      eye, both eyes.
+    Warns of depths in half floats. Raises InputError for a missing file, and for a file that is no holdout.
     """
     check_pattern(for_eye(pattern, tasks[0].eye))
     coarse: dict[Path, bool] = {}

@@ -46,8 +46,8 @@ from clsplat.shots.motion import Moments
 from clsplat.shots.optics import Optics, headers
 
 LATLONG_ATTRIBUTES: dict[str, str | int] = {"textureformat": "LatLong Environment", "openexr:levelmode": 0}
-"""OpenImageIO's attributes for EXR's envmap. The level mode says that the file has no mipmap levels. OpenImageIO would
-keep the file open for these."""
+"""OpenImageIO's attributes for EXR's envmap. Level mode 0 is a file without mipmap levels. OpenImageIO would keep the
+file open for more levels."""
 _ENCODING_FIELDS_BY_SUFFIX = {
     ".exr": ("depth", "parts", "compression"),
     **dict.fromkeys((".png", ".tif", ".tiff", ".dpx"), ("bits",)),
@@ -58,7 +58,7 @@ _ENCODING_FIELDS_BY_SUFFIX = {
 
 
 def key_of(number: int, eye: str) -> str:
-    """Key of a frame within its job."""
+    """Key of a frame within its job: the frame's number, and the eye if frames of both eyes have files of their own."""
     return f"{number} {eye}" if eye else str(number)
 
 
@@ -84,7 +84,7 @@ class Record:
 
     seconds: time for rendering and writing, without waiting.
     skipped: True if the file was there already.
-    eye: eye of a stereo pair in two files.
+    eye: left or right, if the eyes of a stereo pair have files of their own.
     blank, kernel_ms, transfer_ms: as in `Measured`.
     """
 
@@ -106,7 +106,7 @@ class Record:
         return key_of(self.frame, self.eye or "")
 
     def document(self) -> dict[str, Any]:
-        """The record for JSON, without values that were not measured."""
+        """Return the record as a JSON object, without values that were not measured."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -118,14 +118,14 @@ class Task:
     camera: camera of the whole frame, in its final size.
     path: path of the file.
     after, earlier: cameras of the next and the previous frame, for motion channels, of the same size; or None.
-    stretch: cameras while the shutter is open, None for a static camera.
-    before: state of the file when the job began (`finished_frames.stamp`).
+    stretch: cameras while the shutter is open; None for a static camera.
+    before: state of the file when the job began, by `finished_frames.stamp`.
     sampling: shutter and lens of this frame; None means the job's.
-    optics: shutter and lens that a USD stage sets.
+    optics: shutter and lens in a USD stage.
     eye: left or right of a stereo pair.
     right: task of the right eye, if one file holds both.
-    lens: the photograph's lens by which the picture is warped.
-    holdout: absolute path, None without a holdout.
+    lens: the photograph's lens, by which the picture is distorted; or None.
+    holdout: absolute path of the holdout's file; None without a holdout.
     placed: placements of the models at each of the `model_times`, in frames from the frame; None for a single model
       used as it is.
     nears: the models' near plane at these times, empty if the camera has its own.
@@ -163,8 +163,10 @@ class Task:
         return (self,) if self.right is None else (self, self.right)
 
     def at(self, time: float) -> Camera:
-        """Camera of the whole frame at a time, in frames after this one; with the models' near plane and ray
-        setting."""
+        """Return the camera of the whole frame at a time, with the models' near plane and ray setting.
+
+        time: in frames relative to this frame.
+        """
         near = self.nears.get(time)
         if time == 0 or self.stretch is None:
             return self.camera if near in (None, self.camera.near) else replace(self.camera, near=near)
@@ -172,9 +174,9 @@ class Task:
         return camera if near is None else camera.before(near)
 
     def seen_by(self, gaussians: Gaussians, nears: Mapping[float, float]) -> Task:
-        """The task with cameras that have the model's near plane, and are drawn along rays if the model needs it.
+        """Return the task with cameras that have the model's near plane, and its setting to project along rays.
 
-        nears: near planes by time.
+        nears: near planes by time in frames relative to this frame.
         """
 
         def seen(camera: Camera) -> Camera:
@@ -186,18 +188,18 @@ class Task:
 
     @property
     def is_video(self) -> bool:
-        """True if the file holds other frames too."""
+        """True if the task's file is a video, which holds other frames too."""
         return self.path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def sampling_of(task: Task, pictures: PictureConfig) -> SamplingConfig:
-    """Shutter and lens of a frame."""
+    """Shutter and lens of a frame: the task's own, else the job's."""
     return task.sampling or pictures.sampling
 
 
 @dataclass(frozen=True)
 class MatteNames:
-    """A matte channel: names of its objects, and a digest of the object of each Gaussian."""
+    """A Cryptomatte channel: names of its objects, and a digest of the array with each Gaussian's object."""
 
     channel: str
     names: tuple[str, ...]
@@ -210,13 +212,13 @@ class RenderOptions:
 
     channels: names from the table in `config.channels`.
     attributes: attributes for the file's header.
-    pictures: windows, samples and colours of a frame.
+    pictures: framing, motion blur, depth of field, distortion and colour space.
     recorded: the model's colour space.
     deep: settings of deep pictures, None for flat ones.
     drawn: digest of the rasterizer's settings.
     gains: three factors of the model's colours, or nine entries of a matrix; empty for unchanged colours.
     holdout: settings for reading holdouts; None without holdouts.
-    mattes: the mattes among the channels.
+    mattes: the Cryptomattes among the channels.
     ids_from: property of the model files that holds semantic ids.
     """
 
@@ -235,10 +237,10 @@ class RenderOptions:
 
 
 def picture_camera(task: Task, pictures: PictureConfig) -> Camera:
-    """Camera of the written picture: its size, its window, and the middle of the shutter. Of a warped picture's camera
-    only size and window are used.
+    """Return the camera of the written picture, with its size and window, at the middle of the shutter.
 
-    Raises InputError for a region outside the frame.
+    For a distorted picture, only the camera's size and window have a meaning. Raises InputError for a region outside
+    the frame.
     """
     warp = warp_of(task, pictures)
     shown = task.at(sampling_of(task, pictures).middle) if warp is None else warp.shown
@@ -246,9 +248,9 @@ def picture_camera(task: Task, pictures: PictureConfig) -> Camera:
 
 
 def framed(camera: Camera, config: FramingConfig) -> Camera:
-    """The camera of the written picture, from a camera of the frame's size.
+    """Apply overscan or region to a camera of the frame's size. Returns the camera of the written picture.
 
-    Its window is None if the picture is the whole frame. Raises InputError for a region outside the frame.
+    The camera's window is None if the picture is the whole frame. Raises InputError for a region outside the frame.
     """
     pixels, share = parse_overscan(config.overscan)
     if config.region:
@@ -270,21 +272,21 @@ def framed(camera: Camera, config: FramingConfig) -> Camera:
 
 
 def lens_of(task: Task, pictures: PictureConfig) -> Places | None:
-    """The lens or STMap that warps the picture, None if nothing does. Raises InputError for an unreadable map."""
+    """Return the lens or STMap that distorts the picture; None without one. Raises InputError for an unreadable map."""
     if stmap := pictures.warp.stmap:
         return ByMap(read_stmap(Path(stmap)))
     return ByLens(task.lens) if task.lens is not None else None
 
 
 def warp_of(task: Task, pictures: PictureConfig) -> Warp | None:
-    """The warp of the picture, None without distortion."""
+    """Return the warp that distorts the rendered picture; None without distortion."""
     lens = lens_of(task, pictures)
     return None if lens is None else Warp(lens, task.at(sampling_of(task, pictures).middle))
 
 
 def straight_camera(task: Task, pictures: PictureConfig) -> Camera:
-    """Camera of the rendered picture: `picture_camera`, or the straight window from which a warped picture is
-    sampled."""
+    """Return the camera that is rendered: `picture_camera`, or for a distorted picture the undistorted window that it
+    is sampled from."""
     camera, warp = picture_camera(task, pictures), warp_of(task, pictures)
     return camera if warp is None else warp.of_window(camera)[1] or camera
 
@@ -304,10 +306,11 @@ def camera_before(task: Task, pictures: PictureConfig) -> Camera | None:
 
 
 def end_before(task: Task, time: float, pictures: PictureConfig) -> float | None:
-    """The time from which the camera at `time` is extrapolated; both count frames from the task's frame.
+    """Return the time from which the camera at `time` is extrapolated, or None if it is not.
 
-    None if the shot's source defines the camera at `time`, and for a shot of one frame. A USD stage defines its camera
-    while the shutter is open; motion is extrapolated from the shutter's middle.
+    time: in frames relative to the task's frame, like the result.
+    Times between the first and the last frame, and those of a shot of one frame, are not extrapolated. A USD stage
+    defines its camera while the shutter is open; motion is extrapolated from the shutter's middle.
     """
     if task.ends is None or task.ends[0] <= task.number + time <= task.ends[1]:
         return None
@@ -318,8 +321,10 @@ def end_before(task: Task, time: float, pictures: PictureConfig) -> float | None
 
 
 def model_times(task: Task, pictures: PictureConfig, channels: Collection[str]) -> list[float]:
-    """Times at which the models of a frame are evaluated, in frames from it: the shutter's middle, its samples, and one
-    frame later or earlier for motion channels."""
+    """Return the times at which the models of a frame are needed, in frames relative to the frame.
+
+    These are the shutter's middle, the samples, and one frame later or earlier for motion channels.
+    """
     sampling = sampling_of(task, pictures)
     times = [sampling.middle, *(sampling.sample_times if sampling.moves else ())]
     times += [sampling.middle + by for name, by in (("motion", 1), ("backward", -1)) if name in channels]
@@ -327,10 +332,10 @@ def model_times(task: Task, pictures: PictureConfig, channels: Collection[str]) 
 
 
 def plain(value: Any) -> Any:
-    """Convert a value to JSON types.
+    """Convert a value to JSON types, for a digest.
 
-    A dataclass becomes its differences from the defaults, so that adding a setting later does not change digests.
-    Floats have 12 digits, because processors differ in the last ones.
+    A dataclass becomes its differences from the defaults, so that a new setting does not change digests. Floats are
+    rounded to 12 digits, because processors differ in the last ones.
     """
     if is_dataclass(value) and not isinstance(value, type):
         changes = {}
@@ -357,8 +362,8 @@ def digest_of(*parts: Any) -> str:
 def settings_digest(task: Task, options: RenderOptions) -> str:
     """Digest of everything that a frame depends on, except the model files.
 
-    Includes cameras, channels, encoding, pictures, rasterizer, the content of its holdout, and the models' placements.
-    For models with one file per frame, it includes the content of these files.
+    These are cameras, channels, encoding, picture settings, rasterizer, the content of the holdout's file, and the
+    models' placements. For models with one file per frame, the content of these files is included.
     """
     pictures, sampling = options.pictures, sampling_of(task, options.pictures)
     encoding = {
@@ -377,7 +382,7 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     used = sampling if sampling.on else None
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
-    # Files that were made before the far plane clipped have another digest.
+    # Frames with a far plane have another digest than files of versions that did not clip at it.
     made += ("far",) if task.camera.far < inf else ()
     colour = replace(pictures.colour, ocio_config=configuration_digest(pictures.colour.ocio_config))
     if task.holdout is not None:
@@ -395,15 +400,15 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
 
 
 def header(task: Task, options: RenderOptions, whole: Task | None = None) -> FrameFileHeader:
-    """Header of a frame's file: frame, model, version, settings, colour space, and the camera's matrices, if any.
+    """Make the header of a frame's file: frame, model, version, settings, colour space, and matrices of the camera.
 
     An EXR file also gets its window, and an attribute that marks a whole panorama.
-    whole: the file's task, if the file has other views too.
+    whole: task of the whole file, if the file has both eyes.
     """
     camera = picture_camera(task, options.pictures)
     matrices = camera_matrices(camera)
     if warp_of(task, options.pictures) is not None:
-        matrices.pop("worldToNDC", None)  # no matrix describes a warp
+        matrices.pop("worldToNDC", None)  # no matrix describes a distorted picture
     attributes = {
         **options.attributes,
         "clsplat:frame": task.number,

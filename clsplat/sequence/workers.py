@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loop of a job: threads that render, encode and write its frames. No OpenCL here.
+"""Threads of a render job, which render, encode and write its frames. No OpenCL here.
 
 Each device has one thread that renders; a few more threads encode and write. A frame is written under a temporary name
 and then renamed, so that a file is complete even if the job is killed. Frames of a video are prepared by these threads
@@ -48,10 +48,9 @@ ENCODING_COPIES = 3
 
 
 def encode_frame(task: Task, frame: RenderedFrame, options: RenderOptions) -> Result:
-    """Encode a frame and write it atomically, unless it was written in strips already. For a video, return the planes
-    instead.
+    """Encode a frame and write it atomically, unless it was written in strips already. Raises ClsplatError.
 
-    Raises ClsplatError.
+    A frame of a video is not written: the result has its planes.
     """
     start, yuv = time.monotonic(), None
     if task.is_video:
@@ -78,7 +77,7 @@ def record_of(
     *,
     skipped: bool = False,
 ) -> Record:
-    """The record of a task's frame."""
+    """Make the record of a task's finished frame. seconds: time for rendering and writing."""
     camera = picture_camera(task, options.pictures)
     return Record(
         task.name,
@@ -96,7 +95,7 @@ def record_of(
 
 
 def frame_bytes(task: Task, options: RenderOptions) -> int:
-    """Main memory that a frame takes until it is written. A frame in strips takes the memory of one strip."""
+    """Estimate the bytes of main memory that a frame takes until it is written: for a frame in strips, of one strip."""
     camera, framing = picture_camera(task, options.pictures), options.pictures.framing
     pixels, finer = camera.width * camera.height * len(task.views), framing.supersample**2
     if not task.is_video:
@@ -113,7 +112,7 @@ def frame_bytes(task: Task, options: RenderOptions) -> int:
 
 
 def frames_ahead(tasks: Sequence[Task], options: RenderOptions, devices: int) -> tuple[int, int]:
-    """Number of threads that write, and of frames held at once, so that main memory is bounded."""
+    """Choose the number of threads that write, and the number of frames in main memory at once. Returns both."""
     largest = max((frame_bytes(task, options) for task in tasks), default=1)
     writers = max(1, min(MAX_FILE_THREADS, os.cpu_count() or 1))
     held = max(devices + 2, min(WRITE_QUEUE_BYTES // max(largest, 1), devices + writers + 1))
@@ -132,7 +131,7 @@ def run_tasks(
     """Render the frames, and at the same time write them or add them to the video.
 
     A thread for each renderer takes the next free frame. The first error of a thread is raised when all have ended.
-    shared: other jobs may render some of these frames. Frames are then claimed, and those of other jobs awaited.
+    shared: True if other jobs may render some of these frames. Each frame is then claimed before it is rendered.
     on_done: function that is called in this thread for each frame whose file is complete, in any order. For a video it
     is called in order, when the frame has been encoded.
     """
@@ -168,10 +167,10 @@ def run_tasks(
             devices.submit(render, renderer).add_done_callback(tell_failure)
         for record in encoded(tasks, (finished.get().result() for _ in tasks), video):
             if video is not None:
-                room.release()  # frames start in order, so that the video's next frame never waits for this place
+                room.release()  # cannot deadlock: frames start in order, so the video's next frame is in memory already
             on_done(record)
     except KeyboardInterrupt:
-        abandon()  # a thread may wait for a driver that hangs
+        abandon()  # end the trial of a driver that hangs, which a thread may wait for
         raise
     finally:
         frames.stop.set()
@@ -183,15 +182,15 @@ def run_tasks(
 
 
 def _skipped(task: Task, options: RenderOptions) -> Future[Result]:
-    """The result of a frame that another job has finished."""
+    """Return the result of a frame that another job has finished, as a completed future."""
     outcome: Future[Result] = Future()
     outcome.set_result((record_of(task, options, skipped=True), None))
     return outcome
 
 
 def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter | None) -> Iterator[Record]:
-    """Records of frames as their files are completed; for a video in the order of the tasks, when the frames are
-    added."""
+    """Yield the record of each frame when its file is complete; for a video, in the order of the tasks, when the frame
+    has been encoded."""
     if video is None:
         for record, _ in results:
             yield record
@@ -211,9 +210,9 @@ def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter
 def open_video(
     tasks: Sequence[Task], config: VideoConfig, options: RenderOptions
 ) -> AbstractContextManager[VideoWriter | None]:
-    """The video that the tasks' frames belong to, None if they have files of their own.
+    """Open the video that the tasks' frames belong to. The context is None if frames have files of their own.
 
-    The file gets its final name at the end of the block, unless an error is raised.
+    The file gets its final name at the end of the context, unless an error is raised.
     """
     if not (tasks and tasks[0].is_video):
         return nullcontext()

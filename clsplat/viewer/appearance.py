@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Appearance of a model on a page: edits of the Gaussians, displayed channel, colour map. Uses no OpenCL or viser."""
+"""Appearance of a model on the viewer's page: edits of the Gaussians, displayed channel, colour map. Uses no OpenCL and
+no viser."""
 
 from __future__ import annotations
 
@@ -24,7 +25,9 @@ Box = tuple[float, float, float, float, float, float]
 MAX_EDITED_OPACITY = 0.999
 """Upper limit of an increased opacity. It is below 1, whose logit is infinite."""
 SIZE_FACTOR_RANGE = (0.05, 2.0)
+"""Smallest and largest value of the slider that multiplies all scales."""
 OPACITY_FACTOR_RANGE = (0.0, 3.0)
+"""Smallest and largest value of the slider that multiplies all opacities."""
 VIRIDIS_RGB = np.array(
     [(68, 1, 84), (71, 44, 122), (59, 81, 139), (44, 113, 142), (33, 144, 141), (39, 173, 129), (92, 200, 99),
      (170, 220, 50), (253, 231, 37)],
@@ -53,13 +56,19 @@ class Look:
     crop: Box | None = None
 
     def changes(self, degree: int) -> Look | None:
-        """The settings that edit a model of this SH degree, with the default mode; None if they change nothing."""
+        """Return the settings that edit a model of this SH degree, or None if they do not change it.
+
+        The mode of the result is always "colour", as the displayed channel is no edit.
+        """
         asked = replace(self, mode="colour", degree=min(self.degree, degree))
         return None if asked == Look(degree=degree) else asked
 
 
 def read_look(mode: Any, degree: Any, size: Any, opacity: Any, crop: Any = None) -> Look:
-    """The look for the values of a page's controls. Numbers outside a slider's range are clamped."""
+    """Make a `Look` of the values of a page's controls. Numbers outside a slider's range are clamped.
+
+    crop: two corners of the box, or None.
+    """
     box = None
     if crop is not None:
         corners = np.asarray(crop, np.float64).reshape(2, 3)
@@ -80,7 +89,7 @@ def _within(value: Any, low: float, high: float, usual: float) -> float:
 
 
 def edited(gaussians: Gaussians, look: Look) -> Gaussians:
-    """The model with the edits of a look. Unchanged arrays are shared with the input."""
+    """Apply SH degree, size, opacity and crop box of a look to a model. Unchanged arrays are shared with the input."""
     model = drop_sh(gaussians, look.degree) if look.degree < gaussians.sh_degree else replace(gaussians)
     if look.size != 1:
         model.log_scales = gaussians.log_scales + np.float32(math.log(look.size))
@@ -99,12 +108,12 @@ def colour_picture(image: Float32) -> Image:
 
 
 def alpha_picture(alpha: Float32) -> Image:
-    """Alpha as a grey picture (H, W, 3) uint8: transparent pixels are black."""
+    """Convert alpha to a grey picture (H, W, 3) uint8, with black for transparent pixels."""
     return colour_picture(np.broadcast_to(alpha[:, :, None], (*alpha.shape, 3)))
 
 
 def depth_picture(depth: Float32, alpha: Float32) -> tuple[Image, str]:
-    """Depth as a picture (H, W, 3) uint8, and a text with its range. Near is bright, transparent is black."""
+    """Convert depth to a picture (H, W, 3) uint8, and describe its range. Near is bright, transparent is black."""
     seen = alpha > 0.5
     if not seen.any():
         return np.zeros((*depth.shape, 3), np.uint8), "nothing is visible"
@@ -114,7 +123,7 @@ def depth_picture(depth: Float32, alpha: Float32) -> tuple[Image, str]:
 
 
 def count_picture(count: NDArray[np.int32]) -> tuple[Image, str]:
-    """Number of Gaussians per pixel as a picture (H, W, 3) uint8, bright for many, and a text with its range."""
+    """Convert numbers of Gaussians per pixel to a picture (H, W, 3) uint8, bright for many, and describe its range."""
     most = max(float(np.quantile(count, 0.995)), 1.0)
     return _shaded(count / most, None), f"0 to {most:,.0f} Gaussians per pixel (bright), maximum {int(count.max()):,}"
 

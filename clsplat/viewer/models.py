@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models that the viewer shows: from a file, or in training. `clsplat.rendering.rasterizer` renders them.
+"""Models that the viewer shows, from a file or in training, and the rendering of their pictures.
 
-Only the thread that created a model may render its pictures, because a device has one queue.
+Only the thread that created a model may render its pictures, because a device has one command queue.
 """
 
 from __future__ import annotations
@@ -25,13 +25,16 @@ from clsplat.viewer.appearance import Image, Look, alpha_picture, colour_picture
 from clsplat.viewer.pose import MAX_PAGE_PICTURE_PIXELS
 
 MAX_MODELS_ON_DEVICE = 2
-"""Maximum number of models on the device: the model of the file, and an edited model."""
+"""Maximum number of models on the device: the unchanged model of the file, and an edited one."""
 CHANNEL_FLOATS_PER_GAUSSIAN = 3
-"""Floats per Gaussian for channels other than colour, for which the limit of a picture's size leaves memory."""
+"""Floats per Gaussian of channels other than colour. The limit of a picture's size leaves device memory for them."""
 
 
 def draft(config: RasterizerConfig) -> RasterizerConfig:
-    """Rasterizer settings for pictures in motion: approximations that save time. SH settings are unchanged."""
+    """Return rasterizer settings for pictures of a moving camera, with the approximations of the preset fast.
+
+    SH settings are unchanged.
+    """
     fast = RASTERIZER_PRESETS["fast"]
     return replace(
         config,
@@ -41,7 +44,7 @@ def draft(config: RasterizerConfig) -> RasterizerConfig:
 
 
 class HeldModel:
-    """Model from a file. The device holds the unchanged model, and the model with the edits of the last look."""
+    """Model from a file. The device holds the unchanged model, and one with the edits of the last `Look`."""
 
     version = 0
     """Version number of the model. It is constant, as the model does not change."""
@@ -54,7 +57,10 @@ class HeldModel:
         background: Sequence[float],
         space: str = SRGB,
     ) -> None:
-        """space: the model's colour space (`colour.recorded_space`)."""
+        """Keep the model, and prepare exact and draft rasterizers.
+
+        space: the model's colour space (`colour.recorded_space`).
+        """
         self.gaussians, self.device, self.background, self.space = gaussians, device, background, space
         self._rasterizers = {True: Rasterizer(device, config), False: Rasterizer(device, draft(config))}
         self._held: dict[Look | None, tuple[Gaussians, dict[bool, Renderer]]] = {}
@@ -65,12 +71,16 @@ class HeldModel:
         return min(MAX_PAGE_PICTURE_PIXELS, frame_pixels(self.device, CHANNEL_FLOATS_PER_GAUSSIAN))
 
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
-        """Render a picture (H, W, 3) uint8, and return it with a remark. Raises CapacityError and InputError."""
+        """Render a picture (H, W, 3) uint8. Returns it, and a remark for the page such as the range of depths.
+
+        exact: False for the approximations of `draft`.
+        Raises CapacityError and InputError.
+        """
         key = look.changes(self.gaussians.sh_degree)
         try:
             return self._picture(key, camera, look, exact=exact)
         except CapacityError:
-            self._held = {key: (self._held[key][0], {})}  # frees the memory of all other models
+            self._held = {key: (self._held[key][0], {})}  # free the device memory of all other models
             return self._picture(key, camera, look, exact=exact)
 
     def _picture(self, key: Look | None, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
@@ -79,7 +89,7 @@ class HeldModel:
         gaussians, renderers = self._held.pop(key)
         while len(self._held) >= MAX_MODELS_ON_DEVICE:
             del self._held[next(iter(self._held))]
-        self._held[key] = (gaussians, renderers)  # the most recently used is last
+        self._held[key] = (gaussians, renderers)  # the model used most recently is last
         renderer = renderers.get(exact)
         if renderer is None:
             renderer = renderers[exact] = Renderer(self.device, self._rasterizers[exact])
@@ -87,7 +97,7 @@ class HeldModel:
 
 
 class LiveModel:
-    """Model in training. It is rendered between two steps in the trainer's memory, without effect on the training."""
+    """Model in training. Pictures are rendered between steps, in the trainer's memory, and do not affect training."""
 
     def __init__(self, trainer: Trainer, background: Sequence[float]) -> None:
         self.trainer, self.background = trainer, background
@@ -103,12 +113,11 @@ class LiveModel:
 
     @property
     def pixels(self) -> int:
-        """Maximum number of pixels of a picture: the training has memory for no more."""
+        """Maximum number of pixels of a picture: those of the largest training view, for which there is memory."""
         return max(view.camera.width * view.camera.height for view in self.trainer.views)
 
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:  # noqa: ARG002  # always exact
-        """Render a picture, and return it with a remark. Raises InputError if a training with limited memory leaves too
-        little memory."""
+        """Render a picture. Returns it, and a remark for the page. Raises InputError if training leaves no memory."""
         trainer = self.trainer
         trainer.settle()
         degree = round(trainer.parameters.coefficients**0.5) - 1
@@ -137,7 +146,7 @@ def render_picture(
     background: Sequence[float],
     space: str,
 ) -> tuple[Image, str]:
-    """Render a picture of a model that is on the host or the device, and return it with a remark."""
+    """Render a picture of a model on the host or the device. Returns it, and a remark for the page."""
     if isinstance(model, Gaussians) and not len(model):
         raise InputError("nothing remains of the model: the crop box contains no Gaussian")
     if look.mode in ("depth", "count"):

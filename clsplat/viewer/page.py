@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The viewer's page, made with viser: its controls and what they do. `viewer.appearance` applies their values to the
-model and to the picture."""
+"""The viewer's page in viser: controls for appearance, cameras, camera paths and screenshots. `viewer.appearance`
+applies the values of the controls to the model and to the picture."""
 
 from __future__ import annotations
 
@@ -44,19 +44,21 @@ PAGE_PHOTO_SIDE_PX = 240
 FRUSTUM_SCALE = 0.05
 """Size of a drawn camera, relative to the distance from the start position to the orbit centre."""
 UP_CHOICES = ("as the scene", "y", "-y", "z", "-z", "x", "-x")
-"""Choices for the up direction."""
+"""Choices of the page's control for the up direction."""
 CAMERA_DISPLAY_CHOICES = ("hidden", "frames", "photos")
-"""Ways to draw the scene's cameras."""
+"""Choices of the page's control for drawing the scene's cameras."""
 CAMERA_COLOURS = {"train": (80, 160, 255), "test": (255, 160, 60), "key": (255, 60, 90)}
+"""Colours, 8-bit, of drawn cameras: of training views, of held-out views, and of a path's key frames."""
 DEFAULT_PICTURE_SIZE_PX = (1280, 720)
 """Default width and height of path pictures and screenshots."""
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Data that all pages share.
+    """Data of the model and its scene that all pages share.
 
-    origin: (3,), subtracted from world positions for the browser, because it computes in float32.
+    start: position and target of a new page's camera.
+    origin: (3,), subtracted from world positions for the browser, which computes in float32.
     box: two corners (3,), the range of the crop sliders.
     degree: the model's SH degree.
     """
@@ -88,7 +90,7 @@ class ViserPage:
         """Show a picture (H, W, 3) with a remark."""
         self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=level.quality)
         self._shown += 1
-        if self._shown == 2:  # added after the first picture, because controls keep a browser busy
+        if self._shown == 2:  # create controls only after the first picture, because they keep a browser busy
             self._build()
         height, width = image.shape[:2]
         self._say(
@@ -265,7 +267,7 @@ class ViserPage:
             button("Save path", lambda: self.tell(f"saved as {save_path(folder, document()).name}"))
 
     def _add_frustum(self, name: str, pose: Pose, kind: str, **options: Any) -> Any:
-        """Draw a camera in the colour of its kind."""
+        """Draw a camera. kind: key of CAMERA_COLOURS."""
         start = self.world.start
         return self.client.scene.add_camera_frustum(
             name,
@@ -295,7 +297,11 @@ class ViserPage:
         return add_side("Width", DEFAULT_PICTURE_SIZE_PX[0]), add_side("Height", DEFAULT_PICTURE_SIZE_PX[1])
 
     def screenshot(self, model: Model, size: tuple[int, int]) -> None:
-        """Send an exact picture of this size, with the bits of `clsplat render`. Raises InputError."""
+        """Render an exact picture, with the bits of `clsplat render`, and send it to the browser as a file.
+
+        size: width and height in pixels.
+        Raises InputError for a size out of range.
+        """
         pose = self.viewer.pose
         if pose is None:
             return
@@ -319,7 +325,7 @@ class ViserPage:
         except ClsplatError as error:
             self.tell(str(error))
         except OSError as error:
-            self.tell(re.sub(r": '.*'$", "", str(error)))  # removes paths of this machine
+            self.tell(re.sub(r": '.*'$", "", str(error)))  # do not show paths of this machine to a browser
 
 
 def png(image: Image) -> bytes:
@@ -331,7 +337,10 @@ def png(image: Image) -> bytes:
 
 @cache
 def thumbnail(view: View) -> Image | None:
-    """A small picture (H, W, 3) of a photograph, masked areas in red and blue; None if the file cannot be read."""
+    """Draw a small picture (H, W, 3) of a photograph, with masked areas in red and blue.
+
+    The result is None if the file cannot be read.
+    """
     camera = view.camera
     scale = min(PAGE_PHOTO_SIDE_PX / max(camera.width, camera.height), 1.0)
     try:
@@ -342,7 +351,7 @@ def thumbnail(view: View) -> Image | None:
 
 
 def edges_of(low: Any, high: Any) -> Any:
-    """The twelve edges of a box, (12, 2, 3) float32."""
+    """Return the end points of the twelve edges of a box, (12, 2, 3) float32. low, high: its corners (3,)."""
     corners = np.array([[(low, high)[bit][axis] for axis, bit in enumerate(bits)] for bits in np.ndindex(2, 2, 2)])
     pairs = [(a, b) for a in range(8) for b in range(a) if (a ^ b).bit_count() == 1]
     return corners[np.array(pairs)].astype(np.float32)

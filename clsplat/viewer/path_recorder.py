@@ -21,7 +21,7 @@ MAX_PATH_FILES = 10_000
 
 
 class KeyFrame(TypedDict):
-    """A key frame in a camera file. fov_y: in degrees."""
+    """A key frame in a camera file. world_from_cam: quaternion. fov_y: vertical field of view in degrees."""
 
     frame: int
     position: list[float]
@@ -46,7 +46,7 @@ class CameraFile(CameraFileHead):
 
 
 def add_key(keys: list[Pose], pose: Pose) -> None:
-    """Append a key frame. Raises InputError if there are too many."""
+    """Append a key frame. Raises InputError if the path has MAX_KEY_FRAMES already."""
     if len(keys) >= MAX_KEY_FRAMES:
         raise InputError(f"there are {MAX_KEY_FRAMES:,} key frames already")
     keys.append(pose)
@@ -60,9 +60,9 @@ def path_document(
     fps: float = DEFAULT_VIDEO_FPS,
     loop: bool = False,
 ) -> str:
-    """The camera file of the key frames, as JSON.
+    """Return the camera file of the key frames, as JSON text.
 
-    size: width and height of the frames.
+    size: width and height of the frames in pixels.
     apart: seconds between keys, rounded to whole frames.
     loop: return to the first key after the last one.
     Raises InputError if there are no keys, and for numbers out of range.
@@ -95,13 +95,13 @@ def path_document(
 
 
 def save_path(folder: Path, document: str) -> Path:
-    """Write the document to path-001.json, or to the next number that is unused. A page cannot choose the name.
+    """Write the document to path-001.json, or with the next unused number. Returns the path.
 
-    Raises OSError, and InputError if no name is free.
+    A page cannot choose the name, for safety. Raises OSError, and InputError if no number is unused.
     """
     for number in range(1, MAX_PATH_FILES):
         path = folder / f"path-{number:03d}.json"
         if not path.exists() and not path.is_symlink():
             atomic_write(path, document.encode())
             return path
-    raise InputError(f"{folder}: has {MAX_PATH_FILES - 1:,} paths already")
+    raise InputError(f"{folder}: has {MAX_PATH_FILES - 1:,} camera paths already, expected fewer; remove some")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose of a page's camera, and its start."""
+"""Camera pose of a viewer's page: checks of what a browser sends, field of view, and the start position."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ class Pose:
     height: int
 
     def camera(self, width: int | None = None, height: int | None = None) -> Camera:
-        """The camera for the size of the page, or for another size. `angle` defines its field of view.
+        """Return the camera for the size of the page, or for another size. `angle` defines the field of view.
 
-        Its numbers have the same bits as if they were written to a camera file (`path_document`) and read again.
+        The camera's numbers have the same bits as if written to a camera file (`path_document`) and read again.
         """
         across, down = width or self.width, height or self.height
         focal = focal_length(math.radians(math.degrees(self.angle(across, down))), down)
@@ -56,16 +56,16 @@ class Pose:
         return Camera(across, down, focal, focal, across / 2, down / 2, turn, -turn @ self.position)
 
     def angle(self, width: int, height: int) -> float:
-        """Vertical field of view in radians for a picture of this size, usually that of the page.
+        """Return the vertical field of view, in radians, of a picture of this size.
 
-        On an upright page, a picture with a larger aspect ratio than the page has the horizontal field of view of the
-        page instead. An aspect ratio over 1 counts as 1 here.
+        It is the page's, except on an upright page: there, a picture with a larger aspect ratio than the page has the
+        page's horizontal field of view. An aspect ratio over 1 counts as 1 here.
         """
         page, picture = self.width / self.height, min(width / height, 1.0)
         return self.fov if page >= picture else 2 * math.atan(math.tan(0.5 * self.fov) * page / picture)
 
     def same(self, other: Pose | None) -> bool:
-        """True if the other pose shows the same picture."""
+        """True if all values of the other pose are the same, so that it shows the same picture."""
         names = [item.name for item in fields(self)]
         return other is not None and all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
 
@@ -77,7 +77,7 @@ def read_pose(
     size: tuple[int, int],
     origin: Float64,
 ) -> Pose | None:
-    """The pose for values that a browser sent, which may be arbitrary; None if no camera can have these values.
+    """Make a pose of the values that a browser sent. Returns None if no camera can have these values.
 
     wxyz: quaternion of the rotation from the camera's axes (COLMAP's) to the world's.
     position: camera position relative to `origin` (3,).
@@ -101,9 +101,9 @@ def read_pose(
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """The start of a page: camera position, orbit centre and up direction in the world.
+    """Camera of a newly opened page: position, orbit centre (`target`) and up direction in the world.
 
-    fov, aspect: vertical field of view, and width / height, of a picture that must be visible as a whole.
+    fov, aspect: vertical field of view in radians, and width / height, of a picture that must be visible as a whole.
     """
 
     position: Float64
@@ -113,7 +113,7 @@ class Start:
     aspect: float = 1.0
 
     def fov_on(self, width: int, height: int) -> float:
-        """Vertical field of view on a page of this size.
+        """Return the vertical field of view, in radians, on a page of this size.
 
         It is `fov`, or more on a narrow page, such as on an upright phone, to show the whole width.
         """
@@ -121,10 +121,10 @@ class Start:
 
 
 def wide_enough(fov: float, aspect: float, width: int, height: int) -> float:
-    """Vertical field of view in radians with which a page of this size shows a whole picture.
+    """Return the vertical field of view, in radians, with which a page of this size shows a whole picture.
 
-    fov: vertical field of view of the picture.
-    aspect: its width / height.
+    fov: vertical field of view of the picture in radians.
+    aspect: width / height of the picture.
     The result is at least `fov`. If it is larger than `fov`, it is at most MAX_START_FOV_Y_RADIANS.
     """
     more = aspect * height / max(width, 1)
@@ -132,9 +132,9 @@ def wide_enough(fov: float, aspect: float, width: int, height: int) -> float:
 
 
 def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
-    """The viewer's start: the pose of the first camera that is not an outlier.
+    """Choose the viewer's start: the pose of the first camera that is not an outlier.
 
-    The orbit centre is in front of it, at the depth of the point that all cameras look at.
+    The orbit centre is in front of this camera, at the depth of the point that all cameras look at.
 
     Without cameras, the start is in front of the points (N, 3), with y down and z forward as in a COLMAP scene.
     All vectors are in world coordinates.
@@ -158,10 +158,10 @@ def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
 
 
 def leaning(up: Float64, ahead: Float64, degrees: float) -> Float64 | None:
-    """Up direction (3,), of unit length, of a camera that looks `ahead` and is rolled clockwise by `degrees`.
+    """Return the up direction (3,), of unit length, of a camera that looks `ahead` and is rolled by `degrees`.
 
-    It is `up` rotated about the viewing direction, clockwise as seen from behind the camera. None if the camera looks
-    along `up`.
+    The result is `up`, rotated about the viewing direction, clockwise as seen from behind the camera. It is None if the
+    camera looks along `up`.
     """
     length = float(np.linalg.norm(ahead) * np.linalg.norm(up))
     if not float(np.linalg.norm(np.cross(ahead, up))) > 1e-3 * length:
@@ -171,12 +171,12 @@ def leaning(up: Float64, ahead: Float64, degrees: float) -> Float64 | None:
 
 
 def looking(start: Start, size: tuple[int, int]) -> Pose:
-    """Pose at the start of a page of this size."""
+    """Return the pose of a newly opened page of this size, in pixels."""
     rotation, _ = look_at(start.position, start.target, start.up)
     return Pose(rotation.T, start.position, start.fov_on(*size), *size)
 
 
 def fitted(width: int, height: int, scale: float, most: float = MAX_PAGE_PICTURE_PIXELS) -> tuple[int, int]:
-    """Width and height of a picture: the page's size times `scale`, reduced to at most `most` pixels."""
+    """Return width and height of a picture: the page's size times `scale`, reduced to at most `most` pixels in all."""
     scale = min(scale, math.sqrt(most / (width * height)))
     return max(1, round(width * scale)), max(1, round(height * scale))

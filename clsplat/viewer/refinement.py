@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Refinement of a viewer's pictures: coarse in motion, exact at rest. In training they take a fraction of its time.
+"""Refinement of a viewer's pictures: coarse while the camera moves, exact at rest. While a model is trained, pictures
+take a limited fraction of the time.
 
 This module uses neither OpenCL nor viser. Times are in seconds, from any monotonic clock.
 """
@@ -10,30 +11,30 @@ import math
 from dataclasses import dataclass
 
 SETTLE_SECONDS_RANGE = (0.2, 1.0)
-"""Seconds without a change before refinement begins: the minimum, and the maximum, for browsers with slow updates."""
+"""Minimum and maximum of the seconds without a change after which refinement begins. Slow browsers need more."""
 FIRST_SETTLE_SECONDS = 0.5
-"""Seconds before the first refinement, in which the browser gets ready to show pictures."""
+"""Seconds before the first refinement. In this time the browser gets ready to show pictures."""
 REST_INTERVAL_RATIO = 3.0
 """A camera is at rest if it has not changed for this multiple of the usual interval between changes."""
 MOTION_PICTURE_SECONDS = 0.04
-"""Time limit in seconds of a picture in motion, including its encoding and excluding the browser."""
+"""Time in seconds that a picture of a moving camera should take, with encoding but without the browser."""
 MAX_UNPREPARED_EXACT_SECONDS = 0.6
-"""Maximum seconds that an exact picture may take to follow a coarse one directly. Before a slower one, pictures of
-growing size are shown."""
+"""Seconds that exact pictures may take. If they take longer, pictures of growing size are shown between the coarse and
+the exact one."""
 MIN_MOTION_SCALE = 1 / 8
 """Minimum size of a picture relative to the page. A smaller picture would not be recognisable."""
 PAGE_JPEG_QUALITIES = (60, 95)
-"""JPEG quality in motion and at rest."""
+"""JPEG quality of coarse and of exact pictures."""
 VIEWER_TIME_FRACTIONS = (0.2, 0.05)
 """Maximum fractions of a training's time for pictures: while a viewer moves, and while all are at rest."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """The next picture to render.
+    """Size and exactness of a picture.
 
     scale: size of the picture relative to the page.
-    exact: True for the last picture of a refinement, which is exact.
+    exact: True for the last picture of a refinement.
     """
 
     scale: float
@@ -41,21 +42,22 @@ class Level:
 
     @property
     def quality(self) -> int:
-        """JPEG quality."""
+        """JPEG quality of the picture, from 0 to 100."""
         return PAGE_JPEG_QUALITIES[self.exact]
 
 
 def next_scale(scale: float, seconds: float) -> float:
-    """Scale of the next picture in motion, after a picture of `scale` took `seconds`.
+    """Return the scale of a moving camera's next picture, after a picture of `scale` took `seconds`.
 
-    The time limit is approached in steps, because a part of the time does not depend on the number of pixels.
+    The scale changes in limited steps towards MOTION_PICTURE_SECONDS, because a part of the time does not depend on the
+    number of pixels.
     """
     factor = math.sqrt(MOTION_PICTURE_SECONDS / max(seconds, 1e-4))
     return min(max(scale * min(max(factor, 0.6), 1.2), MIN_MOTION_SCALE), 1.0)
 
 
 class Refinement:
-    """State of a viewer's refinement. Pictures are coarse in motion, finer at rest, and finally exact."""
+    """State of a viewer's refinement. Pictures are coarse while the camera moves, then finer, and finally exact."""
 
     def __init__(self, now: float) -> None:
         self.scale = 0.25
@@ -69,7 +71,7 @@ class Refinement:
 
     @property
     def moving(self) -> bool:
-        """True if the displayed picture is older than the last change."""
+        """True if the displayed picture is older than the last change of camera or look."""
         return self._shown != self.changes
 
     def changed(self, now: float) -> None:
@@ -82,7 +84,7 @@ class Refinement:
         self._at = now
 
     def due(self, now: float, model: int = 0) -> Level | None:
-        """The next picture, if it is due now; else None.
+        """Return size and exactness of the next picture if it is due now, otherwise None.
 
         model: version number of the model, which changes in training.
         """
@@ -95,7 +97,7 @@ class Refinement:
         return Level(2 * self._level.scale, exact=False)
 
     def wait(self, now: float, model: int = 0) -> float | None:
-        """Seconds until a picture is due; None if no picture is due before a change."""
+        """Return the seconds until a picture is due, or None if none is due before camera, look or model change."""
         if self.moving:
             return 0.0
         if self._level.exact and self._model == model:
@@ -103,9 +105,10 @@ class Refinement:
         return max(0.0, self._at + self._settle - now)
 
     def shown(self, begun: int, level: Level, seconds: float, now: float, model: int = 0) -> None:
-        """Record that a picture was sent, after `seconds` of work.
+        """Record that a picture was sent to the page.
 
-        begun: the value of `changes` when its rendering began.
+        begun: the value of `changes` when rendering of the picture began.
+        seconds: time for rendering and encoding.
         """
         if level.exact:
             self._exact_takes = seconds
@@ -115,14 +118,17 @@ class Refinement:
 
 
 class Share:
-    """Limit on the fraction of a training's time that pictures take."""
+    """Limit on the fraction of a training's time that pictures take.
+
+    shares: the fractions while a viewer moves, and while all are at rest.
+    """
 
     def __init__(self, shares: tuple[float, float] = VIEWER_TIME_FRACTIONS) -> None:
         self._moving, self._still = shares
         self._end, self._seconds = -math.inf, 0.0
 
     def ready(self, now: float, *, moving: bool) -> bool:
-        """True if another picture may be rendered."""
+        """True if another picture may be rendered now. moving: True if a viewer's camera moves."""
         share = self._moving if moving else self._still
         return now - self._end >= self._seconds * (1 - share) / share
 

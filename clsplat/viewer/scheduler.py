@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scheduler of the pictures and other requests of all viewers, on a single thread. Uses neither OpenCL nor viser.
+"""Scheduler that renders the pictures of all viewers, one after the other, on a single thread. Uses neither OpenCL nor
+viser.
 
 Any thread may report a viewer's changes. Only `work` renders, on the thread that owns the device.
 """
@@ -31,9 +32,9 @@ class Page(Protocol):
 
 @dataclass(eq=False)
 class Viewer:
-    """A viewer: its page, refinement, look and pose.
+    """A viewer: an open page, with its refinement, appearance settings and camera pose.
 
-    trouble: the last error message on the page; "" since a picture was shown.
+    trouble: the error message that the page shows; "" once a picture was shown.
     """
 
     page: Page
@@ -44,9 +45,10 @@ class Viewer:
 
 
 class Viewing:
-    """All viewers of a model.
+    """All viewers of a model, and the jobs for the thread that owns the device.
 
-    model: the model; None until it exists.
+    model: the model that is shown; None until training has created it.
+    clock: function that returns the time in seconds.
     """
 
     def __init__(self, model: Model | None = None, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -81,7 +83,7 @@ class Viewing:
                 self.wake()
 
     def looks(self, viewer: Viewer, look: Look) -> None:
-        """Set a viewer's look."""
+        """Set a viewer's appearance settings. Equal settings do not count as a change."""
         with self._news:
             if look != viewer.look:
                 viewer.look = look
@@ -95,7 +97,7 @@ class Viewing:
             self.wake()
 
     def wake(self) -> None:
-        """End a `wait`."""
+        """Make a thread that is in `wait` return."""
         with self._news:
             self._is_news = True
             self._news.notify_all()
@@ -131,7 +133,10 @@ class Viewing:
         return bool(job or turn)
 
     def _turn(self, version: int, share: Share | None) -> tuple[Viewer, Level] | None:
-        """The viewer whose picture is due and who has waited longest, and the picture's level; None if none is due."""
+        """Choose the viewer whose picture is due and who has waited longest. Returns None if no picture is due.
+
+        The result also has the picture's size and exactness.
+        """
         now = self.clock()
         if share is not None and not (share.ready(now, moving=True) or share.ready(now, moving=False)):
             return None
@@ -143,12 +148,12 @@ class Viewing:
 
     def _show(self, viewer: Viewer, level: Level, begun: int, model: Model, share: Share | None) -> None:
         start, version, pose, look = self.clock(), model.version, viewer.pose, viewer.look
-        assert pose is not None, "only a viewer with a pose has a turn"
+        assert pose is not None, "pictures are only due for viewers with a pose"
         camera = pose.camera().resized(*fitted(pose.width, pose.height, level.scale, model.pixels))
         try:
             image, text = model.picture(camera, look, exact=level.exact)
             if viewer in self._viewers:
-                # the camera may have moved during the rendering, so that the picture is outdated
+                # if the camera has moved during rendering, the picture is outdated and not marked as exact
                 moved_on = level.exact and viewer.refinement.changes != begun
                 viewer.page.show(image, Level(level.scale, exact=False) if moved_on else level, text)
             viewer.trouble = ""

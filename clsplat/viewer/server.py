@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The viewer's server in viser (the extra `view`): connections of viewers, and everything that they share.
+"""The viewer's web server, built with viser (the extra `view`): its address, connections of pages, and protection from
+other servers' pages.
 
-It serves viser's page and web socket messages, and no files of this machine.
+The server sends viser's page and web socket messages, and no files of this machine.
 """
 
 from __future__ import annotations
@@ -34,14 +35,14 @@ from clsplat.viewer.scheduler import Viewer, Viewing
 LOCAL_HOST_PATTERN = r"(?i:localhost|127(\.\d+){3}|\[::1\])(:\d+)?"
 """Pattern of the host names to which a server answers if only this machine can reach it."""
 VISER_FAR_PLANE = 1000.0
-"""viser's default far plane, for the cameras and boxes that viser draws."""
+"""viser's default far plane in world units, for the cameras and boxes that the browser draws."""
 
 
 @dataclass(frozen=True)
 class Address:
-    """Address at which the server listens.
+    """Address at which the server listens, and the folder in which pages may save camera paths.
 
-    paths: folder for saved camera paths; None if saving is off.
+    paths: the folder; None if pages may not save.
     """
 
     host: str = VIEWER_HOST
@@ -65,7 +66,7 @@ class Address:
             addresses = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
             family, kind, protocol, _, address = addresses[0]
             with socket.socket(family, kind, protocol) as probe:
-                if os.name == "posix":  # as asyncio does; on Windows this would take over another server's port
+                if os.name == "posix":  # like asyncio; on Windows it would take over another server's port
                     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(address)
                 probe.listen()
@@ -88,9 +89,9 @@ class Address:
 
 
 class Server:
-    """Server of the pages, which runs until `close`. Raises InputError if it cannot listen.
+    """Server of the viewer's pages, which runs until `close`. Raises InputError if it cannot listen at the address.
 
-    training: True to add controls that pause a training.
+    training: True to add a button that pauses training.
     """
 
     def __init__(self, viewing: Viewing, world: World, address: Address, *, training: bool = False) -> None:
@@ -98,7 +99,7 @@ class Server:
         import viser
 
         self.viewing, self.world, self.address = viewing, world, address
-        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # when a viewer has left
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # after a page was closed
         with _quiet(), _guarded(address):
             self._server: Any = viser.ViserServer(host=address.host, port=address.port, label="clsplat", verbose=False)
         server = self._server
@@ -126,7 +127,7 @@ class Server:
             async def moved(camera: Any) -> None:
                 nonlocal fov, before
                 size = (camera.image_width, camera.image_height)
-                # a resize fits the start's field of view anew, but keeps that of a camera that was clicked
+                # fit the start's field of view to a resized page, but keep the field of view of a clicked camera
                 if size != before and min(size) > 0 and math.isclose(camera.fov, fov, rel_tol=1e-6):
                     fov = camera.fov = start.fov_on(*size)
                 before = size
@@ -146,18 +147,18 @@ class Server:
 
     @property
     def url(self) -> str:
-        """URL for a browser. Its host is localhost if only this machine can reach the server, else the host's name."""
+        """URL of the page. Its host is localhost if only this machine can reach the server, else the address's host."""
         host = self.address.host
         name = "localhost" if self.address.local else f"[{host}]" if ":" in host else host
         return f"http://{name}:{self._server.get_port()}"
 
     def tell(self, text: str) -> None:
-        """Show a training's state on all pages."""
+        """Show a text with the training's state on all pages."""
         if self._status is not None and self._status.content != text:
             self._status.content = text
 
     def close(self) -> None:
-        """Disconnect all pages and stop."""
+        """Disconnect all pages and stop the server."""
         with _quiet():
             self._server.stop()
 
@@ -177,17 +178,17 @@ class Server:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence viser's prints: standard output belongs to --json."""
+    """Discard viser's prints inside the context, because standard output belongs to --json."""
     with contextlib.redirect_stdout(io.StringIO() if sys.stdout is not None else None):
         yield
 
 
 @contextlib.contextmanager
 def _guarded(address: Address) -> Iterator[None]:
-    """Inside the block, new servers refuse requests from pages of other servers.
+    """Make servers that are created inside the context refuse requests from pages of other servers.
 
-    An invalid message ends its connection, with a line on standard error. viser has no settings for either; its
-    websocket library has.
+    The servers also end a connection with an invalid message, with a line on standard error. viser has no settings for
+    this, so `serve` of its websocket library is replaced.
     """
     from websockets.asyncio import server
 
@@ -221,7 +222,7 @@ def _guarded(address: Address) -> Iterator[None]:
 
 
 def _tell(_: Any, context: dict[str, Any]) -> None:
-    """Print a line instead of a traceback. This is asyncio's exception handler."""
+    """Print one line about an exception in asyncio, whose own handler would print a traceback."""
     error = context.get("exception")
     words = f"{type(error).__name__}: {error}" if error is not None else str(context.get("message", ""))
     message = plain(" ".join(words.split()))[:200].rstrip(": ")
@@ -229,7 +230,7 @@ def _tell(_: Any, context: dict[str, Any]) -> None:
 
 
 def refused(headers: Any, *, local: bool) -> str:
-    """Reason why a request is refused; '' if it is accepted.
+    """Return the reason why a request is refused, or '' if it is accepted.
 
     A request from a page of another server is refused: its origin and host differ in name or port.
     Any port is accepted, since a tunnel (ssh -L) may change it.

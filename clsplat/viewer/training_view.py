@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The viewer of a training. It renders pictures between steps, in a limited fraction of the training's time."""
+"""Viewer of `clsplat train --view`: pictures are rendered between training steps, in a limited fraction of the time."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ STATUS_INTERVAL_SECONDS = 0.5
 
 
 class TrainingView:
-    """Viewer hook of `clsplat.api.train`, called between two steps.
+    """Hook that `clsplat.api.train` calls between two steps, to render pictures for all viewers.
 
-    It renders for all viewers, in a limited fraction of the training's time.
+    last: number of the last training step, for the text of the progress.
     """
 
     def __init__(self, viewing: Viewing, server: Server, background: tuple[float, float, float], last: int) -> None:
@@ -33,7 +33,10 @@ class TrainingView:
         self._told_at = -math.inf
 
     def __call__(self, trainer: Trainer, interrupted: Callable[[], bool]) -> None:
-        """Render a picture if it is due, and wait while paused. Returns at once without viewers, unless paused."""
+        """Render a picture if it is due, and wait while training is paused.
+
+        interrupted: function that is True when training must end.
+        """
         viewing = self.viewing
         if viewing.model is None:
             viewing.model = LiveModel(trainer, self.background)

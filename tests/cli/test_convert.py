@@ -234,7 +234,7 @@ def test_psnr_before_and_after_with_cameras_that_move_along(scene: Path, tmp_pat
         (["--spz-version", "3"], "--spz-version: is for SPZ files, "),
         (["--sh-bits", "5"], "--sh-bits: is for SPZ files, "),
         *(
-            (flags.split(), f"{flags.split()[0]}: has an effect only with --scene, expected that flag too")
+            (flags.split(), f"{flags.split()[0]}: has an effect only with --scene, expected --scene too")
             for flags in ("--resolution 200", "--background white", "--test-every 4")
         ),
         *((["--sh-bits", bits], f"--sh-bits {bits}: expected bits from 1 to 8") for bits in ("0", "9,4", "5,4,3", "x")),

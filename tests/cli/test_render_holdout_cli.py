@@ -147,7 +147,7 @@ def test_frames_are_rendered_again_where_the_cg_changes(folder: Path, tmp_path: 
     write_flat(tmp_path / "cg/z.0002.exr", {"Z": depth})
     capsys.readouterr()
     assert render(folder, tmp_path, flags.format(tmp_path / "cg")) == 0
-    assert "1 of the frames that are there were made" in capsys.readouterr().err
+    assert "1 of the existing frames were made" in capsys.readouterr().err
     changed = [path.name for path in before if path.stat().st_mtime_ns != before[path]]
     assert changed == ["a.0002.exr"]
     assert render(folder, tmp_path, "--alpha --frames 1 --skip-existing") == 0  # none at all is another picture
@@ -167,7 +167,7 @@ def test_cg_that_ends_with_the_frame_is_told_with_overscan(folder: Path, tmp_pat
     flags = f"--frames 2 --overscan 4 --holdout {tmp_path}/z.exr"
     write_flat(tmp_path / "z.exr", {"Z": np.full((HEIGHT, WIDTH), 4.0)})
     assert render(folder, tmp_path, flags) == 0
-    assert "z.exr: ends with the frame, and nothing is held out in the overscan" in capsys.readouterr().err
+    assert "z.exr: ends at the frame's edge; nothing is held out in the overscan" in capsys.readouterr().err
     larger = {"Z": np.full((HEIGHT + 8, WIDTH + 8), 4.0)}
     write_flat(tmp_path / "z.exr", larger, size=(WIDTH, HEIGHT), window=(-4, -4, WIDTH + 8, HEIGHT + 8))
     assert "overscan" not in ran(capsys, render, folder, tmp_path, flags).err
@@ -191,7 +191,7 @@ def test_a_bent_picture_is_held_out_straight(folder: Path, tmp_path: Path, capsy
     write_flat(tmp_path / "all.exr", {"Z": np.full((HEIGHT, WIDTH), 4.0)})
     call = f"--frames 2 --holdout {tmp_path}/all.exr --stmap {tmp_path}/shift.exr"
     assert (
-        "all.exr: ends with the frame, and nothing is held out where the warped picture extends"
+        "all.exr: ends at the frame's edge; nothing is held out where the warped picture extends"
         in ran(capsys, render, folder, tmp_path / "told", call).err
     )
 
@@ -234,7 +234,7 @@ def test_calls_that_make_no_sense(folder: Path, tmp_path: Path, capsys: Capture)
         (f"{held} --width 20", f"z.0001.exr: has a display window of {WIDTH}x{HEIGHT} pixels, expected 20x"),
         (f"{held} --holdout.channel depth.Z", "has the channels Z, expected depth.Z; give the channel of its depths"),
         ("--holdout.channel Z", "--holdout.channel Z: is for holdouts, expected --holdout with it"),
-        (f"{held} --deep", "--deep and --holdout exclude each other: a deep picture is held out where"),
+        (f"{held} --deep", "--deep and --holdout exclude each other: compositing applies holdouts"),
         ("--holdout.depths ray", "--holdout.depths ray: is for holdouts, expected --holdout with it"),
         (f"--holdout {folder}/z.$X.exr --frames 1", "z.$X.exr: no such holdout"),
         (f"--holdout {folder}/z.{{shot}}.exr", "{shot} is not known, expected {name}"),

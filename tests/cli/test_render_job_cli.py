@@ -176,7 +176,7 @@ def test_frames_made_otherwise_are_told_and_rendered_again(shot: list[str], tmp_
         assert render(shot, tmp_path, "--skip-existing", *change) == 0
         count = 4 if "half" in change else COUNT
         said = capsys.readouterr()
-        assert f"warning: --skip-existing: {count} of the frames that are there were made of another model" in said.err
+        assert f"warning: --skip-existing: {count} of the existing frames were made of another model" in said.err
         rendered = re.findall(
             r"  \d+\.\d\d s(?:  \d+:\d\d left)?$", said.out, re.MULTILINE
         )  # slow ones tell what is left
@@ -387,9 +387,10 @@ def test_pictures_of_others_are_left(extension: str, shot: list[str], tmp_path: 
 def test_flags_that_the_files_have_no_use_for(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     flags = ("--frames", "1", "--exr", "half", "--compression", "piz", "--quality", "50")
     said = ran(capsys, render, shot, tmp_path, *flags, pattern="a.####.png").err
-    assert "warning: not used for .png: --exr, --compression, --quality\n" in said
+    assert "warning: flags without effect on .png files: --exr, --compression, --quality\n" in said
     assert render(shot, tmp_path, "--frames", "1", "--channels", "depth", "--background", "white", "--bits", "16") == 0
-    assert "warning: not used for .exr of these channels: --bits, --background\n" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "warning: flags without effect on .exr files of these channels: --bits, --background\n" in said
 
 
 def test_a_frame_with_a_hole_is_not_whole(shot: list[str], tmp_path: Path) -> None:

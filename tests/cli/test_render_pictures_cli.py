@@ -256,9 +256,9 @@ def test_a_frame_of_other_settings_is_not_what_is_wanted(
     assert render_shot(second, tmp_path, more) == 0
     assert (tmp_path / "a.0001.exr").stat().st_mtime_ns == written
     told = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
-    again = [line for line in told if "1 of the frames that are there were made of another model, or with" in line]
+    again = [line for line in told if "1 of the existing frames were made of another model, or with" in line]
     assert len(again) == (0 if kept else 1)
-    assert all(line.endswith("not used for .exr: --quality") for line in told if line not in again)
+    assert all(line.endswith("flags without effect on .exr files: --quality") for line in told if line not in again)
 
 
 @pytest.mark.parametrize("extension", ["tif", "jpg", "dpx"])
@@ -278,15 +278,15 @@ def test_files_without_attributes_say_how_they_were_made(
     (tmp_path / "moved.json").write_text(json.dumps(document))
     moved = [*shot[:2], str(tmp_path / "moved.json")]
     (line,) = ran(capsys, render_shot, moved, tmp_path, "--frames 1,2 --skip-existing", pattern).err.splitlines()
-    assert "1 of the frames that are there were made of another model, or with other cameras or settings" in line
+    assert "1 of the existing frames were made of another model, or with other cameras or settings" in line
     changed = {path.name for path, stamp in before.items() if path.stat().st_mtime_ns != stamp}
     assert changed == {f"a.0002.{extension}"}
     other = {"jpg": "--quality 50"}.get(extension, "--bits 16")
     assert render_shot(moved, tmp_path, f"--frames 1,2 --skip-existing {other}", pattern) == 0
-    assert "2 of the frames that are there were made of another model, or with other" in capsys.readouterr().err
+    assert "2 of the existing frames were made of another model, or with other" in capsys.readouterr().err
     replace(hidden_model(), sh=0.9 * hidden_model().sh).save(tmp_path / "other.ply")
     assert render_shot([str(tmp_path / "other.ply"), *moved[1:]], tmp_path, f"--skip-existing {other}", pattern) == 0
-    assert "2 of the frames that are there were made of another model" in capsys.readouterr().err
+    assert "2 of the existing frames were made of another model" in capsys.readouterr().err
 
 
 def test_frames_that_do_not_say_how_they_were_made(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
@@ -420,7 +420,7 @@ def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Captu
         ("--alpha", "a.mov", "ProRes hq cannot hold alpha, expected --video.prores 4444"),
         ("--bits 8", "a.#.dpx", "a.#.dpx has 10 or 16 bits, expected one of them"),
         ("--bits 10", "a.#.png", "--bits 10: is for DPX, expected 8 or 16"),
-        ("--alpha", "a.#.dpx", "a DPX of 10 bits is written without alpha here, expected --bits 16"),
+        ("--alpha", "a.#.dpx", "DPX files of 10 bits are written without alpha, expected --bits 16"),
         ("--video.crf 99", "a.mp4", "--video.crf 99: expected 0 to 51"),
         ("--colorspace ACEScg", "a.#.png", "its colours would be ACEScg, which is linear, expected sRGB; write .exr"),
         ("--colorspace lin_rec709 --bits 16", "a.#.tif", "would be lin_rec709, which is linear, expected sRGB"),

@@ -276,7 +276,7 @@ def test_skip_existing_goes_by_the_map(shot: list[str], tmp_path: Path, capsys: 
     [
         ("--stmap none.exr", "none.exr: no such image file"),
         ("--stmap GIVEN --distort", "--stmap and --distort exclude each other"),
-        ("--stmap GIVEN --overscan 4", "has values for 96x64 pixels from 0,0 on, expected all of the picture"),
+        ("--stmap GIVEN --overscan 4", "covers 96x64 pixels from 0,0 on, expected all of the picture"),
         ("--stmap GIVEN --channels motion", "--stmap: motion is not defined for distorted pictures"),
         ("--stmap WHOLE", "WHOLE: has R, G, B as uint8, expected an STMap's R and G as floats"),
         ("--distort", "describes no photographs with lenses, expected a COLMAP model's folder or a transforms.json"),
@@ -335,7 +335,7 @@ def test_a_map_that_points_nowhere_is_told(shot: list[str], tmp_path: Path, caps
     places[:, : WIDTH // 2] = np.nan
     write_stmap(tmp_path / "map.exr", places, WIDTH, HEIGHT)
     assert render(shot, tmp_path / "a.exr", f"--stmap {tmp_path}/map.exr") == 0
-    assert "beyond the straight picture, or have no place in it" in capsys.readouterr().err
+    assert "outside the undistorted picture, or have no place in it" in capsys.readouterr().err
     assert not np.asarray(oiio.ImageBuf(str(tmp_path / "a.exr")).get_pixels(oiio.FLOAT))[:, : WIDTH // 2].any()
 
 

@@ -371,7 +371,7 @@ def test_a_report_that_fails_does_not_fail_the_training(
 ) -> None:
     monkeypatch.setattr(report_page, "write_report", raising(ClsplatError("no room")))
     assert train(scene, tmp_path / "run", short(iterations=5)) == 0
-    assert "warning: no report.html (no room); try again with: clsplat report" in capfd.readouterr().err
+    assert "warning: report.html was not written (no room); try again with: clsplat report" in capfd.readouterr().err
     assert (tmp_path / "run" / "eval.json").exists()
 
 

@@ -178,7 +178,7 @@ def test_a_scheduler_without_workers(
             come.cancel()
     lines = [line for line in capsys.readouterr().err.splitlines() if "has no workers" in line]
     assert len(lines) >= 2
-    assert f"--scheduler {empty.scheduler_address}: has no workers; frames wait until one is there" in lines[0]
+    assert f"--scheduler {empty.scheduler_address}: has no workers; frames wait until one connects" in lines[0]
     assert all("for " in line for line in lines[1:])
     assert contents(tmp_path) == {name: data for name, data in whole.items() if name < "a.0004"}
 

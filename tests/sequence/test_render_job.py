@@ -349,7 +349,8 @@ def test_folders_are_looked_at_first(tmp_path: Path, monkeypatch: pytest.MonkeyP
     refuses("is not writable", finished_frames.check_folders, tasks_in(tmp_path / "new" / "shot"))
     assert not (tmp_path / "new").exists()
     monkeypatch.setattr(Path, "mkdir", lambda *_, **__: (_ for _ in ()).throw(OSError(30, "Read-only file system")))
-    refuses("cannot be made: the disk is read-only", finished_frames.make_folders, tasks_in(tmp_path / "new" / "shot"))
+    tasks = tasks_in(tmp_path / "new" / "shot")
+    refuses("cannot be created: the disk is read-only", finished_frames.make_folders, tasks)
 
 
 def test_the_digest_goes_by_what_a_colour_configuration_says(tmp_path: Path) -> None:

@@ -166,7 +166,7 @@ def test_records_tell_the_eyes_apart(shot: list[str], tmp_path: Path, capsys: Ca
         ("a.##.png", "--stereo 0.1", "has no {eye} in it"),
         ("a.mp4", "--stereo 0.1", "a video holds one eye, expected --eye left or right"),
         ("{eye}.mp4", "--stereo 0.1", "a video holds one eye"),
-        ("{eye}.##.exr", "", "has an eye's name in it, expected --stereo"),
+        ("{eye}.##.exr", "", "has a field for the eye, expected --stereo"),
         ("a.##.exr", "--stereo 0", "--stereo 0: expected the distance of the eyes above 0, or stage"),
         ("a.##.exr", "--stereo wide", "--stereo wide: expected the distance"),
         ("a.##.exr", "--stereo 0.1 --convergence -3", "--convergence -3.0: expected a depth above 0"),

@@ -110,7 +110,7 @@ def test_refusals(scene: Scene, default_device: Device, tmp_path: Path) -> None:
     refuses("--refine-lenses: not supported with --batch 2", TrainConfig(refine_lenses=True, batch=2).check)
     with pytest.raises(InputError, match="--refine-lenses: not supported with 2 devices"):
         TrainConfig(refine_lenses=True).on_devices(2, explicit=False)
-    refuses("over 0 and at most 50 hundredths", TrainConfig(lens_reach=0.0).check)
+    refuses("over 0 and at most 50 percent", TrainConfig(lens_reach=0.0).check)
     run = Run.create(tmp_path / "run", CONFIG)
     train(scene, replace(CONFIG, iterations=4), device=default_device, run=run)
     with pytest.raises(InputError, match="refine_lenses is True, a resumed run"):

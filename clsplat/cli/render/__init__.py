@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat render`: flags, their request, its job, the plan, and the writing of frames."""
+"""`clsplat render`: its flags and their checks, the cameras, the plan of --dry-run, and the writing of frames."""

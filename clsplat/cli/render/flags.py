@@ -60,10 +60,10 @@ class RenderVerb(Verb):
     them, or steps in their order such as 'rotate=0,90,0 scale=2 translate=1,0,0'. A JSON file can hold key frames or a
     matrix a frame (docs/shot.md)."""
     path: Annotated[Literal["turntable", "spiral", "through"] | None, arg(metavar="turntable|spiral|through")] = None
-    """Path made from the cameras, instead of the cameras themselves. turntable: around their common focus; spiral: the
-    same twice, while rising and sinking; through: along the cameras in their order, smoothed. Frames count from 1.
-    Without --cameras it uses the cameras of a run's photographs. For a model alone the path goes around it, or around
-    a scene's most detailed part."""
+    """Path made from the cameras, instead of the cameras themselves. turntable: around their common focus; spiral: two
+    such turns, rising and sinking; through: along the cameras in their order, smoothed. Frames count from 1.
+    Without --cameras, the path is made from the cameras of a run's photographs. For a model file it goes around the
+    model, or around a scene's most detailed part."""
     up: Annotated[str | None, arg(metavar="AXIS|X,Y,Z")] = None
     """Up direction of a path around a model, without --cameras: x, y, z, -x, -y, -z or three numbers. If not given: -y,
     as in a COLMAP scene. With it the path goes around a run's model too. Write --up=-z if it begins with a minus."""
@@ -165,7 +165,7 @@ class RenderVerb(Verb):
             raise InputError(f"--lenses {self.lenses} and --distort exclude each other: --distort applies the lens")
         bundle, lenses = RASTERIZER_PRESETS["default"], self.lenses or "undistort"
         if self.model.is_dir() and (is_run(self.model) or model_path(self.model) == self.model):
-            config = Run.open(self.model).config  # refuses a folder that is neither a run nor a model
+            config = Run.open(self.model).config  # refuse a folder that is neither a run nor a model
             bundle, lenses = config.rasterizer, self.lenses or ("undistort" if self.path else config.lenses)
         if self.preset is not None:
             bundle = RASTERIZER_PRESETS[self.preset]

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Job of `clsplat render`: tasks, models and options of a request, the checks that need them, the plan that --dry-run
-prints, and the writing of its frames."""
+"""Job of `clsplat render`: load models and cameras, make a task for each frame, print the plan of --dry-run, and write
+the frames."""
 
 from __future__ import annotations
 
@@ -41,10 +41,12 @@ from clsplat.version import package_version
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that is known before the first frame is rendered.
+    """Models, frames and options of a call of `clsplat render`, ready to be rendered.
 
-    spaces: colour space of the model and of the pictures.
+    tasks: a task for each frame.
+    spaces: colour spaces of the model and of the written pictures, by name.
     video: encoding of the video, with its frame rate.
+    mattes: objects of each Cryptomatte channel.
     """
 
     request: Request
@@ -102,7 +104,7 @@ def job_of(request: Request) -> Job:
 
 
 def _models(flags: RenderVerb) -> JobModels:
-    """Load the models of MODEL and --transform. Raises InputError."""
+    """Load the model or models that MODEL names, placed by --transform. Raises InputError."""
     wrong = f"--appearance {flags.appearance}: is for one run's model, but {flags.model}"
     if flags.appearance is not None and is_layout(flags.model):
         raise InputError(f"{wrong} is a shot of several")
@@ -112,16 +114,18 @@ def _models(flags: RenderVerb) -> JobModels:
 
 
 def _video(flags: RenderVerb, fps: float | None, path: Path, sizes: Collection[tuple[int, int]]) -> VideoConfig:
-    """Video settings, with the shot's frame rate unless a flag sets another.
+    """Return the video settings, with the shot's frame rate unless a flag sets another.
 
-    Raises InputError for a rate or sizes that no video has, and for a file that may not be replaced. --skip-existing
-    replaces clsplat's own.
+    fps: the shot's frames a second, or None.
+    sizes: (width, height) of the pictures, of which a video needs a single one.
+    Raises InputError for a rate or sizes that no video has, and for a file that may not be replaced. With
+    --skip-existing a video that clsplat wrote may be replaced.
     """
     if not flags.is_video:
         return flags.video
     if len(sizes) > 1:
         texts = sorted(f"{width}x{height}" for width, height in sizes)
-        raise InputError(f"{path}: frames are of the sizes {examples(texts)}, expected one; give --width and --height")
+        raise InputError(f"{path}: frames have sizes {examples(texts)}, expected a single one; give --width, --height")
     check_size(path, *next(iter(sizes)))
     if path.exists() or path.is_symlink():
         ours = flags.skip_existing and bool(video_record(path))
@@ -139,10 +143,10 @@ def _video(flags: RenderVerb, fps: float | None, path: Path, sizes: Collection[t
 
 
 def _picture_sizes(tasks: Sequence[Task], pictures: PictureConfig, *, deep: bool) -> set[tuple[int, int]]:
-    """Sizes of the pictures, which are checked before rendering.
+    """Return the sizes (width, height) of the pictures, and check the pictures' cameras.
 
-    Raises InputError if the framing does not suit a frame, if deep stereo pairs are in one file, or if two eyes cannot
-    share a file.
+    Raises InputError if a camera does not allow the framing, if deep stereo pairs are in one file, or if two eyes
+    cannot share a file.
     """
     if deep and tasks[0].right is not None:
         raise InputError(f"--deep: {tasks[0].path} would hold both eyes, expected a file for each: {{eye}} in -o")
@@ -159,13 +163,13 @@ def _picture_sizes(tasks: Sequence[Task], pictures: PictureConfig, *, deep: bool
 
 
 def _check_pair(task: Task, left: Camera, right: Camera) -> None:
-    """Raise InputError for eyes that differ in window size or pixel shape: an EXR file has one for all parts."""
+    """Raise InputError if eyes in one EXR file differ in window size or pixel aspect ratio, which all parts share."""
     advice = f"{task.path} holds both eyes, expected them alike, or a file for each: {{eye}} in -o"
     sizes = [f"{frame.width}x{frame.height}" for frame in (left.window or left, right.window or right)]
     if sizes[0] != sizes[1]:
         what = f"is {sizes[0]} for the left eye and {sizes[1]}"
         raise InputError(f"--stereo: frame {task.number} {what} for the right; {advice}")
-    # compared as float32, the precision in which the headers of a stage's frames store it
+    # compare as float32, the precision in which EXR headers store the pixel aspect ratio
     shapes = [str(np.float32(eye.fy / eye.fx)) for eye in (left, right)]
     if task.optics is not None and shapes[0] != shapes[1]:
         what = f"has pixels of the aspect ratio {shapes[0]} for the left eye and {shapes[1]}"
@@ -173,7 +177,7 @@ def _check_pair(task: Task, left: Camera, right: Camera) -> None:
 
 
 def check_warps(tasks: Sequence[Task], pictures: PictureConfig) -> None:
-    """Raise InputError for panoramas, which cannot be distorted, and for a map that does not cover the picture.
+    """Raise InputError for panoramas, which cannot be distorted, and for an STMap that does not cover the picture.
 
     Warns if a part of the picture stays empty.
     """
@@ -189,29 +193,29 @@ def check_warps(tasks: Sequence[Task], pictures: PictureConfig) -> None:
             window = camera.window or Window(0, 0, camera.width, camera.height)
             if not stmap.covers(window.x, window.y, camera.width, camera.height):
                 raise InputError(
-                    f"{flag}: has values for {stmap.values.shape[1]}x{stmap.values.shape[0]} pixels from {stmap.x},"
-                    f"{stmap.y} on, expected all of the picture; leave --overscan out, or write a larger data window"
+                    f"{flag}: covers {stmap.values.shape[1]}x{stmap.values.shape[0]} pixels from {stmap.x},{stmap.y} "
+                    "on, expected all of the picture; omit --overscan, or write the STMap with a larger data window"
                 )
         if (part := warp.empty) > 0:
             empty[task.number] = max(part, empty.get(task.number, 0.0))
     if empty:
         number, part = max(empty.items(), key=lambda item: item[1])
-        advice = "" if pictures.warp.stmap else "; --lenses native renders fisheyes without a straight picture"
+        advice = "" if pictures.warp.stmap else "; --lenses native renders fisheyes without undistorted pictures"
         warn(
-            f"{flag}: {100 * part:.0f} % of frame {number} stays black and transparent: its pixels lie more than a "
-            f"frame's size beyond the straight picture, or have no place in it{advice}"
+            f"{flag}: {100 * part:.0f} % of frame {number} stays black and transparent: these pixels lie more than a "
+            f"frame's size outside the undistorted picture, or have no place in it{advice}"
         )
 
 
 def dry_run(job: Job, plans: Sequence[DevicePlan]) -> int:
-    """Print the job, and the memory plan of each device that renders it."""
+    """Print the plan of --dry-run: frames, files and options, and the memory plan of each device."""
     document = _plan_document(job, plans)
     print(json.dumps(document, indent=2) if job.request.flags.json else "\n".join(_plan_lines(job, document, plans)))
     return 0
 
 
 def _plan_document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
-    """The plan as data, for --json."""
+    """Return the plan of --dry-run as the object that --json prints."""
     tasks, options = job.tasks, job.options
     flags = job.request.flags
     skipped = finished_frames.frames_there(tasks, options, job.video) if flags.skip_existing else set()
@@ -257,7 +261,7 @@ def _plan_document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
 
 
 def _plan_lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> Iterator[str]:
-    """The plan as lines of text."""
+    """Yield the plan of --dry-run as lines of text."""
     frames = document["frames"]
     paths = dict.fromkeys((frames[0]["path"], frames[-1]["path"]))
     spaces = dict.fromkeys((document["model_colorspace"], document["colorspace"]))
@@ -283,7 +287,7 @@ def _plan_lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan])
 
 
 def _sizes(frames: Sequence[dict[str, Any]]) -> list[str]:
-    """Distinct sizes of the pictures, and the frames that contain them."""
+    """Return the distinct picture sizes as texts, each with its place in the frame if the picture is a part of one."""
     sizes = {(frame["width"], frame["height"], tuple(frame.get("window", ()))) for frame in frames}
     texts = []
     for width, height, window in sorted(sizes):
@@ -306,8 +310,9 @@ def _samples(job: Job) -> str:
 
 
 def write_frames(job: Job, renderers: Sequence[Any]) -> int:
-    """Render and write the frames that are not there, with a renderer for each device or on a farm.
+    """Render and write all frames, with a renderer for each device or on a Dask cluster.
 
+    --skip-existing leaves out frames whose files exist.
     Raises ClsplatError, and KeyboardInterrupt with the number of frames done.
     """
     tasks, options = job.tasks, job.options
@@ -362,7 +367,10 @@ def write_frames(job: Job, renderers: Sequence[Any]) -> int:
 
 
 def _print_profile(records: Iterable[Record], wall: float, devices: int) -> None:
-    """Print the fraction of the wall time in which the devices worked."""
+    """Print the percentages of the wall time in which the devices ran kernels and transfers.
+
+    wall: wall time of all frames in seconds.
+    """
     kernels, transfers = (
         sum(getattr(record, name) or 0.0 for record in records) / (10 * max(wall, 1e-9) * max(devices, 1))
         for name in ("kernel_ms", "transfer_ms")

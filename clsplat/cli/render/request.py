@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Request of `clsplat render`: its flags, checked before any camera or model is read."""
+"""Checks of the flags of `clsplat render`, before any camera or model is read."""
 
 from __future__ import annotations
 
@@ -26,16 +26,17 @@ _EXTENSIONS_BY_FLAG = {
     "bits": (".png", ".tif", ".tiff", ".dpx"),
     "quality": (".jpg", ".jpeg"),
 }
-"""File endings for which each encoding flag has an effect."""
+"""File endings on which each encoding flag has an effect."""
 
 
 @dataclass(frozen=True)
 class Request:
     """Call of `clsplat render` whose flags are valid, and agree with each other.
 
-    pictures: settings of the flags; a USD stage may still change them.
-    holdout: settings for reading holdouts; None without any.
+    pictures: picture settings from the flags. A USD stage may still change them.
+    holdout: settings for reading holdout files, or None without --holdout.
     devices: selector of each device; None for the default device.
+    memory_limit: limit of device memory in bytes, or None.
     resize: function that resizes a camera by --width, --height and --scale.
     """
 
@@ -51,12 +52,12 @@ class Request:
 
 
 def checked(flags: RenderVerb) -> Request:
-    """The request of these flags. Warns of flags without effect.
+    """Check the flags and return them as a request. Warns of flags without effect.
 
     Raises InputError, and DeviceError for a device that is not there.
     """
     if flags.cameras is None:
-        check_around(flags.path, among_own=True)  # the cameras of a run's photographs are read later
+        check_around(flags.path, among_own=True)  # a run's own cameras are read later
     channels = parse_channels(f"{flags.channels},alpha" if flags.alpha or flags.deep else flags.channels)
     check_format(flags.output, channels, video=True)
     flags.video.check()
@@ -89,8 +90,7 @@ def checked(flags: RenderVerb) -> Request:
 
 
 def _colour(colour: ColourConfig) -> ColourConfig:
-    """Colour settings with the absolute path of the OCIO configuration, as processes that render may run in other
-    folders."""
+    """Return the colour settings with the OCIO configuration's absolute path, as workers may run in other folders."""
     source = colour.ocio_config or os.environ.get("OCIO", "")
     if source and "://" not in source:
         source = str(Path(source).absolute())
@@ -98,12 +98,12 @@ def _colour(colour: ColourConfig) -> ColourConfig:
 
 
 def _warp(warp: WarpConfig) -> WarpConfig:
-    """Lens settings with the absolute path of the map, as processes that render may run in other folders."""
+    """Return the lens settings with an absolute path of the STMap, as workers may run in other folders."""
     return replace(warp, stmap=str(Path(warp.stmap).absolute())) if warp.stmap else warp
 
 
 def _check_mattes(channels: Collection[str], ids_from: str | None, compression: str) -> None:
-    """Raise InputError for mattes without their inputs, or in a file whose compression would change them."""
+    """Raise InputError for Cryptomattes without --ids-from, or in a file whose compression would change their ids."""
     if ("semantic" in channels) != (ids_from is not None):
         given = f"--ids-from {ids_from}" if ids_from is not None else "--channels semantic"
         raise InputError(f"{given}: expected --channels semantic and --ids-from together")
@@ -127,7 +127,11 @@ def _check_deep(flags: RenderVerb, pictures: PictureConfig, channels: tuple[str,
 
 
 def bits_of(path: str, bits: int | None, channels: Collection[str]) -> int:
-    """Bits per channel for files of that name, from --bits. Raises InputError if the format does not support them."""
+    """Return the bits per channel for files of that name.
+
+    bits: value of --bits, or None for the format's default.
+    Raises InputError if the format does not support the bits.
+    """
     extension = Path(path).suffix.lower()
     if extension == ".dpx" and bits == 8:
         raise InputError(f"--bits 8: {path} has 10 or 16 bits, expected one of them")
@@ -135,7 +139,7 @@ def bits_of(path: str, bits: int | None, channels: Collection[str]) -> int:
         raise InputError(f"--bits 10: is for DPX, expected 8 or 16 for {path}")
     chosen = bits or (10 if extension == ".dpx" else 8)
     if extension == ".dpx" and chosen == 10 and "alpha" in channels:
-        raise InputError(f"{path}: a DPX of 10 bits is written without alpha here, expected --bits 16 with it")
+        raise InputError(f"{path}: DPX files of 10 bits are written without alpha, expected --bits 16 for alpha")
     return chosen
 
 
@@ -153,7 +157,7 @@ def _background(text: str) -> tuple[float, float, float]:
 
 
 def _holdout(flags: RenderVerb) -> HoldoutConfig | None:
-    """Settings for reading holdouts; None without any. Raises InputError."""
+    """Return the settings for reading holdout files, or None without --holdout. Raises InputError."""
     config = flags.holding
     if flags.holdout is None:
         if config != HoldoutConfig():
@@ -161,12 +165,15 @@ def _holdout(flags: RenderVerb) -> HoldoutConfig | None:
             raise InputError(f"--holdout.{given}: is for holdouts, expected --holdout with it")
         return None
     if flags.deep:
-        raise InputError("--deep and --holdout exclude each other: a deep picture is held out where it is composited")
+        raise InputError("--deep and --holdout exclude each other: compositing applies holdouts to deep pictures")
     return config
 
 
 def resizer(width: int | None, height: int | None, scale: float) -> Callable[[Camera], Camera]:
-    """Function that resizes a camera by --width, --height and --scale. Raises InputError for impossible sizes."""
+    """Return a function that resizes a camera by --width, --height and --scale.
+
+    Raises InputError for impossible sizes.
+    """
     for flag, value in (("--width", width), ("--height", height), ("--scale", scale)):
         if value is not None and not 0 < value < float("inf"):
             raise InputError(f"{flag} {value}: expected a number above 0")
@@ -185,11 +192,11 @@ def resizer(width: int | None, height: int | None, scale: float) -> Callable[[Ca
 
 
 def _devices(flags: RenderVerb) -> tuple[str | None, ...]:
-    """Device selectors in --device. Raises InputError."""
+    """Return the device selectors of --device; (None,) for the default device. Raises InputError."""
     if flags.workers is not None and flags.workers < 1:
         raise InputError(f"--workers {flags.workers}: expected at least 1")
     if flags.workers is not None and flags.scheduler is not None:
-        raise InputError("--workers and --scheduler exclude each other: a new cluster here, or one that is there")
+        raise InputError("--workers and --scheduler exclude each other: a new cluster, or one that runs already")
     words = [word.strip() for word in flags.device.split(",")] if flags.device else []
     if not words:
         return (None,)
@@ -206,9 +213,9 @@ def _devices(flags: RenderVerb) -> tuple[str | None, ...]:
 
 
 def _warn_of_unused(flags: RenderVerb, channels: Collection[str]) -> None:
-    """Warn of flags that have no effect on these files, or on a farm."""
+    """Warn of flags that have no effect on files of this format and channels, or on a Dask cluster."""
     if flags.profile and flags.on_farm:
-        warn("--profile is not used: it is for devices of this process")
+        warn("--profile has no effect: it measures devices of this process, and a Dask cluster renders")
     defaults = {field.name: field.default for field in fields(RenderVerb)}
     names = [
         name
@@ -217,9 +224,9 @@ def _warn_of_unused(flags: RenderVerb, channels: Collection[str]) -> None:
         and getattr(flags, name) != defaults[name]
         and not (name == "exr" and flags.deep)
     ]
-    what = flags.extension
+    what = f"{flags.extension} files"
     if "rgb" not in channels and flags.background is not None:
         names.append("background")
         what += " of these channels"
     if names:
-        warn(f"not used for {what}: {', '.join(f'--{name}' for name in names)}")
+        warn(f"flags without effect on {what}: {', '.join(f'--{name}' for name in names)}")

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The shots that the flags of `clsplat render` ask for, two with --stereo, and the settings of a USD stage."""
+"""Cameras of `clsplat render`: the shot that its flags ask for, one for each eye with --stereo, and the settings taken
+from a USD stage."""
 
 from __future__ import annotations
 
@@ -26,16 +27,17 @@ from clsplat.shots.stereo import pair_of_stage, shot_of
 STEREO_ROLE_ATTRIBUTE = "stereoRole"
 """Attribute that marks the left and the right camera of a stage, for `--stereo stage`."""
 _STAGE_FLOAT32_TOLERANCE = 1e-6
-"""Tolerance for equal fractions of a frame: a stage stores them in float32."""
+"""Tolerance for equal fractions of a frame and equal aspect ratios, which a stage stores in float32."""
 _PIXEL_CENTRE_TOLERANCE_PX = 1e-3
-"""Tolerance in pixels for an edge on a pixel's centre: the float32 precision in a picture 16384 pixels wide."""
+"""Distance in pixels within which a data window's edge counts as on a pixel's centre: the precision of float32 in a
+picture 16384 pixels wide."""
 
 
 def shots_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[str, Shot]:
-    """Shots by eye, with all frames, before --frames selects some. Without stereo there is one shot, under "".
+    """Return the shot of each eye, with all its frames; without stereo a single shot, under "".
 
-    models: function that loads the models. Paths around the models need them, and a single still camera, which shows
-      every frame of a changing model.
+    models: function that loads the models. It is called for a path around the models, and for a single still camera,
+      which shows every frame of a changing model.
     Raises InputError.
     """
     shots = _cameras_asked(flags, models)
@@ -45,14 +47,14 @@ def shots_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[str,
 
 
 def _cameras_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[str, Shot]:
-    """Shots of the cameras or the path, by eye."""
+    """Return the shot of --cameras or of --path for each eye, before a still camera is repeated for each frame."""
     pairs, size = flags.pairs, (flags.width, flags.height)
     paths = _stage_cameras(pairs, flags.cameras, flags.usd_camera) if pairs.of_stage else {}
     if flags.cameras is None:
         if flags.usd_camera is not None:
             raise InputError(f"--usd-camera {flags.usd_camera}: expected the USD stage in --cameras with it")
         own = own_cameras(None if flags.transform else run_of(flags.model))
-        check_around(flags.path, among_own=bool(own) and flags.up is None)  # checked before the models are loaded
+        check_around(flags.path, among_own=bool(own) and flags.up is None)  # report errors before models are loaded
         shots = [shot_around(models().at(1), flags.path, count=flags.count, size=size, up=flags.up, own=own)]
     elif flags.up is not None:
         raise InputError(f"--up {flags.up}: is for paths around the model, expected no --cameras with it")
@@ -72,15 +74,15 @@ def _cameras_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[s
 
 
 def _stage_cameras(stereo: StereoConfig, cameras: Path | None, usd_camera: str | None) -> dict[str, str]:
-    """Path of each eye's camera in the USD stage, for --stereo stage. Raises InputError."""
+    """Find the path of each eye's camera in the USD stage, for --stereo stage. Raises InputError."""
     if cameras is None or cameras.suffix.lower() not in USD_SUFFIXES:
-        raise InputError(f"--stereo stage: expected a USD stage in --cameras, not {cameras}")
+        raise InputError(f"--stereo stage: expected a USD stage in --cameras, not {cameras or 'none'}")
     pair = dict(zip(EYES, pair_of_stage(cameras, usd_camera), strict=True))
     return {eye: pair[eye] for eye in stereo.eyes}
 
 
 def _of_eyes(stereo: StereoConfig, shots: list[Shot], paths: dict[str, str]) -> dict[str, Shot]:
-    """Shot of each eye. Without stereo there is one shot, under "".
+    """Return the shot of each eye; without stereo a single shot, under "".
 
     shots: the shot of the cameras, or the two shots of the eyes' cameras in the stage.
     paths: path of each eye's camera in the stage.
@@ -100,9 +102,10 @@ def _of_eyes(stereo: StereoConfig, shots: list[Shot], paths: dict[str, str]) -> 
 def with_stage(
     pictures: PictureConfig, source: object, shot: Shot, tasks: Sequence[Task]
 ) -> tuple[PictureConfig, tuple[str, ...]]:
-    """Settings with the stage's data window and the first frame's shutter and lens; and the names of stage settings
-    that are not applied.
+    """Return picture settings with a USD stage's data window, shutter and lens, and the stage settings not applied.
 
+    source: the stage's file, for messages.
+    shot: the shot read from the stage. Its first frame gives the shutter and the lens.
     Raises InputError for a data window without a pixel.
     """
     unapplied = (*_lens_unapplied(pictures.sampling, tasks), *_shape_unsaid(tasks[0]))
@@ -121,7 +124,7 @@ def with_stage(
 
 
 def _shape_unsaid(task: Task) -> tuple[str, ...]:
-    """A note on the stage's pixel aspect ratio, if the file format cannot store it and so shows square pixels."""
+    """Return a note on the stage's pixel aspect ratio if the file format cannot store it, which then shows squares."""
     shape, kind = task.camera.fy / task.camera.fx, task.path.suffix.lower()
     if task.optics is None or kind == ".exr" or abs(shape - 1) < _STAGE_FLOAT32_TOLERANCE:
         return ()
@@ -131,10 +134,10 @@ def _shape_unsaid(task: Task) -> tuple[str, ...]:
 def _framing(
     framing: FramingConfig, source: object, window: tuple[float, float, float, float], camera: Camera
 ) -> FramingConfig | None:
-    """The framing that renders a data window, as a region or an overscan of the camera's frame.
+    """Return the framing that renders a data window, as a region or an overscan of the camera's frame.
 
-    A pixel is rendered if the window covers its centre. The result is None if the window extends beyond the frame on
-    one side but is not an overscan.
+    window: left, bottom, right and top as fractions of the frame. A pixel is rendered if the window covers its centre.
+    The result is None if the window extends beyond the frame, but not equally on all sides as an overscan does.
     """
     left, bottom, right, top = window
     width, height = camera.width, camera.height
@@ -154,9 +157,9 @@ def _framing(
 
 
 def _lens_unapplied(flags: SamplingConfig, tasks: Sequence[Task]) -> tuple[str, ...]:
-    """A note on the stage's lens, if no flag overrides it and no picture shows its blur.
+    """Return a note on the stage's lens if pictures do not show its blur and no flag overrides it.
 
-    This happens if the lens has no focus distance, or the camera is orthographic.
+    The blur is missing if the lens has no focus distance, or if the camera is orthographic.
     """
     if flags.aperture is not None or flags.f_stop is not None:
         return ()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat render`, from the call to the exit status.
+"""`clsplat render`, from its flags to its exit status.
 
-`clsplat.cli.render.request` checks the flags. `clsplat.cli.render.job` reads cameras and models, and makes the tasks.
-For --dry-run it prints them, else it has them rendered and written.
+`clsplat.cli.render.request` checks the flags. `clsplat.cli.render.job` reads cameras and models, and makes a task for
+each frame. With --dry-run it prints the tasks, otherwise it renders and writes their frames.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ __all__ = ["RenderVerb", "run"]
 
 
 def run(verb: RenderVerb, services: Services) -> int:
-    """Render a model from cameras to images."""
+    """Render a model to an image for each camera, or print the plan with --dry-run."""
     from clsplat.cli.render.job import dry_run, job_of, write_frames
     from clsplat.cli.render.request import checked
 
@@ -38,5 +38,5 @@ def run(verb: RenderVerb, services: Services) -> int:
         return dry_run(job, [renderer.memory_plan(job.tasks) for renderer in renderers])
     for renderer in renderers:
         renderer.check(job.tasks)
-    with terminable():  # installed again: pycolmap and kernel compilers have installed handlers of their own
+    with terminable():  # install signal handlers again, as pycolmap and kernel compilers replace them
         return write_frames(job, renderers)

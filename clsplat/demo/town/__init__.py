@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A synthetic town of any size: its blocks, its photographs by ray casting, and its COLMAP scene."""
+"""Synthetic town of any size (`clsplat demo --town`): blocks of houses, ray-cast photographs, and a COLMAP scene."""

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The city blocks of an endless grid. A block depends on the seed and its two indices alone.
+"""City blocks of the demo's town: houses, flats or a park, trees, cars, and points on the surfaces.
+
+The town is an endless grid of blocks. A block depends on the seed and its two indices alone.
 
 A block's corner is at the crossing of two streets. x and y are along the streets, and the ground is z = 0.
 """
@@ -28,7 +30,7 @@ POINTS_PER_BLOCK = 1200
 GROUND_POINTS = 400
 """Number of a block's points that lie on the ground."""
 MAX_HEIGHT_METRES, BLOCK_REACH_METRES = 20.0, 12.0
-"""Bounds of every block: its height, and how far its trees and cars may reach beyond its edges."""
+"""Maximum height of a block, and maximum reach of trees and cars beyond a block's edges."""
 GROUND_FACE, SKY_FACE = -1, -2
 """Surface numbers of the ground and the sky, which belong to no solid."""
 CAR_PAINTS: Final = np.array(
@@ -41,13 +43,13 @@ _BLOCKS_KEPT = 512
 class CityBlock:
     """A block of the town.
 
-    i, j: its indices along x and y.
-    solids: its solids, in metres from its corner.
+    i, j: indices of the block along x and y.
+    solids: houses, trees and so on, in metres from the block's corner.
     low, high: corners (3,) of a box around the solids.
-    points: (POINTS_PER_BLOCK, 3) float64 on its surfaces, in metres from its corner.
+    points: (POINTS_PER_BLOCK, 3) float64, points on the surfaces, in metres from the block's corner.
     solid_of_point: (POINTS_PER_BLOCK,), index of the solid on which a point lies, or GROUND_FACE.
-    face_of_point: (POINTS_PER_BLOCK,), index of the point's face in that solid.
-    normals: (POINTS_PER_BLOCK, 3), outward.
+    face_of_point: (POINTS_PER_BLOCK,), index of the solid's face on which a point lies.
+    normals: (POINTS_PER_BLOCK, 3), outward normals at the points.
     """
 
     i: int
@@ -68,7 +70,7 @@ class CityBlock:
 
 @lru_cache(maxsize=_BLOCKS_KEPT)
 def city_block(seed: int, i: int, j: int) -> CityBlock:
-    """Block (i, j) of the town with this seed."""
+    """Build block (i, j) of the town with this seed."""
     generator = block_generator(seed, 0, i, j)
     builder = Builder()
     kind = generator.choice(("houses", "flats", "park"), p=(0.6, 0.28, 0.12))
@@ -82,12 +84,15 @@ def city_block(seed: int, i: int, j: int) -> CityBlock:
 
 
 def block_generator(seed: int, purpose: int, i: int, j: int, *more: int) -> np.random.Generator:
-    """Random numbers for one purpose in a block, whose indices may be negative."""
+    """Return the random generator of block (i, j) for one purpose. The indices may be negative.
+
+    purpose: number that tells the block's random generators apart.
+    """
     return np.random.default_rng([seed, purpose, i & 0xFFFFFFFF, j & 0xFFFFFFFF, *more])
 
 
 def car(builder: Builder, x: float, y: float, turn: float, paint_of_car: Float64) -> None:
-    """Add a car, 4.2 metres long, whose front is at the angle `turn` from x."""
+    """Add a car, 4.2 metres long, that faces in the direction at the angle `turn` from x, in radians."""
     tint = (float(paint_of_car[0]), float(paint_of_car[1]), float(paint_of_car[2]))
     body, glass = Cover(paint.PLAIN, 4.0, tint), Cover(paint.PLAIN, 4.0, (0.07, 0.09, 0.11))
     back = np.array([np.cos(turn), np.sin(turn)]) * 0.25
@@ -121,7 +126,7 @@ def _tree(builder: Builder, generator: np.random.Generator, x: float, y: float, 
 
 
 def _house(builder: Builder, generator: np.random.Generator, x: float, y: float, turn: float) -> None:
-    """A detached house with a gabled roof and a chimney; its ridge is along the angle `turn`."""
+    """Add a detached house with a chimney and a gabled roof, whose ridge is at the angle `turn` from x."""
     half = [float(generator.integers(least, least + 2)) * WINDOW_METRES / 2 for least in (3, 2)]
     eaves = STOREY_METRES * float(generator.integers(1, 3)) + 0.15
     shift = (float(generator.integers(4)) / 4, 0.0)
@@ -138,7 +143,7 @@ def _house(builder: Builder, generator: np.random.Generator, x: float, y: float,
 
 
 def _houses(builder: Builder, generator: np.random.Generator) -> None:
-    """Houses on the lots along the streets, with hedges; trees in the gardens."""
+    """Add houses on the lots along the streets, hedges, and trees in the gardens."""
     for lot in range(9):
         column, row = lot % 3, lot // 3
         x, y = (PAVEMENT_METRES + (place + 0.5) * LOT_METRES for place in (column, row))
@@ -159,7 +164,7 @@ def _houses(builder: Builder, generator: np.random.Generator) -> None:
 
 
 def _flats(builder: Builder, generator: np.random.Generator) -> None:
-    """Two or three long buildings with flat roofs, and trees between them."""
+    """Add two or three long buildings with flat roofs, and trees between them."""
     gravel = Cover(paint.ROOFS[3], paint.ROOF_METRES, _tint(generator), _shift(generator), 0.0)
     metal = Cover(paint.ROOFS[4], 3.0, _tint(generator), _shift(generator), 0.0)
     rows = ((9.0, 2.0), (30.0, 2.0), (51.0, 2.0)) if generator.uniform() < 0.4 else ((14.0, 3.0), (46.0, 3.0))
@@ -189,7 +194,7 @@ def _flats(builder: Builder, generator: np.random.Generator) -> None:
 
 
 def _park(builder: Builder, generator: np.random.Generator) -> None:
-    """Trees, a pavilion and benches."""
+    """Add the trees, the pavilion and the benches of a park."""
     places: list[Float64] = []
     while len(places) < 22:
         place = generator.uniform(11, 49, 2)
@@ -203,7 +208,7 @@ def _park(builder: Builder, generator: np.random.Generator) -> None:
 
 
 def _street_trees(builder: Builder, generator: np.random.Generator) -> None:
-    """Trees and lamps on the pavements of the block's two streets."""
+    """Add trees and lamps on the pavements of the block's two streets."""
     metal = Cover(paint.PLAIN, 2.0, (0.22, 0.25, 0.24))
     for along_y in (False, True):
         for place in np.arange(13.0, 54.0, 8.0) + generator.uniform(-1.0, 1.0, 6):
@@ -229,7 +234,10 @@ def _parked_cars(builder: Builder, generator: np.random.Generator) -> None:
 def _points(
     solids: Solids, generator: np.random.Generator
 ) -> tuple[Float64, NDArray[np.int64], NDArray[np.int64], Float64]:
-    """Points on the surfaces, their solids, faces and normals. Undersides have no points."""
+    """Draw random points on the surfaces of a block. Returns the points, their solids, faces and normals.
+
+    Undersides have no points.
+    """
     ground = np.zeros((GROUND_POINTS, 3))
     ground[:, :2] = generator.uniform(0, BLOCK_METRES, (GROUND_POINTS, 2))
     count = POINTS_PER_BLOCK - GROUND_POINTS
@@ -241,7 +249,7 @@ def _points(
     areas[:, 5] = 4 * x * y
     areas[roofs] = np.stack([y * z, y * z, 0 * x, 0 * x, 0 * x, 0 * x, 2 * x * steep, 2 * x * steep], axis=1)[roofs]
     areas[balls] = 0
-    areas[balls, 0] = 2 * np.pi * x[balls] ** 2  # half of the area, as foliage has enough points
+    areas[balls, 0] = 2 * np.pi * x[balls] ** 2  # half of the area, as foliage would get too many points
     chosen = generator.choice(areas.size, count, p=(areas / areas.sum()).ravel())
     solid, face = chosen // 8, chosen % 8
     a, b = generator.uniform(-1, 1, (2, count))
@@ -272,8 +280,14 @@ def _on_roofs(
     local: Float64,
     normals: Float64,
 ) -> None:
-    """Move points of roofs to their gables and slopes, in place."""
-    share = (b + 1) / 2  # fraction of the roof's height
+    """Move points of roofs to the roofs' gables and slopes, in place.
+
+    roof: (n,), True for points on roofs.
+    a, b: (n,), random numbers in [-1, 1]: along the ridge or across the gable, and up.
+    half: (n, 3), half sizes of each point's solid.
+    local, normals: (n, 3), points and normals in the solid's own axes, to be changed.
+    """
+    share = (b + 1) / 2  # height of each point, as a fraction of the roof's
     gable = roof & (face < 2)
     local[gable, 1] = (a * (1 - share) * half[:, 1])[gable]
     local[gable, 2] = (share * half[:, 2])[gable]

@@ -19,17 +19,18 @@ from clsplat.scenes.dataset import Lens, colmap_camera_models
 UNKNOWN_POINT = np.uint64(2**64 - 1)
 """Point number of an observation that belongs to no track."""
 _OBSERVATION = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
+"""Observation in images.bin: its position in pixels, and its point's number."""
 _COUNT = struct.Struct("<Q")
 
 
 @dataclass(eq=False)
 class ModelImage:
-    """An image of a model.
+    """An image of a COLMAP model, with its observations.
 
-    camera: number of its camera, from 1.
+    camera: number of the image's camera, from 1.
     rotation, translation: (3, 3) and (3,) float64, `cam_from_world`.
-    pixels: (n, 2) float64, its observations.
-    points: (n,) uint64, number of the point of each observation; UNKNOWN_POINT for none.
+    pixels: (n, 2) float64, position of each observation in pixels.
+    points: (n,) uint64, number of each observation's point; UNKNOWN_POINT for none.
     """
 
     name: str
@@ -42,13 +43,13 @@ class ModelImage:
 
 @dataclass(eq=False)
 class ModelPoints:
-    """The points of a model, numbered from 1.
+    """The points of a COLMAP model, numbered from 1, with their tracks.
 
     places: (n, 3) float64, world coordinates.
     colours: (n, 3) uint8.
-    tracks: (n + 1,), index of each point's first observation in the next two arrays; last, their length.
-    images: numbers of the images that show it, from 1.
-    observations: the observation's index in that image.
+    tracks: (n + 1,), index of each point's first observation in the next two arrays; last, the length of these arrays.
+    images: for each observation, the number of its image, from 1.
+    observations: for each observation, its index in that image.
     """
 
     places: Float64
@@ -82,7 +83,7 @@ def write_images(path: Path, count: int, images: Iterable[ModelImage]) -> None:
 
 
 def write_points(path: Path, points: ModelPoints) -> None:
-    """Write points3D.bin. Errors are 0, because the observations are exact."""
+    """Write points3D.bin. Reprojection errors are 0, because the observations are exact."""
     pairs = np.stack([points.images, points.observations], axis=1).astype("<u4")
     layout = struct.Struct("<Q3d3BdQ")
     with atomic_writer(path) as file:

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cameras of a block: flights over it that look straight down and at a slant, and rows along its two streets.
+"""Cameras of the demo town's photographs, block by block: flights that look straight down or at a slant, and drives
+along the block's two streets.
 
-They depend on the seed, the block's indices and the number of photographs of a block, but not on the town's size.
+The cameras depend on the seed, the block's indices and the number of photographs of a block, but not on the size of the
+town.
 """
 
 from __future__ import annotations
@@ -20,24 +22,27 @@ from clsplat.scenes.dataset import Lens
 from clsplat.shots.viewpoints import look_at
 
 AIR_VIEW_RADIANS, STREET_VIEW_RADIANS = math.radians(62.0), math.radians(78.0)
-"""Angles of view across the longer side, of the flights and in the streets."""
+"""Angles of view across the picture's longer side, of the flights' cameras and of the street cameras."""
 STRAIGHT_FLIGHT_METRES, SLANTED_FLIGHT_METRES, CAR_CAMERA_METRES = 55.0, 48.0, 2.4
 """Heights above the ground of cameras that look straight down, of oblique cameras, and of cameras on a car."""
 SLANT_RADIANS = math.radians(40.0)
 """Angle of the oblique cameras' axes below the horizon."""
 TOWN_FISHEYE_COEFFICIENTS = (-0.02, 0.0005, 0.0, 0.0)
+"""k1 to k4 of the OPENCV_FISHEYE lens in the streets."""
 STRAIGHT_SHARE, STREET_SHARE = 0.3, 0.3
 """Fractions of a block's photographs that look straight down, and that are taken in streets. The rest is slanted."""
 DIRECTIONS: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]])
+"""Directions of view of the four oblique flights: north, east, south, west."""
 _YAWS = (0.38, -0.38)
+"""Angles in radians by which street cameras look to the right of the driving direction, in turn."""
 
 
 @dataclass(frozen=True, eq=False)
 class TownPhotograph:
-    """A photograph that is planned.
+    """A photograph to be taken.
 
     name: path below the folder of pictures.
-    i, j, index: indices of its block, and its index among the block's photographs.
+    i, j, index: the two indices of the photograph's block, and its index among the block's photographs.
     camera: the camera with its exact pose, in the town's coordinates.
     lens: the camera's intrinsics, as in a COLMAP model.
     gain: exposure, as a factor of the light.
@@ -53,7 +58,7 @@ class TownPhotograph:
 
 
 def lenses(config: TownConfig) -> tuple[Lens, Lens]:
-    """The lens of the flights and the lens of the streets."""
+    """Return the lens of the flights, and the lens of the street cameras."""
     width, height = config.width, config.height
     centre = (width / 2, height / 2)
 
@@ -61,7 +66,7 @@ def lenses(config: TownConfig) -> tuple[Lens, Lens]:
         focal = 0.5 * max(width, height) / math.tan(0.5 * angle)
         return Lens("PINHOLE", width, height, (focal, focal, *centre))
 
-    if config.is_fisheye:  # half a circle across the longer side
+    if config.is_fisheye:  # the lens covers 180 degrees across the longer side
         k1, k2, *_ = TOWN_FISHEYE_COEFFICIENTS
         angle = math.pi / 2
         focal = 0.5 * max(width, height) / (angle * (1 + k1 * angle**2 + k2 * angle**4))
@@ -75,7 +80,7 @@ def lenses(config: TownConfig) -> tuple[Lens, Lens]:
 
 
 def photographs(config: TownConfig, i: int, j: int) -> list[TownPhotograph]:
-    """The photographs of block (i, j), sorted by name."""
+    """Plan the photographs of block (i, j), sorted by name."""
     straight, street = round(STRAIGHT_SHARE * config.photos), round(STREET_SHARE * config.photos)
     generator = block_generator(config.seed, 3, i, j)
     poses = [
@@ -97,11 +102,11 @@ def photographs(config: TownConfig, i: int, j: int) -> list[TownPhotograph]:
 
 
 Row = tuple[str, int, Float64, Float64, Float64]
-"""Name, flight, position, direction of view and up direction of a photograph."""
+"""Name, number of the flight, position, direction of view and up direction of a photograph."""
 
 
 def _straight(count: int, generator: np.random.Generator) -> list[Row]:
-    """Cameras that look down, on lines along x that are flown back and forth."""
+    """Plan photographs that look straight down, along lines in x that are flown back and forth."""
     lines, rows = max(1, round(math.sqrt(count))), []
     for index, (x, y, line) in enumerate(_over_block(count, lines)):
         place = np.array([x, y, STRAIGHT_FLIGHT_METRES]) + generator.normal(0, 0.6, 3)
@@ -112,7 +117,7 @@ def _straight(count: int, generator: np.random.Generator) -> list[Row]:
 
 
 def _slanted(count: int, generator: np.random.Generator) -> list[Row]:
-    """Photographs of four oblique flights, which look in four directions."""
+    """Plan the photographs of four oblique flights, one for each of DIRECTIONS."""
     rows, down = [], math.tan(SLANT_RADIANS)
     for side, forward in enumerate(DIRECTIONS):
         some = len(range(side, count, 4))
@@ -128,7 +133,10 @@ def _slanted(count: int, generator: np.random.Generator) -> list[Row]:
 
 
 def _street(count: int, generator: np.random.Generator) -> list[Row]:
-    """Cameras along the block's two streets, both ways, on the right-hand side, that look right and left in turn."""
+    """Plan photographs along the block's two streets, both ways, on the right-hand side.
+
+    The cameras look to the right and to the left in turn.
+    """
     rows: list[Row] = []
     for street, begin in enumerate((0, count // 2)):
         some = (count // 2, count - count // 2)[street]
@@ -146,7 +154,7 @@ def _street(count: int, generator: np.random.Generator) -> list[Row]:
 
 
 def _over_block(count: int, lines: int) -> list[tuple[float, float, int]]:
-    """Positions x, y over a block, evenly spaced along lines, each with the number of its line."""
+    """Return positions x, y over a block, evenly spaced along lines, each with the index of its line."""
     places = []
     for line in range(lines):
         some = len(range(line, count, lines))
@@ -161,7 +169,7 @@ def _upright(generator: np.random.Generator) -> Float64:
 
 
 def _gain(config: TownConfig, flight: int, i: int, j: int, index: int) -> float:
-    """Exposure of a photograph. Each flight along a row of blocks has its own, which drifts from block to block."""
+    """Exposure factor of a photograph. Each flight along a row of blocks has its own, which drifts along the flight."""
     if config.exposure == 0:
         return 1.0
     level, phase, speed = block_generator(config.seed, 4, 0, j, flight).uniform(-1, 1, 3)

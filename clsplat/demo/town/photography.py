@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs of the town: pixels, masks of moving cars, and observations of points."""
+"""Photographs of the demo's town by ray casting: pixels, masks of moving cars, and observations of points."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from clsplat.demo.town.visibility import Caster, Sight, blocks_in_sight
 BAND_PIXELS = 1 << 16
 """Number of pixels whose rays are cast at once, which limits the memory."""
 POINT_METRES = 130.0
-"""Distance up to which points are observed."""
+"""Largest distance in metres between a camera and a point that it observes."""
 FREE_METRES = 9.0
-"""Least distance of moving cars from the camera."""
+"""Smallest distance of moving cars from the camera, in metres."""
 TONE = np.float32(1 / 1.6)
 """Exponent of the tone curve."""
 
@@ -96,7 +96,7 @@ def take(config: TownConfig, photograph: TownPhotograph) -> TakenPhotograph:
 
 
 def _shaded(camera: Camera, shader: Shader, sight: Sight, first: int, last: int) -> Float32:
-    """Linear colours of rows of pixels, (rows, width, 3)."""
+    """Shade the picture's rows from `first` up to but without `last`. Returns linear colours (rows, width, 3)."""
     centres = world_rays(camera, first, last, ((0.0, 0.0),))
     directions = np.stack([np.broadcast_to(axis, (1, last - first, camera.width)).ravel() for axis in centres], axis=1)
     flat = sight.surfaces.reshape(len(SAMPLES), -1)
@@ -116,7 +116,10 @@ def _shaded(camera: Camera, shader: Shader, sight: Sight, first: int, last: int)
 
 
 def _moving_cars(config: TownConfig, photograph: TownPhotograph) -> CityBlock:
-    """The moving cars in a photograph, as a block: in the streets of its block and of the eight blocks around it."""
+    """Place the moving cars of a photograph in the streets of its block and of the eight blocks around this block.
+
+    The result is a block that holds nothing but these cars.
+    """
     generator = block_generator(config.seed, 5, photograph.i, photograph.j, photograph.index)
     builder = Builder()
     corner = np.array([photograph.i, photograph.j]) * BLOCK_METRES
@@ -138,7 +141,10 @@ def _moving_cars(config: TownConfig, photograph: TownPhotograph) -> CityBlock:
 
 
 class _Candidates:
-    """Points in front of a photograph's camera. Solids may hide some of them."""
+    """Points in front of a photograph's camera. `see` marks those that no solid hides.
+
+    blocks: number of the caster's blocks with points: all but the last, of moving cars.
+    """
 
     def __init__(self, caster: Caster, blocks: int) -> None:
         camera, position = caster.camera, caster.position
@@ -170,7 +176,10 @@ class _Candidates:
         self._seen = np.zeros(len(rows), np.bool_)
 
     def see(self, surfaces: NDArray[np.int32], first: int, last: int) -> None:
-        """Mark the points that the rows from `first` to `last` show: those whose surface the nearest ray meets."""
+        """Mark points in the rows from `first` to `last` as visible if their pixel's ray meets the surface they lie on.
+
+        surfaces: (4, rows, columns), the surfaces that the rays meet, as in `Sight`.
+        """
         y = self._pixels[:, 1]
         rows = np.flatnonzero((y >= first) & (y < last))
         x, y = self._pixels[rows].T
@@ -179,7 +188,7 @@ class _Candidates:
         self._seen[rows] = surfaces[sample, row - first, column] == self._surfaces[rows]
 
     def observations(self, pixels: Float32, mask: Bool | None) -> Observations:
-        """The visible points outside the mask's excluded pixels."""
+        """Return the visible points, except where `mask` is False."""
         column, row = np.floor(self._pixels).astype(np.int64).T
         seen = self._seen if mask is None else self._seen & mask[row, column]
         colours = np.rint(pixels[row[seen], column[seen]] * 255).astype(np.uint8)
@@ -187,6 +196,6 @@ class _Candidates:
 
 
 def _away(block: CityBlock, position: Float64) -> Float64:
-    """Horizontal vector (2,) to a position from the nearest point of a block's ground."""
+    """Horizontal vector (2,) from the nearest point of a block's ground to a position."""
     low = block.corner[:2]
     return np.asarray(position[:2] - np.clip(position[:2], low, low + BLOCK_METRES))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The settings of a town, and their checks."""
+"""Settings of the demo's town (`clsplat demo --town`), and their checks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clsplat.errors import InputError
 
 TownRig = Literal["perspective", "fisheye", "panorama"]
 MAX_TOWN_SIDE = 1000
-"""Largest number of blocks along a side."""
+"""Largest number of blocks along a side of the town."""
 MAX_PHOTOS_PER_BLOCK = 1000
 MIN_TOWN_PHOTO_SIDE, MAX_TOWN_PHOTO_SIDE = 16, 8192
 """Limits of a photograph's width and height in pixels."""
@@ -51,16 +51,16 @@ class TownConfig:
 
     @property
     def is_fisheye(self) -> bool:
-        """True for fisheyes in the streets."""
+        """True if the cameras in the streets are fisheyes."""
         return self.rig == "fisheye"
 
     @property
     def is_panorama(self) -> bool:
-        """True for panoramas in the streets."""
+        """True if the cameras in the streets take panoramas."""
         return self.rig == "panorama"
 
     def check(self) -> None:
-        """Raise InputError, which names the flag, for an invalid value."""
+        """Raise InputError naming the flag of the first invalid value."""
         sides = f"1 to {MAX_TOWN_SIDE} blocks a side, such as 3x2"
         size = f"{MIN_TOWN_PHOTO_SIDE} to {MAX_TOWN_PHOTO_SIDE} pixels a side, such as 640x400"
         shorter, longer = min(self.width, self.height), max(self.width, self.height)
@@ -87,12 +87,12 @@ class TownConfig:
                 raise InputError(f"--{flag} {value}: expected {expected}")
 
     def record(self) -> dict[str, Any]:
-        """The settings as a JSON object."""
+        """Return the settings as a JSON object, for town.json."""
         return asdict(self) | {"origin": list(self.origin)}
 
 
 def two_numbers(flag: str, text: str, example: str) -> tuple[int, int]:
-    """Parse two numbers from a text such as 3x2. Raises InputError, which names the flag."""
+    """Parse two numbers from a text such as 3x2. Raises InputError naming the flag."""
     match = re.fullmatch(r"\s*(\d{1,9})\s*[xX]\s*(\d{1,9})\s*", text)
     if match is None:
         raise InputError(f"--{flag} {text}: expected two whole numbers, such as {example}")
@@ -100,7 +100,7 @@ def two_numbers(flag: str, text: str, example: str) -> tuple[int, int]:
 
 
 def three_numbers(flag: str, text: str) -> tuple[float, float, float]:
-    """Parse coordinates from a text such as 500000,4650000,0. Raises InputError, which names the flag."""
+    """Parse coordinates from a text such as 500000,4650000,0. Raises InputError naming the flag."""
     try:
         x, y, z = map(float, text.split(","))
     except ValueError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shading of the rays of a photograph: textures, light and haze."""
+"""Shading of the rays that photograph the demo's town: textures, light, street markings and haze."""
 
 from __future__ import annotations
 
@@ -27,11 +27,13 @@ from clsplat.demo.town.textures import GROUND_METRES, HAZE_COLOUR, TEXTURE_SIDE,
 from clsplat.demo.town.visibility import SIGHT_METRES
 
 HAZE_METRES = 150.0
-"""Distance at which haze begins."""
+"""Distance from the camera at which haze begins, in metres."""
 SLANT_BLUR = np.float32(0.7)
-"""A surface seen at a slant has a mip level coarser by this times log2(1 / cosine of the slant)."""
+"""Blur of surfaces seen at a slant: this times log2(1 / cosine of the slant) is added to their mip level."""
 LOT_COVERS: Final = np.array([paint.GRASS] * 9 + [paint.SOIL] * 3 + [paint.GRAVEL] * 2 + [paint.PAVING] * 2, np.int32)
+"""Textures from which the ground of a lot is drawn."""
 GROUND_DENSITY = np.float32(np.log2(TEXTURE_SIDE / GROUND_METRES))
+"""log2 of the texels per metre of ground."""
 
 
 class Shader:
@@ -48,7 +50,7 @@ class Shader:
         self.pixel = np.float32(1 / max(camera.fx, camera.fy))
 
     def colours(self, directions: Float32, surfaces: NDArray[np.int32]) -> Float32:
-        """Linear colours (n, 3) of rays.
+        """Shade rays. Returns linear colours (n, 3).
 
         directions: (n, 3), as from `world_rays`.
         surfaces: (n,), as in `Sight`.
@@ -70,9 +72,10 @@ class Shader:
         return result
 
     def _faces(self, surfaces: NDArray[np.int32]) -> tuple[NDArray[np.int64], Float32, Bool]:
-        """Table of the seen faces: for each surface the index of its row (n,), the rows, and a mask of the balls' rows.
+        """Collect the table's rows of all faces that the rays meet, in metres relative to the camera.
 
-        Faces are in metres from the camera. In the row of a ball, its centre and radius take the place of the plane.
+        Returns the index (n,) of each surface's row, the rows, and a mask of the rows of balls. The row of a ball has
+        centre and radius in place of the plane.
         """
         seen = np.zeros(self.starts[-1] * FACES_PER_SOLID, np.bool_)
         seen[surfaces] = True
@@ -147,13 +150,13 @@ class Shader:
         return _hazy(colours * light_on(np.array([[0, 0, 1]], np.float32)), depth * length)
 
     def _ground_cover(self, px: Float32, py: Float32, first: NDArray[np.int64]) -> tuple[NDArray[np.int32], Float32]:
-        """Texture (n,) and tint (n, 3) of the ground at px, py (n,), in metres from the corner of block `first`."""
+        """Choose texture (n,) and tint (n, 3) of the ground at px, py (n,), in metres from block `first`'s corner."""
         column, row = np.floor(px / BLOCK_METRES), np.floor(py / BLOCK_METRES)
         fx, fy = px - column * BLOCK_METRES, py - row * BLOCK_METRES
         inner = np.minimum(_to_street(fx), _to_street(fy))
         lot_x, lot_y = ((place - PAVEMENT_METRES) * np.float32(1 / LOT_METRES) for place in (fx, fy))
         lot = np.clip(lot_x, 0, 2.5).astype(np.int64) + 3 * np.clip(lot_y, 0, 2.5).astype(np.int64)
-        far = np.abs(column) + np.abs(row) > 1e6  # near the horizon, where haze hides everything
+        far = np.abs(column) + np.abs(row) > 1e6  # ground near the horizon, which haze hides
         column, row = (
             np.where(far, 0, column).astype(np.int64) + first[0],
             np.where(far, 0, row).astype(np.int64) + first[1],
@@ -171,7 +174,7 @@ class Shader:
         return texture.astype(np.int32), tint
 
     def near_ground_seam(self, directions: Float32) -> Bool:
-        """True (n,) for rays to the ground that meet it within a pixel of a seam between two materials."""
+        """Find the rays that meet the ground within a pixel of a seam between two materials. Returns a mask (n,)."""
         x, y, z = directions.T
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             depth = np.float32(-self.position[2]) / z
@@ -187,7 +190,12 @@ class Shader:
             return np.asarray(seam * slant < depth * self.pixel)
 
     def _level(self, depth: Float32, density: Float32 | np.float32, slant: Float32) -> Float32:
-        """Mip level (n,). slant: cosine between ray and normal."""
+        """Compute the mip level (n,) at the points that rays meet.
+
+        depth: (n,), factor from a ray's direction to the point.
+        density: log2 of the texture's texels per metre.
+        slant: (n,), cosine of the angle between ray and normal.
+        """
         return np.asarray(
             np.log2(np.maximum(depth * self.pixel, 1e-6)) + density - SLANT_BLUR * np.log2(np.maximum(slant, 0.03))
         )
@@ -203,12 +211,15 @@ def _hazy(colours: Float32, distance: Float32) -> Float32:
 
 
 def _to_street(place: Float32) -> Float32:
-    """Distance from the middle of the nearest street, along one axis. place: in [0, BLOCK_METRES)."""
+    """Distance in metres from the middle of the nearest street, along one axis.
+
+    place: coordinate in the block, in [0, BLOCK_METRES).
+    """
     return np.asarray(np.minimum(place, np.float32(BLOCK_METRES) - place))
 
 
 def _cube_coordinates(normals: Float32, radius: Float32) -> tuple[Float32, Float32]:
-    """Texture coordinates (n,) in metres on a ball, from the two smaller components of the normal."""
+    """Texture coordinates u and v (n,), in metres, on balls: the two smaller components of the normal, times radius."""
     x, y, z = normals.T
     ax, ay, az = np.abs(normals).T
     along_z, along_x = (az >= ax) & (az >= ay), ax > ay
@@ -218,7 +229,12 @@ def _cube_coordinates(normals: Float32, radius: Float32) -> tuple[Float32, Float
 
 
 def _mark_streets(colours: Float32, fx: Float32, fy: Float32, width: Float32) -> None:
-    """Paint kerbs, dashes and zebra crossings, in place. width: (n,), width of a pixel on the ground, in metres."""
+    """Paint kerbs, dashes and zebra crossings over the ground's colours, in place.
+
+    colours: (n, 3).
+    fx, fy: (n,), coordinates in the block, in metres.
+    width: (n,), width of a pixel on the ground, in metres.
+    """
     away_x, away_y = _to_street(fx), _to_street(fy)
     near, far = np.minimum(away_x, away_y), np.maximum(away_x, away_y)
     along = np.where(away_x < away_y, fy, fx)
@@ -232,8 +248,10 @@ def _mark_streets(colours: Float32, fx: Float32, fy: Float32, width: Float32) ->
 
 
 def _band(place: Float32, middle: float, half: float, width: Float32) -> Float32:
-    """The part (n,) of a pixel that a band covers. The band reaches from `middle` - `half` to `middle` + `half`; the
-    pixel has its centre at `place` and the width `width`."""
+    """Fraction (n,) of a pixel that a band from `middle` - `half` to `middle` + `half` covers.
+
+    place, width: (n,), centre and width of the pixel, in the same unit.
+    """
     away = np.abs(place - np.float32(middle))
     low = np.maximum(away - width / 2, -half)
     return np.asarray(np.clip((np.minimum(away + width / 2, half) - low) / width, 0, 1))

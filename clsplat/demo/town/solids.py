@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Solids that a block is built of: boxes, gabled roofs and balls, with textured faces.
+"""Solids of the demo town's blocks: boxes, gabled roofs and balls, with textured faces.
 
-A face is a row of numbers. Its texture coordinates are linear in a point, so that a pixel needs one look-up.
+A face is a row of numbers. Its texture coordinates are a linear function of a point, so that a pixel needs one texture
+look-up.
 """
 
 from __future__ import annotations
@@ -20,13 +21,15 @@ FACES_PER_SOLID = 8
 """Rows of a solid in the table of faces. A box has the faces -x, +x, -y, +y, -z and +z. A roof has -x, +x and -z, and
 its two slopes in the last two rows. A ball has only the first row."""
 FACE_VALUES = 18
-"""Number of values of a face. Its plane is n p = d, its texture coordinates are u = U p + u0 and v = V p + v0.
+"""Number of values in the row of a face, with plane n p = d and texture coordinates u = U p + u0 and v = V p + v0.
 
 The values are n (3), d, U (3), u0, V (3), v0, red, green and blue of its light, the index of its texture, log2 of
 texels per metre, and darkness at the ground.
 """
 PLANE_AT, U_AT, V_AT, LIGHT_AT, TEXTURE_AT, DENSITY_AT, DARKNESS_AT = 0, 4, 8, 12, 15, 16, 17
+"""Index of these values in the row of a face."""
 BOUNCED_LIGHT = np.float32(0.11)
+"""Light that the ground reflects to a surface that faces down."""
 Triple = tuple[float, float, float]
 
 
@@ -41,10 +44,10 @@ def light_on(normals: Float32) -> Float32:
 
 @dataclass(frozen=True)
 class Cover:
-    """The surface of a face.
+    """Texture and colour of a face.
 
-    texture: index of its texture.
-    metres: length of a side of the texture.
+    texture: index of the texture.
+    metres: length of a side of the texture, in metres.
     tint: factors of red, green and blue.
     shift: offset of the texture, as a fraction of its side.
     darkness: fraction of the light that is missing at the ground.
@@ -57,7 +60,7 @@ class Cover:
     darkness: float = 0.35
 
     def numbers(self) -> tuple[float, ...]:
-        """The values in one row: texture, metres, tint, shift, darkness."""
+        """Return the fields as one row of numbers: texture, metres, tint, shift, darkness."""
         return (self.texture, self.metres, *self.tint, *self.shift, self.darkness)
 
 
@@ -67,7 +70,8 @@ class Solids:
 
     kinds: (n,), SOLID_BOX, SOLID_ROOF or SOLID_BALL.
     centres: (n, 3) float64. A roof's centre is in the middle of its base.
-    halves: (n, 3) float64, half sizes along its own axes. A roof's third value is its height; its ridge is along x.
+    halves: (n, 3) float64, half sizes along the solid's own axes. A roof's third value is its height. The ridge is
+    along x.
     turns: (n, 2) float64, cosine and sine of the turn about z.
     faces: (n, FACES_PER_SOLID, FACE_VALUES) float64.
     """
@@ -94,7 +98,7 @@ class Solids:
 
 @dataclass(frozen=True)
 class _Row:
-    """A solid to be built, with a cover for its sides and another for its top."""
+    """A solid for `Builder.build`, with a cover for its sides and another for its top."""
 
     kind: int
     centre: tuple[float, float, float]
@@ -127,7 +131,7 @@ class Builder:
         self._rows.append(_Row(SOLID_BALL, centre, (radius, radius, radius), 0.0, cover, cover))
 
     def build(self) -> Solids:
-        """All solids that were added."""
+        """Return all solids that were added, with their faces."""
         if not self._rows:
             return Solids()
         angles = np.array([row.turn for row in self._rows])
@@ -149,14 +153,21 @@ def about_z(vectors: Float64, turns: Float64) -> Float64:
 
 
 def slopes(halves: Float64, sign: float) -> tuple[Float64, Float64]:
-    """Normals of a slope of roofs, and the directions up it, (n, 3) each. sign: sign of the normals' y."""
+    """Return the normals of one slope of each roof, and the directions up this slope, (n, 3) each.
+
+    halves: (n, 3), half sizes of the roofs, as in `Solids`.
+    sign: 1 or -1, the sign of the normals' y. It chooses the slope.
+    """
     steep = np.hypot(halves[:, 1], halves[:, 2])
     across, up, zero = halves[:, 2] / steep, halves[:, 1] / steep, np.zeros(len(halves))
     return np.stack([zero, sign * across, up], axis=1), np.stack([zero, -sign * up, across], axis=1)
 
 
 def _faces(solids: Solids, sides: list[Cover], tops: list[Cover]) -> Float64:
-    """The table of faces, (n, FACES_PER_SOLID, FACE_VALUES)."""
+    """Compute the table of faces of solids, (n, FACES_PER_SOLID, FACE_VALUES).
+
+    sides, tops: cover of each solid's sides and of its top.
+    """
     table = np.zeros((len(solids), FACES_PER_SOLID, FACE_VALUES))
     of_side, of_top = (np.array([cover.numbers() for cover in covers]) for covers in (sides, tops))
     c, s = solids.turns.T

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The textures of a town, with mip levels, and the sky with its ring of hills.
+"""Textures of the demo's town, with mip levels, and the sky with its ring of hills.
 
-All houses share them, so memory does not grow with the town. Each texture repeats in both directions. A face has the
-index of a texture, an offset and a tint.
+All houses share the textures, so memory does not grow with the town. Each texture repeats in both directions. A face
+has the index of a texture, an offset and a tint.
 """
 
 from __future__ import annotations
@@ -22,10 +22,12 @@ TEXTURE_LEVELS = 10
 FACADES, ROOFS = range(9), range(9, 14)
 ASPHALT, PAVEMENT, GRASS, GRAVEL, SOIL, PAVING = range(14, 20)
 LEAVES, BARK, PLAIN = range(20, 22), 22, 23
+"""Indices of the textures of each material."""
 TEXTURE_COUNT = 24
 FACADE_METRES, ROOF_METRES, GROUND_METRES, LEAF_METRES = 12.0, 6.0, 8.0, 3.0
 """Lengths of a texture's side on facades, roofs, ground and leaves. A facade has four windows and four storeys."""
 SKY_ROWS, SKY_COLUMNS = 512, 2048
+"""Size of the sky's texture: elevations and azimuths."""
 HAZE_COLOUR: Final = np.array([0.50, 0.56, 0.63], np.float32)
 """Colour of the horizon, and of everything far away."""
 Colour = tuple[float, float, float]
@@ -38,7 +40,8 @@ _LEVEL_STARTS = np.concatenate([[0], np.cumsum(_LEVEL_SIDES**2)]).astype(np.int3
 class Brush:
     """Random numbers and noise for one texture. Textures of a town share noise fields, each at its own offset.
 
-    fields: the shared noise fields by their parameters, computed as needed.
+    white: Fourier transform of the white noise that the fields are filtered from.
+    fields: the shared noise fields by the parameters of `rough`, computed as needed.
     """
 
     def __init__(
@@ -65,20 +68,27 @@ class Brush:
 
 
 def mixed(colours: tuple[Colour, ...], value: Pixels) -> Pixels:
-    """Linear interpolation between colours: values (h, w), about [-2, 2], to (h, w, 3)."""
+    """Map values (h, w) of about [-2, 2] to colours (h, w, 3), by linear interpolation between equally spaced ones."""
     stops = np.linspace(-1.6, 1.6, len(colours))
     channels = [np.interp(value, stops, levels) for levels in zip(*colours, strict=True)]
     return np.stack(channels, axis=-1).astype(np.float32)
 
 
 def _grid(period: float, width: float, offset: float = 0.0) -> Pixels:
-    """Soft lines (TEXTURE_SIDE,) of `width` texels, every `period` texels: 1 on a line, 0 elsewhere."""
+    """Return a row of texels (TEXTURE_SIDE,) with a soft line every `period` texels: 1 on a line, 0 elsewhere.
+
+    width, offset: width of a line, and position of the first, in texels.
+    """
     place = (np.arange(TEXTURE_SIDE) + 0.5 - offset) % period
     return np.asarray(np.clip(width / 2 + 0.5 - np.minimum(place, period - place), 0, 1), np.float32)
 
 
 def _bricks(rows: int, columns: int, joint: float, generator: np.random.Generator) -> tuple[Pixels, Pixels]:
-    """Bricks in staggered rows: the joints, 1 on a joint, and a random value from -1 to 1 for each brick, (h, w)."""
+    """Lay bricks in staggered rows. Returns the joints, 1 on a joint, and a random value of each brick, (h, w) each.
+
+    joint: width of a joint in texels.
+    The values are from -1 to 1.
+    """
     y, x = np.mgrid[0:TEXTURE_SIDE, 0:TEXTURE_SIDE].astype(np.float32) + np.float32(0.5)
     row = (y * rows / TEXTURE_SIDE).astype(int)
     place = (x / TEXTURE_SIDE * columns + 0.5 * (row % 2)) % columns
@@ -90,7 +100,7 @@ def _bricks(rows: int, columns: int, joint: float, generator: np.random.Generato
 
 
 def _wall(kind: int, brush: Brush) -> Pixels:
-    """The wall of a facade, without its windows."""
+    """Paint the wall of a facade without windows: brick, plaster or panels."""
     stain, grain = brush.rough(0.5, 1.2), brush.rough(0.05, 0.6)
     if kind % 3 == 0:  # brick
         joints, brick = _bricks(120, 40, 1.0, brush.generator)
@@ -119,7 +129,7 @@ def _paint(image: Pixels, box: tuple[float, float, float, float], colour: Any) -
 
 
 def _facade(kind: int, brush: Brush) -> Pixels:
-    """Four windows by four storeys; the lowest storey, with a door, is at the bottom."""
+    """Paint a facade of four storeys with four windows each. The ground floor, at the bottom, may have a door."""
     image = _wall(kind, brush)
     cell = TEXTURE_SIDE / 4
     wide, tall = ((0.40, 0.48), (0.52, 0.56), (0.84, 0.58))[kind // 3]
@@ -138,7 +148,7 @@ def _facade(kind: int, brush: Brush) -> Pixels:
                 _paint(image, (left, top + 12, right, bottom), generator.uniform(0.12, 0.45, 3))
                 _paint(image, (right - 12, top + 60, right - 7, top + 66), (0.8, 0.7, 0.4))
                 continue
-            drawn = generator.uniform(0.0, 0.7)  # a curtain or a blind
+            drawn = generator.uniform(0.0, 0.7)  # height of a curtain, as a fraction of the window's
             _paint(
                 image,
                 (left, top, right, top + drawn * tall * cell),
@@ -216,7 +226,7 @@ def _packed(image: Pixels) -> NDArray[np.uint32]:
 
 
 def _levels(image: Pixels) -> NDArray[np.uint32]:
-    """All mip levels of a texture in one row, finest first. A texel is the mean of four texels of the finer level."""
+    """Return all mip levels of a texture in one row, the finest first. A texel is the mean of four finer texels."""
     rows = [_packed(image).ravel()]
     while len(image) > 1:
         image = 0.25 * (image[::2, ::2] + image[1::2, ::2] + image[::2, 1::2] + image[1::2, 1::2])
@@ -225,7 +235,7 @@ def _levels(image: Pixels) -> NDArray[np.uint32]:
 
 
 class Textures:
-    """The baked textures of a town, (TEXTURE_COUNT x texels of all levels,) as packed colours."""
+    """All textures of a town with their mip levels, as packed colours in one array, and the sky."""
 
     def __init__(self, seed: int) -> None:
         painters: list[tuple[Callable[[int, Brush], Pixels], int]] = [
@@ -243,7 +253,7 @@ class Textures:
         self._sky = _baked_sky(brushes[-1])
 
     def colours(self, texture: NDArray[np.int32], u: Float32, v: Float32, level: Float32) -> Float32:
-        """Trilinear look-up, (n, 3) in [0, 1].
+        """Look up colours (n, 3) in [0, 1] by trilinear filtering.
 
         texture: (n,), index of the texture.
         u, v: (n,), texture coordinates to the right and up, in sides of the texture; they may have any value.
@@ -294,7 +304,10 @@ class Textures:
 
 
 def _baked_sky(brush: Brush) -> Pixels:
-    """Sky with clouds above a ring of hills, (SKY_ROWS, SKY_COLUMNS, 3): elevations from 90 degrees down to 0."""
+    """Paint a sky with clouds above a ring of hills, (SKY_ROWS, SKY_COLUMNS, 3).
+
+    The rows are elevations from 90 degrees down to 0.
+    """
     elevation = np.linspace(90, 0, SKY_ROWS, dtype=np.float32)[:, None]
     azimuth = np.linspace(0, 2 * np.pi, SKY_COLUMNS, endpoint=False)
     zenith = np.array([0.22, 0.38, 0.68], np.float32)
@@ -319,5 +332,5 @@ def _baked_sky(brush: Brush) -> Pixels:
 
 @lru_cache(maxsize=2)
 def textures(seed: int) -> Textures:
-    """The textures of a seed, cached."""
+    """Return the textures of the town with this seed, from a cache if possible."""
     return Textures(seed)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rays of a photograph's pixels, and screen rectangles of boxes, for each projection."""
+"""Rays of the pixels of the demo town's photographs, and screen rectangles of boxes, for each projection."""
 
 from __future__ import annotations
 
@@ -15,22 +15,27 @@ from clsplat.cameras.model import CameraModel
 SAMPLES = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 """Offsets x, y of a pixel's rays from its centre, in pixels."""
 NEAR_METRES = 0.05
+"""Distance of a perspective camera's near plane in metres."""
 _ANGLES = 1 << 16
+"""Number of angles in the table that inverts the fisheye's radius."""
 _CIRCLE = 32
-"""Number of directions on the edge of a cone around a ball. They bound its part of the picture."""
+"""Number of directions on the edge of the cone around a box. They bound the box's part of a fisheye picture."""
 Planes = tuple[Float32, Float32, Float32]
 LensKey = tuple[CameraModel, int, int, float, float, float, float, tuple[float, ...]]
 
 
 def lens_key(camera: Camera) -> LensKey:
-    """The camera without its pose, as the key under which its rays are cached."""
+    """Return a camera's model, size and intrinsics without its pose, as the key under which its rays are cached."""
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     return (camera.model, camera.width, camera.height, *intrinsics, camera.radial)
 
 
 @lru_cache(maxsize=16)
 def _local_rays(key: LensKey, first: int, last: int, places: tuple[tuple[float, float], ...]) -> Planes:
-    """Directions in the camera's axes, as three arrays that broadcast to (places, rows, columns)."""
+    """Compute ray directions in the camera's axes, as three arrays that broadcast to (places, rows, columns).
+
+    places: offsets x, y of a pixel's rays from its centre, in pixels.
+    """
     model, width, _, fx, fy, cx, cy, radial = key
     across, down = np.array(places).T
     a = ((np.arange(width) + 0.5 + across[:, None] - cx) / fx)[:, None, :]
@@ -52,7 +57,7 @@ def _local_rays(key: LensKey, first: int, last: int, places: tuple[tuple[float, 
 def world_rays(
     camera: Camera, first: int, last: int, places: tuple[tuple[float, float], ...] = SAMPLES
 ) -> tuple[Float32, Float32, Float32]:
-    """Directions x, y, z along the world's axes, (places, rows, columns) each, of the rows from `first` to `last`.
+    """Return the x, y and z of ray directions in the world, (places, rows, columns) each, of rows `first` to `last`.
 
     Directions of a perspective camera have a depth of 1, other directions a length of 1.
     """
@@ -63,7 +68,7 @@ def world_rays(
 
 
 def rectangles(camera: Camera, low: Float64, high: Float64) -> NDArray[np.int32]:
-    """Rectangles (n, 4) of the picture that contain boxes: first row, end row, first column, end column.
+    """Return rectangles (n, 4) of the picture that contain boxes: first row, end row, first column, end column.
 
     The ends are exclusive. The rectangle of a box that is not seen is empty. In a panorama columns may lie beyond the
     edges, where the picture repeats.
@@ -91,7 +96,10 @@ _EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).
 
 
 def _flat_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
-    """Screen bounds (n, 4) in pixels: left, right, top and bottom of boxes, cut off at the near plane (perspective)."""
+    """Screen bounds (n, 4) of boxes in a perspective picture, in pixels: left, right, top, bottom.
+
+    Boxes are cut off at the near plane.
+    """
     corners = np.where(_CORNERS, high[:, None], low[:, None]) @ camera.rotation.T
     begins, ends = corners[:, _EDGES[:, 0]], corners[:, _EDGES[:, 1]]
     rise = ends[..., 2] - begins[..., 2]
@@ -160,7 +168,7 @@ def _fisheye_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
     x = camera.cx + camera.fx * radius * edge[..., 0] / level
     y = camera.cy + camera.fy * radius * edge[..., 1] / level
     bounds = np.stack([x.min(axis=1), x.max(axis=1), y.min(axis=1), y.max(axis=1)], axis=1)
-    whole = theta + angle >= np.pi  # the cone contains the backward direction, which is the picture's whole edge
+    whole = theta + angle >= np.pi  # the backward direction is the whole edge of the picture
     bounds[whole] = (-1e9, 1e9, -1e9, 1e9)
     return bounds
 
@@ -168,7 +176,7 @@ def _fisheye_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
 def _fisheye_radius(radial: tuple[float, ...], theta: Float64) -> Float64:
     """Image radii, in focal lengths, at angles `theta` from the axis: eq. (18) of docs/cameras.md.
 
-    With the town's coefficients they increase up to 180 degrees, so that every direction has a place in the picture.
+    With the town's coefficients, radii increase up to 180 degrees, so every direction has a position in the picture.
     """
     square, series = theta * theta, np.zeros_like(theta)
     for coefficient in reversed(radial):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nearest surface of each ray: the solids of the blocks around a camera, cast one by one from near to far.
+"""Ray casting of the demo's town: the nearest surface of each ray. Solids around a camera are cast from near to far.
 
 Only the rays of a solid's screen rectangle are cast. A solid, or a whole block, is skipped if all rays of its rectangle
 have met something nearer.
@@ -68,8 +68,8 @@ Slices = tuple[slice, slice, slice]
 class _Part(NamedTuple):
     """A screen rectangle of a box. A box that crosses the edge of a panorama has two.
 
-    box: number of the box.
-    near: distance of the box in metres.
+    box: index of the box.
+    near: distance of the box from the camera, in metres.
     top, bottom, left, right: rows from `top` and columns from `left`, up to but without `bottom` and `right`.
     """
 
@@ -84,7 +84,7 @@ class _Part(NamedTuple):
 class Caster:
     """Casts the rays of one photograph against blocks.
 
-    Solids are numbered across all `blocks`: `starts` has the number of each block's first solid.
+    starts: number of each block's first solid. Solids are numbered across all blocks.
     """
 
     def __init__(self, camera: Camera, blocks: Sequence[CityBlock]) -> None:
@@ -98,7 +98,7 @@ class Caster:
         self._inner: dict[int, list[_Part]] = {}
 
     def sight(self, first: int, last: int) -> Sight:
-        """The surfaces that the rays of the picture's rows `first` to `last` meet."""
+        """Find the surfaces that the rays of the picture's rows from `first` up to but without `last` meet."""
         directions = world_rays(self.camera, first, last)
         rays = _Rays(directions, self.position, first)
         done = set()
@@ -112,7 +112,7 @@ class Caster:
         return Sight(directions, rays.surfaces)
 
     def _solids_of(self, index: int) -> list[_Part]:
-        """Parts of the picture that a block's solids may cover, from near to far."""
+        """Return the screen rectangles of a block's solids, from near to far."""
         if index not in self._inner:
             block = self.blocks[index]
             low, high = (corner + (block.corner - self.position) for corner in block.solids.bounds())
@@ -121,7 +121,7 @@ class Caster:
 
 
 def _placed(camera: Camera, low: Float64, high: Float64) -> list[_Part]:
-    """Parts of the picture that boxes may cover, from near to far. low, high: as for `rectangles`."""
+    """Return the screen rectangles of boxes, from near to far. low, high: corners of the boxes, as for `rectangles`."""
     bounds, near = rectangles(camera, low, high), _nearest(low, high)
     width, wraps = camera.width, camera.model.wraps
     order = np.argsort(near, kind="stable")
@@ -142,7 +142,7 @@ def _nearest(low: Float64, high: Float64) -> Float64:
 
 
 class _Rays:
-    """Rays of some rows of a picture, with the distance and the number of the nearest surface so far."""
+    """Rays of a picture's rows from `first` on, with the distance and number of the nearest surface found so far."""
 
     def __init__(self, directions: tuple[Float32, Float32, Float32], position: Float64, first: int) -> None:
         self.position, self.first = position, first
@@ -154,7 +154,7 @@ class _Rays:
         self.distance = np.where(falls, ground, np.float32(np.inf))
         self.surfaces = np.where(falls, np.int32(GROUND_FACE), np.int32(SKY_FACE))
         x, y, z = (axis[:, :: max(axis.shape[1] - 1, 1), :: max(axis.shape[2] - 1, 1)] for axis in directions)
-        self._longest = float(np.sqrt((x**2 + y**2 + z**2).max()))  # the longest ray is at a corner
+        self._longest = float(np.sqrt((x**2 + y**2 + z**2).max()))  # a corner has the longest direction
 
     def slices(self, part: _Part) -> Slices:
         """Index (samples, rows, columns) of the rays that fall into a part of the picture."""
@@ -168,7 +168,12 @@ class _Rays:
         return bool(self.distance[self.slices(part)].max() * self._longest > part.near)
 
     def cast(self, block: CityBlock, solid: int, number: int, part: Slices) -> None:
-        """Cast the rays of a part against a solid. number: number of the solid across all blocks."""
+        """Cast the rays of a part of the picture against a solid, and keep the hits that are nearest so far.
+
+        solid: index of the solid in its block.
+        number: number of the solid across all blocks.
+        part: index of the rays, by `slices`.
+        """
         solids = block.solids
         centre = (self.position - block.corner - solids.centres[solid]).astype(np.float32)
         half, kind = solids.halves[solid].astype(np.float32), int(solids.kinds[solid])
@@ -251,7 +256,11 @@ class _Rays:
 
 
 def _slab(over: Float32, start: np.float32, half: np.float32) -> tuple[Float32, Float32]:
-    """Distances at which rays enter and leave the slab between two planes at +-half from the origin."""
+    """Return the distances at which rays enter and leave the slab between two planes at +-half from the origin.
+
+    over: reciprocals of the rays' directions along the planes' normal.
+    start: position of the rays' origin along this normal.
+    """
     middle = over * -start
     reach = np.abs(over)
     reach *= half

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing of a town as a COLMAP scene: photographs, masks, cameras, and points with tracks."""
+"""Writing of the demo's town as a COLMAP scene: photographs, masks, cameras, and points with tracks."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ from clsplat.progress import CountedFraction, Progress, no_progress
 from clsplat.scenes.dataset import Lens
 
 TOWN_RECORD_FILE = "town.json"
-"""File with the settings in a town's folder. A folder with this file may be replaced."""
+"""File in a town's folder with the town's settings and counts. A folder with this file may be replaced."""
 EXACT_POSES_FOLDER = "exact"
 """Folder with the exact cameras, a COLMAP model without points. It is written if the scene's cameras are noisy."""
 MAX_TOWN_WORKERS = 8
 """Largest default number of threads. More would wait for the interpreter's lock, and take more memory."""
 MIN_TRACK_LENGTH = 2
-"""Smallest number of photographs that show a point of the scene."""
+"""Smallest number of photographs that must show a point, so that the COLMAP model has it."""
 
 
 def write_town(
@@ -65,7 +65,7 @@ def write_town(
     workers: number of threads, which changes no bytes; None for one per core, up to MAX_TOWN_WORKERS.
     progress: function that is called with a text and the completed fraction.
     Raises InputError for invalid settings and for a folder that must not be replaced, and ClsplatError if a file
-    cannot be written. After KeyboardInterrupt no files remain. What a killed call left is removed by the next one.
+    cannot be written. After KeyboardInterrupt no files remain. Files of a killed call are removed by the next call.
     """
     config.check()
     check_folder(output, overwrite=overwrite)
@@ -113,14 +113,14 @@ def check_folder(output: Path, *, overwrite: bool) -> None:
 def _take_all(
     result: Path, config: TownConfig, planned: Sequence[TownPhotograph], workers: int, progress: Progress
 ) -> list[Observations]:
-    """Take and write all photographs. Returns their observations."""
+    """Ray-cast and write all photographs. Returns the points that each shows."""
     for i, j in sorted({(shot.i, shot.j) for shot in planned}):
         for folder in ("images", "masks") if config.cars else ("images",):
             (result / folder / f"{i:04d}_{j:04d}").mkdir(parents=True)
     progress("painting the town", 0.0)
     textures(config.seed)
     seen: list[Observations] = []
-    pool = ThreadPoolExecutor(workers, "clsplat-town")  # NumPy releases the interpreter lock in its loops
+    pool = ThreadPoolExecutor(workers, "clsplat-town")  # parallel, as NumPy releases the interpreter lock
     try:
         for done, observations in enumerate(pool.map(partial(_take_and_write, result, config), planned), 1):
             seen.append(observations)
@@ -142,7 +142,10 @@ def _take_and_write(result: Path, config: TownConfig, shot: TownPhotograph) -> O
 def _write_model(
     result: Path, config: TownConfig, planned: Sequence[TownPhotograph], seen: Sequence[Observations]
 ) -> int:
-    """Write the cameras and points. Returns the number of points."""
+    """Write the COLMAP model: cameras, images and points. Returns the number of points.
+
+    seen: the points that each photograph shows.
+    """
     sparse = result / "sparse" / "0"
     sparse.mkdir(parents=True)
     points, of_image = _tracks(config, seen)
@@ -162,12 +165,16 @@ def _write_model(
 
 
 def _noise(config: TownConfig, shot: TownPhotograph) -> Float64:
-    """Error (3,) of the written position of a camera, in metres."""
+    """Draw the random error (3,), in metres, that the written position of a photograph's camera gets."""
     return block_generator(config.seed, 6, shot.i, shot.j, shot.index).normal(0, 1, 3) * config.pose_noise
 
 
 def _image(config: TownConfig, shot: TownPhotograph, air: Lens, error: Float64) -> ModelImage:
-    """A photograph without observations, with an error (3,) in its written position. air: lens of the flights."""
+    """Make the COLMAP image of a photograph, still without observations.
+
+    air: lens of the photographs from the air.
+    error: (3,), metres to add to the camera's position.
+    """
     rotation = shot.camera.rotation
     position = shot.camera.position + np.array(config.origin) + error
     none = np.zeros((0, 2)), np.zeros(0, np.uint64)
@@ -175,7 +182,10 @@ def _image(config: TownConfig, shot: TownPhotograph, air: Lens, error: Float64) 
 
 
 def _tracks(config: TownConfig, seen: Sequence[Observations]) -> tuple[ModelPoints, list[NDArray[np.uint64]]]:
-    """Points with their tracks, and for each photograph the point numbers (k,) of its observations."""
+    """Collect the observations of all photographs to points with tracks.
+
+    Returns the points, and for each photograph the point numbers (k,) of its observations.
+    """
     lengths = np.array([len(each.points) for each in seen])
     rows = np.concatenate([np.column_stack([each.blocks, each.points]) for each in seen])
     known, inverse, counts = np.unique(rows, axis=0, return_inverse=True, return_counts=True)
@@ -204,7 +214,10 @@ def _tracks(config: TownConfig, seen: Sequence[Observations]) -> tuple[ModelPoin
 
 
 def _places(config: TownConfig, points: NDArray[np.int32]) -> Float64:
-    """World coordinates (n, 3). points: (n, 3), two indices of a block and an index in the block, sorted by block."""
+    """Return the world coordinates (n, 3) of points.
+
+    points: (n, 3), the two indices of a point's block and the point's index in the block, sorted by block.
+    """
     places = np.empty((len(points), 3))
     steps = np.flatnonzero((points[1:, :2] != points[:-1, :2]).any(axis=1)) + 1
     for rows in np.split(np.arange(len(points)), steps):
