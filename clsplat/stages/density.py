@@ -95,12 +95,17 @@ class DensityStatistics:
     whole_largest: DeviceArray | StoredArray | None = None
     of_slots: bool = False
 
+    @classmethod
+    def of(cls, arrays: Mapping[str, Any], *, of_slots: bool = False) -> DensityStatistics:
+        """Make statistics of arrays by name."""
+        return cls(**arrays, of_slots=of_slots)
+
     @property
     def on_device(self) -> DensityStatistics:
         """The arrays that kernels get: of a streamed model, those of the pool's slots."""
         if not isinstance(self.seen, StoredArray):
             return self
-        return DensityStatistics(**{name: array.in_pool for name, array in self.named().items()}, of_slots=True)
+        return self.of({name: array.in_pool for name, array in self.named().items()}, of_slots=True)
 
     def rows(self, start: int, stop: int) -> DensityStatistics:
         """The statistics `on_device` of the Gaussians [start, stop). A pool has them in its first slots."""
@@ -108,7 +113,7 @@ class DensityStatistics:
         if (start, stop) == (0, self.seen.shape[0]):
             return self
         arrays = {name: array.rows(start, stop) for name, array in self.named().items()}
-        return DensityStatistics(**arrays, of_slots=self.of_slots)
+        return self.of(arrays, of_slots=self.of_slots)
 
     def named(self) -> dict[str, Any]:
         """The arrays by name."""
@@ -146,17 +151,16 @@ class DensityStatistics:
 def new_statistics(device: Device, count: int, *, contributions: bool = False) -> DensityStatistics:
     """Initial statistics of `count` Gaussians: zero, with infinite contributions."""
     names = statistics_names(contributions=contributions)
-    arrays: dict[str, Any] = {name: allocate(device, (count,), np.float32) for name in names}
+    arrays = {name: allocate(device, (count,), np.float32) for name in names}
     for name, array in arrays.items():
         array.fill(initial_value(name))
-    return DensityStatistics(**arrays)
+    return DensityStatistics.of(arrays)
 
 
 def pooled_statistics(pool: ChunkPool) -> DensityStatistics:
     """The statistics in the store of a pool."""
     names = [name for name in statistics_names(contributions=True) if f"{KIND}/{name}" in pool.store.fields]
-    arrays: dict[str, Any] = {name: StoredArray(pool, f"{KIND}/{name}") for name in names}
-    return DensityStatistics(**arrays)
+    return DensityStatistics.of({name: StoredArray(pool, f"{KIND}/{name}") for name in names})
 
 
 def statistics_numbers(camera: Camera) -> tuple[float, ...]:
@@ -367,7 +371,7 @@ def carried(
     source: arrays by name (`DensityStatistics.named`). Each is removed as soon as it is copied, so that the memory for
     one of them is enough.
     """
-    arrays: dict[str, Any] = {}
+    arrays = {}
     for name in tuple(source):
         old = source.pop(name)
         copies = name in CONTRIBUTION_STATISTICS or not densified
@@ -380,7 +384,7 @@ def carried(
         for begin, listed in _on_device(work, rows):
             to = arrays[name].rows(begin, begin + listed.shape[0])
             _gather_array(device, listed, old, to, np.inf)
-    return DensityStatistics(**arrays)
+    return DensityStatistics.of(arrays)
 
 
 def _on_device(work: Workspace, rows: DeviceArray | NDArray[np.uint32]) -> Iterator[tuple[int, DeviceArray]]:

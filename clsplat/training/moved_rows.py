@@ -3,20 +3,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float32
 from clsplat.chunks.gathering import SourceList, row_entries
 from clsplat.chunks.order import ORDERED_ROWS, beside_parents, space_order
 from clsplat.device.buffers import DeviceArray
 from clsplat.optimisation.density_rules import FRESH
 from clsplat.stages.density import DeviceRowList
-from clsplat.stages.device_gaussians import AnyGaussians
+from clsplat.stages.device_gaussians import AnyGaussians, HostGaussians, rows_at, set_rows_at
 from clsplat.training.density import RowPlan
 
+HALVED_ROWS = 1 << 15
+"""Split Gaussians of a model in a store whose halves are computed at a time."""
 Places = NDArray[np.integer[Any]] | slice
 
 
@@ -78,14 +83,40 @@ def ordered(plan: RowPlan, parameters: AnyGaussians) -> MovedRows | None:
     return MovedRows(entries[order], halves, places)
 
 
-def both(first: Places, second: Places) -> Places:
+def halve(
+    parameters: AnyGaussians,
+    moved: MovedRows,
+    halves: Callable[[Mapping[str, Float32], bool], Mapping[str, Float32]],
+    halved: Sequence[str],
+) -> None:
+    """Replace the copies of split Gaussians with their halves.
+
+    halves: function that computes the first or, if its second argument is True, the second halves.
+    halved: parameter groups that it computes them from.
+    """
+    first, second = moved.halves_at
+    if not (isinstance(parameters, HostGaussians) and parameters.pool):  # one copy of each array crosses the bus
+        split = {group: rows_at(parameters[group], second) for group in halved}
+        sides = [halves(split, later) for later in (False, True)]
+        for group, values in sides[0].items():
+            set_rows_at(parameters[group], _both(first, second), np.concatenate([values, sides[1][group]]))
+        return
+    for places, begin in product((first, second), range(0, moved.halves // 2, HALVED_ROWS)):
+        # the second halves are copies until they are replaced, after all first ones
+        copies, some = (_some_of(each, begin, HALVED_ROWS) for each in (second, places))
+        split = {group: rows_at(parameters[group], copies) for group in halved}
+        for group, values in halves(split, places is second).items():
+            set_rows_at(parameters[group], some, values)
+
+
+def _both(first: Places, second: Places) -> Places:
     """Places of first and second halves in one."""
     if isinstance(first, slice) or isinstance(second, slice):
         return slice(first.start, second.stop)  # type: ignore[union-attr]  # both are
     return np.concatenate([first, second])
 
 
-def some_of(places: Places, begin: int, count: int) -> Places:
+def _some_of(places: Places, begin: int, count: int) -> Places:
     """So many of the places, from the one of number `begin` on, or as many as there are."""
     if isinstance(places, slice):
         return slice(places.start + begin, min(places.start + begin + count, places.stop))

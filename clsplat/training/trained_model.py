@@ -63,7 +63,6 @@ from clsplat.stages.device_gaussians import (
     host_model,
     host_zeros,
     pooled,
-    rows_at,
     saved_models,
     set_rows_at,
     to_device,
@@ -71,14 +70,12 @@ from clsplat.stages.device_gaussians import (
     upload_gaussians,
 )
 from clsplat.training.density import RowPlan
-from clsplat.training.moved_rows import MovedRows, both, ordered, some_of
+from clsplat.training.moved_rows import halve, ordered
 from clsplat.training.stability.health import examine
 
 _ALL_ROWS = new_values()
 EXAMINED_CHUNKS = 64
 """Chunks whose numbers are examined at once."""
-HALVED_ROWS = 1 << 15
-"""Split Gaussians of a model in a store whose halves are computed at a time."""
 
 
 class TrainedModel:
@@ -129,13 +126,13 @@ class TrainedModel:
 
         A scratch file that has some of them is open in the context. Raises InputError for arrays of another model.
         """
-        arrays: dict[str, Any] = dict(checkpoint.arrays)
+        saved: Mapping[str, Any] = {}
         with ExitStack() as reading:
             try:
                 if checkpoint.manifest is not None:
                     store = reading.enter_context(closing(ChunkStore.opened(checkpoint.manifest, writable=False)))
                     models = saved_models(store)
-                    arrays |= {name: SavedArray(store, name) for name in store.fields}
+                    saved = {name: SavedArray(store, name) for name in store.fields}
                 else:
                     models = [host_model(checkpoint.arrays, kind) for kind in KINDS]
                 n, most = max(model.coefficients for model in models), (self._sh_degree + 1) ** 2
@@ -143,7 +140,7 @@ class TrainedModel:
                     raise ValueError(f"has {n} SH coefficients, more than the {most} of --sh-degree {self._sh_degree}")
             except ValueError as error:
                 raise unusable(checkpoint, str(error)) from None
-            yield models, replace(checkpoint, arrays=arrays)
+            yield models, replace(checkpoint, arrays={**checkpoint.arrays, **saved})
 
     def load(self, models: Sequence[HostGaussians], checkpoint: Checkpoint) -> None:
         """Continue with the models and the statistics of a checkpoint (`saved`).
@@ -256,7 +253,7 @@ class TrainedModel:
         if moved is not None:
             self._move(moved.rows, changes, new_statistics=plan.new_statistics)
             if moved.halves and plan.halves is not None:
-                self._halve(moved, plan.halves, plan.halved)
+                halve(self.parameters, moved, plan.halves, plan.halved)
         changes()
         for group, (rows, values) in plan.values.items():
             set_rows_at(self.parameters[group], rows if moved is None else moved.at(rows), values)
@@ -460,28 +457,6 @@ class TrainedModel:
                 replace(to_host(model), rows=self.plan.rows) if self.plan.streamed else to_device(self._device, model)
             )
         return model
-
-    def _halve(
-        self,
-        moved: MovedRows,
-        halves: Callable[[Mapping[str, Float32], bool], Mapping[str, Float32]],
-        halved: Sequence[str],
-    ) -> None:
-        """Replace the copies of split Gaussians with their halves, computed from the groups `halved`."""
-        first, second = moved.halves_at
-        if self._pool is None:  # one copy of each array crosses the bus
-            split = {group: rows_at(self.parameters[group], second) for group in halved}
-            sides = [halves(split, later) for later in (False, True)]
-            for group, values in sides[0].items():
-                set_rows_at(self.parameters[group], both(first, second), np.concatenate([values, sides[1][group]]))
-            return
-        for places, begin in product((first, second), range(0, moved.halves // 2, HALVED_ROWS)):
-            copies, some = (
-                some_of(each, begin, HALVED_ROWS) for each in (second, places)
-            )  # second halves are still copies
-            split = {group: rows_at(self.parameters[group], copies) for group in halved}
-            for group, values in halves(split, places is second).items():
-                set_rows_at(self.parameters[group], some, values)
 
     def _move(
         self, rows: DeviceArray | NDArray[np.uint32], changes: Callable[[], None], *, new_statistics: bool

@@ -63,7 +63,7 @@ def _small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(visible_chunks, "ORDERED_ROWS", 2 * CHUNK_ROWS)
     for module in (trained_model, moved_rows):
         monkeypatch.setattr(module, "ORDERED_ROWS", 2 * CHUNK_ROWS)
-    monkeypatch.setattr(trained_model, "HALVED_ROWS", 50)
+    monkeypatch.setattr(moved_rows, "HALVED_ROWS", 50)
     monkeypatch.setattr(density, "LISTED_ROWS", 640)
     monkeypatch.setattr(gathering, "BLOCK_CHUNKS", 1)
 
