@@ -333,7 +333,8 @@ def test_a_file_that_is_removed_while_it_is_trained_in(go: Train, whole: Callabl
 
     with pytest.warns(UserWarning, match="has been removed while it was in use") as caught:
         run = go(until=14, each=remove)
-    assert len(caught) == 2
+    told = [each for each in caught if "removed while" in str(each.message)]  # a killed training leaves files open
+    assert len(told) == 2
     assert len(files_of(run)) == 1
     assert go().model_path.read_bytes() == wanted
 

@@ -47,6 +47,8 @@ from clsplat.training.trainer import Trainer
 
 DIGEST_ROWS = 1 << 18
 SECONDS_BETWEEN_LOOKS = 0.02
+CHANGED_TOGETHER = 16
+"""Consecutive chunks, neighbours in space, that density control changes together."""
 REMOVED_EVERY, CLONED_EVERY = 50, 20
 """Density control removes one in this many Gaussians of a chunk, and clones one in this many."""
 
@@ -97,10 +99,12 @@ def large_trainer(scene: Scene, config: TrainConfig, arguments: Any, count: int,
 
 def changed_rows(count: int, share: float) -> NDArray[np.uint32]:
     """Rows of the plain after density control: in every chunk of a share of them some are cloned, others removed."""
-    rng, parts = np.random.default_rng(2), []
-    for first in range(0, count, CHUNK_ROWS):
+    rng, parts, changes = np.random.default_rng(2), [], False
+    for number, first in enumerate(range(0, count, CHUNK_ROWS)):
         rows = np.arange(first, min(first + CHUNK_ROWS, count), dtype=np.uint32)
-        if rng.random() < share:
+        if number % CHANGED_TOGETHER == 0:
+            changes = rng.random() < share
+        if changes:
             rows = rows[np.arange(len(rows)) % REMOVED_EVERY > 0]
             fresh = rows[::CLONED_EVERY]
             rows = np.insert(rows, np.arange(0, len(rows), CLONED_EVERY) + 1, fresh | FRESH)
