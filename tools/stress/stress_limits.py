@@ -168,8 +168,8 @@ class Trainings:
         write_scene(folder / "scene", -(-count // CELL_ROWS), options.views, near=False, height=CAMERA_HEIGHT)
         write_points(cloud, count)
         self.common = [str(folder / "scene"), "--points", str(cloud), *settings(count, options.steps)]
-        self.seconds = 0.0
-        """Duration of the longest training without kills."""
+        self.seconds: dict[tuple[str, ...], float] = {}
+        """Durations of trainings by their flags."""
 
     def start(self, case: Case, run: Path, *limit: str) -> subprocess.Popen[str]:
         """Start a training, or resume it if the run exists. limit: further flags."""
@@ -197,7 +197,7 @@ class Trainings:
         process, begun = self.start(case, run, *limit), time.monotonic()
         with MemoryPeak(process.pid) as peak:
             said = end_of(process)
-        self.seconds = max(self.seconds, time.monotonic() - begun)
+        self.seconds[case.flags] = time.monotonic() - begun
         pictures = re.search(r"(\d+) pictures", said)
         if case.watched and (pictures is None or pictures[1] == "0"):
             raise ClsplatError(f"{case.name}: expected pictures, found {tail(said)}")
@@ -211,7 +211,8 @@ class Trainings:
         def keep(finished: Path) -> None:
             digests.add(digest(finished))
 
-        killer = Killer(lambda path: self.start(case, path), keep, self.seconds, self.options.seed)
+        lifetime = self.seconds.get(case.flags, max(self.seconds.values()))
+        killer = Killer(lambda path: self.start(case, path), keep, lifetime, self.options.seed)
         figures = killer.survive(run, self.options.kills)
         return Result(digests, f"{figures.kills} kills, {figures.writing} of them while a checkpoint was written")
 
