@@ -41,6 +41,8 @@ whose growth by each step is an upper limit; fewer wait more often for the devic
 MAX_SHARE_IN_VIEW = 0.6
 """Share of the chunks in view above which a step runs over the whole model. On a CPU, with 0.4 of a town in view, steps
 take 0.89 of the time of steps over the whole; with 0.78 of bonsai, 1.01."""
+_BOUNDED_GROUPS = ("means", "log_scales")
+"""Parameter groups that the bounds of a chunk are measured from."""
 _ROWS_AT_ONCE = 1 << 16
 """Rows of a checkpoint that are looked at together."""
 MOST_MISSED_STEPS = 1024
@@ -179,13 +181,13 @@ class VisibleChunks(Component):
         if isinstance(gaussians, DeviceGaussians):
             return self._measured_on_device(gaussians, numbers)
         assert gaussians.pool is not None
-        slots = gaussians.pool.slots_of(numbers)
+        store, slots = gaussians.pool.store, gaussians.pool.slots_of(numbers)
         found, there = np.empty((len(numbers), BOUNDS_FLOATS), np.float32), slots >= 0
         if there.any():
             found[there] = self._measured_on_device(gaussians.in_pool, slots[there].astype(np.uint32))
         for place in np.flatnonzero(~there):
-            rows = gaussians.pool.store.starts[numbers[place] : numbers[place] + 2].tolist()
-            one = ChunkBounds.measured(*(gaussians[group].get_rows(*rows) for group in ("means", "log_scales")))
+            rows = store.starts[numbers[place] : numbers[place] + 2].tolist()
+            one = ChunkBounds.measured(*(store.get_rows(f"parameters/{group}", *rows) for group in _BOUNDED_GROUPS))
             found[place] = np.concatenate([one.lowest[0], one.highest[0], one.largest])
         return found
 
@@ -359,7 +361,7 @@ class VisibleChunks(Component):
         ratio = 0.0
         for begin in range(0, count, _ROWS_AT_ONCE):
             rows = slice(begin, begin + _ROWS_AT_ONCE)
-            for group in ("means", "log_scales"):
+            for group in _BOUNDED_GROUPS:
                 with np.errstate(divide="ignore", invalid="ignore"):
                     each = np.abs(first[group][rows]) / np.sqrt(second[group][rows])
                 ratio = float(np.max(each, initial=ratio, where=~np.isnan(each)))  # NaN: both are 0
