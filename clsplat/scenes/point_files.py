@@ -79,10 +79,7 @@ def read_cloud(path: Path) -> Cloud:
 
 
 def of_one_colour(colors: Float32) -> bool:
-    """Return True if several points all have the same colour, as after reading a file without colours.
-
-    colors: (N, 3), of the points.
-    """
+    """Return True if all of several colours (N, 3) are equal, as those of points from a file without colours."""
     return len(colors) > 1 and bool((colors == colors[0]).all())
 
 
