@@ -3,21 +3,44 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.chunks.gathering import SourceList, row_entries
+from clsplat.arrays import Float32
+from clsplat.chunks.gathering import NewValues, SourceList, row_entries
 from clsplat.chunks.order import ORDERED_ROWS, beside_parents, space_order
 from clsplat.device.buffers import DeviceArray
 from clsplat.optimisation.density_rules import FRESH
-from clsplat.stages.density import DeviceRowList
-from clsplat.stages.device_gaussians import AnyGaussians
+from clsplat.stages.density import DeviceRowList, new_values
+from clsplat.stages.device_gaussians import AnyGaussians, rows_at, set_rows_at
 from clsplat.training.density import RowPlan
 
 Places = NDArray[np.integer[Any]] | slice
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """A move of a model's Gaussians to other arrays or chunks.
+
+    rows: for each new row, the old row that it copies, plus FRESH if new. None keeps all rows.
+    coefficients: number of SH coefficients; 0 for as many as there are.
+    changes: function that is called before the first change of the model.
+    values: of rows and fields that are new.
+    """
+
+    rows: NDArray[np.uint32] | None = None
+    coefficients: int = 0
+    changes: Callable[[], None] = lambda: None
+    values: NewValues = field(default_factory=new_values)
+
+    def count(self, before: int) -> int:
+        """Number of Gaussians after the move of so many."""
+        return before if self.rows is None else len(self.rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +99,32 @@ def ordered(plan: RowPlan, parameters: AnyGaussians) -> MovedRows | None:
     places = np.empty_like(order)
     places[order] = np.arange(len(order), dtype=np.uint32)
     return MovedRows(entries[order], halves, places)
+
+
+def halve(
+    parameters: AnyGaussians,
+    moved: MovedRows,
+    halves: Callable[[Mapping[str, Float32], bool], Mapping[str, Float32]],
+    halved: Sequence[str],
+    at_once: int,
+) -> None:
+    """Replace the copies of split Gaussians with their halves, computed from the groups `halved`.
+
+    at_once: number of split Gaussians whose halves are computed at a time; 0 computes all, so that one copy of each
+        array crosses the bus.
+    """
+    first, second = moved.halves_at
+    if at_once == 0:
+        split = {group: rows_at(parameters[group], second) for group in halved}
+        sides = [halves(split, later) for later in (False, True)]
+        for group, values in sides[0].items():
+            set_rows_at(parameters[group], both(first, second), np.concatenate([values, sides[1][group]]))
+        return
+    for places, begin in product((first, second), range(0, moved.halves // 2, at_once)):
+        copies, some = (some_of(each, begin, at_once) for each in (second, places))  # second halves are still copies
+        split = {group: rows_at(parameters[group], copies) for group in halved}
+        for group, values in halves(split, places is second).items():
+            set_rows_at(parameters[group], some, values)
 
 
 def both(first: Places, second: Places) -> Places:
