@@ -3,6 +3,8 @@
 // that they are, then NO_CHUNK; and `model_rows`, the number of rows of the model. Of a streamed model, whose chunks
 // are in the slots of a pool in any order, `chunks` has slots and `model_rows` the rows of all slots. Arrays by view,
 // such as splats and tile_counts, have the rows of the launch; parameters, moments and statistics those of the model.
+// With FIRST_ROWS, of slots, a kernel has the parameter `first_rows` (n / CHUNK_ROWS): the number that the first row of
+// each of these chunks has in the whole model.
 #ifdef CHUNKS
 #define CHUNK_PARAMETERS , __global const uint *chunks, const uint model_rows
 
@@ -28,4 +30,11 @@ static inline uint end_of_rows(uint row, uint n, long ahead, uint model_rows) {
 #else
 #define CHUNK_PARAMETERS
 #define ROW_OF_MODEL(row) (row)
+#endif
+
+// The number of a row in the whole model, also of a row in a slot.
+#ifdef FIRST_ROWS
+#define ROW_NUMBER(row) (first_rows[(row) / CHUNK_ROWS] + (row) % CHUNK_ROWS)
+#else
+#define ROW_NUMBER(row) ROW_OF_MODEL(row)
 #endif

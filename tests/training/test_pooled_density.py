@@ -51,6 +51,9 @@ SETTINGS = {
         warmup=(),
         density={"min_opacity": 0.2, "prune_every": 7, "max_screen_radius": 9.0, "opacity_reset_every": 0},
     ),
+    "thinning": short(
+        iterations=40, report=False, warmup=(), thinning=0.4, density={"max_gaussians": 12_500, "stop": 22}
+    ),
     "contributions": short(
         iterations=40, report=False, warmup=(), density={"min_contribution": 1e-3, "max_gaussians": 16_000, "stop": 22}
     ),
