@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from calls import noted
-from same_bytes import State
+from same_bytes import State, opened_again
 from test_visible_chunks import CONFIG, assert_same, state, wide_model
 from tiny import run_steps, short
 
@@ -278,11 +278,12 @@ def test_rows_of_a_large_model_rise(scene: Scene, limits: Limits, monkeypatch: p
     trainer.close()
 
 
-@pytest.mark.parametrize("memory", [5 << 20, LITTLE])
-def test_batches_of_a_pooled_model(scene: Scene, default_device: Device, memory: int) -> None:
+@pytest.mark.parametrize(("memory", "devices"), [(5 << 20, 1), (LITTLE, 1), (LITTLE, 2)])
+def test_batches_of_a_pooled_model(scene: Scene, default_device: Device, memory: int, devices: int) -> None:
     """Sums over the views are in main memory, beside the chunks of the pool. It has one slot even if the plan, which
-    counts rows here, has room for fewer."""
+    counts rows here, has room for fewer. Another device's views are added to the statistics part by part."""
     config = short(iterations=8, batch=2, report=False, warmup=(), sh_degree_every=2, density={"every": 3, "start": 2})
     wanted = after(4, trainer_of(scene, config, default_device))
     limited = open_device(memory_limit=memory)
-    assert_same(after(4, trainer_of(scene, config, lambda: (limited, UNLIMITED))), wanted)
+    further = [opened_again(default_device) for _ in range(devices - 1)]
+    assert_same(after(4, trainer_of(scene, config, lambda: (limited, UNLIMITED), further=further)), wanted)
