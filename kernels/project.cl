@@ -8,8 +8,8 @@
 //   visible; tile_counts (n): 0 where culled. With NO_FRUSTUM_CULL shown (n): 1 where a splat is written, including
 //   Gaussians without a tile. With SH_DEGREES sh_degrees (n): the highest SH degree that each Gaussian uses. With
 //   THINNED a Gaussian is left out if its random word is under `threshold`, and `factor` multiplies the opacities of
-//   the others; model_row: the first Gaussian's row in the model; key0, key1: the step's random key. CHUNKS: see
-//   shared/chunks.h.
+//   the others; model_row: the first Gaussian's row in the model; key0, key1: the step's random key. CHUNKS and
+//   FIRST_ROWS: see shared/chunks.h.
 // Equations: docs/gradients.md, (1) to (13), (44) to (47) and (53) to (57); orthographic docs/cameras.md, (15) to (17);
 //   Kerbl et al. 2023, section 4.
 #include "shared/math.h"
@@ -39,8 +39,11 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
 #endif
 #ifdef THINNED
                       ,
-                      const uint model_row, const uint key0, const uint key1, const uint threshold,
-                      const float factor
+                      const uint model_row, const uint key0, const uint key1, const uint threshold, const float factor
+#ifdef FIRST_ROWS
+                      ,
+                      __global const uint *first_rows
+#endif
 #endif
                           CHUNK_PARAMETERS) {
 #ifdef CHUNKS
@@ -69,7 +72,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
 #ifdef THINNED
   Lanes left;
   for (uint lane = 0; lane < LANES; ++lane)
-    left.lane[lane] = thinning((uint)ROW_OF_MODEL(first_row + lane) + model_row, key0, key1, threshold, factor);
+    left.lane[lane] = thinning((uint)ROW_NUMBER(first_row + lane) + model_row, key0, key1, threshold, factor);
   opacity *= left.all;
 #endif
   floatL dx = FROM_CAMERA(means, X, 0), dy = FROM_CAMERA(means, Y, 1), dz = FROM_CAMERA(means, Z, 2);

@@ -5,7 +5,7 @@
 // Owner: A work-item owns a Gaussian. Built with one lane; LANES and ITEMS do not change its bits.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
 // Buffers: The inputs of project.cl, without NO_FRUSTUM_CULL -> splats (n, RAY_SIZE), with directions in the camera's
-//   axes and distances in world units; tile_counts (n). CHUNKS: see shared/chunks.h.
+//   axes and distances in world units; tile_counts (n). CHUNKS and FIRST_ROWS: see shared/chunks.h.
 // Equations: docs/cameras.md, (8) to (14), (18), (19), (30), (32); colour docs/gradients.md, (12).
 #include "shared/math.h"
 #define NEEDS_TANGENTS
@@ -71,6 +71,10 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
                            ,
                            const uint model_row, const uint key0, const uint key1, const uint threshold,
                            const float factor
+#ifdef FIRST_ROWS
+                           ,
+                           __global const uint *first_rows
+#endif
 #endif
                                CHUNK_PARAMETERS) {
   const size_t i = get_global_id(0);
@@ -83,7 +87,7 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
 #endif
   float opacity = sigmoidL(opacity_logits[i]);
 #ifdef THINNED
-  opacity *= thinning((uint)ROW_OF_MODEL(i) + model_row, key0, key1, threshold, factor);
+  opacity *= thinning((uint)ROW_NUMBER(i) + model_row, key0, key1, threshold, factor);
 #endif
   if (!(opacity > ALPHA_MIN)) return;
   RayProjection p;

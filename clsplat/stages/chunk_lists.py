@@ -19,10 +19,12 @@ class ChunkList:
 
     numbers: uint32, numbers of chunks in rising order, or of slots in the order of their chunks; then NO_CHUNK.
     model_rows: number of rows of the model, or of all slots.
+    first_rows: of slots, (k,) uint32, the number of each chunk's first row in the model; None if nobody asks for it.
     """
 
     numbers: DeviceArray
     model_rows: int
+    first_rows: DeviceArray | None = None
 
     @property
     def rows(self) -> int:
@@ -32,7 +34,8 @@ class ChunkList:
     @property
     def key(self) -> tuple[object, ...]:
         """All that launches over these chunks depend on, except the numbers of the chunks."""
-        return self.numbers.buffer, self.numbers.shape, self.model_rows
+        first = None if self.first_rows is None else self.first_rows.buffer
+        return self.numbers.buffer, self.numbers.shape, self.model_rows, first
 
     @property
     def arguments(self) -> tuple[DeviceArray, int]:
@@ -52,19 +55,38 @@ def padded_chunks(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
     return padded
 
 
-def send_chunks(work: Workspace, name: str, numbers: NDArray[np.uint32], model_rows: int) -> ChunkList:
-    """Send a list (`ChunkList`) to the workspace's array `name`."""
+def send_chunks(
+    work: Workspace,
+    name: str,
+    numbers: NDArray[np.uint32],
+    model_rows: int,
+    first_rows: NDArray[np.integer[Any]] | None = None,
+) -> ChunkList:
+    """Send a list (`ChunkList`) to the workspace's array `name`, and its first rows to another."""
     padded = padded_chunks(numbers)
-    array = work.array(name, padded.shape, np.uint32)
+    array, first = work.array(name, padded.shape, np.uint32), None
     array.send(padded)
-    return ChunkList(array, model_rows)
+    if first_rows is not None:
+        rows = np.zeros(padded.shape, np.uint32)
+        rows[: len(first_rows)] = first_rows
+        first = work.array(f"{name}_rows", padded.shape, np.uint32)
+        first.send(rows)
+    return ChunkList(array, model_rows, first)
 
 
-def exact_chunks(work: Workspace, name: str, numbers: NDArray[np.integer[Any]], model_rows: int) -> ChunkList:
+def exact_chunks(
+    work: Workspace,
+    name: str,
+    numbers: NDArray[np.integer[Any]],
+    model_rows: int,
+    first_rows: NDArray[np.integer[Any]],
+) -> ChunkList:
     """Send a list as `send_chunks` does, without any NO_CHUNK."""
-    array = work.array(name, numbers.shape, np.uint32)
-    array.set(numbers.astype(np.uint32))
-    return ChunkList(array, model_rows)
+    sent = []
+    for array, values in ((name, numbers), (f"{name}_rows", first_rows)):
+        sent.append(work.array(array, values.shape, np.uint32))
+        sent[-1].set(values.astype(np.uint32))
+    return ChunkList(sent[0], model_rows, sent[1])
 
 
 @dataclass(frozen=True, eq=False)

@@ -231,7 +231,8 @@ def chunk_parts(
     begins = range(0, len(chunks.numbers), pool.slots)
     for begin in reversed(begins) if changes else begins:
         numbers = chunks.numbers[begin : begin + pool.slots]
-        slots = exact_chunks(work, "chunk_slots", pool.place(numbers, changes=changes), pool.rows)
+        placed, first_rows = pool.place(numbers, changes=changes), pool.store.starts[numbers]
+        slots = exact_chunks(work, "chunk_slots", placed, pool.rows, first_rows)
         start = CHUNK_ROWS * begin
         yield start, start + CHUNK_ROWS * len(numbers), tuple(model.in_pool for model in streamed), slots
 

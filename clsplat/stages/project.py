@@ -125,10 +125,13 @@ def project(
         defines = {**out.chunk_defines, **({"SH_DEGREES": True} if "sh_degrees" in part.arrays else {})}
         if part["sh_rest"].dtype == np.float16:
             defines["SH_HALF"] = True
-        thinned: tuple[float, ...] = ()
+        thinned: tuple[object, ...] = ()
         if thinning is not None:
             defines["THINNED"] = True
             thinned = (start, *thinning_numbers(thinning))
+            if out.chunks is not None and out.chunks.first_rows is not None:
+                defines["FIRST_ROWS"] = True
+                thinned = (0, *thinning_numbers(thinning), out.chunks.first_rows.buffer)
         rows = out.tile_counts.shape[0]
         if rays:
             kernel, lanes = device.kernels("project_rays", {"LANES": 1, **defines}).project_rays, 1

@@ -27,7 +27,7 @@ from clsplat.training.batch import OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PE
 from clsplat.training.density import StatisticsNeeds
 from clsplat.training.step.component import Component
 from clsplat.training.step.gradient_step import slot_fields
-from clsplat.training.step.visible_chunks import settings_of_whole_streams, streams_by_chunk
+from clsplat.training.step.visible_chunks import settings_of_whole_steps, streams_by_chunk
 from clsplat.training.supervision.decoded_store import DecodedStore, remove_decoded
 from clsplat.training.supervision.decoding import Decoder
 from clsplat.training.supervision.host_photographs import HostPhotographs
@@ -260,7 +260,7 @@ class MemoryPlanner:
         try:
             return plan_step(device, count, coefficients, cameras, self._config.rasterizer, memory, models=models)
         except CapacityError as error:
-            whole = settings_of_whole_streams(self._config) if count > ORDERED_ROWS else []
+            whole = settings_of_whole_steps(self._config) if count > ORDERED_ROWS else []
             if not whole:
                 raise
             raise CapacityError(

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
@@ -12,17 +12,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
-from clsplat.chunks.gathering import SourceList, row_entries
+from clsplat.chunks.gathering import NewValues, SourceList, row_entries
 from clsplat.chunks.order import ORDERED_ROWS, beside_parents, space_order
 from clsplat.device.buffers import DeviceArray
 from clsplat.optimisation.density_rules import FRESH
-from clsplat.stages.density import DeviceRowList
-from clsplat.stages.device_gaussians import AnyGaussians, HostGaussians, rows_at, set_rows_at
+from clsplat.stages.density import DeviceRowList, new_values
+from clsplat.stages.device_gaussians import AnyGaussians, rows_at, set_rows_at
 from clsplat.training.density import RowPlan
 
-HALVED_ROWS = 1 << 15
-"""Split Gaussians of a model in a store whose halves are computed at a time."""
 Places = NDArray[np.integer[Any]] | slice
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """A move of a model's Gaussians to other arrays or chunks.
+
+    rows: for each new row, the old row that it copies, plus FRESH if new. None keeps all rows.
+    coefficients: number of SH coefficients; 0 for as many as there are.
+    changes: function that is called before the first change of the model.
+    values: of rows and fields that are new.
+    """
+
+    rows: NDArray[np.uint32] | None = None
+    coefficients: int = 0
+    changes: Callable[[], None] = lambda: None
+    values: NewValues = field(default_factory=new_values)
+
+    def count(self, before: int) -> int:
+        """Number of Gaussians after the move of so many."""
+        return before if self.rows is None else len(self.rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,35 +106,35 @@ def halve(
     moved: MovedRows,
     halves: Callable[[Mapping[str, Float32], bool], Mapping[str, Float32]],
     halved: Sequence[str],
+    at_once: int,
 ) -> None:
-    """Replace the copies of split Gaussians with their halves.
+    """Replace the copies of split Gaussians with their halves, computed from the groups `halved`.
 
-    halves: function that computes the first or, if its second argument is True, the second halves.
-    halved: parameter groups that it computes them from.
+    at_once: number of split Gaussians whose halves are computed at a time; 0 computes all, so that one copy of each
+        array crosses the bus.
     """
     first, second = moved.halves_at
-    if not (isinstance(parameters, HostGaussians) and parameters.pool):  # one copy of each array crosses the bus
+    if at_once == 0:
         split = {group: rows_at(parameters[group], second) for group in halved}
         sides = [halves(split, later) for later in (False, True)]
         for group, values in sides[0].items():
-            set_rows_at(parameters[group], _both(first, second), np.concatenate([values, sides[1][group]]))
+            set_rows_at(parameters[group], both(first, second), np.concatenate([values, sides[1][group]]))
         return
-    for places, begin in product((first, second), range(0, moved.halves // 2, HALVED_ROWS)):
-        # the second halves are copies until they are replaced, after all first ones
-        copies, some = (_some_of(each, begin, HALVED_ROWS) for each in (second, places))
+    for places, begin in product((first, second), range(0, moved.halves // 2, at_once)):
+        copies, some = (some_of(each, begin, at_once) for each in (second, places))  # second halves are still copies
         split = {group: rows_at(parameters[group], copies) for group in halved}
         for group, values in halves(split, places is second).items():
             set_rows_at(parameters[group], some, values)
 
 
-def _both(first: Places, second: Places) -> Places:
+def both(first: Places, second: Places) -> Places:
     """Places of first and second halves in one."""
     if isinstance(first, slice) or isinstance(second, slice):
         return slice(first.start, second.stop)  # type: ignore[union-attr]  # both are
     return np.concatenate([first, second])
 
 
-def _some_of(places: Places, begin: int, count: int) -> Places:
+def some_of(places: Places, begin: int, count: int) -> Places:
     """So many of the places, from the one of number `begin` on, or as many as there are."""
     if isinstance(places, slice):
         return slice(places.start + begin, min(places.start + begin + count, places.stop))

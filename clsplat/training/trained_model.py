@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
-from clsplat.chunks.gathering import NewValues
 from clsplat.chunks.manifest import Manifest
 from clsplat.chunks.order import ORDERED_ROWS, space_order
 from clsplat.chunks.store import ChunkStore, record_type
@@ -70,12 +69,14 @@ from clsplat.stages.device_gaussians import (
     upload_gaussians,
 )
 from clsplat.training.density import RowPlan
-from clsplat.training.moved_rows import halve, ordered
+from clsplat.training.moved_rows import Move, halve, ordered
 from clsplat.training.stability.health import examine
 
-_ALL_ROWS = new_values()
+_STAY = Move()
 EXAMINED_CHUNKS = 64
 """Chunks whose numbers are examined at once."""
+HALVED_ROWS = 1 << 15
+"""Split Gaussians of a model in a store whose halves are computed at a time."""
 
 
 class TrainedModel:
@@ -236,7 +237,7 @@ class TrainedModel:
     def widen(self, coefficients: int) -> None:
         """Make room for more SH coefficients, which start from zero."""
         if self._pool is not None:
-            self._move_chunks(None, lambda: None, new_values(), coefficients)
+            self._move_chunks(Move(coefficients=coefficients))
             return
         if not self.plan.gathers:
             self._take_down()
@@ -253,7 +254,7 @@ class TrainedModel:
         if moved is not None:
             self._move(moved.rows, changes, new_statistics=plan.new_statistics)
             if moved.halves and plan.halves is not None:
-                halve(self.parameters, moved, plan.halves, plan.halved)
+                halve(self.parameters, moved, plan.halves, plan.halved, HALVED_ROWS if self._pool is not None else 0)
         changes()
         for group, (rows, values) in plan.values.items():
             set_rows_at(self.parameters[group], rows if moved is None else moved.at(rows), values)
@@ -274,32 +275,22 @@ class TrainedModel:
             change_rows(model[group], change)
 
     def _place(
-        self,
-        models: Models | None = None,
-        statistics: Mapping[str, ReadableArray] | None = None,
-        rows: NDArray[np.uint32] | None = None,
-        coefficients: int = 0,
-        changes: Callable[[], None] = lambda: None,
-        values: NewValues = _ALL_ROWS,
+        self, models: Models | None = None, statistics: Mapping[str, ReadableArray] | None = None, move: Move = _STAY
     ) -> None:
         """Put Gaussians where the plan assigns them. The rows of a large streamed model are in a store of chunks.
 
         models: new parameters and moments, not in a store. None keeps this model's, which are or will be in a store.
         statistics: those of new models by name, of which others begin anew; None keeps this model's.
-        rows: for each new row, the old row that it copies. None keeps all rows.
-        coefficients: number of SH coefficients; 0 for as many as there are.
-        changes: called before the first change of this model.
-        values: of moved rows.
         """
         parameters = self.parameters if models is None else models[0]
         assert parameters is not None
-        count, coefficients = parameters.count if rows is None else len(rows), coefficients or parameters.coefficients
+        count, coefficients = move.count(parameters.count), move.coefficients or parameters.coefficients
+        move = replace(move, coefficients=coefficients)
+        del parameters
         if self.plan.streamed and count > ORDERED_ROWS:
-            del parameters
-            self._to_store(models, statistics, count, rows, coefficients, changes, values)
+            self._to_store(models, statistics, count, move)
         elif models is None:
-            del parameters
-            self._from_store(count, rows, coefficients, changes, values)
+            self._from_store(count, move)
         else:
             placed = [self._placed(model) for model in models if model is not None]
             self.close()
@@ -310,22 +301,16 @@ class TrainedModel:
                 self.statistics.load({name: array.get() for name, array in statistics.items()})
 
     def _to_store(
-        self,
-        models: Models | None,
-        statistics: Mapping[str, ReadableArray] | None,
-        count: int,
-        rows: NDArray[np.uint32] | None,
-        coefficients: int,
-        changes: Callable[[], None],
-        values: NewValues,
+        self, models: Models | None, statistics: Mapping[str, ReadableArray] | None, count: int, move: Move
     ) -> None:
-        """Put Gaussians into a new store, and make its pool. Arguments as those of `_place`."""
+        """Put `count` Gaussians into a new store, and make its pool. Arguments as those of `_place`."""
         source, old = self.with_moments if models is None else models, self._pool if models is None else None
         named = self.statistics.named() if statistics is None else statistics
-        copied = CopiedRows(by_field(source) | {f"{KIND}/{name}": each for name, each in named.items()}, rows, values)
-        path, widest = self._scratch(self._record_bytes(coefficients) * count), self._fields((self._sh_degree + 1) ** 2)
-        starts = old.store.starts if old is not None and rows is None else None
-        store = ChunkStore(count, self._fields(coefficients), path, widest=widest, starts=starts)
+        arrays = by_field(source) | {f"{KIND}/{name}": array for name, array in named.items()}
+        copied = CopiedRows(arrays, move.rows, move.values)
+        path, fields = self._scratch(self._record_bytes(move.coefficients) * count), self._fields(move.coefficients)
+        starts = old.store.starts if old is not None and move.rows is None else None
+        store = ChunkStore(count, fields, path, widest=self._widest, starts=starts)
         make = partial(ChunkPool, self._device, self._work, store, self.plan.rows)
         try:
             pool = make() if isinstance(source[0], HostGaussians) and old is None else None
@@ -333,63 +318,58 @@ class TrainedModel:
         except BaseException:
             store.close()
             raise
-        changes()
-        del source, old, named, copied  # the old arrays make room for the new pool
+        move.changes()
+        del source, old, named, arrays, copied  # the old arrays make room for the new pool
         vars(self).pop("statistics", None)
         self._free_models()
-        self._use(pool or make(), coefficients)
+        self._use(pool or make(), move.coefficients)
 
-    def _move_chunks(
-        self, rows: NDArray[np.uint32] | None, changes: Callable[[], None], values: NewValues, coefficients: int
-    ) -> None:
+    def _move_chunks(self, move: Move) -> None:
         """Move the rows of a model in a store, which stays where it is unless main memory has no room for it any
-        longer. Arguments as those of `_place`."""
+        longer."""
         assert self._pool is not None
-        count, store = self.parameters.count if rows is None else len(rows), self._pool.store
-        to_file = store.path is None and self._scratch(self._record_bytes(coefficients) * count) is not None
+        count, store = move.count(self.parameters.count), self._pool.store
+        to_file = store.path is None and self._scratch(self._record_bytes(move.coefficients) * count) is not None
         if to_file or not self.plan.streamed or count <= ORDERED_ROWS:
-            self._place(rows=rows, coefficients=coefficients, changes=changes, values=values)
+            self._place(move=move)
             return
         self._pool.release()
-        store.move(rows, values, changes, self._fields(coefficients) if rows is None else None)
+        store.move(move.rows, move.values, move.changes, self._fields(move.coefficients) if move.rows is None else None)
         self._pool.free()
         self._pool = None
         self._free_models()
-        self._use(ChunkPool(self._device, self._work, store, self.plan.rows), coefficients)
+        self._use(ChunkPool(self._device, self._work, store, self.plan.rows), move.coefficients)
 
     def _fields(self, coefficients: int) -> dict[str, tuple[int, ...]]:
         """Fields of a store of this model."""
         return fields_of(coefficients) | statistics_fields(contributions=self._counts_contributions)
 
+    @property
+    def _widest(self) -> dict[str, tuple[int, ...]]:
+        """Fields with the final SH degree."""
+        return self._fields((self._sh_degree + 1) ** 2)
+
     def _record_bytes(self, coefficients: int) -> int:
         """Bytes of a Gaussian in a store."""
         return MODELS * 4 * floats_of(coefficients) + gaussian_bytes(contributions=self._counts_contributions)
 
-    def _from_store(
-        self,
-        count: int,
-        rows: NDArray[np.uint32] | None,
-        coefficients: int,
-        changes: Callable[[], None],
-        values: NewValues,
-    ) -> None:
-        """Take this model's Gaussians from its store to arrays. Arguments as those of `_place`."""
+    def _from_store(self, count: int, move: Move) -> None:
+        """Take `count` Gaussians from this model's store to arrays."""
         old, self._pool = self._pool, None
         assert old is not None
         old.write_back()
-        changes()
+        move.changes()
         self._free_models()
-        old.arrays.clear()
+        old.free()
         if self.plan.streamed:
-            to = [host_zeros(count, coefficients, self.plan.rows) for _ in KINDS]
+            to = [host_zeros(count, move.coefficients, self.plan.rows) for _ in KINDS]
             self.parameters, self.first, self.second = to
         else:
-            on_device = [allocate_gaussians(self._device, count, coefficients) for _ in KINDS]
+            on_device = [allocate_gaussians(self._device, count, move.coefficients) for _ in KINDS]
             self.parameters, self.first, self.second = on_device
         self.statistics = new_statistics(self._device, count, contributions=self._counts_contributions)
-        arrays = self._by_field()
         stored = {name: StoredArray(old, name) for name in old.store.fields}
-        CopiedRows(stored, rows, values).to_arrays(arrays)
+        CopiedRows(stored, move.rows, move.values).to_arrays(self._by_field())
         old.close()
 
     def _free_models(self) -> None:
@@ -403,7 +383,7 @@ class TrainedModel:
         if (
             manifest is None
             or dict(manifest.fields) != self._fields(coefficients)
-            or manifest.slot_bytes != record_type(self._fields((self._sh_degree + 1) ** 2)).itemsize
+            or manifest.slot_bytes != record_type(self._widest).itemsize
             or not self.plan.streamed
             or self._files is None
             or not self._files.may_write(manifest.path)
@@ -467,12 +447,10 @@ class TrainedModel:
             try_gather(self._device, count, self.parameters)
         try:
             self.plan = self._make_plan(count)
-            values = new_values(densified=new_statistics)
-            if self._pool is not None:
-                self._move_chunks(_on_host(rows), changes, values, self.parameters.coefficients)
-                return
-            if self.plan.streamed and count > ORDERED_ROWS:
-                self._place(rows=_on_host(rows), changes=changes, values=values)
+            if self._pool is not None or (self.plan.streamed and count > ORDERED_ROWS):
+                values = new_values(densified=new_statistics)
+                move = Move(_on_host(rows), self.parameters.coefficients, changes, values)
+                self._place(move=move) if self._pool is None else self._move_chunks(move)
                 return
             rows = self._gather(rows, on_device=gathers and self.plan.gathers, changes=changes)
         except CapacityError as error:

@@ -1,7 +1,9 @@
 // Maps the rows of a launch that covers only some chunks of a model to rows of the model. With CHUNKS, a kernel has the
 // parameters CHUNK_PARAMETERS at its end. `chunks` (n / CHUNK_ROWS): the model's chunk for each CHUNK_ROWS rows of the
 // launch, then NO_CHUNK; `model_rows`: the number of rows of the model. The chunks of a streamed model lie in the slots
-// of a pool, in any order; then `chunks` has slots, and `model_rows` counts the rows of all slots.
+// of a pool, in any order; then `chunks` has slots, and `model_rows` counts the rows of all slots. With FIRST_ROWS, a
+// kernel over slots has the parameter `first_rows` (n / CHUNK_ROWS): for each chunk, the row of the whole model that
+// its first row is.
 //
 // Arrays of a view, such as splats and tile_counts, have the rows of the launch. Parameters, moments and statistics
 // have the rows of the model.
@@ -30,4 +32,11 @@ static inline uint end_of_rows(uint row, uint n, long ahead, uint model_rows) {
 #else
 #define CHUNK_PARAMETERS
 #define ROW_OF_MODEL(row) (row)
+#endif
+
+// The number of a row in the whole model, also of a row in a slot.
+#ifdef FIRST_ROWS
+#define ROW_NUMBER(row) (first_rows[(row) / CHUNK_ROWS] + (row) % CHUNK_ROWS)
+#else
+#define ROW_NUMBER(row) ROW_OF_MODEL(row)
 #endif

@@ -20,6 +20,7 @@ from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, group_shapes
 from clsplat.layouts.columns import CHUNK_ROWS, SLOT_PLAIN, SPLAT
+from clsplat.optimisation.dropout import Thinning
 from clsplat.selftest.case import fresh_readback
 from clsplat.stages.adam import AdamStep
 from clsplat.stages.bounds import bounds
@@ -81,7 +82,7 @@ class Model:
         self.pool.place(np.array([4, 5, 1, 3]), changes=False)
         self.slots = self.pool.place(LISTED, changes=True)
         assert (np.diff(self.slots.astype(int)) < 0).any(), "the slots rise"
-        slots = send_chunks(self.work, "slots", self.slots, self.pool.rows)
+        slots = send_chunks(self.work, "slots", self.slots, self.pool.rows, self.pool.store.starts[LISTED])
         return [(self.whole, self.chunks), (tuple(model.in_pool for model in self.streamed), slots)]
 
     def check(self) -> None:
@@ -91,9 +92,11 @@ class Model:
                 assert_same_bits(streamed[group].get(), whole[group].get(), f"{kind} {group}")
 
 
-def seen(device: Device, model: DeviceGaussians, chunks: ChunkList, camera: Camera) -> tuple[DeviceArray, Projected]:
+def seen(
+    device: Device, model: DeviceGaussians, chunks: ChunkList, camera: Camera, thinning: Thinning | None = None
+) -> tuple[DeviceArray, Projected]:
     camera_array = upload(device, pack_camera(camera))
-    return camera_array, project(device, Workspace(device), model, camera, camera_array, chunks=chunks)
+    return camera_array, project(device, Workspace(device), model, camera, camera_array, thinning, chunks)
 
 
 def made_slots(device: Device, counts: NDArray[np.uint32]) -> Slots:
@@ -113,12 +116,14 @@ def test_bounds(shaped_device: Device) -> None:
 
 
 @pytest.mark.slow_in_groups
+@pytest.mark.parametrize("thinning", [None, Thinning(0.4, (3, 4))])
 @pytest.mark.parametrize("projection", quick(["perspective", "fisheye"], "perspective"))
-def test_projection(shaped_device: Device, projection: str) -> None:
+def test_projection(shaped_device: Device, projection: str, thinning: Thinning | None) -> None:
+    """Thinning goes by a row's number in the model."""
     model = Model(shaped_device)
     camera = model.camera if projection == "perspective" else replace(model.camera, projection=projection)
     device = shaped_device if projection == "perspective" else shaped_device.with_switches(camera.model.defines)
-    (_, wanted), (_, got) = (seen(device, each[0], chunks, camera) for each, chunks in model.both())
+    (_, wanted), (_, got) = (seen(device, each[0], chunks, camera, thinning) for each, chunks in model.both())
     counts = wanted.tile_counts.get()
     assert (counts > 0).sum() > 100
     assert_same_bits(got.tile_counts.get(), counts)
@@ -179,13 +184,14 @@ def test_catching_up(shaped_device: Device) -> None:
 def test_more_chunks_than_slots(shaped_device: Device, slots: int) -> None:
     """A projection and a step, some chunks at a time."""
     model, step = Model(shaped_device, slots), AdamStep(OptimiserConfig(), 6, RATES)
-    camera_array, whole = seen(shaped_device, model.whole[0], model.chunks, model.camera)
+    camera_array = upload(shaped_device, pack_camera(model.camera))
     numbers = ChunkNumbers(LISTED)
-    some = project(
-        shaped_device, Workspace(shaped_device), model.streamed[0], model.camera, camera_array, chunks=numbers
-    )
-    counts = whole.tile_counts.get()
-    assert_same_bits(some.tile_counts.get(), counts[: numbers.rows])
+    for thinning in (Thinning(0.4, (3, 4)), None):
+        _, whole = seen(shaped_device, model.whole[0], model.chunks, model.camera, thinning)
+        work = Workspace(shaped_device)
+        some = project(shaped_device, work, model.streamed[0], model.camera, camera_array, thinning, numbers)
+        counts = whole.tile_counts.get()
+        assert_same_bits(some.tile_counts.get(), counts[: numbers.rows])
     pairs, readback = made_slots(shaped_device, counts), fresh_readback(shaped_device)
     screen = Screen(upload(shaped_device, np.zeros((len(counts), 2), np.float32)))
     project_step(shaped_device, step, model.whole, camera_array, whole, pairs, screen, readback)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from calls import noted
-from same_bytes import State
+from same_bytes import State, opened_again
 from test_visible_chunks import CONFIG, assert_same, state, wide_model
 from tiny import run_steps, short
 
@@ -51,6 +51,9 @@ SETTINGS = {
         warmup=(),
         density={"min_opacity": 0.2, "prune_every": 7, "max_screen_radius": 9.0, "opacity_reset_every": 0},
     ),
+    "thinning": short(
+        iterations=40, report=False, warmup=(), thinning=0.4, density={"max_gaussians": 12_500, "stop": 22}
+    ),
     "contributions": short(
         iterations=40, report=False, warmup=(), density={"min_contribution": 1e-3, "max_gaussians": 16_000, "stop": 22}
     ),
@@ -63,7 +66,7 @@ def _small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(visible_chunks, "ORDERED_ROWS", 2 * CHUNK_ROWS)
     for module in (trained_model, moved_rows):
         monkeypatch.setattr(module, "ORDERED_ROWS", 2 * CHUNK_ROWS)
-    monkeypatch.setattr(moved_rows, "HALVED_ROWS", 50)
+    monkeypatch.setattr(trained_model, "HALVED_ROWS", 50)
     monkeypatch.setattr(density, "LISTED_ROWS", 640)
     monkeypatch.setattr(gathering, "BLOCK_CHUNKS", 1)
 
@@ -275,11 +278,12 @@ def test_rows_of_a_large_model_rise(scene: Scene, limits: Limits, monkeypatch: p
     trainer.close()
 
 
-@pytest.mark.parametrize("memory", [5 << 20, LITTLE])
-def test_batches_of_a_pooled_model(scene: Scene, default_device: Device, memory: int) -> None:
+@pytest.mark.parametrize(("memory", "devices"), [(5 << 20, 1), (LITTLE, 1), (LITTLE, 2)])
+def test_batches_of_a_pooled_model(scene: Scene, default_device: Device, memory: int, devices: int) -> None:
     """Sums over the views are in main memory, beside the chunks of the pool. It has one slot even if the plan, which
-    counts rows here, has room for fewer."""
+    counts rows here, has room for fewer. Another device's views are added to the statistics part by part."""
     config = short(iterations=8, batch=2, report=False, warmup=(), sh_degree_every=2, density={"every": 3, "start": 2})
     wanted = after(4, trainer_of(scene, config, default_device))
     limited = open_device(memory_limit=memory)
-    assert_same(after(4, trainer_of(scene, config, lambda: (limited, UNLIMITED))), wanted)
+    further = [opened_again(default_device) for _ in range(devices - 1)]
+    assert_same(after(4, trainer_of(scene, config, lambda: (limited, UNLIMITED), further=further)), wanted)

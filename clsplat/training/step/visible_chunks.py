@@ -70,13 +70,7 @@ def runs_by_chunk(config: TrainConfig, device: Device) -> bool:
 
 def streams_by_chunk(config: TrainConfig, device: Device, count: int) -> bool:
     """True if a model of `count` Gaussians may be streamed by chunks."""
-    return count > ORDERED_ROWS and not settings_of_whole_streams(config) and runs_by_chunk(config, device)
-
-
-def settings_of_whole_streams(config: TrainConfig) -> list[str]:
-    """The settings with which a model is streamed as a whole. Thinning draws its random numbers by the row of the
-    launch, which is not the model's if only chunks are streamed."""
-    return settings_of_whole_steps(config) + (["--thinning"] if config.thinning else [])
+    return count > ORDERED_ROWS and runs_by_chunk(config, device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,8 +157,8 @@ class VisibleChunks(Component):
     def before_step(self, gaussians: AnyGaussians) -> None:
         """Measure the bounds of chunks whose Gaussians may have moved."""
         pool = gaussians.pool if isinstance(gaussians, HostGaussians) else None
-        if isinstance(gaussians, HostGaussians) and (pool is None or self._config.thinning > 0):
-            return  # thinning draws its random numbers by the row of the launch
+        if isinstance(gaussians, HostGaussians) and pool is None:
+            return
         self._divide(pool)
         self._streamed, self._slots = pool is not None, len(self._last) if pool is None else pool.slots
         if pool is not None:
@@ -283,7 +277,8 @@ class VisibleChunks(Component):
             return PlacedChunks(model, ChunkNumbers(chunks.numbers))
         if pool is None:
             return PlacedChunks(model, send_chunks(work, "chunks", chunks.numbers, model[0].count))
-        slots = send_chunks(work, "chunk_slots", pool.place(chunks.numbers, changes=True), pool.rows)
+        first_rows = pool.store.starts[chunks.numbers] if self._config.thinning > 0 else None
+        slots = send_chunks(work, "chunk_slots", pool.place(chunks.numbers, changes=True), pool.rows, first_rows)
         return PlacedChunks(_in_pool(model), slots)
 
     def _note(self, step: AdamStep) -> None:
