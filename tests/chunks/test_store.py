@@ -334,6 +334,23 @@ def test_low_slots_are_taken_first() -> None:
     np.testing.assert_array_equal(table.targets(np.array([3, 0])), [3, 4])
 
 
+def test_a_file_gives_back_what_it_has_beyond_its_bound(store: ChunkStore) -> None:
+    """Once nothing at its end is used any longer."""
+    kept = []
+    for step in range(3):
+        records = written(store, float(step))
+        kept.append(store.manifest().slots)
+        store.hold(kept)
+        assert size_of(store) == (step + 1) * store.nbytes, "nothing is free at its end"
+    store.hold(kept[2:])
+    assert size_of(store) == 3 * store.nbytes, "what is used is there"
+    records = written(store, 5.0)
+    assert store.slots.current.max() < 20, "the lowest slots are free"
+    store.hold([store.manifest().slots])
+    assert size_of(store) * 10 == MAX_TENTHS * store.nbytes
+    assert store.read(ALL).tobytes() == records.tobytes()
+
+
 def test_runs() -> None:
     assert list(runs(np.array([4, 5, 2, NO_SLOT, 0, 1, NO_SLOT]))) == [(0, 4, 2), (2, 2, 1), (4, 0, 2)]
     assert list(runs(np.array([], np.int64))) == []
