@@ -102,7 +102,7 @@ def test_a_constant_is_noted_and_not_written(
         made.fill("none", value)
     got = made.read(ALL)
     assert (got["b"] == value).all()
-    assert got["a"].tobytes() == records["a"].tobytes()
+    np.testing.assert_array_equal(got["a"].reshape(-1, 3)[:COUNT], records["a"].reshape(-1, 3)[:COUNT])
     made.set_at("b", np.array([5]), np.ones(1, np.float32))
     assert made.get_rows("b", 4, 7).tolist() == [value, 1, value]
     made.write(np.array([3]), records[3:4])
