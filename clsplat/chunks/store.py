@@ -68,7 +68,8 @@ class ChunkStore:
         self._set_fields(fields)
         self.release: Callable[[], KeptSlots | None] = lambda: None
         self._memory: list[NDArray[np.uint8] | None] = [None] * self.chunks if path is None else []
-        """The bytes of each chunk in main memory, None before it is written: an array each, to be given back alone."""
+        """The bytes of each chunk in main memory, None before it is written: an array each, to be given back alone. A
+        chunk has its rows of each field there, and no room behind them."""
         self._given_back = 0
         self._constants = np.full((self.chunks, len(self._names)), ZERO)
         """By chunk and field, ZERO or INFINITE if all elements are that, whatever the record has; else WRITTEN."""
@@ -123,8 +124,10 @@ class ChunkStore:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all records, or of their slots in the file."""
-        return self.chunks * (self.record.itemsize if self.path is None else self.file.slot_bytes)
+        """Bytes of all rows, or of the chunks' slots in the file."""
+        if self.path is None:
+            return self.count * self.record.itemsize // CHUNK_ROWS
+        return self.chunks * self.file.slot_bytes
 
     def close(self) -> None:
         """Give back the memory, or remove the file unless a checkpoint names slots of it. The store cannot be used any
@@ -147,9 +150,9 @@ class ChunkStore:
         """
         records = np.empty(len(numbers), self.record)
         if self.path is None:
-            for row, number in zip(_rows_of(records), numbers, strict=True):
+            for place, (number, length) in enumerate(zip(numbers, self.lengths(numbers).tolist(), strict=True)):
                 if (held := self._memory[number]) is not None:
-                    row[:] = held
+                    _unpack(held, length, records[place : place + 1])
         else:
             self.file.read(self.slots.current[numbers], records)
             for place, number in enumerate(numbers):
@@ -163,8 +166,8 @@ class ChunkStore:
     def write(self, numbers: NDArray[np.integer[Any]], records: NDArray[Any]) -> None:
         """Replace the records of these chunks. Raises WriteError if they cannot be written."""
         if self.path is None:
-            for row, number in zip(_rows_of(records), numbers, strict=True):
-                self._in_memory(int(number))[:] = row
+            for place, (number, length) in enumerate(zip(numbers, self.lengths(numbers).tolist(), strict=True)):
+                self._memory[number] = _packed(records[place : place + 1], length)
             self._constants[numbers] = WRITTEN
             return
         self._make_room(partial(self.slots.needed, numbers))
@@ -211,8 +214,9 @@ class ChunkStore:
     ) -> list[NDArray[np.uint8] | None]:
         memory = [None if old == NEW else self._memory[old] for old in to.kept.tolist()]
         for numbers, records in made:
-            for row, number in zip(_rows_of(records), numbers.tolist(), strict=True):
-                memory[number] = row.copy()
+            lengths = to.starts[numbers + 1] - to.starts[numbers]
+            for place, (number, length) in enumerate(zip(numbers.tolist(), lengths.tolist(), strict=True)):
+                memory[number] = _packed(records[place : place + 1], length)
         return memory
 
     def _move_in_file(
@@ -381,17 +385,20 @@ class ChunkStore:
         """The bytes of a chunk in main memory."""
         held = self._memory[number]
         if held is None:
-            held = self._memory[number] = np.zeros(self.record.itemsize, np.uint8)
+            rows = int(self.starts[number + 1] - self.starts[number])
+            held = self._memory[number] = np.zeros(rows * self.record.itemsize // CHUNK_ROWS, np.uint8)
         return held
 
     def _field(self, number: int, field: str) -> NDArray[np.float32]:
-        """A field (CHUNK_ROWS, ...) of a chunk's record. In main memory it is the field itself."""
+        """A field of a chunk, (CHUNK_ROWS, ...). In main memory it is the field itself, of as many rows as it has."""
         kind, offset = self.record.fields[field][:2]  # type: ignore[index]  # it has fields
         of_field = number, self._names.index(field)
         constant = int(self._constants[of_field])
         if self.path is None:
-            held = self._in_memory(number)[offset : offset + kind.itemsize]
-            rows = held.view(np.float32).reshape(kind.shape)
+            length = int(self.starts[number + 1] - self.starts[number])
+            begin, nbytes = (size * length // CHUNK_ROWS for size in (offset, kind.itemsize))
+            held = self._in_memory(number)[begin : begin + nbytes]
+            rows = held.view(np.float32).reshape(length, *kind.shape[1:])
             self._constants[of_field] = WRITTEN
         else:
             rows = np.empty(kind.shape, np.float32)
@@ -455,6 +462,20 @@ def _carried(values: NDArray[Any], to: Division, shape: tuple[int, int]) -> NDAr
     return carried
 
 
-def _rows_of(records: NDArray[Any]) -> NDArray[np.uint8]:
-    """The bytes (k, itemsize) of records (k,)."""
-    return np.ascontiguousarray(records).view(np.uint8).reshape(len(records), records.dtype.itemsize)
+def _packed(record: NDArray[Any], rows: int) -> NDArray[np.uint8]:
+    """The first rows of each field of a record (1,), one field after the other."""
+    if rows == CHUNK_ROWS:
+        return np.array(record).view(np.uint8)
+    return np.concatenate([record[name][0, :rows].reshape(-1) for name in record.dtype.names or ()]).view(np.uint8)
+
+
+def _unpack(packed: NDArray[np.uint8], rows: int, record: NDArray[Any]) -> None:
+    """Copy to a record (1,) what `_packed` has made of one."""
+    if rows == CHUNK_ROWS:
+        record.view(np.uint8)[:] = packed
+        return
+    begin, values = 0, packed.view(np.float32)
+    for name in record.dtype.names or ():
+        field = record[name][0, :rows]
+        field[:] = values[begin : begin + field.size].reshape(field.shape)
+        begin += field.size

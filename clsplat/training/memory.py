@@ -219,10 +219,8 @@ class MemoryPlanner:
         Raises CapacityError, or InputError for too little main memory.
         """
         by_chunk = streams_by_chunk(self._config, self._rasterizer.device, count)
-        on_host, record = (
-            self._rasterizer.device.shares_memory,
-            record_bytes(self._config, contributions=needs.contributions),
-        )
+        on_host = self._rasterizer.device.shares_memory
+        record = record_bytes(self._config, contributions=needs.contributions)
         memory = StepMemory(
             fields=slot_fields(needs, nearness=bool(self._config.depth_use)),
             photographs=sum(view.camera.width * view.camera.height for view in self._scene.train_views),

@@ -246,6 +246,18 @@ def test_rows_in_any_order_with_more_coefficients(monkeypatch: pytest.MonkeyPatc
     np.testing.assert_array_equal(to.get_rows("first/a", 0, len(rows)), host["first/a"][rows])
 
 
+def test_chunks_in_main_memory_have_no_room_behind_their_rows() -> None:
+    made, host = filled(None)
+    rows = np.arange(ROWS, dtype=np.uint32)
+    rows = np.insert(rows, [5, CHUNK_ROWS * 3 + 5], [4 | int(FRESH), (CHUNK_ROWS * 3 + 4) | int(FRESH)]).astype(
+        np.uint32
+    )
+    made.move(rows, NewValues(), lambda: None)
+    assert made.chunks == 8
+    assert_has(made, moved(host, rows))
+    assert sum(len(held) for held in made._memory if held is not None) == made.nbytes == len(rows) * 4 * (3 + 6 + 1)
+
+
 def test_chunks_are_given_back_as_they_are_copied(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a store of 60 chunks in main memory a second copy has room for a few."""
     monkeypatch.setattr(gathering, "BLOCK_CHUNKS", 2)

@@ -22,13 +22,14 @@ from clsplat.chunks import gathering
 from clsplat.chunks.order import beside_parents
 from clsplat.chunks.slot_file import SlotFile
 from clsplat.chunks.store import ChunkStore
-from clsplat.config.training import TrainConfig
+from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.device.selection import open_device
 from clsplat.errors import WriteError
 from clsplat.files.atomic import write_error
 from clsplat.gaussians import floats_of
 from clsplat.layouts.columns import CHUNK_ROWS, SPLAT
+from clsplat.models.edit import take
 from clsplat.scenes.scene import Scene
 from clsplat.stages import density
 from clsplat.training import moved_rows, trained_model
@@ -156,6 +157,29 @@ def test_no_second_copy_of_the_model(scene: Scene, limits: Limits) -> None:
     assert host < each * (grown + 6 * CHUNK_ROWS) + 100 * count
     assert rows < count / 2
     assert device < 4 * len(SPLAT) * rows
+
+
+def test_what_is_hidden_takes_no_memory_of_the_device(scene: Scene) -> None:
+    """Also with contributions: nothing there is as long as the model."""
+    config = replace(SETTINGS["contributions"], optimiser=OptimiserConfig(sparse=True))
+    model, used = wide_model(around=False), []
+    hidden = np.flatnonzero(model.means[:, 1] > 20)
+    for copies in (0, 3):
+        larger = take(model, np.concatenate([np.arange(len(model)), np.tile(hidden, copies)]))
+        larger.means[len(model) :, 1] += 50
+        device = open_device(memory_limit=LITTLE)
+        trainer = Trainer(scene, config, device, larger)
+        run_steps(5, trainer)
+        pool = trainer.model._pool
+        assert pool is not None
+        used.append((len(larger), device.memory.used, pool.slots))
+        in_view = trainer.plan.need.row
+        trainer.close()
+    (few, of_few, slots), (many, of_many, slots_of_many) = used
+    assert many > 3 * few
+    assert slots == slots_of_many
+    # chunks are other ones, of which a view may show one more
+    assert of_many - of_few < CHUNK_ROWS * in_view < 8 * (many - few)
 
 
 class Shuffles(Adaptive):
