@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lists of the chunks of a model over whose rows stages run."""
+"""Lists of the chunks that a launch runs over, such as the chunks that a view shows."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from clsplat.layouts.columns import CHUNK_ROWS, NO_CHUNK
 
 @dataclass(frozen=True, eq=False)
 class ChunkList:
-    """Chunks of a model over whose rows a launch runs (`kernels/shared/chunks.h`), or slots of a pool that have them.
+    """Chunks whose rows a launch runs over (`kernels/shared/chunks.h`). In a pool, the slots that hold the chunks.
 
-    numbers: uint32, numbers of chunks in rising order, or of slots in the order of their chunks; then NO_CHUNK.
-    model_rows: number of rows of the model, or of all slots.
+    numbers: uint32, numbers of the chunks in rising order, or their slots in the same order; then NO_CHUNK as padding.
+    model_rows: number of rows of the model, or of all slots of the pool.
     """
 
     numbers: DeviceArray
@@ -26,24 +26,24 @@ class ChunkList:
 
     @property
     def rows(self) -> int:
-        """Number of rows of a launch."""
+        """Number of rows that a launch runs over, padding included."""
         return CHUNK_ROWS * self.numbers.shape[0]
 
     @property
     def key(self) -> tuple[object, ...]:
-        """All that launches over these chunks depend on, except the numbers of the chunks."""
+        """Key for command buffers: everything that launches over these chunks depend on, except the chunks' numbers."""
         return self.numbers.buffer, self.numbers.shape, self.model_rows
 
     @property
     def arguments(self) -> tuple[DeviceArray, int]:
-        """The kernels' arguments CHUNK_PARAMETERS."""
+        """Kernel arguments for CHUNK_PARAMETERS of kernels/shared/chunks.h."""
         return self.numbers, self.model_rows
 
 
 def padded_chunks(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """The numbers of chunks, then NO_CHUNK, in one of few lengths, so that arrays and command buffers are reused.
+    """Pad numbers of chunks with NO_CHUNK to one of few lengths, so that arrays and command buffers are reused.
 
-    The length is at most a quarter more than needed, or 1.
+    The length is at least 1, and at most a quarter more than needed.
     """
     wanted = max(len(numbers), 1)
     unit = 1 << max(wanted.bit_length() - 3, 0)
@@ -53,7 +53,7 @@ def padded_chunks(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 
 def send_chunks(work: Workspace, name: str, numbers: NDArray[np.uint32], model_rows: int) -> ChunkList:
-    """Send a list (`ChunkList`) to the workspace's array `name`."""
+    """Upload a padded list of chunks to the workspace's array `name`, without waiting for the device."""
     padded = padded_chunks(numbers)
     array = work.array(name, padded.shape, np.uint32)
     array.send(padded)
@@ -61,7 +61,7 @@ def send_chunks(work: Workspace, name: str, numbers: NDArray[np.uint32], model_r
 
 
 def exact_chunks(work: Workspace, name: str, numbers: NDArray[np.integer[Any]], model_rows: int) -> ChunkList:
-    """Send a list as `send_chunks` does, without any NO_CHUNK."""
+    """Upload a list of chunks without padding to the workspace's array `name`."""
     array = work.array(name, numbers.shape, np.uint32)
     array.set(numbers.astype(np.uint32))
     return ChunkList(array, model_rows)
@@ -69,14 +69,14 @@ def exact_chunks(work: Workspace, name: str, numbers: NDArray[np.integer[Any]], 
 
 @dataclass(frozen=True, eq=False)
 class ChunkNumbers:
-    """Chunks of a streamed model, in rising order, of which only some at a time have room on the device.
+    """Chunks of a streamed model for a pass that brings them to the device in parts (`chunk_parts`).
 
-    numbers: their numbers.
+    numbers: numbers of the chunks, in rising order.
     """
 
     numbers: NDArray[np.integer[Any]]
 
     @property
     def rows(self) -> int:
-        """Number of rows of all launches."""
+        """Number of rows that the launches of all parts run over."""
         return CHUNK_ROWS * len(self.numbers)
