@@ -27,12 +27,12 @@
 #endif
 
 #define BLOCK 16         // number of steps between two checks for parameters that no longer change
-#define LEAST_BETA2 0.9f // least beta2 for which (193) holds throughout a block of steps
+#define LEAST_BETA2 0.9f // least beta2 for which equation (193) of docs/gradients.md holds throughout a block of steps
 // A movement below this fraction of a parameter changes no bit of it: 2^-28, an eighth of the least half ulp.
 #define STILL 3.725290298e-9f
 
 // The missed steps of one array of a chunk. rates, roots: the array's columns of the table, from the first missed step
-// on; highest: the largest rate, or INFINITY if (193) does not apply.
+// on; highest: the largest rate, or INFINITY if equation (193) of docs/gradients.md does not apply.
 typedef struct {
   __global const float *rates, *roots;
   uint steps;

@@ -1,10 +1,10 @@
-// Adaptive density control: its statistics, the marks of Gaussians, and the copies of rows.
+// Adaptive density control: statistics, the marks of Gaussians to clone, split and prune, and copies of rows.
 //
 // Owner: A work-item owns a Gaussian; in gather_rows, an output row.
 // Launch: One work-item for each Gaussian or row, in groups of 64; work-items past the end do nothing.
 // Buffers: tile_counts (n): 0 if not visible; screen (n, 2): gradient with respect to the mean's image position, per
 //   pixel; splats (n, SPLAT_SIZE) in pixels. Statistics (n) are updated in place. Other shapes are above each kernel.
-//   The statistics of a view have CHUNKS as in chunks.h.
+//   density_statistics and contribution_statistics can run over listed chunks only (CHUNKS, as in chunks.h).
 // Equations: docs/gradients.md, (43) and (55); Kerbl et al. 2023, section 5.
 #include "shared/math.h"
 #include "shared/splat.h"
@@ -14,15 +14,16 @@
 #include "shared/rays.h"
 #endif
 
-// Norm of the i-th row of `screen` (n, 2), converted from per pixel to per unit of NDC (docs/gradients.md, (43)).
+// Norm of the i-th row of `screen` (n, 2), converted from per pixel to per unit of NDC: equation (43) of
+// docs/gradients.md.
 static inline float ndc_norm(__global const float *screen, const size_t i, const float x_scale, const float y_scale) {
   const float gx = x_scale * screen[2 * i], gy = y_scale * screen[2 * i + 1];
   return sqrt(fma1(gx, gx, gy * gy));
 }
 
-// Gaussians with tiles are visible. x_scale, y_scale: convert `screen` to NDC -> gradient_sums (n): sums of norms; seen
-// (n): numbers of views; radii (n): largest radius at 3 sigma, in pixels. Here and below, a value of a view that is not
-// finite is ignored, as if the Gaussian were not visible in it.
+// Adds a view to the statistics of its visible Gaussians. x_scale, y_scale: factors that convert `screen` to NDC ->
+// gradient_sums (n): sums of gradient norms; seen (n): numbers of views; radii (n): largest radius at 3 sigma, in
+// pixels. A view in which a Gaussian's norm or radius is not finite is ignored, as if it did not show the Gaussian.
 __kernel void density_statistics(const uint n, const float x_scale, const float y_scale,
 #ifdef RAYS
                                  const float pixels, // pixels per radian
@@ -49,8 +50,9 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
   radii[row] = radii[row] > radius ? radii[row] : radius;
 }
 
-// contributions (n) to this view, in pixels, of the Gaussians that have tiles; area: number of full-size pixels in a
-// pixel of this view -> totals, largest (n): sum and maximum over the views.
+// Adds a view to the statistics of contributions. contributions (n): those to this view, in pixels; area: number of
+// full-size pixels in a pixel of this view -> totals, largest (n): sum and maximum over the views. Contributions that
+// are not finite are ignored.
 __kernel void contribution_statistics(const uint n, const float area, __global const uint *tile_counts,
                                       __global const float *contributions, __global float *totals,
                                       __global float *largest CHUNK_PARAMETERS) {
@@ -63,8 +65,8 @@ __kernel void contribution_statistics(const uint n, const float area, __global c
   largest[row] = largest[row] > contribution ? largest[row] : contribution;
 }
 
-// Scores of the Gaussians for densification. seen (n): numbers of views -> scores (n): the mean gradient norm if it is
-// over gradient_edge, else UNWANTED; USELESS if no contribution to a view is over contribution_edge. A mean that is not
+// Computes scores for densification. seen (n): numbers of views -> scores (n): USELESS if no contribution to a view is
+// over contribution_edge; else the mean gradient norm, if it is over gradient_edge; else UNWANTED. A mean that is not
 // finite counts as 0.
 __kernel void density_scores(const uint n, const float gradient_edge, const float contribution_edge,
                              __global const float *gradient_sums, __global const float *seen,
@@ -79,9 +81,9 @@ __kernel void density_scores(const uint n, const float gradient_edge, const floa
   scores[i] = useless ? USELESS : wanted ? gradient : UNWANTED;
 }
 
-// Marks n Gaussians, of which number i is the model's row first + i. scores, radii, logits (n); log_scales (n, 3);
-// cut_off, cut_off_row: scores above `cut_off` qualify, and scores equal to it up to row cut_off_row -> marks (3, n), 0
-// or 1: the Gaussian remains, is cloned, is split.
+// Marks the Gaussians that remain, that are cloned and that are split. Gaussian i is row first + i of the model.
+// scores, radii, logits (n); log_scales (n, 3); cut_off, cut_off_row: a Gaussian may be cloned or split if its score is
+// above `cut_off`, or equals it up to row cut_off_row -> marks (3, n), 0 or 1: remains, is cloned, is split.
 __kernel void density_marks(const uint n, const uint first, const float cut_off, const uint cut_off_row,
                             const float large_edge, const float transparent_edge, const float oversized_edge,
                             const float oversized_half_edge, const float radius_edge, __global const float *scores,
@@ -100,9 +102,9 @@ __kernel void density_marks(const uint n, const uint first, const float cut_off,
   marks[2 * (size_t)n + i] = !gone && wanted && large && !(largest > oversized_half_edge);
 }
 
-// marks (3, n); places (3, n): their prefix sums; counts[0]: the sum of marks; first: as in density_marks -> rows (2n):
-// the source row of each new row; counts[1]: the number of splits. Order: remaining Gaussians, clones, first halves,
-// second halves. All but the remaining ones have the flag FRESH.
+// Lists the rows that follow from the marks. marks (3, n); places (3, n): exclusive prefix sums of marks; counts[0]:
+// the sum of marks; first: as in density_marks -> rows (2n): the source row of each new row; counts[1]: the number of
+// splits. Order: remaining Gaussians, clones, first halves, second halves. Clones and halves have the flag FRESH.
 __kernel void density_rows(const uint n, const uint first, __global const uint *marks, __global const uint *places,
                            __global uint *rows, __global uint *counts) {
   const size_t i = get_global_id(0);
@@ -117,7 +119,8 @@ __kernel void density_rows(const uint n, const uint first, __global const uint *
   if (i == 0) counts[1] = splits;
 }
 
-// rows (count): the source row in `from` of each row of `to`. If `renews`, FRESH rows are filled with `fresh` instead.
+// Copies rows of `width` floats from `from` to `to`. rows (count): the source row of each row of `to`. If `renews`,
+// FRESH rows are filled with `fresh` instead.
 __kernel void gather_rows(const uint count, const uint width, const uint renews, const float fresh,
                           __global const uint *rows, __global const float *from, __global float *to) {
   const uint j = get_global_id(0);

@@ -74,12 +74,12 @@ __kernel void ewa_grad(const uint n, const uint padded, __constant float *camera
     return;
   }
 
-  // (159): twice the gradient with respect to the whitened covariance.
+  // Equation (159) of docs/gradients.md: twice the gradient with respect to the whitened covariance.
   const floatL l11 = sqrt(p.syy / p.det), l12 = -(p.sxy / p.syy) * l11, l22 = 1.0f / sqrt(p.syy);
   const floatL ga = GATHER(d_conics, 3, 0), gb = 0.5f * GATHER(d_conics, 3, 1), gc = GATHER(d_conics, 3, 2);
   const floatL g_u = fmaL(ga, l11, gb * l12), g_v = fmaL(gb, l11, gc * l12);
   floatL uu = -2.0f * fmaL(l11, g_u, l12 * g_v), uv = -2.0f * (l22 * g_v), vv = -2.0f * (l22 * l22 * gc);
-#ifdef COMPENSATED // (160)
+#ifdef COMPENSATED // equation (160) of docs/gradients.md
   const floatL thinner =
       p.det0 > LEAST_DETERMINANT ? GATHER(d_compensations, 1, 0) * compensation2(&p) : (floatL)(0.0f);
   const floatL by_det0 = p.det0 > LEAST_DETERMINANT ? thinner / p.det0 : (floatL)(0.0f);
@@ -90,7 +90,7 @@ __kernel void ewa_grad(const uint n, const uint padded, __constant float *camera
   floatL d_t1[3], d_t2[3], d_size = (floatL)(0.0f);
   const floatL lean = l11 / p.syy;
 
-#ifdef COVARIANCES // (163), (164)
+#ifdef COVARIANCES // equations (163), (164) of docs/gradients.md
   Lanes d_v[6];
   floatL wu[3], wv[3], gu[3], gv[3], hu[3], hv[3];
   cross(p.v2, p.n, wu);
@@ -124,7 +124,7 @@ __kernel void ewa_grad(const uint n, const uint padded, __constant float *camera
   d_v[2].all += by_det0 * (n1 * fmaL(n0, p.v[4], fmaL(n2, p.v[1], -(n1 * p.v[2]))) - n0 * n2 * p.v[3]);
   d_v[4].all += by_det0 * (n0 * fmaL(n1, p.v[2], fmaL(n2, p.v[1], -(n0 * p.v[4]))) - n1 * n2 * p.v[0]);
 #endif
-#else // (58) to (60), (161), (162)
+#else // equations (58) to (60), (161), (162) of docs/gradients.md
   Lanes d_scale[3], d_quaternion[4];
   floatL wu[3], wv[3], turned[3];
   FOR_AXES(k) {
@@ -174,8 +174,8 @@ __kernel void ewa_grad(const uint n, const uint padded, __constant float *camera
   d_size = fmaL((floatL)(2.0f), thinner, d_size);
 #endif
 
-  // (165), (166): the gradient with respect to the mean in the camera's axes, through its image position, the Jacobian
-  // and its depth.
+  // Equations (165), (166) of docs/gradients.md: the gradient with respect to the mean in the camera's axes, through
+  // its image position, the Jacobian and its depth.
   const floatL d_u = GATHER(d_means2d, 2, 0), d_v2 = GATHER(d_means2d, 2, 1);
   floatL d_x, d_y, d_z;
 #ifdef FISHEYE

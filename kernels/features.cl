@@ -11,15 +11,15 @@
 // Equations: docs/channels.md, (61) to (64), (74) and (75).
 #include "shared/math.h"
 #if defined(FEATURE_MOTION) || defined(FEATURE_BACKWARD)
-#define NEEDS_MOTION // motion_of in shared/camera/, (64)
+#define NEEDS_MOTION // motion_of in shared/camera/, equation (64) of docs/channels.md
 #endif
 #include "shared/lanes.h"
 #include "shared/elementary.h"
 #include "shared/gaussian.h"
 
 #ifdef FEATURE_NORMAL
-// (62): the axis of the smallest scale, in world axes, with the sign that faces the camera. (dx, dy, dz): the view
-// direction at the mean.
+// Equation (62) of docs/channels.md: the axis of the smallest scale, in world axes, with the sign that faces the
+// camera. (dx, dy, dz): the view direction at the mean.
 static inline void normal_of(__global const float *q, __global const float *log_scales, float dx, float dy, float dz,
                              __global float *normal) {
   const int first = log_scales[1] < log_scales[0] ? 1 : 0;

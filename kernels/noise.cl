@@ -17,8 +17,8 @@
 #define WORDS (HALVES / 2)    // number of random 32-bit words, each with two of these numbers
 #define SPREAD 1.86881232e-5f // 1 / sqrt(HALVES * (2^32 - 1) / 12), the inverse of the sum's standard deviation
 
-// The normally distributed number `index` of a row, (93). The sum is an integer below 2^23, so the result is rounded
-// only once.
+// The normally distributed number `index` of a row, equation (93) of docs/gradients.md. The sum is an integer below
+// 2^23, so the result is rounded only once.
 static inline float normal(uint row_word, uint index) {
   int sum = -(HALVES * 65535) / 2;
   for (uint k = 0; k < WORDS; ++k) {
@@ -40,7 +40,8 @@ __kernel void add_noise(const uint n, const uint first_row, const uint key0, con
   const float e0 = normal(row_word, 0), e1 = normal(row_word, 1), e2 = normal(row_word, 2);
   const float by = amount * sigmoidL(100.0f * (dead - sigmoidL(logit)));
 
-  // (92): adds, for each axis of the ellipsoid, the axis times its variance times the component of the noise along it.
+  // Equation (92) of docs/gradients.md: adds, for each axis of the ellipsoid, the axis times its variance times the
+  // component of the noise along it.
   __global const float *q = quaternions + 4 * (size_t)i;
   __global const float *l = log_scales + 3 * (size_t)i;
   __global float *mean = means + 3 * (size_t)i;

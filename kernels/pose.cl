@@ -32,8 +32,8 @@ __kernel void pose_rows(const uint n, const uint first_block, const int coeffici
     shift[1] += gy;
     shift[2] += gz;
 
-    // (142): the gradient with respect to the view direction. For parallel rays this direction does not depend on the
-    // mean.
+    // Equation (142) of docs/gradients.md: the gradient with respect to the view direction. For parallel rays this
+    // direction does not depend on the mean.
     const float distance = sqrt(fma1(x, x, fma1(y, y, z * z)));
     const float ux = SEEN_ALONG(x, distance, camera[CAMERA_R20]), uy = SEEN_ALONG(y, distance, camera[CAMERA_R21]),
                 uz = SEEN_ALONG(z, distance, camera[CAMERA_R22]);
@@ -43,7 +43,8 @@ __kernel void pose_rows(const uint n, const uint first_block, const int coeffici
     float weight[16], by[3];
     for (int k = 1; k < coefficients; ++k, f += 3) weight[k] = fma1(red, f[0], fma1(green, f[1], blue * f[2]));
     sh_direction_gradient(coefficients, ux, uy, uz, weight, by);
-    // (141): SH do not rotate with the camera, so the torque of the gradient through the direction is subtracted.
+    // Equation (141) of docs/gradients.md: SH do not rotate with the camera, so the torque of the gradient through the
+    // direction is subtracted.
     const float across_x = uy * by[2] - uz * by[1], across_y = uz * by[0] - ux * by[2],
                 across_z = ux * by[1] - uy * by[0];
 

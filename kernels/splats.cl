@@ -36,8 +36,8 @@ __kernel void splats(const uint n, const int tiles_x, const int tiles_y, const i
   const floatL a = GATHER(conics, 3, 0), b = GATHER(conics, 3, 1), c = GATHER(conics, 3, 2);
   const floatL opacity = GATHER(opacities, 1, 0);
 
-  // (170): a c - b^2 to the last bit. If rounding has made a conic singular, it gets the smallest determinant that
-  // float32 resolves.
+  // Equation (170) of docs/gradients.md: a c - b^2 to the last bit. If rounding has made a conic singular, it gets the
+  // smallest determinant that float32 resolves.
   const floatL bb = b * b, ac = a * c;
   const floatL exact = fmaL(a, c, -bb) + fmaL(-b, b, bb), least = ROUNDING * ac;
   const floatL det = exact > least ? exact : least;
@@ -54,12 +54,12 @@ __kernel void splats(const uint n, const int tiles_x, const int tiles_y, const i
   field[SPLAT_PIXEL_Y].all = floorL(my);
   field[SPLAT_SUB_X].all = mx - field[SPLAT_PIXEL_X].all;
   field[SPLAT_SUB_Y].all = my - field[SPLAT_PIXEL_Y].all;
-  field[SPLAT_L11].all = WHITEN * root; // (171)
+  field[SPLAT_L11].all = WHITEN * root; // equation (171) of docs/gradients.md
   field[SPLAT_L12].all = WHITEN * (b / root);
   field[SPLAT_L22].all = WHITEN * sqrt(det / a);
   field[SPLAT_LOG2O].all = log2o;
   field[SPLAT_DEPTH].all = depth;
-  field[SPLAT_HALF_W].all = sqrt(budget * (c / det)) / WHITEN; // (172)
+  field[SPLAT_HALF_W].all = sqrt(budget * (c / det)) / WHITEN; // equation (172) of docs/gradients.md
   field[SPLAT_HALF_H].all = sqrt(budget * (a / det)) / WHITEN;
   field[SPLAT_INVERSE_L11].all = 1.0f / field[SPLAT_L11].all;
 

@@ -54,24 +54,25 @@ __kernel void splats_grad(const uint n, const int width, const int first, __glob
   if (count > 0) { // the splats of other Gaussians are uninitialised
     __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
     const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
-    by_mean[0] = -INVERSE_WHITEN2 * (l11 * sums[SLOT_GU]); // (173)
+    by_mean[0] = -INVERSE_WHITEN2 * (l11 * sums[SLOT_GU]); // equation (173) of docs/gradients.md
     by_mean[1] = -INVERSE_WHITEN2 * fma1(l12, sums[SLOT_GU], l22 * sums[SLOT_GV]);
-    // (174): moments of the offsets in pixels. If the ellipse is a needle, the moment along the needle is by far the
-    // largest, so it is added last.
+    // Equation (174) of docs/gradients.md: moments of the offsets in pixels. If the ellipse is a needle, the moment
+    // along the needle is by far the largest, so it is added last.
     const float in_x = splat[SPLAT_INVERSE_L11], in_y = 1.0f / l22, lean = l12 * in_y;
     const float uv = fma1(-lean, sums[SLOT_GVV], sums[SLOT_GUV]);
     const float uu = fma1(-lean, sums[SLOT_GUV] + uv, sums[SLOT_GUU]);
     by_conic[0] = -0.5f * (in_x * in_x * uu);
     by_conic[1] = -(in_x * in_y * uv);
     by_conic[2] = -0.5f * (in_y * in_y * sums[SLOT_GVV]);
-    by_opacity = sums[SLOT_G] / exp2L(splat[SPLAT_LOG2O]); // (175)
+    by_opacity = sums[SLOT_G] / exp2L(splat[SPLAT_LOG2O]); // equation (175) of docs/gradients.md
   }
   for (int k = 0; k < 2; ++k) d_means2d[2 * (size_t)i + k] = by_mean[k];
   for (int k = 0; k < 3; ++k) d_conics[3 * (size_t)i + k] = by_conic[k];
   d_opacities[i] = by_opacity;
   store_values(i, width, first, sums + SLOT_RED, d_values);
 #ifdef ABSOLUTE_GRADIENTS
-  for (int k = 0; k < 2; ++k) absolute[2 * (size_t)i + k] = INVERSE_WHITEN2 * sums[ABSOLUTE + k]; // (176)
+  for (int k = 0; k < 2; ++k)
+    absolute[2 * (size_t)i + k] = INVERSE_WHITEN2 * sums[ABSOLUTE + k]; // equation (176) of docs/gradients.md
 #endif
 }
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bounds of a chunk's Gaussians, and how far Adam may have moved them since they were measured.
+"""Bounding boxes of chunks for culling, and how far Adam may have moved the Gaussians since they were measured.
 
 Noise, density control and repairs move Gaussians too. After them a chunk is measured again.
 """
@@ -19,12 +19,13 @@ from clsplat.layouts.columns import CHUNK_ROWS
 _HALF_ULP = 2.0**-24
 """Largest rounding error of a float32, relative to its value."""
 _ROUNDING = 1e-6
-"""Relative slack of the root of r, for the rounding of a step's moments. It is more than eight roundings of float32."""
+"""Relative slack of sqrt(r), the ratio in `largest_step`, for the rounding of a step's moments. It is more than eight
+roundings of float32."""
 _SLACK = 1e-3
-"""Relative slack of the bounds. It covers the rounding of a step, and second moments that underflow."""
+"""Relative slack of the bounds of a step. It covers the rounding of a step, and second moments that underflow."""
 GROUP_FACTOR = 1.5
-"""Factor of a group's radius, with which the group's sphere contains the spheres of its chunks. These reach at most
-sqrt(2) half diagonals of the group's box from its middle."""
+"""Factor on half the diagonal of a group's box, for a sphere that contains the spheres around the boxes of its chunks.
+These reach at most sqrt(2) half diagonals from the middle of the group's box."""
 _LEAST_EPSILON = 1e-15
 """Smallest epsilon of Adam with which second moments that underflow move a parameter by less than _SLACK."""
 
@@ -33,9 +34,10 @@ _LEAST_EPSILON = 1e-15
 class ChunkBounds:
     """Bounds of B chunks, in float64.
 
-    lowest, highest: (B, 3), of the means, in world units.
+    lowest, highest: (B, 3), the smallest and largest coordinates of the means, in world units.
     largest: (B,), the largest log scale.
-    factor: of spheres and rounding; GROUP_FACTOR for bounds of groups, which are visible where one of their chunks is.
+    factor: factor on the radii of spheres around the boxes, and on rounding. It is GROUP_FACTOR for bounds of groups,
+        so that a group is visible wherever one of its chunks is.
     """
 
     lowest: Float64
@@ -45,7 +47,7 @@ class ChunkBounds:
 
     @classmethod
     def measured(cls, means: Float32, log_scales: Float32) -> ChunkBounds:
-        """The bounds of the chunks of a model, from means and log scales (n, 3). A NaN among them makes a NaN."""
+        """Measure the chunks of a model, from means and log scales (n, 3). The bounds of a chunk with a NaN are NaN."""
         starts = np.arange(0, len(means), CHUNK_ROWS)
         if len(starts) == 0:
             return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
@@ -66,8 +68,10 @@ class ChunkBounds:
 
     @cached_property
     def terms(self) -> Float64:
-        """Rows (8, B): middles of the boxes (3), half sides (3), largest standard deviations, and for each box the sum
-        of its farthest corner's coordinates, to which rounding is relative."""
+        """Rows (8, B): the boxes' middles (3), half sides (3), largest standard deviations, and magnitudes.
+
+        The magnitude is the sum of the absolute coordinates of the box's farthest corner; rounding is relative to it.
+        """
         with np.errstate(over="ignore", invalid="ignore"):
             middle, half = 0.5 * (self.lowest + self.highest).T, 0.5 * (self.highest - self.lowest).T
             farthest = self.factor * (np.abs(middle) + half).sum(axis=0)
@@ -75,15 +79,16 @@ class ChunkBounds:
 
     @cached_property
     def radius(self) -> Float64:
-        """Radii (B,) of spheres around the boxes: half diagonals, and more around groups."""
+        """Radii (B,) of spheres around the boxes: half the diagonal, times `factor`."""
         half = self.terms[3:6]
         return np.asarray(self.factor * np.sqrt(np.einsum("ij,ij->j", half, half)))
 
     def widened(self, mean_step: float | Float64, log_scale_step: float | Float64, updates: int = 0) -> ChunkBounds:
-        """The bounds after each coordinate of a mean, and each log scale, has moved by at most these steps.
+        """Return the bounds after training steps that may have moved the Gaussians.
 
-        mean_step, log_scale_step: a number, or one for each chunk (B,).
-        updates: number of updates of a parameter in this time, each of which rounds it to float32.
+        mean_step, log_scale_step: the most by which a mean's coordinate, and a log scale, have moved: a number, or one
+            for each chunk (B,).
+        updates: number of updates of a parameter in these steps, each of which rounds it to float32.
         """
         with np.errstate(invalid="ignore", over="ignore"):
             x, y, z = np.maximum(np.abs(self.lowest), np.abs(self.highest)).T
@@ -94,9 +99,12 @@ class ChunkBounds:
 
 
 def _with_rounding(step: float | Float64, size: Float64, updates: int) -> Float64:
-    """The movement (B,) of values of at most `size` (B,) by `step` in all, if each of `updates` parts is rounded.
+    """Return the most (B,) by which values move in `updates` updates that are rounded to float32.
 
-    A movement d makes values of at most size + d, and so roundings of at most (size + d) 2^-24 each.
+    After a movement d the values are at most size + d, so that each rounding is at most (size + d) 2^-24.
+
+    step: the most by which the updates add up to without rounding.
+    size: (B,), the largest absolute values at first.
     """
     share = updates * _HALF_ULP
     if share >= 1:
@@ -106,7 +114,7 @@ def _with_rounding(step: float | Float64, size: Float64, updates: int) -> Float6
 
 
 def largest_step(config: OptimiserConfig) -> float:
-    """The most by which a step of Adam moves a parameter, as a multiple of the learning rate: 7.3 by default.
+    """Return the most by which a step of Adam moves a parameter, as a multiple of the learning rate: 7.3 by default.
 
     Let b1, b2 be the decays, r = b1^2 / b2 < 1, and S(x) = 1 + x + ... + x^(t - 1). After t steps with gradients g_i,
     Cauchy and Schwarz give for the moments m and v:
@@ -121,23 +129,24 @@ def largest_step(config: OptimiserConfig) -> float:
         (1 - b1) / sqrt((1 - b2) (1 - r)).
 
     It rises because log S(e^u) grows from t to t + 1 by a convex function of u, and b1 is the geometric mean of r and
-    b2. A row that has had fewer updates than its step counts has a smaller S(r), so the bound holds for it too.
+    b2. A row with fewer updates than the t of the corrections has a smaller S(r), so the bound holds for it too.
 
-    The kernel's decays are float32, and corrections in float64: both are taken into account. Infinite if r >= 1, or
-    if epsilon is so small that second moments under float32's range matter.
+    The bound takes into account that the kernel has float32 decays, and the corrections float64 ones. It is infinite if
+    r >= 1, or if epsilon is so small that second moments below float32's range matter.
     """
     beta1, beta2, root = _decays(config)
     if root >= 1 or beta2 >= 1 or config.epsilon < _LEAST_EPSILON:
         return math.inf
     limit = (1 - beta1) / math.sqrt((1 - beta2) * (1 - root**2))
-    # A correction and its moment have decays that differ by rounding; their quotient is between 1 and its first value.
+    # Decays of corrections and moments differ by rounding; so the quotient of a moment's factor and its correction is
+    # between 1 and its value at the first step.
     first = (1 - beta1) / (1 - config.beta1)
     second = math.sqrt((1 - config.beta2) / (1 - beta2))
     return limit * max(first, 1.0) * max(second, 1.0) * (1 + _SLACK)
 
 
 def largest_resumed_step(config: OptimiserConfig, ratio: float, step: int) -> float:
-    """`largest_step` after step number `step`, for moments that other decays may have made.
+    """Return `largest_step` after a resume, for moments that a training with other decays may have made.
 
     Let c be the limit in `largest_step`, so that (1 - b1)^2 / (1 - b2) = (1 - r) c^2. If |m| <= d sqrt(v) with d >= c,
     Cauchy and Schwarz give for the next moments
@@ -146,19 +155,20 @@ def largest_resumed_step(config: OptimiserConfig, ratio: float, step: int) -> fl
 
     So d stays a bound. The correction of a later step is at most 1 / (1 - b1^t).
 
-    ratio: the largest |m| / sqrt(v).
+    ratio: the largest |m| / sqrt(v) in the checkpoint.
+    step: number of the checkpoint's step.
     """
     return max(largest_step(config), ratio / (1 - config.beta1 ** (step + 1)) * (1 + _SLACK))
 
 
 def hidden_path(config: OptimiserConfig, step: float | None = None) -> float:
-    """The most by which all later steps with gradient 0 move a parameter, as a multiple of their largest learning rate.
+    """Return the most by which any number of steps with gradient 0 move a parameter: 66 learning rates by default.
 
-    It is 66 by default. In the k-th such step, the first moment has fallen to b1^k and the root of the second to
-    b2^(k / 2) of its value. So by the argument of `largest_step` the step is at most (b1 / sqrt(b2))^k times its bound,
-    and the sum over k = 1, 2, ... is a geometric series. With sparse Adam, which takes no such step, it is not needed.
+    In the k-th step with gradient 0, the first moment has fallen to b1^k times its value, and the root of the second to
+    b2^(k / 2) times. So by the argument of `largest_step` that step is at most (b1 / sqrt(b2))^k times the bound of a
+    step, and the sum over k = 1, 2, ... is a geometric series. Sparse Adam takes no steps with gradient 0.
 
-    step: bound of a step; None takes `largest_step`.
+    step: bound of a step, as a multiple of the learning rate; None takes `largest_step`.
     """
     _, _, root = _decays(config)
     step = largest_step(config) if step is None else step
@@ -166,7 +176,7 @@ def hidden_path(config: OptimiserConfig, step: float | None = None) -> float:
 
 
 def _decays(config: OptimiserConfig) -> tuple[float, float, float]:
-    """The decays of the kernel's moments, and the root of r, b1 / sqrt(b2), with its slack."""
+    """The kernel's decays b1 and b2 in float32, and sqrt(r) = b1 / sqrt(b2) with its slack."""
     beta1, beta2 = float(np.float32(config.beta1)), float(np.float32(config.beta2))
     root = beta1 / math.sqrt(beta2) * (1 + _ROUNDING) if beta2 > 0 else math.inf
     return beta1, beta2, root

@@ -15,13 +15,15 @@ from clsplat.chunks.bounds import GROUP_FACTOR, ChunkBounds
 GROUP = 64
 """Consecutive chunks in a group, and groups in a group of the next level."""
 MOST_ON_TOP = 2048
-"""Number of bounds that are looked at one by one. They take about as long as the calls of NumPy for another level."""
+"""Largest number of bounds that are tested without groups above them. Testing them takes about as long as the calls of
+NumPy for another level of groups."""
 _FLOATS = 7
+"""Floats of bounds: lowest (3) and highest coordinates (3) of the means, largest log scale."""
 
 Sees = Callable[[ChunkBounds], Bool]
-"""True (n,) for bounds in view: `culling.visible` of a picture."""
+"""Function that returns True (n,) for bounds in view, such as `culling.visible` for a picture."""
 Movement = Callable[[NDArray[np.integer]], Float64]
-"""Movements (2, n) of means and log scales of chunks with given numbers (n,)."""
+"""Function from numbers of chunks (n,) to the most by which their means and log scales have moved (2, n)."""
 
 
 class BoundsTable:
@@ -29,7 +31,7 @@ class BoundsTable:
 
     The bounds of a group enclose the bounds of its chunks. They are NaN if a chunk's bounds are not finite.
 
-    chunks: number of chunks. Their bounds are NaN, which leave nothing out, until they are measured.
+    chunks: number of chunks. Until they are measured their bounds are NaN, and they count as in view.
     """
 
     def __init__(self, chunks: int) -> None:
@@ -40,7 +42,7 @@ class BoundsTable:
         self._most_moved = np.zeros((2, 1))
 
     def measure(self, numbers: NDArray[np.uint32], found: Float32) -> None:
-        """Take the bounds (n, 7) of some chunks, which have been measured: lowest, highest, largest log scale."""
+        """Store the measured bounds of some chunks. found: (n, 7), in the order of `_FLOATS`."""
         self._levels[0][numbers] = found
         self._moved[:, numbers] = 0.0
         self._most_moved = self._moved.max(axis=1, initial=0.0, keepdims=True)
@@ -54,16 +56,19 @@ class BoundsTable:
             level[changed] = np.where(finite[:, None], sides, np.nan)
 
     def move(self, numbers: NDArray[np.uint32], steps: Float64) -> None:
-        """Note that coordinates of means, and log scales, of some chunks have moved by at most `steps` (2, n or 1)."""
+        """Record that a training step has moved the Gaussians of some chunks.
+
+        steps: (2, n or 1), the most by which a mean's coordinate, and a log scale, have moved.
+        """
         self._moved[:, numbers] += steps
         self._most_moved = np.maximum(self._most_moved, self._moved[:, numbers].max(axis=1, initial=0.0, keepdims=True))
 
     def seen(self, sees: Sees, hidden: Movement, most_hidden: Float64, updates: int) -> NDArray[np.uint32]:
-        """The chunks for which `sees` is True, in rising order. Only chunks of groups in view are tested.
+        """Return the chunks for which `sees` is True, in rising order. Only chunks of groups in view are tested.
 
-        hidden: further movements of chunks.
-        most_hidden: (2, 1), the largest for any chunk.
-        updates: number of updates of a parameter in all this time, as of `ChunkBounds.widened`.
+        hidden: movements of chunks that `move` has not recorded.
+        most_hidden: (2, 1), the largest of these movements for any chunk.
+        updates: number of updates of a parameter since the oldest measurement (`ChunkBounds.widened`).
         """
         most = self._most_moved + most_hidden
         near = np.arange(len(self._levels[-1]))
@@ -77,7 +82,7 @@ class BoundsTable:
 
 
 def _members(groups: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Numbers (n, GROUP) of the members of these groups, of which the last group has some too many."""
+    """Numbers (n, GROUP) of the members of these groups. The last group may have numbers past the last member."""
     return GROUP * groups[:, None] + np.arange(GROUP)
 
 

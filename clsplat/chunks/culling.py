@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chunks that a camera may see. A chunk is left out only if none of its rows can reach a tile of the picture.
+"""Frustum culling of chunks: a chunk is left out only if none of its Gaussians can reach a tile of the picture.
 
-Rows are bounded as kernels/project.cl and project_rays.cl compute them: these kernels would count no tile for any row
-of a chunk that is left out. Opacities count as 1, and rotations of Gaussians as unknown.
+The bounds follow the formulas and the rounding of kernels/project.cl and project_rays.cl, which would count no tile for
+any Gaussian of a chunk that is left out. Opacities are taken as 1, and rotations as unknown.
 """
 
 from __future__ import annotations
@@ -28,11 +28,12 @@ _DEFAULT_RASTERIZER = RasterizerConfig()
 _LOW_PASS_ROOT = math.sqrt(0.3)
 """Root of the larger variance, in px^2, that projection adds (LOW_PASS in kernels/shared/gaussian.h)."""
 _REACH_SLACK = 1.001
-"""Factor of a Gaussian's reach. The kernels round it by 1e-4 at most, and along rays enlarge it by as much."""
+"""Factor on a Gaussian's reach. The kernels round it by 1e-4 at most, and along rays enlarge it by at most 1e-4."""
 _ROUNDING = 1e-5
 """Slack relative to the terms of a plane. A mean in two floats is rounded to float32 at the end, by 6e-8."""
 _CANCELLED = 1e-11
-"""Slack relative to coordinates in the world, which may cancel in the camera: what two floats, and float64, round."""
+"""Slack relative to coordinates in the world, which may cancel in the camera's axes. It covers the rounding of two
+floats and of float64."""
 _ANGLE_SLACK = 1e-4
 """Slack of directions in radians. In float32 they are rounded by 1e-6, and 22 times that near a pole."""
 _LEAST_AHEAD = 2e-4
@@ -45,12 +46,14 @@ as containing the axis. The kernels use 0.999."""
 
 @dataclass(frozen=True, eq=False)
 class _Planes:
-    """The sides of a picture on an image plane, then its near and far plane, as functions of a box: negative beyond.
+    """The four sides of a picture on an image plane, then its near and far plane, as functions of a chunk's bounds.
+
+    A function is the sum of three parts. It is negative if the whole chunk is beyond the plane.
 
     terms: (6, 8), factors of `ChunkBounds.terms`.
     by_distance: (6,), factors of the distance of a box's farthest corner from the camera.
-    constant: (6,).
-    centre: (3, 1), of the camera in the world.
+    constant: (6,), constant parts.
+    centre: (3, 1), the camera's centre in the world.
     """
 
     terms: Float64
@@ -61,15 +64,15 @@ class _Planes:
 
 @dataclass(frozen=True, eq=False)
 class PictureBorders:
-    """Borders of a camera's picture, and limits of depth: all that culling has to know of a camera.
+    """The borders of a camera's picture and its limits of depth, which culling compares chunks with.
 
     culls: False if every chunk counts as visible.
     square: True if Gaussians are listed in the square of their longest half axis, which is at most the root of the sum
         of both half axes' squares.
     reach: standard deviations at which a Gaussian ends.
-    stretch: the most by which the camera's matrix makes a length longer: more than 1 if it is not quite a rotation.
+    stretch: largest factor by which the camera's matrix changes a length; 1 for an exact rotation.
     low, high: (2,), borders of the tiles in pixels, from the principal point.
-    slack: (2,), rounding in pixels of a place near the picture.
+    slack: (2,), rounding error in pixels of image positions near the picture.
     depths: least and largest depth.
     """
 
@@ -107,14 +110,16 @@ class PictureBorders:
     def planes(self) -> _Planes:
         """The planes beyond which chunks are hidden, for cameras with an image plane.
 
-        By (2) to (6) of docs/gradients.md, the half width of an ellipse is at most k (f sqrt(1 + r^2) s / z + b), with
-        k the reach, s the largest scale, r the limit of x/z in the Jacobian, and b^2 the low-pass. An ellipse reaches
-        the left border l, from the principal point, if f x/z + k (f sqrt(1 + r^2) s / z + b) >= l. Times z > 0 this is
+        By equations (2) to (6) of docs/gradients.md, the half width of an ellipse is at most k (f sqrt(1 + r^2) s / z +
+        b), with k the reach, s the largest scale, r the limit of x/z in the Jacobian, and b^2 the low-pass. An ellipse
+        reaches the left border l, from the principal point, if f x/z + k (f sqrt(1 + r^2) s / z + b) >= l. Times z > 0
+        this is
 
             f x + (k b - l) z + k f sqrt(1 + r^2) s >= 0,
 
-        which is linear in the mean: a box is beyond the border if its farthest corner along (f, 0, k b - l) is. Means
-        beyond the left border have r between the Jacobian's limit and the border. For parallel rays z is 1 and r is 0.
+        which is linear in the mean. So a box is beyond the border if its farthest corner along (f, 0, k b - l) is
+        beyond it. For means beyond the left border, r is between the Jacobian's limit and the border. For parallel rays
+        z is 1 and r is 0.
         """
         camera, parallel = self.camera, self.camera.model.parallel
         limits, blur = camera.frustum_limits, self.reach * _LOW_PASS_ROOT
@@ -143,15 +148,15 @@ class PictureBorders:
 
 
 def visible(picture: PictureBorders, bounds: ChunkBounds) -> Bool:
-    """True (B,) for chunks that may have a row with a tile in a picture; False only if none has one.
+    """Return True (B,) for chunks that a picture may show; False only if no Gaussian of a chunk reaches a tile.
 
-    Chunks whose bounds are not finite are visible. Rows appended to a chunk must be in its bounds.
+    Chunks whose bounds are not finite are visible. Gaussians that are added to a chunk must be inside its bounds.
     """
     if not picture.culls or len(bounds) == 0:
         return np.ones(len(bounds), np.bool_)
     model = picture.camera.model
     hidden = np.zeros(len(bounds), np.bool_)
-    with np.errstate(all="ignore"):  # what is not finite compares as visible
+    with np.errstate(all="ignore"):  # NaN compares as visible
         if model.along_rays:
             cones = _cones(bounds, picture)
             hidden |= _out_of_depth(cones, picture)
@@ -166,7 +171,7 @@ def visible(picture: PictureBorders, bounds: ChunkBounds) -> Bool:
 def _beyond_planes(bounds: ChunkBounds, picture: PictureBorders) -> Bool:
     """True (B,) for chunks beyond a side of the picture on an image plane, or beyond the near or far plane."""
     planes = picture.planes
-    # einsum and not @: BLAS takes threads even for so small a product, and they spin while they wait
+    # einsum instead of @, because BLAS would start threads even for this small product, and they spin while they wait
     farthest_corner = np.einsum("pk,kb->pb", planes.terms, bounds.terms)
     away = bounds.terms[:3] - planes.centre
     distance = picture.stretch * (np.sqrt(np.einsum("ij,ij->j", away, away)) + bounds.radius)
@@ -176,13 +181,13 @@ def _beyond_planes(bounds: ChunkBounds, picture: PictureBorders) -> Bool:
 
 @dataclass(frozen=True, eq=False)
 class _Cones:
-    """Cones from the camera's centre around B chunks, with angles in radians. NaN where there is no such cone.
+    """Cones from the camera's centre around B chunks, with angles in radians.
 
-    middle, half: (3, B), boxes along the camera's axes.
-    distance, radius: (B,), of spheres around the boxes of means in the world.
-    least: (B,), distance of the nearest mean that is not before the near plane.
+    middle, half: (3, B), middles and half sides of the chunks' boxes along the camera's axes.
+    distance, radius: (B,), distances from the camera, and radii, of spheres around the boxes.
+    least: (B,), lower limit of the distance of means beyond the near plane.
     size: (B,), the largest standard deviation.
-    spread: (B,), half angle of the cone of all means.
+    spread: (B,), half angle of the cone around all means; NaN if the camera is inside the sphere.
     factor: `ChunkBounds.factor`.
     """
 
@@ -211,7 +216,7 @@ def _cones(bounds: ChunkBounds, picture: PictureBorders) -> _Cones:
 
 
 def _out_of_depth(cones: _Cones, picture: PictureBorders) -> Bool:
-    """True (B,) for chunks before the near or beyond the far plane, for models along rays."""
+    """Return True (B,) for chunks before the near plane or beyond the far plane, for camera models along rays."""
     flat = picture.camera.model.flat
     depth, half = (cones.middle[2], cones.half[2]) if flat else (cones.distance, cones.radius)
     slack = half + _ROUNDING * (np.abs(depth) + half)
@@ -220,12 +225,13 @@ def _out_of_depth(cones: _Cones, picture: PictureBorders) -> Bool:
 
 
 def _caps(cones: _Cones, picture: PictureBorders, pixel: float) -> tuple[Float64, Float64]:
-    """Half angles (B,), in radians, of the largest cone of a Gaussian around its mean, and of the cone of all of them.
+    """Return two half angles (B,), in radians: of the largest cone that contains a Gaussian, and of the whole chunk's.
 
-    By (12) and (13) of docs/cameras.md, a Gaussian's ellipse lies in the plane that touches the unit sphere at its
-    mean's direction, and a ray reaches the plane at the tangent of the angle between both. The ellipse's half axis is
-    at most k (s / d + b w), with k the reach, s the largest scale, d the distance, b^2 the low-pass and w the pixel's
-    width. The cone of all is NaN from 90 degrees on.
+    A Gaussian's cone is around the direction of its mean. By equations (12) and (13) of docs/cameras.md, the Gaussian's
+    ellipse lies in the plane that touches the unit sphere at this direction; a ray at an angle to the direction reaches
+    the plane at the angle's tangent. The ellipse's half axis is at most k (s / d + b w), with k the reach, s the
+    largest scale, d the distance, b^2 the low-pass and w the pixel's width. The chunk's half angle is NaN from 90
+    degrees on.
 
     pixel: the largest width of a pixel on the tangent plane, in radians.
     """
@@ -235,20 +241,20 @@ def _caps(cones: _Cones, picture: PictureBorders, pixel: float) -> tuple[Float64
 
 
 def _half_turn(sine: Float64, level: Float64) -> Float64:
-    """Half of the angle (B,) that cones cover around an axis; NaN for a cone that nearly contains the axis.
+    """Return half of the angle (B,) that cones cover around an axis; NaN for a cone that nearly contains the axis.
 
-    The cones of single Gaussians then contain it even less: sin(whole - spread) / sin(a - spread) falls with the
-    spread, if the angle a to the axis is larger than the whole.
+    If a chunk's cone, of half angle `whole`, does not contain the axis, the cones of its Gaussians do so even less:
+    sin(whole - spread) / sin(a - spread) falls with the spread, if a, the angle to the axis, is larger than `whole`.
 
-    sine: (B,), of the cones' half angles `whole`.
-    level: (B,), sine of the angle between a cone's middle and the axis.
+    sine: (B,), sine of `whole`.
+    level: (B,), sine of a, the angle between a cone's middle and the axis.
     """
     ratio = sine / level
     return np.where(ratio < _POLE, np.arcsin(ratio), np.nan) + _ANGLE_SLACK
 
 
 def _beyond_panorama(cones: _Cones, picture: PictureBorders) -> Bool:
-    """True (B,) for chunks that a part of a panorama does not show: above, below or at its sides, at any turn."""
+    """Return True (B,) for chunks that a window of a panorama does not show: above it, below it, or beside it."""
     camera, (x, y, z) = picture.camera, cones.middle
     _, whole = _caps(cones, picture, max(max(1.0, 0.5 / camera.fy) / camera.fx, 1 / camera.fy))
     across = np.sqrt(x * x + z * z)
@@ -265,10 +271,10 @@ def _beyond_panorama(cones: _Cones, picture: PictureBorders) -> Bool:
 
 
 def _beyond_borders(cones: _Cones, picture: PictureBorders) -> Bool:
-    """True (B,) for chunks beyond a side of a perspective picture along rays.
+    """Return True (B,) for chunks beyond a side of a perspective picture along rays.
 
-    A border is an angle in the plane of its axis and z. The kernels take a Gaussian's box as infinite where it comes
-    near z = 0, so chunks with means near it are visible.
+    A border of x or y is an angle in the plane of this axis and z. The kernels take a Gaussian's box as infinite where
+    it comes near the plane z = 0, so chunks with means near this plane are visible.
     """
     camera, z = picture.camera, cones.middle[2]
     _, whole = _caps(cones, picture, 1 / min(camera.fx, camera.fy))
@@ -287,7 +293,8 @@ def _beyond_borders(cones: _Cones, picture: PictureBorders) -> Bool:
 
 
 def _radius(camera: Camera, theta: Float64) -> Float64:
-    """Image radii (B,) of a fisheye, in focal lengths, at angles theta (B,) from the axis: (18) of docs/cameras.md."""
+    """Return image radii (B,) of a fisheye, in focal lengths, at angles theta (B,): equation (18) of
+    docs/cameras.md."""
     if not any(camera.radial):
         return theta
     square, (k1, k2, k3, k4) = theta * theta, camera.radial
@@ -295,12 +302,13 @@ def _radius(camera: Camera, theta: Float64) -> Float64:
 
 
 def _beyond_fisheye(cones: _Cones, picture: PictureBorders) -> Bool:
-    """True (B,) for chunks that a fisheye does not show: beyond a side of its picture, or beyond its largest angle.
+    """Return True (B,) for chunks beyond a side of a fisheye's picture, or beyond its largest angle.
 
-    The kernels bound a Gaussian by a rectangle along its mean's direction on the picture: from `inner` to `outer`, and
-    `aside` to both sides. If a Gaussian may contain the axis, or reach the largest angle, the bound is a square around
-    the axis. The rectangle's corner is then at most 1.5 times as far out as the square's side. The
-    sum for a rectangle is at most 2 `outer`, and less than that of a group's square.
+    The kernels bound a Gaussian by a rectangle in the picture, whose sides are along and across the direction from the
+    axis to the mean. It reaches from `inner` to `outer`, and `aside` to both sides. If a Gaussian may contain the axis,
+    or reach the largest angle, the kernels take a square around the axis. Here 1.5 `outer` is then taken on all sides,
+    which no corner of such a rectangle exceeds. A rectangle never reaches beyond 2 `outer`, which is less than the
+    square of a group.
     """
     camera, (x, y, z), fold = picture.camera, cones.middle, picture.camera.fold[0]
     widest = 1.5 / MIN_FISHEYE_SLOPE if any(camera.radial) else max(1.0, 0.5 / (math.pi * camera.fx))
@@ -325,7 +333,7 @@ def _beyond_fisheye(cones: _Cones, picture: PictureBorders) -> Bool:
     ):
         turned = turn_sine * np.sqrt(1 - along * along)
         for side, border in zip((1, -1), borders, strict=True):
-            # cosine of the smallest angle between a mean's direction and that of the border's axis
+            # cosine of the smallest angle in the picture between the direction to a mean and the border's normal
             nearest = np.where(side * along > turn_cosine, 1.0, side * along * turn_cosine + turned)
             support = np.where(nearest > 0, outer, inner) * nearest + aside
             support = np.where(ring, support, 1.5 * cones.factor * outer)
@@ -338,5 +346,5 @@ _ALONG_RAYS: dict[type[CameraModel], Callable[[_Cones, PictureBorders], Bool]] =
     PerspectiveByRays: _beyond_borders,
     Fisheye: _beyond_fisheye,
 }
-"""For models along rays: the chunks that are beyond their pictures. Of other models along rays every chunk counts as
-visible between the near and the far plane."""
+"""By camera model along rays, the function that finds chunks beyond the picture's borders. For models that are not
+listed, every chunk between the near and the far plane counts as visible."""

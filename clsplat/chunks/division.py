@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the rows of a store are divided into chunks, and divided anew where density control has changed them."""
+"""Division of a store's rows into chunks, and new chunks where density control has changed rows."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.optimisation.density_rules import FRESH
 
 NEW = -1
-"""In place of the old chunk that a new one is."""
+"""Value of `Division.kept` for a chunk that is not an old one."""
 _COUNTED_ROWS = 1 << 14
-"""Entries of a list that are looked at together."""
+"""Number of list entries that are counted at a time, which limits the size of copies."""
 
 
 def chunks_of(rows: int) -> int:
-    """Number of chunks of `rows` rows, if all but the last are full."""
+    """Return the number of chunks for `rows` rows, if all chunks but the last are full."""
     return -(-rows // CHUNK_ROWS)
 
 
 def even_starts(count: int) -> NDArray[np.int64]:
-    """The first row of each chunk of `count` rows, and their end, if all chunks but the last are full."""
+    """Return `Division.starts` for `count` rows, if all chunks but the last are full."""
     return np.append(np.arange(0, count, CHUNK_ROWS), count)
 
 
 def chunk_of(starts: NDArray[np.int64], rows: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
-    """The chunk of each row."""
+    """Return the number of the chunk that has each row. starts: as in `Division`."""
     return np.searchsorted(starts, rows, side="right") - 1
 
 
 @dataclass(frozen=True, eq=False)
 class Division:
-    """Chunks after rows have moved.
+    """The chunks of a model after rows have moved.
 
-    starts: (chunks + 1,) int64, the first row of each, and the number of rows.
-    kept: (chunks,) int64, the old chunk that each is without any change, or NEW.
+    starts: (chunks + 1,) int64, the first row of each chunk, then the number of all rows.
+    kept: (chunks,) int64, the number of the old chunk that a chunk equals, or NEW.
     """
 
     starts: NDArray[np.int64]
@@ -46,10 +46,14 @@ class Division:
 
 
 def divided(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> Division:
-    """Chunks for a list of rows in the order of their sources, which `starts` divides into chunks.
+    """Divide rows into chunks after density control.
 
-    Chunks whose rows all stay, without new ones, are kept. Others that follow each other are divided anew, into as few
-    chunks as have room for their rows, of equal lengths. A kept chunk beside them is taken in if it needs no more.
+    An old chunk is kept if all its rows stay and none was added. The rows of consecutive chunks that are not kept are
+    divided into as few chunks as possible, of equal lengths. A kept chunk beside them is merged into these if this
+    needs no further chunk.
+
+    entries: source row of each new row in rising order, plus FRESH if new.
+    starts: first rows of the old chunks, as in `Division`.
     """
     counts, changed = _changes(entries, starts)
     edges = np.flatnonzero(np.diff(changed, prepend=False, append=False))
@@ -72,7 +76,7 @@ def divided(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> Division:
 
 
 def _changes(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """By old chunk, the number of rows that come from it, and whether they differ from those that it has."""
+    """Return, by old chunk, the number of new rows that come from it, and True if they are not just its own rows."""
     lengths = np.diff(starts)
     counts, stay, before = np.zeros_like(lengths), np.zeros_like(lengths), -1
     for begin in range(0, len(entries), _COUNTED_ROWS):
@@ -88,5 +92,5 @@ def _changes(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> tuple[ND
 
 
 def _equal(rows: int, parts: int) -> NDArray[np.int64]:
-    """Lengths of so many parts of `rows` rows, which differ by at most one."""
+    """Return the lengths of `parts` parts of `rows` rows, which differ by at most one."""
     return np.diff(np.arange(parts + 1) * rows // max(parts, 1))

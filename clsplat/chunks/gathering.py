@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows that density control keeps, copies and removes: their list in the model's order, and records of the new chunks.
+"""Rows of a streamed model after density control: which rows are kept and copied, and the records of the new chunks.
 
 New rows stand behind the rows that they are copied from. So a new record needs only a few old ones.
 """
@@ -19,17 +19,17 @@ from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.optimisation.density_rules import FRESH
 
 BLOCK_CHUNKS = 16
-"""Chunks that are read or written at once where many of them are."""
+"""Number of chunks that are read or written at a time in passes over many chunks."""
 _KEPT, _CLONE, _FIRST_HALF, _SECOND_HALF = range(4)
-"""Kinds of rows, in the order of a list by kind."""
+"""Kinds of rows. A list by kind has the rows in the order of these numbers."""
 
 
 @dataclass(frozen=True, eq=False)
 class SourceList:
     """The rows of a model after density control, on the host, in the order of their sources.
 
-    rows: (m,) uint32, a source row each, plus FRESH if new.
-    seconds: (k,) uint32, places of the second halves of split Gaussians. Each is behind its first half.
+    rows: (m,) uint32, the source row of each row, plus FRESH if the row is new.
+    seconds: (k,) uint32, positions in the list of the second halves of split Gaussians. Each is behind its first half.
     """
 
     rows: NDArray[np.uint32]
@@ -46,23 +46,23 @@ class SourceList:
         return 2 * len(self.seconds)
 
     def by_kind(self) -> NDArray[np.uint32]:
-        """The place (m,) here of each row of the list by kind: remaining rows, clones, first halves, second halves."""
+        """Return the order (m,) that sorts the rows by kind: remaining rows, clones, first halves, second halves."""
         kinds = np.where(self.rows < FRESH, np.uint8(_KEPT), np.uint8(_CLONE))
         kinds[self.seconds - 1], kinds[self.seconds] = _FIRST_HALF, _SECOND_HALF
         return np.argsort(kinds, kind="stable").astype(np.uint32)
 
     def entries(self) -> NDArray[np.uint32]:
-        """The list by kind."""
+        """Return the rows, sorted by kind."""
         return self.rows[self.by_kind()]
 
 
 def row_entries(rows: NDArray[np.uint32], fresh: NDArray[np.bool_] | None) -> NDArray[np.uint32]:
-    """Entries of a list from source rows. Those where `fresh` is set are marked FRESH."""
+    """Return source rows as entries of a list: with the flag FRESH where `fresh` is True."""
     return rows.astype(np.uint32) if fresh is None else np.where(fresh, rows | FRESH, rows).astype(np.uint32)
 
 
 def in_source_order(parts: Iterable[NDArray[np.uint32]]) -> SourceList:
-    """A list from lists by kind of the Gaussians of some rows each, which follow each other."""
+    """Merge lists into one in the order of their sources. parts: a list by kind for each range of old rows."""
     rows, seconds, count = [], [], 0
     for part in parts:
         entries = part[beside_parents(part & ~FRESH)]
@@ -74,7 +74,7 @@ def in_source_order(parts: Iterable[NDArray[np.uint32]]) -> SourceList:
 
 
 def _joined(parts: list[NDArray[np.uint32]]) -> NDArray[np.uint32]:
-    """The parts in one array. Each is given back when it is copied."""
+    """Concatenate the parts. The memory of each part is freed as soon as the part is copied."""
     whole = np.empty(sum(map(len, parts)), np.uint32)
     end = len(whole)
     while parts:
@@ -85,16 +85,17 @@ def _joined(parts: list[NDArray[np.uint32]]) -> NDArray[np.uint32]:
 
 
 Reader = Callable[[NDArray[np.int64]], NDArray[Any]]
-"""A function that returns the records of the chunks with these numbers."""
+"""Function from numbers of chunks (k,) to their records (k,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class NewValues:
-    """Values of fields where rows do not have those of the row that they come from.
+    """Values of fields that are not copied from the source row.
 
-    fresh: by kind, the beginning of a field's name: the value of FRESH rows. Fields of other kinds are copied.
-    initial: values of new fields, and of those that begin anew; 0 if a field is not listed.
-    anew: fields that begin anew in every row.
+    fresh: value in FRESH rows, by the beginning of the field's name, such as "first" for first moments. Fields of other
+        kinds are copied.
+    initial: values of new fields, and of the fields `anew`; 0 if a field is not listed.
+    anew: fields that get their initial value in every row.
     """
 
     fresh: Mapping[str, float] = field(default_factory=lambda: {"first": 0.0, "second": 0.0})
@@ -107,10 +108,10 @@ _MOVED_AS_THEY_ARE = NewValues()
 
 @dataclass(frozen=True, eq=False)
 class OldChunks:
-    """Chunks whose rows move.
+    """The chunks of a model before its rows move.
 
-    starts: as in `Division`.
-    read: function that returns the records of some of them.
+    starts: first rows of the chunks, as in `Division`.
+    read: function that returns the records of some of these chunks.
     """
 
     starts: NDArray[np.int64]
@@ -125,13 +126,14 @@ def gathered(
     passed: Callable[[int], None] = lambda _: None,
     values: NewValues = _MOVED_AS_THEY_ARE,
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
-    """Yield numbers and records of the chunks that are new, some at a time. Row j of the model becomes the old row
-    rows[j]; with None all rows stay.
+    """Yield numbers and records of the new chunks, up to BLOCK_CHUNKS at a time.
 
-    SH coefficients that the old records do not have are zero.
+    Row j of the model becomes a copy of the old row rows[j]; with None all rows stay. SH coefficients that the old
+    records do not have are zero.
 
-    record: type of the new records. Other fields of the old ones are left out.
-    passed: called with the number of the first old chunk that is still read, if the sources of `rows` rise.
+    record: type of the new records. Fields that it does not have are left out.
+    passed: called after each yield with the number of the first old chunk that may still be read, if the sources of
+        `rows` rise.
     """
     new = np.flatnonzero(to.kept == NEW)
     for begin in range(0, len(new), BLOCK_CHUNKS):
@@ -156,7 +158,7 @@ def gathered(
 def _entries(
     rows: NDArray[np.uint32] | None, starts: NDArray[np.int64], numbers: NDArray[np.int64]
 ) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
-    """Entries of the rows of some chunks, and their places in the chunks' records, which have CHUNK_ROWS each."""
+    """Return the list's entries for the rows of some chunks, and the positions of these rows in the chunks' records."""
     entries, places = [], []
     for place, number in enumerate(numbers.tolist()):
         begin, end = int(starts[number]), int(starts[number + 1])
@@ -173,7 +175,10 @@ def _copy(
     fresh: NDArray[np.bool_],
     values: NewValues,
 ) -> None:
-    """Copy rows of old records to places in new ones, of both of which the rows count on from record to record."""
+    """Copy rows at positions `at` of old records to positions `places` of new ones.
+
+    Positions count on from record to record: row r of record k is at CHUNK_ROWS k + r.
+    """
     parts, wanted = list(_by_chunk(places)), set(records.dtype.names or ()) - values.anew
     for name in (name for name in old.dtype.names or () if name in wanted):
         rows = old[name].reshape(-1, *old[name].shape[2:]).take(at, axis=0)
@@ -187,7 +192,7 @@ def _copy(
 
 
 def _by_chunk(places: NDArray[np.int64]) -> Iterator[tuple[int, Any, slice]]:
-    """Yield, for each chunk that has some of these rising rows (k,), its number, the rows in it, and which they are."""
+    """Split rising positions (k,) by record. Yields a record's number, the rows in it, and their slice of `places`."""
     chunks = places // CHUNK_ROWS
     ends = np.flatnonzero(np.diff(chunks, append=-1)) + 1
     begin = 0

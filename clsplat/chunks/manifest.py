@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The manifest of a checkpoint whose Gaussians are in a scratch file: slot and checksums of each chunk."""
+"""Manifest of a checkpoint whose Gaussians stay in a scratch file: slot, checksums and length of each chunk."""
 
 from __future__ import annotations
 
@@ -15,26 +15,28 @@ from numpy.typing import NDArray
 from clsplat.layouts.columns import CHUNK_ROWS
 
 MANIFEST_KEY = "chunks"
+"""Key of the manifest in a checkpoint's state."""
 MANIFEST_ARRAYS = ("chunks/lengths", "chunks/slots", "chunks/checksums", "chunks/constants")
-"""Names of its arrays in a checkpoint."""
+"""Names of the manifest's arrays in a checkpoint."""
 WRITTEN, ZERO, INFINITE = np.arange(3, dtype=np.uint8)
 CONSTANTS = {int(ZERO): 0.0, int(INFINITE): np.inf}
-"""Values that a field of a chunk may be known to have everywhere. A field that is WRITTEN has those in its slot."""
+"""Value of all elements of a chunk's field, by the field's code. A field with the code WRITTEN is in the slot."""
 _MOST_FIELDS, _MOST_FLOATS = 64, 64
-"""Limits of what a damaged file can ask for: fields of a record, and elements of a row of one."""
+"""Limits for damaged files: number of fields of a record, and number of elements of a row of a field."""
 
 
 @dataclass(frozen=True, eq=False)
 class Manifest:
-    """List of a checkpoint's chunks.
+    """List of a checkpoint's chunks in a scratch file.
 
     path: the scratch file.
-    slot_bytes: bytes of a slot, of which a record takes the first.
+    slot_bytes: bytes of a slot; the record is at its beginning, and may be shorter.
     fields: shape of a row of each field, float32, by name.
     lengths: (chunks,) int64, the number of rows of each chunk.
-    slots: (chunks,) int64, the slot of each chunk.
+    slots: (chunks,) int64, the slot of each chunk; NO_SLOT if nothing is written.
     checksums: (chunks, fields with elements) uint32, the crc32 of each field of each chunk.
-    constants: of the same shape, uint8: WRITTEN, or the constant that all elements of the field are.
+    constants: uint8 in the shape of `checksums`: WRITTEN if the field is in the slot, or a key of CONSTANTS if all its
+        elements have that value.
     """
 
     path: Path
@@ -46,18 +48,18 @@ class Manifest:
     constants: NDArray[np.uint8]
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Its arrays in a checkpoint."""
+        """Return the manifest's arrays by their names in a checkpoint."""
         return dict(zip(MANIFEST_ARRAYS, (self.lengths, self.slots, self.checksums, self.constants), strict=True))
 
     def state(self) -> dict[str, Any]:
-        """Its part of a checkpoint's state."""
+        """Return the manifest's entries of a checkpoint's state."""
         fields = {name: list(shape) for name, shape in self.fields.items()}
         sizes = {"rows": CHUNK_ROWS, "slot_bytes": self.slot_bytes}
         return {MANIFEST_KEY: {"file": str(self.path), **sizes, "fields": fields}}
 
 
 def manifest_of(arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) -> Manifest | None:
-    """The manifest of a checkpoint; None if its Gaussians are arrays. Raises ValueError for a wrong one."""
+    """Read a checkpoint's manifest; None if it has the Gaussians as arrays. Raises ValueError for damaged data."""
     if (record := state.get(MANIFEST_KEY)) is None:
         return None
     if not isinstance(record, dict) or not set(MANIFEST_ARRAYS) <= arrays.keys():
@@ -86,7 +88,7 @@ def manifest_of(arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) ->
         raise ValueError(f"its chunks have lengths that are not from 1 to {CHUNK_ROWS}")
     written = slots[slots >= 0]
     if slots.min() < -1 or len(np.unique(written)) < len(written):
-        raise ValueError("two of its chunks have one slot")
+        raise ValueError("two of its chunks are in the same slot, or a slot number is below -1")
     if constants.max(initial=WRITTEN) > INFINITE or (constants[slots < 0] == WRITTEN).any():
         raise ValueError("its list of chunks has constants that are not as this version writes them")
     return Manifest(Path(file), slot_bytes, shapes, lengths, slots, checksums, constants)
@@ -97,7 +99,7 @@ def _record_bytes(fields: Mapping[str, tuple[int, ...]]) -> int:
 
 
 def _is_shape(value: object) -> bool:
-    """True for a shape of at most `_MOST_FLOATS` elements, as JSON."""
+    """True for a JSON list that is a shape of at most `_MOST_FLOATS` elements."""
     if not isinstance(value, list) or not all(type(size) is int and 0 <= size <= _MOST_FLOATS for size in value):
         return False
     return prod(value) <= _MOST_FLOATS

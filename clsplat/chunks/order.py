@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The order of a model's rows: along a curve through space, so that the rows of a chunk are neighbours."""
+"""Order of a model's rows along a Z-order (Morton) curve, so that the Gaussians of a chunk are neighbours in space."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float32
 
 ORDERED_ROWS = 65_536
-"""Number of rows up to which a model keeps the order that it has."""
+"""Largest number of rows of a model that is not sorted along the curve."""
 MORTON_BITS_PER_AXIS = 21
+"""Bits of a cell's coordinate along each axis; three of them fit into 64 bits."""
 OUTLIER_SHARE = 1000
-"""One in this many means, at either end of each axis, does not count for the box that is divided into cells."""
+"""One in this many means at either end of each axis is an outlier, which the box that is divided into cells omits."""
 _BLOCK_ROWS = 1 << 15
-"""Rows whose codes are computed together, so that they stay in the processor's cache."""
+"""Number of rows whose codes are computed at a time, so that they stay in the processor's cache."""
 _NOWHERE = np.uint64(2**64 - 1)
 """Code of a mean that is not finite, behind all others."""
 _SPREAD_STEPS = (
@@ -29,11 +30,11 @@ _SPREAD_STEPS = (
 def space_order(means: Float32) -> NDArray[np.uint32]:
     """Rows (n,) in the order of their means (n, 3) along a Z-order curve (Morton 1966).
 
-    The curve goes through cubic cells, 2^21 along the longest side of a box that leaves out OUTLIER_SHARE at both ends
-    of each axis. Means outside it count as at its border. Rows of one cell keep their order. Rows whose means are not
-    finite are last.
+    The curve goes through cubic cells, 2^21 along the longest side of a box around the means without outliers
+    (OUTLIER_SHARE). Means outside the box count as at its border. Rows of one cell keep their order. Rows whose means
+    are not finite are last.
 
-    The order is the same on every machine: the cells are computed by single operations in float64.
+    The order is the same on every machine, because cells are computed by single operations in float64.
     """
     rows = len(means)
     finite = np.isfinite(means).all(axis=1)
@@ -56,24 +57,27 @@ def space_order(means: Float32) -> NDArray[np.uint32]:
 
 
 def beside_parents(sources: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """The stable order (m,) of new rows by their source, so that each stands directly behind the row it comes from.
+    """Return the stable order (m,) of new rows by their source, so that copies stand directly behind their source.
 
-    sources: (m,), the old row from which each new row was copied. Few ascending runs, as density control makes them,
-    are merged in linear time.
+    Takes linear time if the sources are a few ascending runs, as density control makes them.
+
+    sources: (m,), the old row that each new row was copied from.
     """
     return np.argsort(sources, kind="stable").astype(np.uint32)
 
 
 def every_third_bit(numbers: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Numbers (n,) under 2^21 with two zeros between their bits. Three of them, shifted by 0, 1 and 2, are a Morton
-    code."""
+    """Insert two zeros between the bits of numbers (n,) under 2^21.
+
+    Three results, shifted by 0, 1 and 2 bits, make a Morton code.
+    """
     for shift, mask in _SPREAD_STEPS:
         numbers = (numbers | numbers << np.uint64(shift)) & np.uint64(mask)
     return numbers
 
 
 def _middle_box(means: Float32) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lowest and highest coordinates (3,) of means (n, 3) without the outliers of each axis."""
+    """Return the lowest and the highest coordinates (3,) of means (n, 3), without the outliers of each axis."""
     left_out = len(means) // OUTLIER_SHARE
     ends = [left_out, len(means) - 1 - left_out]
     sides = [np.partition(means[:, axis], ends)[ends] for axis in range(3)]

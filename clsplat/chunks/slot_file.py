@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scratch file of slots, which have the records of chunks."""
+"""Reads and writes a scratch file, whose slots hold the records of chunks."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from clsplat.files.atomic import remove, require_room, sync_folder, write_error
 
 
 class ScratchError(InputError):
-    """A scratch file that cannot be used any longer. No row of it has been used that is not as it was written."""
+    """A scratch file cannot be read, or differs from what was written. None of the wrong rows have been used."""
 
 
 class SlotFile:
-    """A file of slots of `slot_bytes` bytes each. A record is at the beginning of a slot.
+    """A file of slots of `slot_bytes` bytes each. A chunk's record is at the beginning of its slot.
 
-    moved: function that is called with the bytes of each read or write, and its seconds.
+    moved: function that is called after each read or write with its number of bytes and its seconds.
     """
 
     def __init__(self, path: Path, slot_bytes: int, file: FileIO) -> None:
@@ -36,7 +36,7 @@ class SlotFile:
 
     @classmethod
     def new(cls, path: Path, slot_bytes: int, slots: int) -> SlotFile:
-        """A new file of so many slots. Raises WriteError."""
+        """Create a file with `slots` slots. Raises WriteError."""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             made = cls(path, slot_bytes, FileIO(path, "x+"))
@@ -53,11 +53,11 @@ class SlotFile:
 
     @classmethod
     def opened(cls, path: Path, slot_bytes: int, *, writable: bool) -> SlotFile:
-        """A file that exists. Raises ScratchError."""
+        """Open an existing file. Raises ScratchError."""
         try:
             return cls(path, slot_bytes, FileIO(path, "r+" if writable else "r"))
         except OSError as error:
-            raise ScratchError(f"{path} cannot be opened: {reason_of(error)}") from None
+            raise ScratchError(f"{path}: cannot be opened: {reason_of(error)}") from None
 
     @property
     def slots(self) -> int:
@@ -71,19 +71,19 @@ class SlotFile:
 
     @property
     def writable(self) -> bool:
-        """True if it was made, or opened to write."""
+        """True if the file was created, or opened for writing."""
         return self._file.writable()
 
     @property
     def is_lost(self) -> bool:
-        """True if the file has been removed, or another is in its place. What it has can still be read."""
+        """True if the file's name has been removed, or names another file. The open file can still be read."""
         try:
             return not os.path.samestat(os.fstat(self._file.fileno()), self.path.stat())
         except OSError:
             return True
 
     def sync(self) -> None:
-        """Have all that was written on the disk. Raises WriteError."""
+        """Flush all writes to the disk. Raises WriteError."""
         try:
             os.fsync(self._file.fileno())
         except OSError as error:
@@ -91,8 +91,8 @@ class SlotFile:
         sync_folder(self.path.parent)
 
     def grow(self, slots: int, more: int) -> None:
-        """Reserve room behind the first `slots` slots, so that a full disk is known before a row is written. Raises
-        WriteError."""
+        """Reserve disk space for `more` slots after the first `slots`, so that a full disk is found before rows are
+        written. Raises WriteError."""
         offset, nbytes = slots * self.slot_bytes, more * self.slot_bytes
         try:
             with require_room(self.path, nbytes):
@@ -104,7 +104,7 @@ class SlotFile:
             raise error if isinstance(error, WriteError) else write_error(self.path, error, needs=nbytes) from None
 
     def cut(self, slots: int) -> None:
-        """Give back what is behind the first slots, if possible."""
+        """Cut the file after its first `slots` slots, if possible."""
         with suppress(OSError):
             self._file.truncate(slots * self.slot_bytes)
 
@@ -113,30 +113,30 @@ class SlotFile:
         self._file.close()
 
     def read(self, slots: NDArray[np.int64], records: NDArray[Any]) -> None:
-        """Read records (k,) from slots. Those without a slot stay as they are. Raises ScratchError."""
+        """Fill `records` (k,) from slots (k,). Records whose slot is NO_SLOT stay as they are. Raises ScratchError."""
         for place, slot, length in self._runs(slots, records.itemsize):
             self.read_at(slot, 0, records[place : place + length])
 
     def write(self, slots: NDArray[np.int64], records: NDArray[Any]) -> None:
-        """Write records (k,) to slots. Raises WriteError."""
+        """Write records (k,) to slots (k,). Raises WriteError."""
         for place, slot, length in self._runs(slots, records.itemsize):
             self.write_at(slot, 0, records[place : place + length])
 
     def read_at(self, slot: int, offset: int, into: NDArray[Any]) -> None:
-        """Read bytes that begin at an offset in a slot. Raises ScratchError."""
+        """Fill an array with the bytes from an offset in a slot on. Raises ScratchError."""
         left, start, begin = into.view(np.uint8).reshape(-1).data, time.perf_counter(), slot * self.slot_bytes + offset
         try:
             self._file.seek(begin)
             while left and (count := self._file.readinto(left)):
                 left = left[count:]
         except OSError as error:
-            raise ScratchError(f"{self.path} cannot be read ({reason_of(error)})") from None
+            raise ScratchError(f"{self.path}: cannot be read: {reason_of(error)}") from None
         if left:
             raise ScratchError(f"{self.path}: has been cut: {len(left):,} bytes at {begin:,} are missing")
         self.moved(into.nbytes, time.perf_counter() - start)
 
     def write_at(self, slot: int, offset: int, values: NDArray[Any]) -> None:
-        """Write bytes to an offset in a slot. Raises WriteError."""
+        """Write the bytes of an array from an offset in a slot on. Raises WriteError."""
         left, start = np.ascontiguousarray(values).view(np.uint8).reshape(-1).data, time.perf_counter()
         try:
             self._file.seek(slot * self.slot_bytes + offset)
@@ -147,7 +147,10 @@ class SlotFile:
         self.moved(values.nbytes, time.perf_counter() - start)
 
     def _runs(self, slots: NDArray[np.int64], nbytes: int) -> Iterator[tuple[int, int, int]]:
-        """Yield (place, slot, length) of records of so many bytes that follow each other in the file."""
+        """Yield (index, slot, length) of records of `nbytes` bytes that are read or written together.
+
+        Records that are shorter than a slot are taken one by one.
+        """
         for place, slot, length in runs(slots):
             step = length if nbytes == self.slot_bytes else 1
             for begin in range(0, length, step):
@@ -155,7 +158,7 @@ class SlotFile:
 
 
 def runs(slots: NDArray[np.int64]) -> Iterator[tuple[int, int, int]]:
-    """Yield (place, slot, length) of each run of slots that follow each other. NO_SLOT is left out."""
+    """Yield (index, slot, length) of each run of consecutive slots, with the index of its first. Omits NO_SLOT."""
     ends = np.flatnonzero((np.diff(slots) != 1) | (slots[:-1] == NO_SLOT)) + 1
     for begin, end in pairwise([0, *ends.tolist(), len(slots)]):
         if begin < end and slots[begin] != NO_SLOT:

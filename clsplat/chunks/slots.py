@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which slots of a scratch file have the chunks of a model and of its kept checkpoints, and which are free."""
+"""Slots of a scratch file: which of them hold chunks of the model or of kept checkpoints, and which are free."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 NO_SLOT = -1
-"""Slot of a chunk that has not been written: all its elements are zero."""
+"""Stands for the slot of a chunk that has not been written, whose elements are all zero."""
 MAX_TENTHS = 22
-"""Most slots of a file, in tenths of the chunks. Two copies of each chunk are always within it: one that the latest
-checkpoint names, and one for the steps since."""
+"""Maximum number of slots of a file, in tenths of the number of chunks. It has room for two copies of each chunk: one
+of the latest checkpoint, and one that later steps change."""
 _GROWTH_SHARE = 16
-"""A file grows by one in this many of the chunks, and at least by what is needed."""
+"""A file grows by the number of chunks divided by this, or by more if more slots are needed."""
 
 
 class SlotTable:
-    """Slots of the chunks of a model in a file of `size` slots.
+    """Table of the slots of a model's chunks in a file of `size` slots.
 
-    current: (chunks,) int64, the slot of each chunk.
+    A slot that a kept checkpoint names (`hold`) is not overwritten: when its chunk is written next, the chunk goes to a
+    free slot. The lowest free slots are taken first. The file grows only when no slot is free.
 
-    A slot that a kept checkpoint names (`hold`) is not written again: its chunk goes to a free slot when it is next
-    written. The lowest free slots are taken first, so that the file grows only when none is free.
+    current: (chunks,) int64, the slot of each chunk of the model.
     """
 
     def __init__(self, current: NDArray[np.int64], size: int) -> None:
@@ -34,7 +34,7 @@ class SlotTable:
 
     @property
     def most(self) -> int:
-        """Most slots that the file is to have."""
+        """Maximum number of slots, beyond which old checkpoints are removed first."""
         return max(MAX_TENTHS * len(self.current) // 10, 1)
 
     @property
@@ -44,11 +44,11 @@ class SlotTable:
 
     @property
     def end(self) -> int:
-        """One more than the last slot that is not free; 0 if all are."""
+        """One more than the last slot that is in use; 0 if all slots are free."""
         return _end(self._used)
 
     def hold(self, kept: Sequence[NDArray[np.int64]]) -> None:
-        """Keep the slots of these checkpoints, and no longer those of others."""
+        """Protect the slots that these checkpoints name from being overwritten, and no other slots."""
         self._held = np.zeros(self.size, np.bool_)
         for slots in kept:
             self._held[slots[(slots >= 0) & (slots < self.size)]] = True
@@ -61,64 +61,64 @@ class SlotTable:
 
     @property
     def end_of_held(self) -> int:
-        """One more than the last slot that a checkpoint names; 0 if none is named."""
+        """One more than the last slot that a kept checkpoint names; 0 if none names one."""
         return _end(self._held)
 
     def in_place(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
-        """True for each chunk whose slot may be written again."""
+        """Return True for each chunk whose own slot may be overwritten."""
         slots: NDArray[np.int64] = self.current[numbers]
         writable: NDArray[np.bool_] = slots != NO_SLOT
         writable[writable] = ~self._held[slots[writable]]
         return writable
 
     def needed(self, numbers: NDArray[np.integer[Any]]) -> int:
-        """Number of free slots that it takes to write these chunks."""
+        """Return the number of free slots that are needed to write these chunks."""
         return int(np.count_nonzero(~self.in_place(numbers)))
 
     def growth(self, lacking: int) -> int:
-        """Slots by which the file is to grow if so many are lacking; 0 if it would be larger than it may be."""
+        """Return by how many slots the file should grow if `lacking` are missing; 0 if it would exceed `most`."""
         if self.size + lacking > self.most:
             return 0
         return min(max(lacking, len(self.current) // _GROWTH_SHARE), self.most - self.size)
 
     def grow(self, slots: int) -> None:
-        """Note that the file has so many more slots."""
+        """Record that the file has `slots` more slots."""
         self.size += slots
         self._held, self._used = (np.append(marks, np.zeros(slots, np.bool_)) for marks in (self._held, self._used))
 
     def cut(self, size: int) -> None:
-        """Note that the file has only so many slots left, of which `end` is not behind the last."""
+        """Record that the file was cut to `size` slots, at least `end`."""
         self.size, self._held, self._used = size, self._held[:size], self._used[:size]
 
     def take(self, count: int) -> NDArray[np.int64]:
-        """Slots for chunks that are not yet of the model. They are not free until `become` or `give_up`."""
+        """Reserve free slots for new chunks, until `become` or `give_up`."""
         slots = np.flatnonzero(~self._used)[:count]
         self._taken = np.append(self._taken, slots)
         self._used[slots] = True
         return slots
 
     def give_up(self) -> None:
-        """Let the slots that were taken be free again."""
+        """Free the slots that `take` has reserved."""
         self._taken = self._taken[:0]
         self._mark()
 
     def become(self, current: NDArray[np.int64]) -> None:
-        """Let the model have other chunks, in these slots. The others that were taken are free."""
+        """Replace the model's chunks by those in these slots. Slots that are no longer used become free."""
         self.current = current
         self.give_up()
 
     def targets(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
-        """The slots to write these chunks to. None may be lacking."""
+        """Return the slots to write these chunks to. There must be enough free slots (`needed`)."""
         slots: NDArray[np.int64] = self.current[numbers]
         moving = ~self.in_place(numbers)
         slots[moving] = np.flatnonzero(~self._used)[: np.count_nonzero(moving)]
         return slots
 
     def written(self, numbers: NDArray[np.integer[Any]], slots: NDArray[np.int64]) -> None:
-        """Note that these chunks have been written to these slots."""
+        """Record that these chunks have been written to these slots."""
         self.current[numbers], self._used[slots] = slots, True
 
 
 def _end(marks: NDArray[np.bool_]) -> int:
-    """One more than the last place that is marked; 0 if none is."""
+    """Return one more than the last index that is True; 0 if none is."""
     return int(np.flatnonzero(marks)[-1]) + 1 if marks.any() else 0

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records of a model's chunks, in main memory or in a scratch file.
+"""Store of a streamed model's chunks, in main memory or in a scratch file.
 
 A record has all fields of CHUNK_ROWS rows, one field after the other, so that a chunk moves by one read or write. In a
 file each field of a record has a checksum, so that a file that was cut or changed never gives a wrong row. A chunk that
-a kept checkpoint names is not overwritten, but written to another slot (docs/decisions/0052-a-store-of-chunks.md). A
-field that was filled with a constant is only noted as such.
+a kept checkpoint names is not overwritten, but written to another slot (docs/decisions/0052-a-store-of-chunks.md). If a
+field has the same value in all elements of a chunk, only a code for this value is stored (`manifest.CONSTANTS`).
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ KeptSlots = Sequence[NDArray[np.int64]]
 
 
 def record_type(fields: Mapping[str, tuple[int, ...]]) -> np.dtype[Any]:
-    """The structured type of a record. fields: shape of a row of each field, float32, by name."""
+    """Return the structured NumPy type of a record. fields: shape of a row of each field, float32, by name."""
     return np.dtype([(name, np.float32, (CHUNK_ROWS, *shape)) for name, shape in fields.items() if prod(shape)])
 
 
 class ChunkStore:
     """Records of the chunks of a model of `count` Gaussians, all zero at first.
 
-    fields: shape of a row of each field, by name. A field without elements takes no place in the records.
-    path: scratch file that holds the records, which is made anew; None holds them in main memory.
-    widest: the fields with the largest shapes that they will have, for which a slot of the file has room.
-    starts: (chunks + 1,) int64, the first row of each chunk, and the number of rows. At first all chunks but the last
-        are full, unless starts are given.
-    opened: that file as it is, and a checkpoint's manifest of it.
-    release: function that is called where the file would become larger than `SlotTable.most`. It removes the oldest
-        checkpoint and returns the slots of those that are left, or None if all have to stay.
+    fields: shape of a row of each field, by name. Fields without elements are not in the records.
+    path: scratch file for the records, which is created; None keeps the records in main memory.
+    widest: the fields with the largest shapes that they will have, which a slot of the file has room for.
+    starts: (chunks + 1,) int64, the first row of each chunk, then the number of all rows. By default all chunks but the
+        last are full.
+    opened: the existing scratch file and the manifest of a checkpoint, to continue from.
+    release: function that is called before the file becomes larger than `SlotTable.most`. It removes the oldest
+        checkpoint and returns the slots of the other checkpoints, or None if all have to stay.
     file: the scratch file.
-    Raises WriteError for a file that cannot be made, or a disk without room for it.
+    Raises WriteError if the file cannot be created, or the disk has too little room.
     """
 
     def __init__(
@@ -68,11 +68,10 @@ class ChunkStore:
         self._set_fields(fields)
         self.release: Callable[[], KeptSlots | None] = lambda: None
         self._memory: list[NDArray[np.uint8] | None] = [None] * self.chunks if path is None else []
-        """The bytes of each chunk in main memory, None before it is written: an array each, to be given back alone. A
-        chunk has its rows of each field there, and no room behind them."""
+        """The rows of each chunk in main memory, as bytes, one field after the other; None before they are written."""
         self._given_back = 0
         self._constants = np.full((self.chunks, len(self._names)), ZERO)
-        """By chunk and field, ZERO or INFINITE if all elements are that, whatever the record has; else WRITTEN."""
+        """(chunks, fields), WRITTEN if the record has the field; ZERO or INFINITE if all elements have this value."""
         if path is None:
             return
         if opened is not None:
@@ -86,17 +85,17 @@ class ChunkStore:
             current = np.full(self.chunks, NO_SLOT, np.int64)
         if (most := int(current.max(initial=NO_SLOT))) >= size:
             self.file.close()
-            raise ScratchError(f"{path}: has been cut: it has room for {size} chunks, expected at least {most + 1}")
+            raise ScratchError(f"{path}: has been cut to {size} chunks, expected at least {most + 1}")
         self.slots = SlotTable(current, size)
 
     @classmethod
     def opened(cls, manifest: Manifest, *, writable: bool) -> ChunkStore:
-        """The records that a checkpoint names. Raises ScratchError for a file that is missing or too short."""
+        """Open the store of a checkpoint. Raises ScratchError if its scratch file is missing or too short."""
         file = SlotFile.opened(manifest.path, manifest.slot_bytes, writable=writable)
         return cls(int(manifest.lengths.sum()), manifest.fields, manifest.path, opened=(file, manifest))
 
     def manifest(self) -> Manifest:
-        """List of the chunks for a checkpoint. All that was written is on the disk then. Raises WriteError."""
+        """Flush the file to the disk, and return the list of its chunks for a checkpoint. Raises WriteError."""
         assert self.path is not None
         self.file.sync()
         arrays = np.diff(self.starts), self.slots.current.copy(), self._checksums.copy(), self._constants.copy()
@@ -113,12 +112,12 @@ class ChunkStore:
         return len(self.starts) - 1
 
     def lengths(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
-        """Number of rows of each of these chunks."""
+        """Return the number of rows of each of these chunks."""
         lengths: NDArray[np.int64] = self.starts[numbers + 1] - self.starts[numbers]
         return lengths
 
     def verify(self) -> None:
-        """Read all chunks. Raises ScratchError if one is not as it was written."""
+        """Read all chunks. Raises ScratchError if a chunk differs from what was written."""
         for numbers in self.blocks():
             self.read(numbers)
 
@@ -130,8 +129,7 @@ class ChunkStore:
         return self.chunks * self.file.slot_bytes
 
     def close(self) -> None:
-        """Give back the memory, or remove the file unless a checkpoint names slots of it. The store cannot be used any
-        longer."""
+        """End the use of the store: free its memory, or remove its file unless a checkpoint names slots of it."""
         self._memory.clear()
         if self.path is None or self.file.closed:
             return
@@ -144,9 +142,9 @@ class ChunkStore:
                 remove(self.path)
 
     def read(self, numbers: NDArray[np.integer[Any]]) -> NDArray[Any]:
-        """Records (k,) of these chunks. Rows behind a chunk's last one are undefined.
+        """Read the records (k,) of these chunks. Rows past the end of a chunk are undefined.
 
-        Raises ScratchError if the file has not what was written.
+        Raises ScratchError if the file cannot be read, or differs from what was written.
         """
         records = np.empty(len(numbers), self.record)
         if self.path is None:
@@ -183,13 +181,15 @@ class ChunkStore:
         changes: Callable[[], None],
         fields: Mapping[str, tuple[int, ...]] | None = None,
     ) -> None:
-        """Let row j be a copy of the row that rows[j] names, in the order of these; with None all rows stay.
+        """Rearrange the model: row j becomes a copy of row rows[j]. With None all rows stay.
 
-        Chunks that stay as they are, are neither read nor written.
+        Chunks that do not change are neither read nor written.
 
-        changes: called before the first row changes. In a file that is when all are written, so that after an error
-            nothing has changed.
-        fields: other shapes of the fields, for more SH coefficients. Then all rows stay, and all chunks are written.
+        rows: source rows in rising order, plus FRESH for new rows.
+        values: values of fields that are not copied.
+        changes: called before the first row changes. For a file this is after all chunks have been written to free
+            slots, so that an error changes nothing.
+        fields: new shapes of the fields, for more SH coefficients. Then all rows stay, and all chunks are written.
         Raises WriteError and ScratchError.
         """
         as_it_is = Division(self.starts, np.full(self.chunks, NEW))
@@ -240,8 +240,10 @@ class ChunkStore:
         self.slots.become(slots)
 
     def get_records(self, start: int, stop: int) -> NDArray[Any]:
-        """The rows [start, stop) as records of CHUNK_ROWS rows each, whatever the chunks are. Rows behind them are
-        undefined. Raises ScratchError."""
+        """Read the rows [start, stop) into records of CHUNK_ROWS rows each, wherever chunks begin and end.
+
+        Rows past `stop` are undefined. Raises ScratchError.
+        """
         numbers, mine, evenly = self._covering(start, stop)
         records = self.read(numbers)
         if evenly:
@@ -252,7 +254,7 @@ class ChunkStore:
         return rows
 
     def set_records(self, start: int, stop: int, rows: NDArray[Any]) -> None:
-        """Replace the rows [start, stop) with such records. Raises WriteError and ScratchError."""
+        """Replace the rows [start, stop) by records like those of `get_records`. Raises WriteError and ScratchError."""
         numbers, mine, evenly = self._covering(start, stop)
         records = rows
         if not evenly:
@@ -263,8 +265,11 @@ class ChunkStore:
         self.write(numbers, records)
 
     def _covering(self, start: int, stop: int) -> tuple[NDArray[np.int64], NDArray[np.bool_], bool]:
-        """The chunks that have the rows [start, stop); which rows (k, CHUNK_ROWS) of theirs these are; and whether
-        these are all of them, CHUNK_ROWS in each chunk but the last."""
+        """Find the chunks that have the rows [start, stop).
+
+        Returns their numbers (k,), marks (k, CHUNK_ROWS) of these rows in the chunks, and True if the chunks have no
+        other rows and all but the last are full.
+        """
         first, last = chunk_of(self.starts, np.array([start, stop - 1])).tolist()
         numbers = np.arange(first, last + 1)
         places, lengths = np.arange(CHUNK_ROWS), self.lengths(numbers)
@@ -274,15 +279,17 @@ class ChunkStore:
         return numbers, mine, whole and bool((lengths[:-1] == CHUNK_ROWS).all())
 
     def hold(self, kept: KeptSlots) -> None:
-        """Keep the slots of these checkpoints, and no longer those of others. A file that is larger than it should be
-        gives back what is free at its end."""
+        """Protect the slots of these checkpoints, and no others, from being overwritten.
+
+        A file with more slots than `SlotTable.most` is cut after its last used slot.
+        """
         self.slots.hold(kept)
         if self.slots.most < self.slots.size > self.slots.end:
             self.slots.cut(max(self.slots.end, self.slots.most))
             self.file.cut(self.slots.size)
 
     def get_rows(self, field: str, start: int, stop: int) -> NDArray[np.float32]:
-        """A copy of the rows [start, stop) of a field. Raises ScratchError as `read`."""
+        """Read the rows [start, stop) of a field. Raises ScratchError if the file is damaged."""
         rows = np.empty((stop - start, *self.fields[field]), np.float32)
         if rows.size == 0:
             return rows
@@ -291,7 +298,7 @@ class ChunkStore:
         return rows
 
     def set_rows(self, field: str, start: int, values: NDArray[np.float32]) -> None:
-        """Replace the rows of a field that begin at `start`. Raises WriteError and ScratchError."""
+        """Replace the rows of a field from `start` on with `values`. Raises WriteError and ScratchError."""
         if values.size == 0:
             return
         for number, mine, theirs in self._pieces(start, start + len(values)):
@@ -300,14 +307,14 @@ class ChunkStore:
             self._set_field(number, field, rows)
 
     def get_at(self, field: str, places: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
-        """A copy of the rows (k,) of a field at these places. Raises ScratchError as `read`."""
+        """Read rows of a field. places: (k,), their indices. Raises ScratchError if the file is damaged."""
         rows = np.empty((len(places), *self.fields[field]), np.float32)
         for number, mine in self._by_chunk(places) if rows.size else ():
             rows[mine] = self._field(number, field)[places[mine] - self.starts[number]]
         return rows
 
     def set_at(self, field: str, places: NDArray[np.integer[Any]], values: NDArray[np.float32]) -> None:
-        """Replace the rows (k,) of a field at these places. Raises WriteError and ScratchError."""
+        """Replace rows of a field. places: (k,), their indices. Raises WriteError and ScratchError."""
         for number, mine in self._by_chunk(places) if values.size else ():
             rows = self._field(number, field)
             rows[places[mine] - self.starts[number]] = values[mine]
@@ -316,7 +323,7 @@ class ChunkStore:
     def rows_of(
         self, numbers: NDArray[np.integer[Any]], kinds: Sequence[str], names: Iterable[str]
     ) -> dict[str, dict[str, NDArray[np.float32]]]:
-        """Rows of the model in these chunks, in rising order: fields `kind`/`name` by kind and name."""
+        """Read all rows of these chunks, of the fields `kind`/`name`. Returns arrays by kind and name."""
         records, mine = self.read(numbers), np.arange(CHUNK_ROWS) < self.lengths(numbers)[:, None]
 
         def rows(field: str) -> NDArray[np.float32]:
@@ -327,13 +334,15 @@ class ChunkStore:
         return {kind: {name: rows(f"{kind}/{name}") for name in names} for kind in kinds}
 
     def blocks(self) -> Iterator[NDArray[np.int64]]:
-        """Numbers of all chunks, some at a time, in rising order."""
+        """Yield the numbers of all chunks in rising order, BLOCK_CHUNKS at a time."""
         for begin in range(0, self.chunks, BLOCK_CHUNKS):
             yield np.arange(begin, min(begin + BLOCK_CHUNKS, self.chunks))
 
     def change(self, field: str, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> None:
-        """Replace the rows of a field with what a function makes of them, chunk by chunk. Chunks that it leaves as they
-        are, are not written. Raises WriteError and ScratchError."""
+        """Apply a function to the rows of a field, chunk by chunk. Chunks that do not change are not written.
+
+        Raises WriteError and ScratchError.
+        """
         for number in range(self.chunks) if prod(self.fields[field]) else ():
             rows = self._field(number, field)
             own = rows[: self.starts[number + 1] - self.starts[number]]
@@ -343,7 +352,7 @@ class ChunkStore:
                 self._set_field(number, field, rows)
 
     def fill(self, field: str, value: float) -> None:
-        """Set every element of a field. If the value is one of CONSTANTS, no chunk is read or written."""
+        """Set all elements of a field to `value`. If this is a value of CONSTANTS, no chunk is read or written."""
         constant = next((each for each, known in CONSTANTS.items() if known == value), None)
         if constant is None:
             self.change(field, lambda rows: np.full_like(rows, value))
@@ -351,7 +360,7 @@ class ChunkStore:
             self._constants[:, self._names.index(field)] = constant
 
     def rename(self, names: Mapping[str, str]) -> None:
-        """Give fields other names. names: the new names by the old ones."""
+        """Rename fields. names: new names by old names."""
         self._set_fields({names.get(name, name): shape for name, shape in self.fields.items()})
 
     def _set_fields(self, fields: Mapping[str, tuple[int, ...]]) -> None:
@@ -359,14 +368,14 @@ class ChunkStore:
         self._names = tuple(self.record.names or ())
 
     def _give_back(self, before: int) -> None:
-        """Give back the memory of the chunks below number `before`, which nobody reads again."""
+        """Free the memory of the chunks before number `before`, which are not read again."""
         for number in range(self._given_back, before) if self.path is None else ():
             self._memory[number] = None
         self._given_back = before
 
     def _pieces(self, start: int, stop: int) -> Iterator[tuple[int, slice, slice]]:
-        """Yield, for each chunk that has some of the rows [start, stop), its number, these rows among them, and in
-        it."""
+        """Split the rows [start, stop) by chunk. Yields a chunk's number, the rows' slice of [start, stop), and their
+        slice of the chunk."""
         number = int(chunk_of(self.starts, np.array(start)))
         while number < self.chunks and (first := int(self.starts[number])) < stop:
             begin, end = max(start, first), min(stop, int(self.starts[number + 1]))
@@ -374,7 +383,7 @@ class ChunkStore:
             number += 1
 
     def _by_chunk(self, places: NDArray[np.integer[Any]]) -> Iterator[tuple[int, NDArray[np.int64]]]:
-        """Yield, for each chunk that has some of the rows at these places, its number, and which of them it has."""
+        """Split row indices (k,) by chunk. Yields a chunk's number, and the positions in `places` of its rows."""
         chunks = chunk_of(self.starts, places)
         order = np.argsort(chunks, kind="stable")
         ends = np.flatnonzero(np.diff(chunks[order])) + 1
@@ -382,7 +391,7 @@ class ChunkStore:
             yield int(chunks[mine[0]]), mine
 
     def _in_memory(self, number: int) -> NDArray[np.uint8]:
-        """The bytes of a chunk in main memory."""
+        """Return the record of a chunk in main memory, as bytes; zeros if it has not been written."""
         held = self._memory[number]
         if held is None:
             rows = int(self.starts[number + 1] - self.starts[number])
@@ -390,7 +399,7 @@ class ChunkStore:
         return held
 
     def _field(self, number: int, field: str) -> NDArray[np.float32]:
-        """A field of a chunk, (CHUNK_ROWS, ...). In main memory it is the field itself, of as many rows as it has."""
+        """Return a field of a chunk: a copy (CHUNK_ROWS, ...) from the file, or the memory itself, (rows, ...)."""
         kind, offset = self.record.fields[field][:2]  # type: ignore[index]  # it has fields
         of_field = number, self._names.index(field)
         constant = int(self._constants[of_field])
@@ -410,7 +419,7 @@ class ChunkStore:
         return rows
 
     def _set_field(self, number: int, field: str, rows: NDArray[np.float32]) -> None:
-        """Write a field that `_field` returned, and that has changed since."""
+        """Write a changed field that `_field` returned. In main memory it is changed already."""
         if self.path is None:
             return
         numbers = np.array([number])
@@ -424,7 +433,7 @@ class ChunkStore:
         self._checksums[of_field], self._constants[of_field] = zlib.crc32(rows.data), WRITTEN
 
     def _make_room(self, needed: Callable[[], int]) -> None:
-        """Let the file have as many free slots as are needed. Raises WriteError."""
+        """Grow the file until it has `needed()` free slots, or remove old checkpoints first. Raises WriteError."""
         assert self.path is not None
         while (lacking := needed() - self.slots.free) > 0:
             more = self.slots.growth(lacking)
@@ -436,7 +445,7 @@ class ChunkStore:
             self.slots.grow(more)
 
     def _check(self, number: int, names: Sequence[str], record: Any) -> None:
-        """Raise ScratchError if fields of a record differ from what was written."""
+        """Raise ScratchError if fields of a record do not have the checksums of what was written."""
         for name in names:
             of_field = number, self._names.index(name)
             if self._constants[of_field] == WRITTEN and zlib.crc32(record[name]) != self._checksums[of_field]:
@@ -444,18 +453,18 @@ class ChunkStore:
 
 
 def _filled(records: NDArray[Any], rows: int) -> NDArray[np.bool_]:
-    """Marks (k, CHUNK_ROWS) of the first rows of records (k,), so many in all."""
+    """Return marks (k, CHUNK_ROWS) of the first `rows` rows of records (k,)."""
     return np.arange(len(records) * CHUNK_ROWS).reshape(-1, CHUNK_ROWS) < rows
 
 
 def _checksums(records: NDArray[Any]) -> NDArray[np.uint32]:
-    """The crc32 (k, fields) of each field of records (k,)."""
+    """Return the crc32 (k, fields) of each field of records (k,)."""
     names = records.dtype.names or ()
     return np.array([[zlib.crc32(record[name]) for name in names] for record in records], np.uint32)
 
 
 def _carried(values: NDArray[Any], to: Division, shape: tuple[int, int]) -> NDArray[Any]:
-    """Values (chunks, fields) of the chunks that are kept, and zeros for the new ones."""
+    """Return values (chunks, fields) after a move: those of kept chunks, and zeros for new chunks."""
     carried, stays = np.zeros(shape, values.dtype), to.kept != NEW
     if stays.any():
         carried[stays] = values[to.kept[stays]]
@@ -463,14 +472,14 @@ def _carried(values: NDArray[Any], to: Division, shape: tuple[int, int]) -> NDAr
 
 
 def _packed(record: NDArray[Any], rows: int) -> NDArray[np.uint8]:
-    """The first rows of each field of a record (1,), one field after the other."""
+    """Return the first rows of each field of a record (1,) as bytes, one field after the other."""
     if rows == CHUNK_ROWS:
         return np.array(record).view(np.uint8)
     return np.concatenate([record[name][0, :rows].reshape(-1) for name in record.dtype.names or ()]).view(np.uint8)
 
 
 def _unpack(packed: NDArray[np.uint8], rows: int, record: NDArray[Any]) -> None:
-    """Copy to a record (1,) what `_packed` has made of one."""
+    """Copy the rows that `_packed` has returned to a record (1,)."""
     if rows == CHUNK_ROWS:
         record.view(np.uint8)[:] = packed
         return

@@ -157,7 +157,8 @@ class SamplingConfig:
     def check(self, *, whole: bool = True) -> None:
         """Raise InputError naming the first setting whose value is invalid.
 
-        whole: False if a USD stage may still add the focus.
+        whole: False for the flags alone, to which a USD stage may still add the focus. So the focus may be missing, but
+            a shutter given by two times has to be open for more than 0 frames.
         """
         rules: tuple[Rule, ...] = (
             (("samples",), lambda value: 1 <= value <= _MAX_SAMPLES_PER_FRAME, f"1 to {_MAX_SAMPLES_PER_FRAME}"),

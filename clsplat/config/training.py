@@ -29,7 +29,8 @@ Photos = Literal["auto", "exact", "8bit"]
 ViewOrderKind = Literal["random", "near"]
 
 MANY_PHOTOGRAPHS = 300
-"""With this many training photographs or more, --photos auto stores 8 bits a channel, and decodes during training."""
+"""Number of training photographs from which photographs are decoded when a step first needs them, not before training.
+--photos auto then stores them with 8 bits per channel."""
 
 
 @dataclass(frozen=True)
@@ -285,9 +286,9 @@ class TrainConfig:
     points_use: PointsUse = "replace"
     """replace: the file's points replace the scene's own. join: they are added."""
     points_limit: int = 0
-    """Maximum number of points to keep, of the file or else of the scene's own. Each occupied voxel keeps one point,
-    the mean of its points' places and colours. Voxels are as small as possible. 0 keeps 200,000 of a file, and all of
-    the scene's own."""
+    """Maximum number of points to keep: of the file --points, or without it of the scene's points. Points are merged by
+    voxel into one point, with the mean of their positions and colours. Voxels are as small as the limit allows. 0 keeps
+    200,000 points of a file, and all points of a scene."""
     sky: int = 0
     """Maximum number of sky points to start from, on a sphere around the scene, where photographs show nothing above
     the scene's points; 0 for none."""

@@ -57,10 +57,10 @@ def _type(value: Any) -> Any:
 
 
 def form_of(device: Device, size: tuple[int, ...], local: tuple[int, ...] | None) -> str:
-    """Words for the size of a launch, if the driver compiles a kernel anew for some sizes; otherwise empty.
+    """Return the suffix that names the kind of a launch in the record of a kernel's sandbox trials; "" as a rule.
 
-    A kernel has a trial for each of these words. The group size is not among them: it may be an image's width, and each
-    width would then need a trial.
+    Drivers that compile a kernel anew for some launch sizes have one kind for many items, and one for group sizes that
+    the driver chooses. Each kind has its own trial. Given group sizes have none: each width of an image would need one.
     """
     if not device.compiles_by_size:
         return ""

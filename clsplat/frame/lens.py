@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lens distortion of rendered frames: where a distorted picture's pixels lie in a straight picture, by an STMap or a
-photograph's lens.
+"""Lens distortion of rendered frames: where a distorted picture's pixels lie in an undistorted picture, by an STMap or
+a photograph's lens.
 
-The straight picture is rendered as far as these positions reach, also beyond the frame. Module `warp` samples it.
+The undistorted picture is rendered as far as these positions reach, also beyond the frame. Module `warp` samples it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from clsplat.images.stmap import StMap
 from clsplat.scenes.dataset import Lens
 
 MAX_BEYOND_EDGE_FRAMES = 1.0
-"""Maximum distance of a position beyond an edge of the straight frame, in frame sizes. Pixels with a larger distance
+"""Maximum distance of a position beyond an edge of the undistorted frame, in frame sizes. Pixels with a larger distance
 show nothing, because the values of a map may be arbitrary there."""
 PLACE_STEP_PX = 2.0**-20
 """Step in pixels to whose multiples positions are rounded, so that subtraction of a window's corner is exact."""
@@ -28,21 +28,23 @@ INTERPOLATION_MARGIN_PX = 2
 PROBE_GRID_SIDE = 33
 """Number of positions across, and down, at which the properties of a whole warp are estimated."""
 MAX_SINGLE_SAMPLE_PX = 1.25
-"""Maximum size of a warped pixel, in pixels of the straight picture, up to which a single sample is enough."""
+"""Maximum size of a warped pixel, in pixels of the undistorted picture, up to which a single sample is enough."""
 MAX_WARP_SAMPLES = 16
 """Maximum number of samples across a warped pixel, and down."""
 _HALF_PIXEL_STEPS = ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
 
 
 class Places(Protocol):
-    """A mapping from positions in a warped picture to positions in a straight picture."""
+    """A mapping from positions in a warped picture to positions in an undistorted picture."""
 
     def size(self, frame: Camera) -> tuple[int, int]:
-        """Width and height of the warped frame that belongs to a straight frame."""
+        """Width and height of the warped frame that belongs to an undistorted frame."""
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """Positions (h, w, 2) in the straight frame of the positions x (w,), y (h,) of the warped frame, all in pixels.
-        NaN where nothing is visible."""
+        """Return positions (h, w, 2) in the undistorted frame of positions x (w,), y (h,) in the warped frame.
+
+        All are in pixels. NaN where nothing is visible.
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,27 +58,27 @@ class ByMap:
         return self.stmap.width, self.stmap.height
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """Positions (h, w, 2) in the straight frame of positions in the warped frame, by the map (`Places.places`)."""
+        """Return `Places.places` by the STMap."""
         u, v = np.moveaxis(self.stmap.at(x, y), 2, 0)
         return np.stack([u * frame.width, (1 - v) * frame.height], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
 class ByLens:
-    """The mapping of a photograph's lens.
+    """The mapping by a photograph's lens.
 
-    The straight frame is that of the camera that `Lens.bare` returns, at any size. The warped picture shows what the
-    photograph shows, with the lens's distortion, at the same size.
+    The undistorted frame is rendered with the camera that `Lens.bare` returns, at any size. The warped picture has the
+    same size and the lens's distortion, as the photograph has.
     """
 
     lens: Lens
 
     def size(self, frame: Camera) -> tuple[int, int]:
-        """Width and height of the warped picture, which has the straight frame's size."""
+        """Width and height of the warped picture, which has the undistorted frame's size."""
         return frame.width, frame.height
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """Positions (h, w, 2) in the straight frame of positions in the warped frame, by the lens (`Places.places`)."""
+        """Return `Places.places` by the lens."""
         bare = self.lens.bare(frame.rotation, frame.translation)
         across, down = np.meshgrid((x - frame.cx) / frame.fx * bare.fx, (y - frame.cy) / frame.fy * bare.fy)
         pixels = np.stack([(across + bare.cx).ravel(), (down + bare.cy).ravel()], axis=1)
@@ -86,18 +88,17 @@ class ByLens:
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """The warp of a frame: the straight frame that is rendered, and the mapping to it from the warped frame.
+    """The warp of a frame: the undistorted frame that is rendered, and the mapping to it from the warped frame.
 
-    source: mapping from positions in the warped frame to positions in the straight frame.
-    frame: camera of the whole straight frame.
+    source: mapping from positions in the warped frame to positions in the undistorted frame.
+    frame: camera of the whole undistorted frame.
     """
 
     source: Places
     frame: Camera
 
     def at(self, x: Float64, y: Float64) -> Float64:
-        """Positions (h, w, 2) in the straight frame of positions x (w,), y (h,) in the warped frame; NaN where they are
-        too far outside."""
+        """Return `Places.places` of the warped frame, with NaN where positions are too far outside."""
         places = np.round(self.source.places(self.frame, x, y) / PLACE_STEP_PX) * PLACE_STEP_PX
         size = np.array([self.frame.width, self.frame.height])
         with np.errstate(invalid="ignore"):
@@ -114,9 +115,9 @@ class Warp:
 
     @cached_property
     def _grid(self) -> tuple[Float64, Float64]:
-        """Positions (33, 33, 2) in the straight frame of pixels spread over the warped frame, and their sizes (33, 33).
+        """Positions (33, 33, 2) in the undistorted frame, and sizes (33, 33), of pixels spread over the warped frame.
 
-        A pixel's size is the distance between its opposite sides in the straight frame, across or down, whichever is
+        A pixel's size is the distance between its opposite sides in the undistorted frame, across or down, whichever is
         larger.
         """
         width, height = self.source.size(self.frame)
@@ -134,13 +135,13 @@ class Warp:
 
     @cached_property
     def samples(self) -> int:
-        """Number of samples across a warped pixel, and down: 1, or more if pixels are larger in the straight frame."""
+        """Number of samples across and down a warped pixel: more than 1 if it is larger in the undistorted frame."""
         most = np.nanmax(self._grid[1], initial=0.0)
         return 1 if most <= MAX_SINGLE_SAMPLE_PX else min(int(np.ceil(most - 1e-3)), MAX_WARP_SAMPLES)
 
     @cached_property
     def clamp(self) -> float:
-        """The value of `Window.clamp`, the Jacobian's limit, for all windows of the straight frame."""
+        """The value of `Window.clamp`, the Jacobian's limit, for all windows of the undistorted frame."""
         places = self._grid[0].reshape(-1, 2)
         if np.isnan(places).all():
             return JACOBIAN_CLAMP_HALF_FRAMES
@@ -149,7 +150,7 @@ class Warp:
         return max(JACOBIAN_CLAMP_HALF_FRAMES, float((2 * beyond / size).max()))
 
     def of_window(self, camera: Camera) -> tuple[Float64, Camera | None]:
-        """Positions (k height, k width, 2) in the straight frame of a warped picture's samples, and a camera whose
+        """Positions (k height, k width, 2) in the undistorted frame of a warped picture's samples, and a camera whose
         window contains them.
 
         k is `samples`. The camera is None if nothing is visible.
@@ -169,8 +170,7 @@ class Warp:
 
 
 def distorted_places(lens: Lens, straight: Camera) -> Float64:
-    """Positions (height, width, 2) in the straight picture of the distorted picture's pixels; NaN where a pixel has no
-    ray."""
+    """Return positions (height, width, 2) of a distorted picture's pixels in the undistorted picture; NaN without ray."""
     grid = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     rays = lens.cam_from_img(np.stack([axis.ravel() for axis in grid], axis=1))
     places = rays * (straight.fx, straight.fy) + (straight.cx, straight.cy)
@@ -178,8 +178,10 @@ def distorted_places(lens: Lens, straight: Camera) -> Float64:
 
 
 def undistorted_places(lens: Lens, straight: Camera) -> Float64:
-    """Positions (height, width, 2) in the distorted picture of the straight picture's pixels; NaN where the lens shows
-    none."""
+    """Return positions (height, width, 2) of an undistorted picture's pixels in the distorted picture.
+
+    NaN where the lens does not show the pixel.
+    """
     x = (np.arange(straight.width) + 0.5 - straight.cx) / straight.fx
     y = (np.arange(straight.height) + 0.5 - straight.cy) / straight.fy
     across, down = np.meshgrid(x, y)

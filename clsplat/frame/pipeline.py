@@ -54,13 +54,14 @@ Pass = Callable[[DrawAt], DrawAt]
 class FrameRequest:
     """A frame to render by a `FramePipeline`.
 
-    at: function from a time, relative to this frame in frames, to the camera of the whole frame in its final size.
+    at: function from a time to the camera of the whole frame in its final size. The time is in frames, 0 at this frame.
     after, before: cameras of the next and the previous frame, for the channels motion and backward.
-    lens: mapping by which the frame is warped; None for a straight frame.
+    lens: lens distortion, as the position in an undistorted picture of each pixel; None for an undistorted frame.
     sampling: the sampling of this frame; None uses the job's.
     cut: function from a camera to the holdout surfaces in its picture, for all samples of the frame.
     models: function from a time to the Gaussians; None uses the pipeline's model.
-    moved: Gaussians at the end of motion and of backward motion; None if they do not move.
+    moved: the model at the next and at the previous frame, for the channels motion and backward; None if it does not
+        move.
     """
 
     at: Callable[[float], Camera]

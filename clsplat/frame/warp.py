@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Warped pictures, sampled from straight pictures at the positions that a `Warp` gives (docs/pictures.md).
+"""Warped pictures, sampled from undistorted pictures at the positions that a `Warp` gives (docs/pictures.md).
 
 The pixels of a window are the same as in the whole warped picture.
 """
@@ -26,7 +26,7 @@ _SAMPLE_ROWS_PER_BATCH = 128
 def warped(draw: Draw, warp: Warp) -> Draw:
     """A Draw of warped pictures. Of the camera that it is called with, only size and window are used.
 
-    `draw` renders windows of the straight frame, with rgb in linear light. A pixel's rgb and alpha are means of
+    `draw` renders windows of the undistorted frame, with rgb in linear light. A pixel's rgb and alpha are means of
     `Warp.samples` x `Warp.samples` samples, interpolated by the Catmull-Rom cubic. Other channels come from the nearest
     pixel. Where nothing is visible, ids are -1 and all other values 0.
     """

@@ -52,7 +52,8 @@ RECORD_TAGS = {
     **dict.fromkeys((".tif", ".tiff", ".jpg", ".jpeg"), "ImageDescription"),
     ".dpx": "DocumentName",
 }
-"""By extension, the header text with a frame's provenance. In a DPX it is the project name, of 200 characters."""
+"""OpenImageIO's name of the header field that holds a frame's provenance, by file extension. In a DPX this is the
+project name, which has room for 200 characters."""
 _RECORD_PATTERN = re.compile(r"clsplat model ([0-9a-z]+) settings ([0-9a-z]+)", re.ASCII)
 
 

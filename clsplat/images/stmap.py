@@ -29,8 +29,8 @@ _ORIENTATION_CELLS_PER_SIDE = 32
 _MIN_CELL_SINE = 0.05
 """A cell has an orientation if the sine of the angle between its mapped sides is at least this, in magnitude."""
 _MIN_ORIENTED_SHARE = 0.7
-"""Least fraction of an STMap's cells with the same orientation. In ordinary pictures about half the cells have it.
-Cells of a grey picture have none, because their mapped sides coincide."""
+"""Minimum fraction of cells with the same orientation in an STMap. In an ordinary picture it is about a half, and in a
+grey picture 0, because the mapped sides of its cells coincide."""
 
 
 @dataclass(frozen=True, eq=False)

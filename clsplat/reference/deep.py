@@ -36,12 +36,12 @@ class Deep:
 
 
 class _Cut:
-    """Cuts each pixel's layers, taken front to back, into slices: eq. (73).
+    """Divides each pixel's layers, from front to back, into slices: equation (73) of docs/pictures.md.
 
     slack: (H, W), the slack s of each pixel.
-    whole: (H, W), transmittance before the first layer.
-    open: (H, W), transmittance before the current slice.
-    placed: (H, W), True if the current slice has its depth.
+    whole: (H, W), transmittance in front of the first layer.
+    open: (H, W), transmittance in front of the current slice.
+    placed: (H, W), True if the depth of the current slice is fixed.
     count: (H, W), number of slices.
     margin: (H, W), as in `Deep`.
     """

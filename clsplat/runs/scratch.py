@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A training's files of chunks: their names, which checkpoints need them, and the removal of the others."""
+"""A training's scratch files (--scratch): their names, which checkpoints need them, and the removal of other files."""
 
 from __future__ import annotations
 
@@ -18,59 +18,63 @@ from clsplat.runs.run import OWNER_DIGITS, SCRATCH_SUFFIX, Run
 
 
 def owner_of(run: Run | None) -> str:
-    """The beginning of the names of a run's files, or of those of a training without a run.
+    """Return the beginning of the names of a run's scratch files, or of a training's without a run.
 
-    The folder's number (inode) tells a run from another that had its path, and was renamed or is in another container.
+    It includes the folder's inode. So it differs from that of another run that had the same path before it was renamed,
+    or has it in another container.
     """
     of = f"{run.path.resolve()} {run.path.stat().st_ino}" if run is not None else f"{machine_mark()} {os.getpid()}"
     return hashlib.sha256(of.encode("utf-8", "surrogatepass")).hexdigest()[:OWNER_DIGITS]
 
 
 class ScratchFiles:
-    """Files of chunks of one training.
+    """The scratch files of one training.
 
-    folder: folder of new files, which other trainings may use too.
-    owner: beginning of the files' names.
-    run: run with the checkpoints that name files; None if there are none.
+    folder: folder for new files, which other trainings may use too.
+    owner: beginning of the files' names (`owner_of`).
+    run: run whose checkpoints name files; None without checkpoints.
     """
 
     def __init__(self, folder: Path, owner: str, run: Run | None) -> None:
         self.folder, self._owner, self._run = folder.absolute(), owner, run
         self._rate = NetworkRate(folder, "--scratch")
         self._named: set[Path] = set()
-        """Files that checkpoints have named, also in other folders."""
+        """Files that checkpoints of this run have named; some may be in other folders."""
 
     def new_file(self) -> Path:
-        """Name of a new file."""
+        """Return a new file's path. The file is not created."""
         return self.folder / f"{self._owner}-{secrets.token_hex(4)}{SCRATCH_SUFFIX}"
 
     def is_own(self, path: Path) -> bool:
-        """True for a file that no other run needs."""
+        """True for a file that only this training can need."""
         inside = self._run is not None and path.parent == (self._run.path / "scratch").absolute()
         return path.name.startswith(self._owner) or inside
 
     def may_write(self, path: Path) -> bool:
-        """True for a file in which this training can go on."""
+        """True for a file that this training may continue to write: its own, in its folder."""
         return self.is_own(path) and path.parent == self.folder
 
     def follow(self, store: ChunkStore) -> None:
-        """Keep the slots of a file that checkpoints name, from now on. Tell the rate of a network disk."""
+        """Protect slots of a store's file that checkpoints name. Measure the file's rate if it is on a network disk."""
         assert store.path is not None
         path = store.path
         store.release, store.file.moved = lambda: self._release(path), self._count
         store.slots.hold(self._kept(path))
 
     def saved(self, store: ChunkStore | None) -> None:
-        """Note that a checkpoint has been written, of the chunks in a file or of others."""
+        """Update after a checkpoint: protect the slots that it names, and remove files that no checkpoint names.
+
+        store: the store of the model; None if the model is not in a scratch file.
+        """
         current = None if store is None else store.path
         if store is not None and current is not None:
             store.hold(self._kept(current))
         self.remove_unnamed(current)
 
     def remove_unnamed(self, current: Path | None = None) -> None:
-        """Remove this training's files that no checkpoint names, such as those of a process that was killed.
+        """Remove this training's scratch files that no checkpoint names, such as those of a process that was killed.
 
-        current: file that stays.
+        current: file that is in use, and stays.
         """
         own = set(self.folder.glob(f"{self._owner}-*{SCRATCH_SUFFIX}")) | set(filter(self.is_own, self._named))
         if not own - {current}:

@@ -156,7 +156,7 @@ def _steps(names: Iterable[str]) -> Iterator[tuple[str, Key]]:
     yield "case", _lower
     yield "extension", _without_extension
     deepest = max((slashed(name).count("/") for name in names), default=0)
-    for count in range(deepest, 0, -1):  # endings of a path with more folders come first
+    for count in range(deepest, 0, -1):  # the last `count` folders and the name
         yield FOLDER_STEP_LABEL, partial(_ending, count, _lower)
         yield f"{FOLDER_STEP_LABEL} and extension", partial(_ending, count, _without_extension)
 

@@ -113,7 +113,7 @@ def frames_there(tasks: Sequence[Task], options: RenderOptions, video: VideoConf
         )
     if changed := [task.path for task, state in states.items() if state == "changed"]:
         warn(
-            f"--skip-existing: {len(changed)} of the existing frames were made of another model, or with other "
+            f"--skip-existing: {len(changed)} of the existing frames were rendered from another model, or with other "
             f"cameras or settings, such as {changed[0]}: they are rendered again"
         )
     return {task.key for task, state in states.items() if state in ("recorded", "unrecorded")}
@@ -123,7 +123,7 @@ def _state(task: Task, options: RenderOptions) -> Literal["recorded", "unrecorde
     """Compare a frame's file with its task. Returns the file's state.
 
     recorded, unrecorded: complete, with or without a record of the settings.
-    changed: made of another model, or with other cameras or settings.
+    changed: rendered from another model, or with other cameras or settings.
     missing: not there, damaged, or with another size or other channels.
     """
     wanted = _identity(task, options)
@@ -140,8 +140,8 @@ def _video_there(tasks: Sequence[Task], options: RenderOptions, video: VideoConf
         return {task.key for task in tasks}
     if path.exists():
         warn(
-            f"--skip-existing: {path} is incomplete, or was made of another model or frames, or with other cameras "
-            "or settings: it is rendered again"
+            f"--skip-existing: {path} is incomplete, or was rendered from another model or of other frames, or with "
+            "other cameras or settings: it is rendered again"
         )
     return set()
 

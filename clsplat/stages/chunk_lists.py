@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lists of the chunks of a model over whose rows stages run."""
+"""Lists of the chunks that a launch runs over, such as the chunks that a view shows."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from clsplat.layouts.columns import CHUNK_ROWS, NO_CHUNK
 
 @dataclass(frozen=True, eq=False)
 class ChunkList:
-    """Chunks of a model over whose rows a launch runs (`kernels/shared/chunks.h`), or slots of a pool that have them.
+    """Chunks whose rows a launch runs over (`kernels/shared/chunks.h`). In a pool, the slots that hold the chunks.
 
-    numbers: uint32, numbers of chunks in rising order, or of slots in the order of their chunks; then NO_CHUNK.
-    model_rows: number of rows of the model, or of all slots.
-    first_rows: of slots, (k,) uint32, the number of each chunk's first row in the model; None if nobody asks for it.
+    numbers: uint32, numbers of the chunks in rising order, or their slots in the same order; then NO_CHUNK as padding.
+    model_rows: number of rows of the model, or of all slots of the pool.
+    first_rows: (k,) uint32, with slots: the first row of each chunk in the whole model; None if no kernel needs it.
     """
 
     numbers: DeviceArray
@@ -28,25 +28,25 @@ class ChunkList:
 
     @property
     def rows(self) -> int:
-        """Number of rows of a launch."""
+        """Number of rows that a launch runs over, padding included."""
         return CHUNK_ROWS * self.numbers.shape[0]
 
     @property
     def key(self) -> tuple[object, ...]:
-        """All that launches over these chunks depend on, except the numbers of the chunks."""
+        """Key for command buffers: everything that launches over these chunks depend on, except the chunks' numbers."""
         first = None if self.first_rows is None else self.first_rows.buffer
         return self.numbers.buffer, self.numbers.shape, self.model_rows, first
 
     @property
     def arguments(self) -> tuple[DeviceArray, int]:
-        """The kernels' arguments CHUNK_PARAMETERS."""
+        """Kernel arguments for CHUNK_PARAMETERS of kernels/shared/chunks.h."""
         return self.numbers, self.model_rows
 
 
 def padded_chunks(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """The numbers of chunks, then NO_CHUNK, in one of few lengths, so that arrays and command buffers are reused.
+    """Pad numbers of chunks with NO_CHUNK to one of few lengths, so that arrays and command buffers are reused.
 
-    The length is at most a quarter more than needed, or 1.
+    The length is at least 1, and at most a quarter more than needed.
     """
     wanted = max(len(numbers), 1)
     unit = 1 << max(wanted.bit_length() - 3, 0)
@@ -62,7 +62,8 @@ def send_chunks(
     model_rows: int,
     first_rows: NDArray[np.integer[Any]] | None = None,
 ) -> ChunkList:
-    """Send a list (`ChunkList`) to the workspace's array `name`, and its first rows to another."""
+    """Upload a padded list of chunks to the workspace's array `name`, and the chunks' first rows to another array,
+    without waiting for the device."""
     padded = padded_chunks(numbers)
     array, first = work.array(name, padded.shape, np.uint32), None
     array.send(padded)
@@ -81,7 +82,7 @@ def exact_chunks(
     model_rows: int,
     first_rows: NDArray[np.integer[Any]],
 ) -> ChunkList:
-    """Send a list as `send_chunks` does, without any NO_CHUNK."""
+    """Upload a list of chunks without padding, and the chunks' first rows."""
     sent = []
     for array, values in ((name, numbers), (f"{name}_rows", first_rows)):
         sent.append(work.array(array, values.shape, np.uint32))
@@ -91,14 +92,14 @@ def exact_chunks(
 
 @dataclass(frozen=True, eq=False)
 class ChunkNumbers:
-    """Chunks of a streamed model, in rising order, of which only some at a time have room on the device.
+    """Chunks of a streamed model for a pass that brings them to the device in parts (`chunk_parts`).
 
-    numbers: their numbers.
+    numbers: numbers of the chunks, in rising order.
     """
 
     numbers: NDArray[np.integer[Any]]
 
     @property
     def rows(self) -> int:
-        """Number of rows of all launches."""
+        """Number of rows that the launches of all parts run over."""
         return CHUNK_ROWS * len(self.numbers)

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches chunk_records.cl: the chunks of a streamed model that are on the device, and their way there and back."""
+"""Pool of a streamed model's chunks on the device, which are fetched from a store and written back (launches
+chunk_records.cl)."""
 
 from __future__ import annotations
 
@@ -21,11 +22,11 @@ from clsplat.device.profile import stage
 from clsplat.layouts.columns import CHUNK_ROWS
 
 INVISIBLE_LOGIT = -1e9
-"""Opacity logit of a row that is not of the model. Its square is finite, as `adam` wants it."""
+"""Opacity logit of padding rows, which no view shows. Its square is finite, because `adam` refuses other values."""
 _VECTOR = 4
-"""Words that an item of the kernel copies."""
+"""Words of 4 bytes that a work-item of the kernel copies."""
 _MAX_CROSSING = 32
-"""Most chunks whose records cross at once. More gain nothing."""
+"""Maximum number of records that cross the bus at a time. More are not faster."""
 
 
 @stage("chunk_records")
@@ -38,12 +39,13 @@ def copy_chunks(
     *,
     to_records: bool,
 ) -> None:
-    """Copy fields of records from or to slots.
+    """Copy chunks between records and the pool's arrays, field by field.
 
-    slots: (k,) uint32, the slot of each record.
+    slots: (k,) uint32, the pool's slot of each record.
     records: (k, words of a record) uint32.
-    record: `chunks.store.record_type`.
-    arrays: by field, (slots x CHUNK_ROWS, ...) float32.
+    record: type of a record (`chunks.store.record_type`).
+    arrays: the pool's arrays by field, (slots x CHUNK_ROWS, ...) float32.
+    to_records: True to copy from the arrays to the records.
     """
     kernel = device.kernels("chunk_records", {"TO_RECORDS": True} if to_records else {}).copy_chunks
     for name in record.names or ():
@@ -54,11 +56,11 @@ def copy_chunks(
 
 
 class ChunkPool:
-    """The chunks of a streamed model that are on the device: parameters, moments and statistics, with room for `rows`
-    Gaussians.
+    """The chunks of a streamed model that are on the device, with parameters, moments and statistics.
 
-    store: records of all chunks. Those on the device may be newer there, until `write_back`.
-    arrays: by field, the rows of the slots.
+    rows: number of Gaussians that the pool has memory for.
+    store: records of all chunks. Until `write_back`, chunks on the device may be newer than their records.
+    arrays: arrays on the device by field, with CHUNK_ROWS rows for each slot.
     caught: (slots,) uint32, the last step up to which the chunk in each slot has been caught up (`stages.catch_up`).
     """
 
@@ -72,16 +74,16 @@ class ChunkPool:
         self.caught = allocate(device, (self.slots,), np.uint32)
         self.caught.fill(0)
         self._caught = np.zeros(store.chunks, np.uint32)
-        """By chunk, `caught` of those that are not on the device."""
+        """(chunks,), the value of `caught` of each chunk that is not on the device."""
         self._residency = Residency(self.slots, store.chunks)
         self._changed = np.zeros(self.slots, np.bool_)
         self.cull: Callable[[Camera], NDArray[np.integer[Any]]] | None = None
-        """The chunks that a camera may show; None if that is not known."""
+        """Function from a camera to the numbers of the chunks that it may show; None if all count as visible."""
         self.moved_bytes = 0
-        """Bytes of the records that have been fetched or written back."""
+        """Bytes of all records that have crossed the bus so far, in both directions."""
 
     def free(self) -> None:
-        """Free the device's memory. The pool cannot be used any longer."""
+        """Free the device's memory. The pool is unusable afterwards."""
         self.arrays.clear()
 
     def close(self) -> None:
@@ -91,15 +93,15 @@ class ChunkPool:
 
     @property
     def rows(self) -> int:
-        """Rows of all slots."""
+        """Number of rows of all slots."""
         return CHUNK_ROWS * self.slots
 
     def place(self, numbers: NDArray[np.integer[Any]], *, changes: bool) -> NDArray[np.uint32]:
-        """Bring these chunks to the device. Returns the slot of each.
+        """Fetch chunks that are not on the device yet. Returns the slot of each chunk.
 
         changes: True if the device will change them.
-        Raises ValueError for more chunks than slots, WriteError, and ScratchError. After an error the chunks that are
-        on the device or in the store are as they were.
+        Raises ValueError for more chunks than slots, WriteError, and ScratchError. An error changes no chunk, neither
+        on the device nor in the store.
         """
         moves = self._residency.plan(numbers)
         if len(moves.fetched):
@@ -115,33 +117,37 @@ class ChunkPool:
         return moves.slots
 
     def place_rows(self, start: int, stop: int) -> None:
-        """Bring the rows [start, stop) to the first rows of the slots, whatever chunks they are of. No chunk is on the
-        device then, so `keep_rows` has to write changes back. Raises WriteError and ScratchError."""
+        """Copy the rows [start, stop) of the model to the first rows of the pool, wherever chunks begin and end.
+
+        The slots then have no whole chunks, so `keep_rows` has to write changes back. Raises WriteError and
+        ScratchError.
+        """
         self.release()
         for begin, end, slots in self._row_groups(start, stop):
             self._to_slots(slots, self.store.get_records(begin, end))
 
     def keep_rows(self, start: int, stop: int) -> None:
-        """Write rows that `place_rows` has brought back to the store. Raises WriteError and ScratchError."""
+        """Write the rows that `place_rows` has copied back to the store. Raises WriteError and ScratchError."""
         for begin, end, slots in self._row_groups(start, stop):
             self.store.set_records(begin, end, self._from_slots(slots))
 
     def _row_groups(self, start: int, stop: int) -> Iterator[tuple[int, int, NDArray[np.uint32]]]:
-        """Yield rows [begin, end) that cross at once, and their slots."""
+        """Split rows into parts that cross the bus one after the other. Yields begin and end of a part, and its
+        slots."""
         slots = np.arange(-(-(stop - start) // CHUNK_ROWS), dtype=np.uint32)
         for some in self._groups(len(slots)):
             begin = start + CHUNK_ROWS * some.start
             yield begin, min(begin + CHUNK_ROWS * len(slots[some]), stop), slots[some]
 
     def write_back(self) -> None:
-        """Write the chunks that the device has changed to the store. Raises WriteError."""
+        """Write the chunks that have changed on the device to the store. Raises WriteError."""
         numbers, slots = self._residency.held()
         changed = self._changed[slots]
         self._write(numbers[changed], slots[changed])
         self._changed[:] = False
 
     def release(self) -> None:
-        """Write back, and forget what is on the device: the store is going to change, or other chunks are wanted."""
+        """Write changed chunks back, and empty all slots. Call it before the store changes."""
         self.write_back()
         nothing, (numbers, slots) = np.zeros(0, np.int64), self._residency.held()
         if len(numbers):
@@ -149,17 +155,17 @@ class ChunkPool:
             self._residency.clear()
 
     def fill(self, field: str, value: float) -> None:
-        """Set every element of a field, in the slots and in the store."""
+        """Set all elements of a field to `value`, in the slots and in the store."""
         self.arrays[field].fill(value)
         self.store.fill(field, value)
 
     def rename(self, names: Mapping[str, str]) -> None:
-        """Give fields other names, in the slots and in the store. names: the new names by the old ones."""
+        """Rename fields, in the slots and in the store. names: new names by old names."""
         self.arrays = {names.get(name, name): array for name, array in self.arrays.items()}
         self.store.rename(names)
 
     def slots_of(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
-        """The slot of each chunk, -1 if it is not on the device."""
+        """Return the slot of each chunk; -1 if it is not on the device."""
         return self._residency.slots_of(numbers)
 
     def _exchange_caught(
@@ -181,7 +187,7 @@ class ChunkPool:
             self._to_slots(slots[some], values)
 
     def _close(self, numbers: NDArray[np.int64], records: NDArray[Any]) -> None:
-        """Let the rows behind each chunk's last one be copies of it that no view shows and no step moves."""
+        """Fill the rows past the end of chunks with copies of the last row that no view shows and no step moves."""
         lengths = self.store.lengths(numbers)
         for place in np.flatnonzero(lengths < CHUNK_ROWS).tolist():
             rows = int(lengths[place])
@@ -208,12 +214,12 @@ class ChunkPool:
         return values.view(self.store.record).reshape(-1)
 
     def _groups(self, count: int) -> list[slice]:
-        """Parts of `count` chunks that cross one after the other."""
+        """Split `count` chunks into parts that cross the bus one after the other."""
         most = min(max(self.slots // CROSSING_SHARE, 1), _MAX_CROSSING)
         return [slice(begin, begin + most) for begin in range(0, count, most)]
 
     def _crossing(self, slots: NDArray[np.uint32]) -> tuple[DeviceArray, DeviceArray]:
-        """Slots on the device, and memory there for their records."""
+        """Upload slots (k,), and return them with device memory for their records."""
         on_device = self._work.array("crossing_slots", slots.shape, np.uint32)
         on_device.set(slots)
         return on_device, self._work.array("crossing", (len(slots), self.store.record.itemsize // 4), np.uint32)
@@ -232,11 +238,11 @@ class StoredArray:
 
     @property
     def in_pool(self) -> DeviceArray:
-        """The rows of the pool's slots."""
+        """The field's array in the pool."""
         return self.pool.arrays[self.field]
 
     def get(self) -> NDArray[np.float32]:
-        """A copy of all rows."""
+        """Return a copy of all rows."""
         return self.get_rows(0, self.pool.store.count)
 
     def set(self, values: NDArray[np.float32]) -> None:
@@ -244,30 +250,30 @@ class StoredArray:
         self.set_rows(0, values)
 
     def get_rows(self, start: int, stop: int) -> NDArray[np.float32]:
-        """A copy of the rows [start, stop)."""
+        """Return a copy of the rows [start, stop)."""
         self.pool.write_back()
         return self.pool.store.get_rows(self.field, start, stop)
 
     def set_rows(self, start: int, values: NDArray[np.float32]) -> None:
-        """Replace the rows that begin at `start`."""
+        """Replace the rows from `start` on with `values`."""
         self.pool.release()
         self.pool.store.set_rows(self.field, start, values)
 
     def get_at(self, places: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
-        """A copy of the rows at these places."""
+        """Return a copy of rows. places: (k,), their indices."""
         self.pool.write_back()
         return self.pool.store.get_at(self.field, places)
 
     def set_at(self, places: NDArray[np.integer[Any]], values: NDArray[np.float32]) -> None:
-        """Replace the rows at these places."""
+        """Replace rows. places: (k,), their indices."""
         self.pool.release()
         self.pool.store.set_at(self.field, places, values)
 
     def change(self, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> None:
-        """Replace the rows with what a function makes of them, chunk by chunk."""
+        """Apply a function to the rows, chunk by chunk."""
         self.pool.release()
         self.pool.store.change(self.field, change)
 
     def fill(self, value: float) -> None:
-        """Set every element."""
+        """Set all elements to `value`."""
         self.pool.fill(self.field, value)

@@ -28,39 +28,39 @@ from clsplat.stages.scan import scan
 
 SCORED_STATISTICS = ("whole_largest", "current_largest")
 LISTED_ROWS = 1 << 16
-"""Rows of a list on the host that are uploaded at a time."""
+"""Number of entries of a row list on the host that are uploaded at a time."""
 CONTRIBUTION_STATISTICS = ("current_totals", "current_largest", "whole_totals", "whole_largest")
 NEXT_EPOCH = {"whole_totals": "current_totals", "whole_largest": "current_largest"}
 NEXT_EPOCH |= {current: whole for whole, current in NEXT_EPOCH.items()}
-"""Names of contributions in the next epoch. Those that become current begin at 0."""
+"""New names of contributions when an epoch begins. The arrays that become current are set to 0 first."""
 KIND = "statistics"
-"""Beginning of the names of statistics in a checkpoint and a store of chunks."""
+"""First part of the names of statistics in a checkpoint and in a store of chunks, before "/"."""
 
 
 def statistics_names(*, contributions: bool) -> tuple[str, ...]:
-    """Names of the statistics: sum, views, radius; with contributions, two values in each of two epochs."""
+    """Return the names of the statistics of `DensityStatistics` that are kept with or without contributions."""
     return ("gradient_sums", "seen", "radii", *(CONTRIBUTION_STATISTICS if contributions else ()))
 
 
 def gaussian_bytes(*, contributions: bool) -> int:
-    """Bytes of each Gaussian's statistics."""
+    """Return the bytes of each Gaussian's statistics."""
     return 4 * len(statistics_names(contributions=contributions))
 
 
 def initial_value(name: str) -> float:
-    """Value of a statistic at first."""
+    """Return the value that a statistic starts from."""
     return np.inf if name in CONTRIBUTION_STATISTICS else 0.0
 
 
 def statistics_fields(*, contributions: bool) -> dict[str, tuple[int, ...]]:
-    """Fields of a store of chunks for the statistics."""
+    """Return the fields of a store of chunks for the statistics."""
     return {f"{KIND}/{name}": () for name in statistics_names(contributions=contributions)}
 
 
 def new_values(*, densified: bool = False) -> NewValues:
-    """Values of moved rows in a store. FRESH rows have moments of zero, and statistics that are infinite.
+    """Return the values that rows get in a store when they move. FRESH rows get zero moments and infinite statistics.
 
-    densified: True if all statistics except contributions begin anew.
+    densified: True if all statistics except contributions start from zero in every row.
     """
     names = statistics_names(contributions=True)
     anew = frozenset(f"{KIND}/{name}" for name in names if densified and name not in CONTRIBUTION_STATISTICS)
@@ -70,20 +70,20 @@ def new_values(*, densified: bool = False) -> NewValues:
 
 @dataclass(frozen=True, eq=False)
 class DensityStatistics:
-    """Statistics per Gaussian, (n,) each: on the device, or fields of a streamed model's chunks.
+    """Statistics per Gaussian for density control, (n,) each: on the device, or fields of a streamed model's chunks.
 
-    These count since the last densification:
+    Since the last densification:
 
     gradient_sums: sums of gradient norms.
     seen: number of views that show the Gaussian.
     radii: largest radius in pixels.
 
-    CONTRIBUTION_STATISTICS are sums of blending weights in the images of the training views, in pixels. They count per
-    epoch, whether or not Gaussians are densified. `totals` is the sum over the views, `largest` the maximum of one
-    view; `current` is the current epoch, `whole` the last complete epoch. They are infinite for a Gaussian that was
+    CONTRIBUTION_STATISTICS are sums of blending weights in the images of the training views, in pixels. They are kept
+    by epoch, whether or not Gaussians are densified. `totals` is the sum over the views, `largest` the maximum over the
+    views; `current` is the current epoch, `whole` the last complete epoch. They are infinite for a Gaussian that was
     not measured in some view of the epoch, for example a new one. They are None if no rule uses them.
 
-    of_slots: True if the arrays are those of a pool's slots.
+    of_slots: True if the arrays are a pool's, with the rows of its slots.
     """
 
     gradient_sums: DeviceArray | StoredArray
@@ -97,18 +97,18 @@ class DensityStatistics:
 
     @classmethod
     def of(cls, arrays: Mapping[str, Any], *, of_slots: bool = False) -> DensityStatistics:
-        """Make statistics of arrays by name."""
+        """Wrap arrays by name as statistics."""
         return cls(**arrays, of_slots=of_slots)
 
     @property
     def on_device(self) -> DensityStatistics:
-        """The arrays that kernels get: of a streamed model, those of the pool's slots."""
+        """The statistics as arrays on the device, for kernels: of a streamed model, the arrays of its pool."""
         if not isinstance(self.seen, StoredArray):
             return self
         return self.of({name: array.in_pool for name, array in self.named().items()}, of_slots=True)
 
     def rows(self, start: int, stop: int) -> DensityStatistics:
-        """The statistics `on_device` of the Gaussians [start, stop). A pool has them in its first slots."""
+        """Return statistics on the device of the Gaussians [start, stop). In a pool, these are in the first slots."""
         start, stop = (0, stop - start) if self.of_slots else (start, stop)
         if (start, stop) == (0, self.seen.shape[0]):
             return self
@@ -116,28 +116,28 @@ class DensityStatistics:
         return self.of(arrays, of_slots=self.of_slots)
 
     def named(self) -> dict[str, Any]:
-        """The arrays by name."""
+        """Return the arrays by name."""
         names = statistics_names(contributions=True)
         return {name: array for name in names if (array := getattr(self, name)) is not None}
 
     def by_field(self) -> dict[str, Any]:
-        """The arrays by the names that they have in a checkpoint and in a store of chunks."""
+        """Return the arrays by their names in a checkpoint and in a store of chunks."""
         return {f"{KIND}/{name}": array for name, array in self.named().items()}
 
     def load(self, values: Mapping[str, Float32]) -> None:
-        """Set the arrays that `values` contains, by name."""
+        """Set arrays by name. Arrays that are not in `values` stay as they are."""
         for name, array in self.named().items():
             if name in values:
                 array.set(values[name])
 
     def forget_contributions(self) -> None:
-        """Set all contributions to infinity, so that none counts as small until an epoch is complete."""
+        """Set all contributions to infinity, so that no Gaussian is pruned by them until an epoch is complete."""
         for name, array in self.named().items():
             if name in CONTRIBUTION_STATISTICS:
                 array.fill(np.inf)
 
     def next_epoch(self) -> DensityStatistics:
-        """Statistics at the start of a new epoch: the current epoch becomes the last complete epoch."""
+        """Return the statistics for a new epoch: the current epoch becomes the last complete epoch."""
         if self.whole_totals is None or self.whole_largest is None:
             return self
         self.whole_totals.fill(0.0)
@@ -149,7 +149,7 @@ class DensityStatistics:
 
 
 def new_statistics(device: Device, count: int, *, contributions: bool = False) -> DensityStatistics:
-    """Initial statistics of `count` Gaussians: zero, with infinite contributions."""
+    """Make the initial statistics of `count` Gaussians: zeros, and infinite contributions."""
     names = statistics_names(contributions=contributions)
     arrays = {name: allocate(device, (count,), np.float32) for name in names}
     for name, array in arrays.items():
@@ -158,13 +158,13 @@ def new_statistics(device: Device, count: int, *, contributions: bool = False) -
 
 
 def pooled_statistics(pool: ChunkPool) -> DensityStatistics:
-    """The statistics in the store of a pool."""
+    """Return the statistics that a pool's store has."""
     names = [name for name in statistics_names(contributions=True) if f"{KIND}/{name}" in pool.store.fields]
     return DensityStatistics.of({name: StoredArray(pool, f"{KIND}/{name}") for name in names})
 
 
 def statistics_numbers(camera: Camera) -> tuple[float, ...]:
-    """Arguments of `add_statistics` that differ between cameras of one size."""
+    """Return the numbers in launches of `add_statistics` that differ between cameras of the same size."""
     return (camera.fx,) if camera.model.along_rays else ()
 
 
@@ -176,9 +176,9 @@ def add_statistics(
     projected: Projected,
     screen: Screen,
 ) -> None:
-    """Add a view to the statistics. Gradient norms are with respect to means in NDC, as is the paper's threshold.
+    """Add a view to the statistics. Gradients are with respect to means in NDC, because the paper's threshold is.
 
-    projected: all rows of the statistics, or those of its `chunks`.
+    projected: splats of all rows of the statistics, or of the chunks that it lists.
     """
     n = projected.tile_counts.shape[0]
     rays = camera.model.along_rays
@@ -194,7 +194,7 @@ def add_statistics(
 def add_contributions(
     device: Device, statistics: DensityStatistics, projected: Projected, contributions: DeviceArray, area: float
 ) -> None:
-    """Add the contributions (n,) that the Gaussians make to a view to the statistics of the current epoch.
+    """Add the contributions (n,) of Gaussians to a view to the statistics of the current epoch.
 
     projected: as for `add_statistics`.
     area: number of full-resolution pixels per pixel of a reduced image; contributions are multiplied by it.
@@ -207,10 +207,10 @@ def add_contributions(
 
 @dataclass(frozen=True, eq=False)
 class DeviceRowList:
-    """The rows of a model after density control, on the device: (m,) uint32, a source row each, plus FRESH if new.
+    """The rows of a model after density control, listed on the device.
 
-    halves: the number of halves of split Gaussians, which are the last rows. The first halves of all split Gaussians
-    precede the second halves.
+    rows: (m,) uint32, the source row of each row, plus FRESH if the row is new.
+    halves: number of halves of split Gaussians, which are the last rows: all first halves, then all second halves.
     """
 
     rows: DeviceArray
@@ -222,7 +222,7 @@ class DeviceRowList:
         return self.rows.shape[0]
 
     def entries(self) -> NDArray[np.uint32]:
-        """The list on the host."""
+        """Return the list on the host."""
         entries: NDArray[np.uint32] = self.rows.get()
         return entries
 
@@ -241,22 +241,25 @@ class DeviceMarker:
     statistics: DensityStatistics
 
     def scores(self, rules: MarkRules) -> Float32:
-        """Mean gradient norms (n,) of the Gaussians that may be densified; negative for the others."""
+        """Return the mean gradient norms (n,) of the Gaussians that may be densified; negative for the others."""
         found = np.empty(self.parameters.count, np.float32)
         for start, stop in self._pieces():
             found[start:stop] = _scored(self.device, self, rules, start, stop).scores.get()
         return found
 
     def rows(self, rules: MarkRules) -> DeviceRowList | SourceList:
-        """List the rows that the rules produce; those of a streamed model on the host."""
+        """List the rows of the model after the rules are applied; on the host if the model is streamed."""
         if isinstance(self.parameters, DeviceGaussians):
             return _listed(self.device, self, rules, 0, self.parameters.count)
         pieces = (_listed(self.device, self, rules, *piece) for piece in self._pieces())
         return in_source_order(piece.entries() for piece in pieces)
 
     def _pieces(self) -> Iterator[tuple[int, int]]:
-        """Rows that are marked together: as many as the plan brings to the device, or of a pool about half as many,
-        which with their statistics take no more memory than the splats of all."""
+        """Yield [start, stop) of rows that are marked together.
+
+        A streamed model is marked in parts of the rows that are on the device at once. With a pool, a part has half as
+        many rows as the pool, so that marks and statistics fit in the memory of the splats.
+        """
         model = self.parameters
         rows = model.rows if isinstance(model, HostGaussians) else max(model.count, 1)
         if isinstance(self.statistics.seen, StoredArray):
@@ -266,7 +269,7 @@ class DeviceMarker:
 
 
 class _Scratch:
-    """Scratch memory for `n` rows.
+    """Arrays for marking `n` rows, in the memory of a frame's splats.
 
     scores (n), float32; marks (3n), places (3n) and rows (2n), uint32.
     """
@@ -282,8 +285,10 @@ class _Scratch:
         self._columns = dict(zip(_COLUMNS, words[4:], strict=True))
 
     def column(self, name: str, array: AnyArray, start: int) -> DeviceArray:
-        """The rows of an array from `start` on: its own if it is on the device, else a copy, which the next one of this
-        name overwrites."""
+        """Return the rows of an array from `start` on, on the device.
+
+        Of an array on the host it is a copy, which the next call with this name overwrites.
+        """
         if isinstance(array, DeviceArray):
             return array.rows(start, start + self._n)
         shape = (self._n, *array.shape[1:])
@@ -309,11 +314,12 @@ def _scored(device: Device, marker: DeviceMarker, rules: MarkRules, start: int, 
 
 @stage("density")
 def _listed(device: Device, marker: DeviceMarker, rules: MarkRules, start: int, stop: int) -> DeviceRowList:
-    """The list of the rows [start, stop), which the next one overwrites."""
+    """Mark and list the rows [start, stop). The next call overwrites the list."""
     n, model, kernels = stop - start, marker.parameters, device.kernels("density")
     scratch, counts = _scored(device, marker, rules, start, stop), allocate(device, (2,), np.uint32)
     columns = [scratch.column(name, model[name], start) for name in ("log_scales", "opacity_logits")]
-    radii = scratch.column("seen", marker.statistics.radii, start)  # the scores are made
+    # The scores have been computed, so the memory of `seen` is free.
+    radii = scratch.column("seen", marker.statistics.radii, start)
     edges = (rules.large, rules.transparent, rules.oversized, rules.oversized_half, rules.radius)
     arrays = (scratch.scores, radii, *columns, scratch.marks)
     launch_items(device, kernels.density_marks, n, n, start, *rules.cut_off, *edges, *arrays)
@@ -335,7 +341,7 @@ def try_gather(device: Device, count: int, source: AnyGaussians) -> None:
 def gather(
     device: Device, rows: DeviceArray | NDArray[np.uint32], source: AnyGaussians, *, renews: bool = False
 ) -> AnyGaussians:
-    """New arrays, on the device or host of the source, whose row j is row rows[j] of the source.
+    """Return new arrays whose row j is row rows[j] of the source, on the device or on the host like the source.
 
     renews: True sets FRESH rows to zero, for moments; False copies them too, for parameters.
     """
@@ -364,12 +370,11 @@ def carried(
     *,
     densified: bool,
 ) -> DensityStatistics:
-    """Statistics of moved rows: row j is row rows[j] of the source, or infinite if FRESH.
+    """Return the statistics of moved rows: row j is row rows[j] of the source, or infinite if it is FRESH.
 
-    Contributions are always carried, the other statistics only if nothing was densified.
-
-    source: arrays by name (`DensityStatistics.named`). Each is removed as soon as it is copied, so that the memory for
-    one of them is enough.
+    densified: True if all statistics except contributions start from zero.
+    source: arrays by name (`DensityStatistics.named`). Each is removed as soon as it is copied, so that only one array
+        is in memory twice.
     """
     arrays = {}
     for name in tuple(source):
@@ -388,7 +393,7 @@ def carried(
 
 
 def _on_device(work: Workspace, rows: DeviceArray | NDArray[np.uint32]) -> Iterator[tuple[int, DeviceArray]]:
-    """A list of rows on the device, with its first place: all of it if it is there, else a part at a time."""
+    """Yield parts of a list of rows on the device, each with the index of its first entry."""
     if isinstance(rows, DeviceArray):
         yield 0, rows
         return
@@ -400,7 +405,7 @@ def _on_device(work: Workspace, rows: DeviceArray | NDArray[np.uint32]) -> Itera
 
 
 def _gather_array(device: Device, rows: DeviceArray, source: DeviceArray, to: DeviceArray, fresh: float | None) -> None:
-    """Gather rows of an array. fresh: the value for FRESH rows; None copies them like the others."""
+    """Copy the rows `rows` of `source` to `to`. fresh: the value for FRESH rows; None copies them like the others."""
     count, width = rows.shape[0], int(np.prod(source.shape[1:]))
     kernel = device.kernels("density").gather_rows
     if width:
@@ -408,7 +413,7 @@ def _gather_array(device: Device, rows: DeviceArray, source: DeviceArray, to: De
 
 
 def widen(device: Device, source: AnyGaussians, coefficients: int) -> AnyGaussians:
-    """The model with more SH coefficients, on the same device or host; the additional ones are zero."""
+    """Return the model with more SH coefficients, which are zero, on the same device or host."""
     rest = np.zeros(group_shapes(source.count, coefficients)["sh_rest"], np.float32)
     rest[:, : source.coefficients - 1] = source["sh_rest"].get()
     if isinstance(source, HostGaussians):

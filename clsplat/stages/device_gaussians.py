@@ -29,7 +29,7 @@ class ShStorage:
     """Storage of the SH coefficients in a model that is only rendered.
 
     coefficients: number of coefficients per channel.
-    degrees: (n,) uint8, the highest degree evaluated for each Gaussian; None evaluates all.
+    degrees: (n,) uint8, the highest degree evaluated for each Gaussian; None evaluates all degrees.
     half: store the bands above 0 as float16.
     """
 
@@ -39,8 +39,8 @@ class ShStorage:
 
     @property
     def floats(self) -> int:
-        """Memory per Gaussian, in floats of 4 bytes. The SH degree, if stored, takes one. Coefficients stored as halves
-        take half a float each, rounded up in all."""
+        """Memory per Gaussian, in floats of 4 bytes, rounded up. A stored SH degree takes one float, and a coefficient
+        stored as a half takes half a float."""
         rest = 3 * (self.coefficients - 1)
         kept = -(-rest // 2) if self.half else rest
         return floats_of(self.coefficients) - rest + kept + (self.degrees is not None)
@@ -51,7 +51,7 @@ A = TypeVar("A")
 
 @dataclass(frozen=True, eq=False)
 class _ByGroup(Generic[A]):
-    """Parameters, gradients or moments: arrays by group name, whose first axis has length `count`."""
+    """Base class of parameters, gradients or moments: arrays by group name, whose first axis has length `count`."""
 
     count: int
     coefficients: int
@@ -61,7 +61,7 @@ class _ByGroup(Generic[A]):
         return self.arrays[group]
 
     def only(self, *groups: str) -> Self:
-        """A copy of this object that has only the arrays of these groups."""
+        """Return a copy of this object with the arrays of these groups only."""
         return replace(self, arrays={group: self.arrays[group] for group in groups})
 
 
@@ -84,7 +84,7 @@ class HostArray:
         return self.values.shape
 
     def get(self) -> NDArray[Any]:
-        """A copy of the array."""
+        """Return a copy of the array."""
         return self.values.copy()
 
     def set(self, values: NDArray[Any]) -> None:
@@ -96,17 +96,17 @@ class HostArray:
         return self.values[start:stop].copy()
 
     def set_rows(self, start: int, values: NDArray[Any]) -> None:
-        """Copy another array into the rows that begin at `start`."""
+        """Replace the rows from `start` on with `values`."""
         self.values[start : start + len(values)] = values
 
     def fill(self, value: float) -> None:
-        """Set every element."""
+        """Set all elements to `value`."""
         self.values.fill(value)
 
 
 @dataclass(frozen=True, eq=False)
 class SavedArray:
-    """A field of the chunks of a checkpoint, with the interface of a DeviceArray for reading."""
+    """A field of a checkpoint's chunks in a scratch file, with the reading part of a DeviceArray's interface."""
 
     store: ChunkStore
     field: str
@@ -124,7 +124,7 @@ class SavedArray:
         return self.store.get_rows(self.field, start, stop)
 
     def __getitem__(self, rows: slice) -> NDArray[np.float32]:
-        """A copy of some rows that follow each other."""
+        """Return a copy of consecutive rows."""
         start, stop, _ = rows.indices(self.store.count)
         return self.get_rows(start, stop)
 
@@ -134,9 +134,9 @@ class HostGaussians(_ByGroup[Any]):
     """Gaussians on the host or in a store of chunks, as `HostArray`, `StoredArray` or `SavedArray`.
 
     rows: number of Gaussians that are on the device at once.
-    kind: "" if the arrays are in main memory; else they are fields `kind`/GROUP of a store.
-    pool: the chunks of that store that are on the device; None for the store of a checkpoint.
-    culls: False to project all chunks, for results by Gaussian of the whole model.
+    pool: pool of the store's chunks on the device; None for arrays in main memory, and for a checkpoint's store.
+    kind: "parameters", "first" or "second" if the arrays are fields `kind`/GROUP of a store; "" in main memory.
+    culls: False to project chunks out of view too, for results that cover every Gaussian of the model.
     """
 
     rows: int
@@ -146,12 +146,12 @@ class HostGaussians(_ByGroup[Any]):
 
     @cached_property
     def in_pool(self) -> DeviceGaussians:
-        """The rows of the pool's slots."""
+        """The arrays of the pool, with the rows of all slots."""
         assert self.pool is not None
         return self.first_in_pool(self.pool.rows)
 
     def first_in_pool(self, rows: int) -> DeviceGaussians:
-        """The first rows of the pool's slots."""
+        """Return the first `rows` rows of the pool's arrays."""
         assert self.pool is not None
         arrays = {name: self.pool.arrays[f"{self.kind}/{name}"].rows(0, rows) for name in self.arrays}
         return DeviceGaussians(rows, self.coefficients, arrays)
@@ -161,19 +161,19 @@ AnyGaussians = DeviceGaussians | HostGaussians
 AnyArray = DeviceArray | HostArray | StoredArray
 ReadableArray = AnyArray | SavedArray
 KINDS = ("parameters", "first", "second")
-"""Kinds of arrays of a model in training, as a checkpoint and a store of chunks name them."""
+"""Names of parameters, first and second moments in a checkpoint and in a store of chunks."""
 
 
 def parts(
     work: Workspace, *models: AnyGaussians, keep: bool = False
 ) -> Iterator[tuple[int, int, tuple[DeviceGaussians, ...]]]:
-    """Yield (start, stop, the models' rows [start, stop) on the device) for each part in turn.
+    """Bring models to the device part by part. Yields (start, stop, the models' rows [start, stop) on the device).
 
-    Models on the device have a single part. Each part of another model is valid until the next part is requested.
+    Models on the device have a single part. Each part of a streamed model is valid until the next part is requested.
 
-    models: all on the device, or none: the first ones in one pool, if there is a pool, and the others in main memory. A
-        part of a pool has as many rows as the pool's slots have room for.
-    keep: True keeps changes of the parts: they are copied back to the host, or to the pool's store.
+    models: all on the device, or all streamed. Streamed models in a pool come first, and share one pool; the others are
+        in main memory. A part of a pool has as many rows as the pool's slots.
+    keep: True if the caller changes the parts. They are then copied back to main memory, or to the pool's store.
     """
     on_device = tuple(model for model in models if isinstance(model, DeviceGaussians))
     if len(on_device) == len(models):
@@ -199,7 +199,7 @@ def parts(
 
 
 def _uploaded(work: Workspace, index: int, model: HostGaussians, start: int, stop: int) -> DeviceGaussians:
-    """A copy on the device of the rows [start, stop) of model number `index` on the host."""
+    """Upload the rows [start, stop) of a model in main memory, to arrays of the workspace named by `index`."""
     arrays = {}
     for name, whole in model.arrays.items():
         values = whole.values[start:stop]
@@ -209,7 +209,7 @@ def _uploaded(work: Workspace, index: int, model: HostGaussians, start: int, sto
 
 
 def fields_of(coefficients: int) -> dict[str, tuple[int, ...]]:
-    """Fields of a store of chunks: parameters, first and second moments."""
+    """Return the fields of a store of chunks for parameters, first and second moments."""
     shapes = group_shapes(1, coefficients)
     return {f"{kind}/{name}": shape[1:] for kind in KINDS for name, shape in shapes.items()}
 
@@ -217,13 +217,15 @@ def fields_of(coefficients: int) -> dict[str, tuple[int, ...]]:
 def chunk_parts(
     work: Workspace, chunks: ChunkNumbers, *models: AnyGaussians, changes: bool = False
 ) -> Iterator[tuple[int, int, tuple[DeviceGaussians, ...], ChunkList]]:
-    """Yield chunks of the models in a pool, as many at a time as it has slots: which rows [start, stop) they are of a
-    launch over all of `chunks`; the rows of the pool's slots, of each model; the list of their slots.
+    """Bring chunks to the device part by part, as many at a time as the pool has slots.
 
-    Each part is valid until the next part is requested.
+    Yields (start, stop, models, slots): the part's rows [start, stop) in a launch over all of `chunks`; the pool's
+    arrays of each model; and the list of the slots that hold the part's chunks. Each part is valid until the next part
+    is requested.
 
-    changes: True if the device will change the models. Then the last chunks come first: a pass that only reads has
-        left them on the device.
+    models: models in one pool.
+    changes: True if the device will change the models. The last chunks then come first, because the pass that only
+        reads, before it, has left them on the device.
     """
     streamed = [model for model in models if isinstance(model, HostGaussians)]
     pool = streamed[0].pool
@@ -242,18 +244,18 @@ Models = Sequence["AnyGaussians | None"]
 
 
 def by_field(models: Models) -> dict[str, AnyArray]:
-    """The arrays of parameters and moments by the names of a store's fields. Moments that are None are left out."""
+    """Return the arrays of parameters and moments by their field names in a store, without moments that are None."""
     given = {kind: model for kind, model in zip(KINDS, models, strict=True) if model is not None}
     return {f"{kind}/{name}": model[name] for kind, model in given.items() for name in PARAMETER_GROUPS}
 
 
 @dataclass(frozen=True, eq=False)
 class CopiedRows:
-    """Gaussians that are copied, chunk by chunk.
+    """A copy of Gaussians that is made chunk by chunk.
 
-    arrays: all by field: those of a pool's store, or others.
+    arrays: arrays to copy from, by field: all of one pool's store, or none.
     rows: row j of the copy is row rows[j]; None copies all rows.
-    values: of rows that are new, and of fields that are not among `arrays`.
+    values: values of new rows, and of fields that are not among `arrays`.
     """
 
     arrays: Mapping[str, ReadableArray]
@@ -261,12 +263,12 @@ class CopiedRows:
     values: NewValues = field(default_factory=NewValues)
 
     def to_store(self, store: ChunkStore) -> None:
-        """Copy to a store. Raises WriteError and ScratchError."""
+        """Write the copy to a store. Raises WriteError and ScratchError."""
         for numbers, records in self._records(store.record, store.starts):
             store.write(numbers, records)
 
     def to_arrays(self, arrays: Mapping[str, AnyArray]) -> None:
-        """Copy to arrays by field, on the device or in main memory. Raises ScratchError."""
+        """Write the copy to arrays by field, on the device or in main memory. Raises ScratchError."""
         record = record_type({name: array.shape[1:] for name, array in arrays.items()})
         count = arrays["parameters/means"].shape[0]
         for numbers, records in self._records(record, even_starts(count)):
@@ -291,7 +293,7 @@ class CopiedRows:
 
 
 def _records(count: int, arrays: Mapping[str, ReadableArray], numbers: NDArray[np.int64]) -> NDArray[Any]:
-    """Records of chunks of `count` Gaussians, from arrays by field."""
+    """Return records of some chunks of `count` Gaussians, from arrays by field."""
     records = np.empty(len(numbers), record_type({name: array.shape[1:] for name, array in arrays.items()}))
     for place, first, length in runs(numbers):
         begin, end = CHUNK_ROWS * first, min(CHUNK_ROWS * (first + length), count)
@@ -304,7 +306,7 @@ def _records(count: int, arrays: Mapping[str, ReadableArray], numbers: NDArray[n
 
 
 def pooled(pool: ChunkPool, coefficients: int) -> tuple[HostGaussians, HostGaussians, HostGaussians]:
-    """Parameters, first and second moments of a pool's store."""
+    """Return parameters, first and second moments of a pool's store."""
 
     def of(kind: str) -> HostGaussians:
         arrays = {name: StoredArray(pool, f"{kind}/{name}") for name in PARAMETER_GROUPS}
@@ -314,7 +316,7 @@ def pooled(pool: ChunkPool, coefficients: int) -> tuple[HostGaussians, HostGauss
 
 
 def saved_models(store: ChunkStore) -> list[HostGaussians]:
-    """Parameters, first and second moments of the chunks of a checkpoint. Raises ValueError for other fields."""
+    """Return parameters, first and second moments of a checkpoint's store. Raises ValueError for other fields."""
     coefficients = store.fields.get("parameters/sh_rest", (0,))[0] + 1
     if {name: shape for name, shape in store.fields.items() if name.split("/")[0] in KINDS} != fields_of(coefficients):
         raise ValueError("its chunks have other fields than this version's")
@@ -331,7 +333,7 @@ def saved_models(store: ChunkStore) -> list[HostGaussians]:
 
 
 def rows_at(array: AnyArray, places: NDArray[np.integer[Any]] | slice) -> NDArray[np.float32]:
-    """A copy of the rows (k,) at these places."""
+    """Return a copy of rows of an array. places: their indices (k,), or a slice."""
     if isinstance(places, slice):
         return array.get_rows(places.start, places.stop)
     if isinstance(array, StoredArray):
@@ -341,7 +343,7 @@ def rows_at(array: AnyArray, places: NDArray[np.integer[Any]] | slice) -> NDArra
 
 
 def set_rows_at(array: AnyArray, places: NDArray[np.integer[Any]] | slice, values: NDArray[np.float32]) -> None:
-    """Replace the rows (k,) at these places."""
+    """Replace rows of an array. places: their indices (k,), or a slice."""
     if isinstance(places, slice):
         array.set_rows(places.start, values)
         return
@@ -354,7 +356,7 @@ def set_rows_at(array: AnyArray, places: NDArray[np.integer[Any]] | slice, value
 
 
 def change_rows(array: AnyArray, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> None:
-    """Replace the rows with what a function makes of them, of all rows or of some at a time."""
+    """Apply a function to the rows of an array, to all at once or chunk by chunk."""
     if isinstance(array, StoredArray):
         array.change(change)
     else:
@@ -386,9 +388,9 @@ def upload_gaussians(device: Device, gaussians: Gaussians, sh: ShStorage | None 
 
 
 def host_gaussians(gaussians: Gaussians, rows: int, sh: ShStorage | None = None) -> HostGaussians:
-    """Gaussians on the host, to be streamed through the device `rows` at a time.
+    """Wrap Gaussians on the host, to be streamed through the device `rows` at a time.
 
-    The arrays are not copied: they are read-only unless the caller may write them.
+    The arrays are not copied.
 
     sh: the SH storage, for a model that is only rendered.
     """
@@ -398,8 +400,8 @@ def host_gaussians(gaussians: Gaussians, rows: int, sh: ShStorage | None = None)
 
 
 def host_model(arrays: Mapping[str, NDArray[Any]], kind: str) -> HostGaussians:
-    """Gaussians on the host, from the arrays of a checkpoint whose names begin with `kind`/. Raises ValueError for a
-    wrong name, shape or dtype."""
+    """Wrap the arrays of a checkpoint whose names begin with `kind`/. Raises ValueError for missing arrays and for a
+    wrong shape or dtype."""
     if missing := [group for group in PARAMETER_GROUPS if f"{kind}/{group}" not in arrays]:
         raise ValueError(f"has no {kind}/{missing[0]}")
     host = {group: arrays[f"{kind}/{group}"] for group in PARAMETER_GROUPS}
@@ -412,14 +414,14 @@ def host_model(arrays: Mapping[str, NDArray[Any]], kind: str) -> HostGaussians:
 
 
 def host_zeros(count: int, coefficients: int, rows: int) -> HostGaussians:
-    """Arrays of zeros on the host: the initial moments of Adam."""
+    """Make arrays of zeros on the host: the initial moments of Adam."""
     shapes = group_shapes(count, coefficients)
     arrays = {name: HostArray(np.zeros(shape, np.float32)) for name, shape in shapes.items()}
     return HostGaussians(count, coefficients, arrays, rows)
 
 
 def to_host(gaussians: AnyGaussians) -> HostGaussians:
-    """A copy in main memory of Gaussians on the device or in a store; those in main memory are returned unchanged."""
+    """Copy Gaussians from the device or from a store to main memory. Those in main memory are returned unchanged."""
     if isinstance(gaussians, HostGaussians) and not gaussians.kind:
         return gaussians
     arrays = {name: HostArray(array.get()) for name, array in gaussians.arrays.items()}
@@ -427,13 +429,13 @@ def to_host(gaussians: AnyGaussians) -> HostGaussians:
 
 
 def to_device(device: Device, gaussians: HostGaussians) -> DeviceGaussians:
-    """A device copy of host Gaussians."""
+    """Copy streamed Gaussians to the device."""
     arrays = {name: upload(device, array.get_rows(0, gaussians.count)) for name, array in gaussians.arrays.items()}
     return DeviceGaussians(gaussians.count, gaussians.coefficients, arrays)
 
 
 def download_gaussians(gaussians: AnyGaussians, start: int = 0, stop: int | None = None) -> Gaussians:
-    """A host copy of the rows [start, stop) as `Gaussians`; None for all rows from `start` on."""
+    """Return a host copy of the rows [start, stop) as `Gaussians`. stop: None for all rows from `start` on."""
     stop = gaussians.count if stop is None else stop
     host = {name: gaussians[name].get_rows(start, stop) for name in PARAMETER_GROUPS}
     sh = np.concatenate([host["sh_dc"][:, None], host["sh_rest"]], axis=1)

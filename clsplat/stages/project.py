@@ -311,7 +311,8 @@ def project_step(
 
 
 class _Build(NamedTuple):
-    """Gaussians per work-item of the gradient, and the define LANES if they are not the lanes of the kernel shape."""
+    """Gaussians per work-item in the gradient's kernel, and its define LANES if this is not the kernel shape's
+    number."""
 
     lanes: int
     defines: dict[str, object]

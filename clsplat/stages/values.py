@@ -18,9 +18,9 @@ from clsplat.stages.splats import SLOT_MOMENT_FIELDS, SPLAT_VALUES, ScreenGradie
 MAX_VALUES_PER_PASS = 32
 """Maximum values per pass if one work-item has a whole tile. If several share a tile, fewer sums fit in registers."""
 _MAX_REGISTER_SUMS = 64
-"""Maximum sums of a work-item that shares its tile, in the forward pass: values times pixels of the work-item."""
+"""Maximum number of sums in registers, values times pixels, of a work-item that shares its tile with others."""
 _MAX_LOCAL_SUMS = 2048
-"""Maximum sums of a group in the gradient, so that they fit in local memory: values times work-items."""
+"""Maximum number of sums in local memory, values times work-items, of a group in the gradient."""
 
 
 def passes(first: int, depth: int, most: int) -> Iterator[tuple[int, int]]:

@@ -102,7 +102,8 @@ class _AddedView(GradientStep):
     noise: Exploration
 
     def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
-        """Keep the parts' gradients, in place of Adam: all views of a batch use the components' state before it."""
+        """Keep the gradients of the view's parts until the batch ends, because all its views use the same
+        parameters."""
         self.own[inputs.place] = own
 
     def update(self, rows: StepRows) -> None:
@@ -292,7 +293,7 @@ class Batch:
 
         step: template for the steps of the single views; its number counts views.
         factor: divisor of the photographs' resolution.
-        probes: function that makes a view's probe from its inputs and step.
+        probes: function that makes the observer of a view's step from its inputs and step.
         statistics: True if density control uses the views' gradients.
         """
         batch, work, device = self.config.batch, self.rasterizer.work, step.device

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Memory of a training: the plans of the devices', the limit of main memory, and the cache of decoded photographs."""
+"""Memory of a training: plans of device memory, the limit of main memory (--max-host-mem), scratch files and cache."""
 
 from __future__ import annotations
 
@@ -35,27 +35,28 @@ from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.supervision.resolution import by_doubling
 
 NO_CACHE = "none"
+"""Value of --cache for no cache of decoded photographs."""
 POOL_QUARTERS = 3
-"""Quarters that the model's chunks get of the main memory which is left after what every step needs. The photographs
+"""Quarters of the main memory beyond the least that photographs need, which go to the model's chunks. The photographs
 get the rest."""
 
 
 def model_bytes(config: TrainConfig) -> int:
-    """Bytes per Gaussian: parameters, moments and statistics, and with a batch also gradients and their sums."""
+    """Return the bytes per Gaussian: parameters, moments, statistics, and with --batch gradients and their sums."""
     arrays = MODELS if config.batch == 1 else OWNER_ARRAYS_PER_PARAMETER
     return arrays * 4 * floats_of((config.sh_degree + 1) ** 2) + gaussian_bytes(contributions=False)
 
 
 @dataclass(frozen=True)
 class HostMemory:
-    """Main memory of a training.
+    """Main memory of a training, with the folders for what it has no room for.
 
     limit: maximum number of bytes for photographs and Gaussians; None for no limit.
     cache: folder of the cache of decoded photographs; None for no cache.
-    keeps_cache: True if the user named that folder, which then stays.
-    scratch: folder of the files of chunks; None for none.
-    owner: beginning of the names of this training's files there.
-    run: run whose checkpoints name these files.
+    keeps_cache: True if the user named the cache's folder, so that it stays after the training.
+    scratch: folder for scratch files of Gaussians; None if there is no folder.
+    owner: beginning of the names of this training's scratch files.
+    run: run whose checkpoints name scratch files.
     """
 
     limit: int | None = None
@@ -73,10 +74,10 @@ class HostMemory:
         run: Run | None,
         scratch: str | Path | None = None,
     ) -> HostMemory:
-        """Main memory as the arguments of `clsplat.train` set it. Raises InputError.
+        """Make it from the arguments of `clsplat.train`. Raises InputError.
 
-        cache: a folder, "none", or None for the run's folder if there is a limit.
-        scratch: a folder, or None for the run's.
+        cache: a folder, or "none". None takes RUN/cache if there is a limit, otherwise no cache.
+        scratch: a folder. None takes RUN/scratch.
         """
         limit = parse_bytes(max_host_mem, "--max-host-mem")
         memory = cls._with_cache(limit, cache, run)
@@ -89,7 +90,7 @@ class HostMemory:
 
     @cached_property
     def files(self) -> ScratchFiles | None:
-        """This training's files of chunks; None if there is no folder for them."""
+        """This training's scratch files; None if there is no folder for them."""
         return ScratchFiles(self.scratch, self.owner, self.run) if self.scratch is not None else None
 
     @classmethod
@@ -101,27 +102,27 @@ class HostMemory:
         return cls(limit) if str(cache) == NO_CACHE else cls(limit, Path(cache), keeps_cache=True)
 
     def photographs(self, scene: Scene, config: TrainConfig) -> HostPhotographs:
-        """Training photographs of a scene."""
+        """Make the store of a scene's training photographs."""
         store = DecodedStore(self.cache) if self.cache is not None else None
         views, factors = scene.require_training_views(), by_doubling(config.warmup).factors
         return HostPhotographs(Decoder(views, config.rounds_photos(len(views)), factors, store), config.batch)
 
     def check(self, scene: Scene, config: TrainConfig, device: Device) -> None:
-        """Raise InputError if the limit is too small for the first step. Writes nothing."""
+        """Raise InputError if the limit is too small for the first step. Creates no files."""
         if self.limit is not None:
             count = len(scene.points) or config.random_points
             taken = count * model_bytes(config)
             if streams_by_chunk(config, device, count):
                 taken = _least_pool(record_bytes(config, contributions=False))
             taken *= device.shares_memory
-            photographs = replace(self, cache=None).photographs(scene, config)  # the cache would make its folder
+            photographs = replace(self, cache=None).photographs(scene, config)  # a cache would create its folder
             self.share(photographs, count, taken, begins=True)
 
     def pool(self, photographs: HostPhotographs, count: int, record: int, *, begins: bool) -> int | None:
-        """Bytes of main memory for the chunks that are on a device which shares it; None if all chunks fit.
+        """Return the bytes for chunks on a device that shares main memory; None if all chunks fit within the limit.
 
         record: bytes of a Gaussian in a chunk.
-        begins: as in `share`.
+        begins: True to raise InputError if the limit is too small for one chunk.
         """
         if self.limit is None or self.limit >= count * record + photographs.least:
             return None
@@ -131,8 +132,10 @@ class HostMemory:
         return max(pool, CHUNK_ROWS * record)
 
     def scratch_file(self, nbytes: int, photographs: HostPhotographs) -> Path | None:
-        """A new file for so many bytes of chunks; None if main memory has room for them. Raises InputError if there is
-        no folder for it."""
+        """Return the path of a new scratch file for `nbytes` of chunks; None if main memory has room for them.
+
+        Raises InputError if there is no folder for the file.
+        """
         if self.limit is None or self.limit >= nbytes + photographs.least:
             return None
         if self.files is None:
@@ -143,17 +146,16 @@ class HostMemory:
         return self.files.new_file()
 
     def remove_scratch(self) -> None:
-        """Remove this training's files of chunks that no checkpoint names, such as those of a process that was
-        killed."""
+        """Remove this training's scratch files that no checkpoint names, such as those of a process that was killed."""
         if self.files is not None:
             self.files.remove_unnamed()
 
     def share(self, photographs: HostPhotographs, count: int, taken: int, *, begins: bool) -> bool:
-        """Give the photographs the memory that the Gaussians leave. Returns False if that is too little.
+        """Limit photographs to the memory that the Gaussians leave. Returns False if this is too little for them.
 
         count: number of Gaussians.
         taken: bytes of the Gaussians on the host.
-        begins: True to raise InputError instead, with the smallest limit that is enough.
+        begins: True to raise InputError if it is too little. The message names the smallest limit that is enough.
         """
         if self.limit is None:
             return True
@@ -172,7 +174,7 @@ class HostMemory:
         )
 
     def end(self, run: Run | None) -> None:
-        """Remove the cache in the folder of a run that has finished, unless it was named as the cache's folder."""
+        """Remove RUN/cache after the training, unless the user named this folder as the cache."""
         if run is None or not run.cache_path.is_dir():
             return
         if not (self.keeps_cache and self.cache is not None and self.cache.resolve() == run.cache_path.resolve()):
@@ -180,22 +182,26 @@ class HostMemory:
 
 
 def record_bytes(config: TrainConfig, *, contributions: bool) -> int:
-    """Bytes of a Gaussian in a chunk: parameters, moments and statistics."""
+    """Return the bytes of a Gaussian in a chunk: parameters, moments and statistics."""
     return MODELS * 4 * floats_of((config.sh_degree + 1) ** 2) + gaussian_bytes(contributions=contributions)
 
 
 def _least_pool(record: int) -> int:
-    """Bytes beside photographs with which the pool has room for one chunk. record: bytes of a Gaussian in it."""
+    """Return the smallest main memory, beside the photographs, whose share for the pool holds one chunk.
+
+    record: bytes of a Gaussian in a chunk.
+    """
     return -(-CHUNK_ROWS * record * 4 // POOL_QUARTERS)
 
 
 UNLIMITED = HostMemory()
+"""Main memory without a limit, a cache and scratch files."""
 
 
 class MemoryPlanner:
-    """Plans the memory of a training, and gives its parts what the plans allow them.
+    """Plans the memory of a training before it begins and at each densification, and sets the limits of its parts.
 
-    begins: True until the first step. Too little main memory is an error until then, and a warning later.
+    begins: True until the first step. Until then too little main memory is an error, afterwards a warning.
     """
 
     def __init__(
@@ -215,7 +221,7 @@ class MemoryPlanner:
         """Plan the memory for `count` Gaussians with their final number of SH coefficients.
 
         needs: statistics of density control.
-        turns: number of arrays for the loss's sums (`stages.loss.loss`).
+        turns: number of arrays of loss sums that steps use in turn (`stages.loss.loss`).
         Raises CapacityError, or InputError for too little main memory.
         """
         by_chunk = streams_by_chunk(self._config, self._rasterizer.device, count)
@@ -245,12 +251,12 @@ class MemoryPlanner:
         return made
 
     def scratch_file(self, nbytes: int) -> Path | None:
-        """A new file for so many bytes of chunks; None if main memory has room for them. Raises InputError."""
+        """Return the path of a new scratch file; None if main memory has room (`HostMemory.scratch_file`)."""
         return self._memory.scratch_file(nbytes, self._photographs.host)
 
     @property
     def scratch_files(self) -> ScratchFiles | None:
-        """The training's files of chunks; None if there is no folder for them."""
+        """The training's scratch files; None if there is no folder for them."""
         return self._memory.files
 
     def _plan(self, device: Device, count: int, memory: StepMemory, models: int) -> Plan:
@@ -262,11 +268,11 @@ class MemoryPlanner:
             if not whole:
                 raise
             raise CapacityError(
-                f"{error}; without {', '.join(whole)} steps need memory for the Gaussians in view alone"
+                f"{error}; without {', '.join(whole)}, steps need memory only for the Gaussians in view"
             ) from None
 
     def _share_host(self, plan: Plan, count: int) -> None:
-        """Give the photographs the main memory that the Gaussians leave."""
+        """Limit photographs to the main memory that the Gaussians leave. Warns once if this is too little."""
         on_host = self._rasterizer.device.shares_memory or plan.streamed
         taken = plan.need.record * (plan.rows if plan.need.pool is not None else count) if on_host else 0
         enough = self._memory.share(self._photographs.host, count, taken, begins=self.begins)

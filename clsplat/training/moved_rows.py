@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rows of a model after density control: their order, and the places of new ones."""
+"""Rows of a model after density control: their order in space, and the halves of split Gaussians."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ class Move:
 
 @dataclass(frozen=True, eq=False)
 class MovedRows:
-    """The rows of a model after a move.
+    """The rows of a model after a plan is carried out.
 
-    rows: (m,) uint32, a source row each, plus FRESH if new.
-    halves: number of halves of split Gaussians.
-    places: place of each row of the list that the plan has; None if they are the same, or as in `listed`.
-    listed: the list, if it is of a large streamed model.
+    rows: (m,) uint32, the source row of each row, plus FRESH if the row is new.
+    halves: number of halves of split Gaussians, two of each.
+    places: new row of each entry of the plan's list; None if the order is the same, or as in `listed`.
+    listed: the plan's list in the order of the sources, of a large streamed model; else None.
     """
 
     rows: DeviceArray | NDArray[np.uint32]
@@ -59,13 +59,13 @@ class MovedRows:
     listed: SourceList | None = None
 
     def at(self, rows: NDArray[Any]) -> NDArray[Any]:
-        """Places in the model of rows of the plan's list."""
+        """Return the rows of the model that entries of the plan's list have become."""
         places = self.places if self.listed is None else self.listed.by_kind()
         return rows if places is None else places[rows]
 
     @property
     def halves_at(self) -> tuple[Places, Places]:
-        """Places in the model of the first halves, and of the second halves."""
+        """Rows of the first halves, and rows of the second halves, in the order of the split Gaussians."""
         if self.listed is not None:
             return self.listed.seconds - 1, self.listed.seconds
         count = self.rows.shape[0]
@@ -74,10 +74,10 @@ class MovedRows:
 
 
 def ordered(plan: RowPlan, parameters: AnyGaussians) -> MovedRows | None:
-    """The rows of a plan in the model's order; None if no row moves.
+    """Return the rows that a plan leads to, in the order of the new model; None if no row moves.
 
-    In a large model new rows stand behind those that they come from. When a model becomes large, its rows are put
-    in order of their places in space.
+    In a model with more than ORDERED_ROWS rows, new rows stand behind the rows that they were copied from. When a model
+    exceeds this number for the first time, its rows are sorted along a curve through space (`space_order`).
     """
     listed, was_large = plan.listed, parameters.count > ORDERED_ROWS
     if plan.rows is not None:
@@ -108,8 +108,10 @@ def halve(
     halved: Sequence[str],
     at_once: int,
 ) -> None:
-    """Replace the copies of split Gaussians with their halves, computed from the groups `halved`.
+    """Replace the two copies of each split Gaussian with its halves.
 
+    halves: function that computes the first halves, or with True as second argument the second halves (`RowPlan`).
+    halved: parameter groups that `halves` reads.
     at_once: number of split Gaussians whose halves are computed at a time; 0 computes all, so that one copy of each
         array crosses the bus.
     """
@@ -121,21 +123,22 @@ def halve(
             set_rows_at(parameters[group], both(first, second), np.concatenate([values, sides[1][group]]))
         return
     for places, begin in product((first, second), range(0, moved.halves // 2, at_once)):
-        copies, some = (some_of(each, begin, at_once) for each in (second, places))  # second halves are still copies
+        # The second halves are read as copies of the split Gaussians. They are replaced after all first halves.
+        copies, some = (some_of(each, begin, at_once) for each in (second, places))
         split = {group: rows_at(parameters[group], copies) for group in halved}
         for group, values in halves(split, places is second).items():
             set_rows_at(parameters[group], some, values)
 
 
 def both(first: Places, second: Places) -> Places:
-    """Places of first and second halves in one."""
+    """Concatenate the rows of first and second halves."""
     if isinstance(first, slice) or isinstance(second, slice):
         return slice(first.start, second.stop)  # type: ignore[union-attr]  # both are
     return np.concatenate([first, second])
 
 
 def some_of(places: Places, begin: int, count: int) -> Places:
-    """So many of the places, from the one of number `begin` on, or as many as there are."""
+    """Return `count` of the places from index `begin` on, or as many as there are."""
     if isinstance(places, slice):
         return slice(places.start + begin, min(places.start + begin + count, places.stop))
     return places[begin : begin + count]

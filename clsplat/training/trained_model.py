@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Gaussians in training: parameters, Adam's moments, density statistics, and the moves of their rows."""
+"""Gaussians in training: parameters, Adam's moments, density statistics, and their rows after density control."""
 
 from __future__ import annotations
 
@@ -74,17 +74,17 @@ from clsplat.training.stability.health import examine
 
 _STAY = Move()
 EXAMINED_CHUNKS = 64
-"""Chunks whose numbers are examined at once."""
+"""Number of chunks that are searched for non-finite values at a time."""
 HALVED_ROWS = 1 << 15
-"""Split Gaussians of a model in a store whose halves are computed at a time."""
+"""Number of split Gaussians whose halves are computed at a time, if the model is in a store of chunks."""
 
 
 class TrainedModel:
     """Parameters, first and second moments and statistics, on the device or streamed from the host.
 
     make_plan: function that plans the device's memory for a number of Gaussians.
-    scratch: function that names a new file for so many bytes of chunks, or returns None to keep them in main memory.
-    files: the training's files of chunks; None if there is no folder for them.
+    scratch: function from bytes of chunks to the path of a new scratch file, or None to keep them in main memory.
+    files: the training's scratch files; None if there is no folder for them.
     sh_degree: final SH degree.
     counts_contributions: True if the statistics have contributions.
     """
@@ -111,11 +111,11 @@ class TrainedModel:
         self._sh_degree, self._counts_contributions = sh_degree, counts_contributions
 
     def begin(self, initial: Gaussians) -> None:
-        """Start from a model on the host. The rows of a large one are put in order of their places in space."""
+        """Start from a model on the host. The rows of a large model are sorted along a curve through space."""
         if len(initial) > ORDERED_ROWS:
             initial = take(initial, space_order(initial.means).astype(np.int64))
         self.plan = self._make_plan(len(initial))
-        if self.plan.streamed:  # a store of chunks is a copy already
+        if self.plan.streamed:  # a large model is copied into a store of chunks
             initial = initial if len(initial) > ORDERED_ROWS else copy.deepcopy(initial)
             self.set(host_gaussians(initial, self.plan.rows))
         else:
@@ -123,9 +123,9 @@ class TrainedModel:
 
     @contextmanager
     def saved(self, checkpoint: Checkpoint) -> Iterator[tuple[list[HostGaussians], Checkpoint]]:
-        """Context with parameters, first and second moments of a checkpoint, and the checkpoint with all its arrays.
+        """Context manager that yields a checkpoint's parameters and moments, and the checkpoint with all its arrays.
 
-        A scratch file that has some of them is open in the context. Raises InputError for arrays of another model.
+        A scratch file that has some of the arrays is open inside the context. Raises InputError for wrong arrays.
         """
         saved: Mapping[str, Any] = {}
         with ExitStack() as reading:
@@ -146,7 +146,7 @@ class TrainedModel:
     def load(self, models: Sequence[HostGaussians], checkpoint: Checkpoint) -> None:
         """Continue with the models and the statistics of a checkpoint (`saved`).
 
-        Statistics that the settings did not need before the checkpoint stay unknown.
+        Statistics that the checkpoint does not have get their initial values.
         Raises InputError for statistics of another model.
         """
         self.free()
@@ -160,19 +160,19 @@ class TrainedModel:
             self._place(models, held)
 
     def free(self) -> None:
-        """Free all arrays, and close the file of chunks."""
+        """Free all arrays, and close the scratch file."""
         self.close()
         del self.parameters, self.first, self.second, self.statistics
 
     def set(
         self, parameters: AnyGaussians, first: AnyGaussians | None = None, second: AnyGaussians | None = None
     ) -> None:
-        """Set the arrays, where the plan assigns them, with new statistics. Moments that are not given start from
-        zero."""
+        """Replace the model, on the device or the host as the plan assigns, with new statistics. Moments that are not
+        given are zero."""
         self._place((parameters, first, second), {})
 
     def kinds(self) -> dict[str, AnyGaussians]:
-        """Parameters, first and second moments, by their names in a checkpoint."""
+        """Return parameters, first and second moments by their names in a checkpoint."""
         return {"parameters": self.parameters, "first": self.first, "second": self.second}
 
     @property
@@ -181,26 +181,26 @@ class TrainedModel:
         return self.parameters, self.first, self.second
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Parameters, moments and statistics by their names in a checkpoint."""
+        """Return parameters, moments and statistics by their names in a checkpoint."""
         return {name: array.get() for name, array in self._by_field().items()}
 
     def _by_field(self) -> dict[str, AnyArray]:
         return by_field(self.with_moments) | self.statistics.by_field()
 
     def by_kind(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Mapping[str, AnyArray]]:
-        """Parameters and moments by kind and group: those of a checkpoint, or of the scratch file, of which a
-        checkpoint has only a manifest."""
+        """Return parameters and moments by kind and group: those of the arrays of a checkpoint, or of the scratch file,
+        of which a checkpoint has only a manifest."""
         if self.in_file:
             return {kind: model.arrays for kind, model in self.kinds().items()}
         return {kind: _host_arrays({g: arrays[f"{kind}/{g}"] for g in PARAMETER_GROUPS}) for kind in KINDS}
 
     @property
     def store(self) -> ChunkStore | None:
-        """The store of the chunks, if they are in a scratch file."""
+        """The store of chunks if it is in a scratch file; None if the model is in memory."""
         return self._pool.store if self._pool is not None and self._pool.store.path is not None else None
 
     def record(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        """Arrays and state of a checkpoint: a manifest if there is a scratch file."""
+        """Return the model's arrays and state for a checkpoint: with a scratch file, its manifest."""
         if (store := self.store) is None or self._pool is None:
             return self.arrays(), {}
         if store.file.is_lost:
@@ -212,12 +212,12 @@ class TrainedModel:
         return manifest.arrays(), manifest.state()
 
     def saved_now(self) -> None:
-        """Note that a checkpoint has been written."""
+        """Update the scratch files after a checkpoint has been written."""
         if self._files is not None:
             self._files.saved(self.store)
 
     def changes_are_finite(self) -> bool:
-        """True if the Gaussians are in a scratch file, and those that have changed since the last checkpoint are
+        """True if the Gaussians are in a scratch file, and all chunks that have changed since the last checkpoint are
         finite."""
         if (store := self.store) is None or self._pool is None:
             return False
@@ -231,11 +231,11 @@ class TrainedModel:
         return True
 
     def marker(self) -> DeviceMarker:
-        """Marker of the Gaussians by density rules."""
+        """Return an object that marks the Gaussians by density rules."""
         return DeviceMarker(self._device, self._work, self.parameters, self.statistics)
 
     def widen(self, coefficients: int) -> None:
-        """Make room for more SH coefficients, which start from zero."""
+        """Increase the number of SH coefficients. The new ones are zero."""
         if self._pool is not None:
             self._move_chunks(Move(coefficients=coefficients))
             return
@@ -246,8 +246,8 @@ class TrainedModel:
     def rearrange(self, plan: RowPlan, changes: Callable[[], None]) -> DeviceArray | HostArray | None:
         """Carry out a plan of density control, or of a repair. Returns the list of rows if rows have moved.
 
-        changes: function that is called just before the first change, when the kernels have been tried in the sandbox
-            and the moved rows have their memory. It may be called several times.
+        changes: function that is called just before the first change, after the kernels have been tried in the sandbox
+            and memory for the moved rows is allocated. It may be called several times.
         Raises CapacityError, before any change, if there is too little memory for the moved rows.
         """
         moved = ordered(plan, self.parameters)
@@ -270,17 +270,17 @@ class TrainedModel:
         return moved.rows if isinstance(moved.rows, DeviceArray) else HostArray(moved.rows)
 
     def change_moments(self, change: Callable[[Float32], Float32]) -> None:
-        """Replace all moments with what a function makes of those of any rows."""
+        """Apply a function to all moments, some rows at a time."""
         for model, group in product((self.first, self.second), PARAMETER_GROUPS):
             change_rows(model[group], change)
 
     def _place(
         self, models: Models | None = None, statistics: Mapping[str, ReadableArray] | None = None, move: Move = _STAY
     ) -> None:
-        """Put Gaussians where the plan assigns them. The rows of a large streamed model are in a store of chunks.
+        """Put Gaussians where the plan assigns them: on the device, in main memory, or in a store of chunks.
 
         models: new parameters and moments, not in a store. None keeps this model's, which are or will be in a store.
-        statistics: those of new models by name, of which others begin anew; None keeps this model's.
+        statistics: statistics of new models by name; others get their initial values. None keeps this model's.
         """
         parameters = self.parameters if models is None else models[0]
         assert parameters is not None
@@ -303,7 +303,7 @@ class TrainedModel:
     def _to_store(
         self, models: Models | None, statistics: Mapping[str, ReadableArray] | None, count: int, move: Move
     ) -> None:
-        """Put `count` Gaussians into a new store, and make its pool. Arguments as those of `_place`."""
+        """Put `count` Gaussians into a new store of chunks, and make its pool. Other arguments as for `_place`."""
         source, old = self.with_moments if models is None else models, self._pool if models is None else None
         named = self.statistics.named() if statistics is None else statistics
         arrays = by_field(source) | {f"{KIND}/{name}": array for name, array in named.items()}
@@ -319,14 +319,14 @@ class TrainedModel:
             store.close()
             raise
         move.changes()
-        del source, old, named, arrays, copied  # the old arrays make room for the new pool
+        del source, old, named, arrays, copied  # frees the old arrays' memory for the new pool
         vars(self).pop("statistics", None)
         self._free_models()
         self._use(pool or make(), move.coefficients)
 
     def _move_chunks(self, move: Move) -> None:
-        """Move the rows of a model in a store, which stays where it is unless main memory has no room for it any
-        longer."""
+        """Move the rows of a model in a store of chunks. The store moves to a scratch file if main memory has no room
+        for it any longer."""
         assert self._pool is not None
         count, store = move.count(self.parameters.count), self._pool.store
         to_file = store.path is None and self._scratch(self._record_bytes(move.coefficients) * count) is not None
@@ -341,7 +341,7 @@ class TrainedModel:
         self._use(ChunkPool(self._device, self._work, store, self.plan.rows), move.coefficients)
 
     def _fields(self, coefficients: int) -> dict[str, tuple[int, ...]]:
-        """Fields of a store of this model."""
+        """Return the fields of a store of this model."""
         return fields_of(coefficients) | statistics_fields(contributions=self._counts_contributions)
 
     @property
@@ -350,11 +350,11 @@ class TrainedModel:
         return self._fields((self._sh_degree + 1) ** 2)
 
     def _record_bytes(self, coefficients: int) -> int:
-        """Bytes of a Gaussian in a store."""
+        """Return the bytes of a Gaussian in a store."""
         return MODELS * 4 * floats_of(coefficients) + gaussian_bytes(contributions=self._counts_contributions)
 
     def _from_store(self, count: int, move: Move) -> None:
-        """Take `count` Gaussians from this model's store to arrays."""
+        """Move this model's Gaussians from its store to arrays. count: number of rows after the move."""
         old, self._pool = self._pool, None
         assert old is not None
         old.write_back()
@@ -379,7 +379,7 @@ class TrainedModel:
             vars(self).pop(name, None)
 
     def _go_on_in(self, manifest: Manifest | None, coefficients: int) -> bool:
-        """Go on in the scratch file of a checkpoint. Returns False if the Gaussians belong elsewhere."""
+        """Continue in the scratch file of a checkpoint. Returns False if this model cannot use the file."""
         if (
             manifest is None
             or dict(manifest.fields) != self._fields(coefficients)
@@ -397,7 +397,7 @@ class TrainedModel:
         return True
 
     def _use(self, pool: ChunkPool, coefficients: int) -> None:
-        """Let the rows be those of a pool's store."""
+        """Set parameters, moments and statistics to those of a pool's store."""
         if self._files is not None and pool.store.path is not None:
             self._files.follow(pool.store)
         self._pool = pool
@@ -406,17 +406,16 @@ class TrainedModel:
 
     @property
     def in_file(self) -> bool:
-        """True if main memory has no room for the whole model."""
+        """True if the model is in a scratch file, because main memory has no room for it."""
         return self.store is not None
 
     @property
     def moved_bytes(self) -> int:
-        """Bytes of chunks that have gone to or come from the device."""
+        """Bytes of chunks that have crossed the bus so far, in both directions."""
         return 0 if self._pool is None else self._pool.moved_bytes
 
     def close(self) -> None:
-        """Remove the scratch file of a streamed model, unless a checkpoint names it. The model cannot be used any
-        longer."""
+        """End the use of a streamed model: remove its scratch file, unless a checkpoint names the file."""
         if self._pool is not None:
             self._pool.close()
             self._pool = None
@@ -431,7 +430,7 @@ class TrainedModel:
         self.parameters, self.first, self.second = [to_host(model) for model in self.with_moments]
 
     def _placed(self, model: AnyGaussians) -> AnyGaussians:
-        """The model on the device or on the host, as the plan assigns; it is moved there if necessary."""
+        """Move a model to the device or to the host, as the plan assigns, if it is not there yet."""
         if isinstance(model, HostGaussians):
             return (
                 replace(to_host(model), rows=self.plan.rows) if self.plan.streamed else to_device(self._device, model)
@@ -441,7 +440,7 @@ class TrainedModel:
     def _move(
         self, rows: DeviceArray | NDArray[np.uint32], changes: Callable[[], None], *, new_statistics: bool
     ) -> None:
-        """Move all arrays, so that row j becomes the old row rows[j], with zero moments if it is FRESH."""
+        """Rearrange all arrays: row j becomes the old row rows[j], with zero moments if it is FRESH."""
         count, before, gathers = rows.shape[0], self.parameters.count, self.plan.gathers
         with only_tried(self._device):
             try_gather(self._device, count, self.parameters)
@@ -462,7 +461,7 @@ class TrainedModel:
     def _gather(
         self, rows: DeviceArray | NDArray[np.uint32], *, on_device: bool, changes: Callable[[], None]
     ) -> DeviceArray | NDArray[np.uint32]:
-        """Move the rows of a model without a store. Returns the list on the device, if they moved there."""
+        """Move the rows of a model without a store. Returns the list of rows, on the device if the rows moved there."""
         if on_device:
             rows = rows if isinstance(rows, DeviceArray) else upload(self._device, rows)
         else:

@@ -1,6 +1,6 @@
-// The light behind a pair in a pixel, reduced to one number by the pixel's gradient. With ITEMS == 1 this is R of (48)
-// in docs/gradients.md. A group of several items keeps D . B of (22), which takes fewer instructions and is more
-// precise.
+// The light behind a pair in a pixel, reduced to one number by the pixel's gradient. With ITEMS == 1 this is R of
+// equation (48) in docs/gradients.md. A group of several items keeps D . B of equation (22), which takes fewer
+// instructions and is more precise.
 
 // BEHIND: the light behind all pairs. t: the final transmittance; at_end: the gradient with respect to t.
 #if ITEMS == 1

@@ -140,8 +140,8 @@ typedef struct {
 #define KEPT(gaussian, pair) (pair)
 #endif
 
-// Copies a splat to *place in local memory, in loads that are under way together. Returns those blocks of the set
-// `among` that the splat reaches.
+// Copies a splat to *place in local memory. All loads are issued before a value is used, so that their latencies
+// overlap. Returns the blocks of the set `among` that the splat reaches.
 static inline uint stage(__local Staged *place, uint gaussian, uint kept, uint slot, uint among,
                          __global const float *splats, int tile_x, int tile_y) {
   __global const float4 *row = (__global const float4 *)splats + (size_t)(SPLAT_SIZE / 4) * gaussian;

@@ -1,8 +1,8 @@
 // Projects LANES Gaussians to ellipses on the image (EWA) with gsplat's conventions. ewa.cl and ewa_grad.cl share this
 // code. Equation numbers refer to docs/gradients.md. The view matrix need not be a rotation, and all its twelve numbers
-// have gradients; therefore (154) uses the matrix's cofactors instead of its rows. With ORTHOGRAPHIC the image is
-// linear in x and y, with FISHEYE in the angle from the axis. With COVARIANCES, covariances replace quaternions and
-// scales.
+// have gradients; therefore equation (154) of docs/gradients.md uses the matrix's cofactors instead of its rows. With
+// ORTHOGRAPHIC the image is linear in x and y, with FISHEYE in the angle from the axis. With COVARIANCES, covariances
+// replace quaternions and scales.
 #include "shared/place.h"
 #define NEEDS_PROJECTION
 #include "shared/camera.h"
@@ -89,8 +89,8 @@ static inline floatL atan_of_ratio(floatL x) {
   return fmaL(t * p, x, x);
 }
 
-// Computes `away`, `bend`, `bend2` and `inverse` of a fisheye's projection, (157) and (158). Near the axis series are
-// used, because terms of the closed forms nearly cancel there.
+// Computes `away`, `bend`, `bend2` and `inverse` of a fisheye's projection, equations (157) and (158) of
+// docs/gradients.md. Near the axis series are used, because terms of the closed forms nearly cancel there.
 static inline void fisheye_of(Ellipse2 *p) {
   const floatL q = fmaL(p->x, p->x, p->y * p->y), d = fmaL(p->z, p->z, q);
   const floatL up = 1.0f / p->z, up2 = up * up, t = q * up2;
@@ -130,8 +130,8 @@ static inline void fisheye_of(Ellipse2 *p) {
 }
 #endif
 
-// Computes the projected covariance with the low-pass eps, (153) to (155). The determinants are sums of squares or of
-// positive terms.
+// Computes the projected covariance with the low-pass eps, equations (153) to (155) of docs/gradients.md. The
+// determinants are sums of squares or of positive terms.
 static inline void covariance2(float eps, Ellipse2 *p) {
   floatL xx, xy, yy;
 #ifdef COVARIANCES
@@ -172,7 +172,8 @@ static inline void covariance2(float eps, Ellipse2 *p) {
 #define EWA_NUMBER2(name, index)                                                                                       \
   {(floatL)(camera[EWA_##name##0 + (index)]), (floatL)(camera[EWA_##name##0_LOW + (index)])}
 
-// Recomputes b1, b2 and c in the lanes of `which`, (57). It uses two floats up to the last step in which terms cancel.
+// Recomputes b1, b2 and c in the lanes of `which`, equation (57) of docs/gradients.md. It uses two floats up to the
+// last step in which terms cancel.
 static inline void refine2(const uint *row, __global const float *quaternions, __constant float *camera, intL which,
                            Ellipse2 *p) {
   Double r[9];
@@ -202,8 +203,8 @@ static inline void refine2(const uint *row, __global const float *quaternions, _
 }
 #endif
 
-// Projects LANES Gaussians, (150) to (155): fills *p, and returns 0 if every lane is culled. Conditions are written so
-// that NaN culls. row (LANES): the Gaussians' rows, from ROWS_OF_ITEM.
+// Projects LANES Gaussians, equations (150) to (155) of docs/gradients.md: fills *p, and returns 0 if every lane is
+// culled. Conditions are written so that NaN culls. row (LANES): the Gaussians' rows, from ROWS_OF_ITEM.
 static inline int project_ellipses(const uint *row, __global const float *means, EWA_SHAPES, __constant float *camera,
                                    Ellipse2 *p) {
   const floatL x = GATHER(means, 3, 0), y = GATHER(means, 3, 1), z = GATHER(means, 3, 2);
@@ -298,5 +299,5 @@ static inline int project_ellipses(const uint *row, __global const float *means,
   return 1;
 }
 
-// The factor by which opacity compensates for the low-pass, (156).
+// The factor by which opacity compensates for the low-pass, equation (156) of docs/gradients.md.
 static inline floatL compensation2(const Ellipse2 *p) { return sqrt(p->det0 / p->det); }

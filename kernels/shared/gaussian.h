@@ -5,7 +5,7 @@
 #include "shared/place.h"
 
 // LOW_PASS: variance added to the projected covariance, in px^2. LEAST_COMPENSATION: the minimum factor of the opacity
-// in (83).
+// in equation (83) of docs/gradients.md.
 #ifdef ANTIALIASED
 #define LOW_PASS 0.1f
 #define LEAST_COMPENSATION 0.005f
@@ -40,7 +40,8 @@ typedef struct {
   ((GATHER(means, 3, index) - camera[CAMERA_P##axis]) - camera[CAMERA_P##axis##_LOW])
 
 #ifndef RAYS
-// Computes the projected covariance from J A and S, (5) to (7), and the determinant as a sum of squares, (56).
+// Computes the projected covariance from J A and S, equations (5) to (7) of docs/gradients.md, and the determinant as a
+// sum of squares, equation (56) of docs/gradients.md.
 static inline void covariance(Projection *p) {
   floatL xx = (floatL)(0.0f), yy = xx, xy = xx, minors = (floatL)(LOW_PASS * LOW_PASS);
 #ifdef ANTIALIASED
@@ -65,8 +66,8 @@ static inline void covariance(Projection *p) {
 #endif
 
 #ifdef ANTIALIASED
-// The factor by which opacity compensates for the low-pass, (83). det0, det: determinants of the covariance without and
-// with the low-pass.
+// The factor by which opacity compensates for the low-pass, equation (83) of docs/gradients.md. det0, det: determinants
+// of the covariance without and with the low-pass.
 static inline floatL compensation(floatL det0, floatL det) {
   const floatL part = det0 / det;
   return part > LEAST_COMPENSATION * LEAST_COMPENSATION ? sqrt(part) : (floatL)(LEAST_COMPENSATION);
@@ -74,8 +75,8 @@ static inline floatL compensation(floatL det0, floatL det) {
 #endif
 
 #ifndef RAYS
-// Recomputes J A and its minors in the lanes of `which`, (57). It uses two floats up to the last step in which terms
-// cancel.
+// Recomputes J A and its minors in the lanes of `which`, equation (57) of docs/gradients.md. It uses two floats up to
+// the last step in which terms cancel.
 static inline void refine(const uint *row, __global const float *quaternions, __constant float *camera, intL which,
                           Projection *p) {
   Double r[9];
@@ -102,8 +103,8 @@ static inline void refine(const uint *row, __global const float *quaternions, __
   }
 }
 
-// Projects LANES Gaussians, (1) and (3) to (7): fills *p, and returns 0 if every lane is culled. Conditions are written
-// so that NaN culls. row (LANES): the Gaussians' rows, from ROWS_OF_ITEM.
+// Projects LANES Gaussians, equations (1) and (3) to (7) of docs/gradients.md: fills *p, and returns 0 if every lane is
+// culled. Conditions are written so that NaN culls. row (LANES): the Gaussians' rows, from ROWS_OF_ITEM.
 static inline int project_gaussians(const uint *row, __global const float *means, __global const float *quaternions,
                                     __global const float *log_scales, __constant float *camera, Projection *p) {
   const floatL x = GATHER(means, 3, 0), y = GATHER(means, 3, 1), z = GATHER(means, 3, 2);

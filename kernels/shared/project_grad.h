@@ -106,10 +106,11 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   const floatL l11 = whitening[0].all, l12 = whitening[1].all, l22 = whitening[2].all;
   const floatL m_g = m[SLOT_G].all, m_gu = m[SLOT_GU].all, m_gv = m[SLOT_GV].all;
 
-  // Opacity, (29) and (41): the sum of g is o dL/do, and do/dlogit = o (1 - o).
+  // Opacity, equations (29) and (41) of docs/gradients.md: the sum of g is o dL/do, and do/dlogit = o (1 - o).
   Lanes d_screen[2];
   d->opacity.all = m_g * sigmoidL(-GATHER(opacity_logits, 1, 0)); // 1 - o, also for o close to 1
-#ifdef PENALTIES                                                  // (91)
+#ifdef PENALTIES
+  // Equation (91) of docs/gradients.md
   const floatL opacity = sigmoidL(GATHER(opacity_logits, 1, 0));
   d->opacity.all = fmaL(opacity_weight * opacity, sigmoidL(-GATHER(opacity_logits, 1, 0)), d->opacity.all);
 #endif
@@ -126,7 +127,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   d_screen[1].all = side_y * d_my;
 #endif
 #else
-  // (50): the gradient with respect to the mean's image position, -W^T (sum of g w).
+  // Equation (50) of docs/gradients.md: the gradient with respect to the mean's image position, -W^T (sum of g w).
   const floatL d_mx = -INVERSE_WHITEN2 * (l11 * m_gu);
   const floatL d_my = -INVERSE_WHITEN2 * fmaL(l12, m_gu, l22 * m_gv);
 #ifdef ABSOLUTE_GRADIENTS
@@ -138,11 +139,12 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
 #endif
 
-  // (58): the whitened columns of M = J A S are (wu[k], wv[k]) times the scale s[k]. They are of order one, and no
-  // large numbers are subtracted.
+  // Equation (58) of docs/gradients.md: the whitened columns of M = J A S are (wu[k], wv[k]) times the scale s[k]. They
+  // are of order one, and no large numbers are subtracted.
   const float unwhiten = INVERSE_WHITEN2 * INVERSE_WHITEN2;
 #ifdef ANTIALIASED
-  // (84): the compensated opacity falls with p.det (low-pass included) and rises with p.det0 (without low-pass).
+  // Equation (84) of docs/gradients.md: the compensated opacity falls with p.det (low-pass included) and rises with
+  // p.det0 (without low-pass).
   const intL compensated = p.det0 / p.det > LEAST_COMPENSATION * LEAST_COMPENSATION;
   const floatL thinner = compensated ? m_g : (floatL)(0.0f), by_det0 = compensated ? m_g / p.det0 : (floatL)(0.0f);
   const floatL uu = fmaL((floatL)(unwhiten), m[SLOT_GUU].all, -INVERSE_WHITEN2 * thinner),
@@ -172,15 +174,15 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
   }
 
-  // (122): the gradient through nearness, 1 / depth, with respect to the depth z.
+  // Equation (122) of docs/gradients.md: the gradient through nearness, 1 / depth, with respect to the depth z.
 #ifndef NEARNESS
 #define LESS_NEAR(z)
 #else
 #define LESS_NEAR(z) -m[SLOT_NEAR].all / ((z) * (z))
 #endif
 
-  // (59) to (61): the gradients with respect to the log scales and to a rotation about the Gaussian's axes, and the
-  // gradient through the Jacobian.
+  // Equations (59) to (61) of docs/gradients.md: the gradients with respect to the log scales and to a rotation about
+  // the Gaussian's axes, and the gradient through the Jacobian.
   floatL d_size = (floatL)(0.0f), along_u = d_size, along_v = d_size, turned[3];
 #ifdef LENS
   Lanes lens[4];
@@ -197,7 +199,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #else
     const floatL c[3] = {p.c[k], p.c[l], p.c[n]};
 #endif
-    const floatL area = p.s[l] * p.s[n], minor = area * c[0]; // (85) to (87)
+    const floatL area = p.s[l] * p.s[n], minor = area * c[0]; // equations (85) to (87) of docs/gradients.md
     const floatL other_l = p.s[n] * p.s[k] * c[1], other_n = p.s[k] * p.s[l] * c[2];
     d->scale[k].all = fmaL(by_det0, fmaL(other_l, other_l, other_n * other_n), d->scale[k].all);
     const floatL lever = by_det0 * minor * area;
@@ -218,7 +220,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
     along_u = fmaL(tu, depth, along_u);
     along_v = fmaL(tv, depth, along_v);
-#ifdef LENS // (144): a focal length is a factor of a row of M
+#ifdef LENS // equation (144) of docs/gradients.md: a focal length is a factor of a row of M
     lens[0].all = fmaL(l11 * tu, p.s[k] * p.b1[k], lens[0].all);
     lens[1].all = fmaL(fmaL(l12, tu, l22 * tv), p.s[k] * p.b2[k], lens[1].all);
 #endif
@@ -275,14 +277,16 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   lens[0].all += compensated ? m_g : (floatL)(0.0f);
   lens[1].all += compensated ? m_g : (floatL)(0.0f);
 #endif
-  lens[0].all = fmaL(p.jx * p.x, d_mx, fmaL(p.jx * p.z * p.rx, beyond[0], lens[0].all)); // (145)
+  // Equation (145) of docs/gradients.md
+  lens[0].all = fmaL(p.jx * p.x, d_mx, fmaL(p.jx * p.z * p.rx, beyond[0], lens[0].all));
   lens[1].all = fmaL(p.jy * p.y, d_my, fmaL(p.jy * p.z * p.ry, beyond[1], lens[1].all));
   lens[2].all = d_mx + beyond[0];
   lens[3].all = d_my + beyond[1];
 #endif
 
-  // Colour, (38) to (40): a clamped channel has no gradient. The SH basis depends on the mean through the view
-  // direction; the gradient through the direction is omitted if it overflows for very large SH coefficients.
+  // Colour, equations (38) to (40) of docs/gradients.md: a clamped channel has no gradient. The SH basis depends on the
+  // mean through the view direction; the gradient through the direction is omitted if it overflows for very large SH
+  // coefficients.
   floatL vx = FROM_CAMERA(means, X, 0), vy = FROM_CAMERA(means, Y, 1), vz = FROM_CAMERA(means, Z, 2);
   const floatL length = sqrt(fmaL(vx, vx, fmaL(vy, vy, vz * vz)));
   vx = (floatL)(SEEN_ALONG(vx, length, camera[CAMERA_R20]));

@@ -1,8 +1,8 @@
 // The alpha of a Gaussian along a pixel's ray, and the ray's whitened coordinates on the plane tangent to the unit
 // sphere at the mean's direction. Equation numbers refer to docs/cameras.md. Include lanes.h before.
 
-// Returns log2 of the uncapped alpha along the ray (x, y, z), (14), and sets (u, v) to the whitened point at which the
-// ray meets the tangent plane at the mean's direction.
+// Returns log2 of the uncapped alpha along the ray (x, y, z), equation (14) of docs/cameras.md, and sets (u, v) to the
+// whitened point at which the ray meets the tangent plane at the mean's direction.
 static inline floatL offset_of_ray(floatL x, floatL y, floatL z, __global const float *splat, floatL *u, floatL *v) {
   const floatL along = fmaL(x, (floatL)(splat[RAY_FX]), fmaL(y, (floatL)(splat[RAY_FY]), z * splat[RAY_FZ]));
   // U and V are perpendicular to the mean's direction, so only the difference of the ray from this direction counts.

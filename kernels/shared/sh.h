@@ -118,7 +118,7 @@ static inline int colour_is_drawn(float4 colour) {
   return colour.x < COLOUR_LIMIT && colour.y < COLOUR_LIMIT && colour.z < COLOUR_LIMIT;
 }
 
-// Stores red, green and blue, clamped at 0 as in (12).
+// Stores red, green and blue, clamped at 0 as in equation (12) of docs/gradients.md.
 static inline void store_colour(float4 colour, __global float *rgb) {
   rgb[0] = colour.x > 0.0f ? colour.x : 0.0f;
   rgb[1] = colour.y > 0.0f ? colour.y : 0.0f;

@@ -6,10 +6,10 @@
 #define WALKS 3                          // number of walks over the list
 #define FIRST_STEP (DEEP_LEVELS / STEPS) // coarse step of the slack, in levels; STEPS * STEPS is DEEP_LEVELS
 
-// Advances the current slice past a Gaussian that reduces the light from `before` to `after`, (73). *open: the light at
-// the slice's start; once the slice's depth is fixed, minus the light behind the Gaussian at that depth. slack: the
-// largest error; taken: the lanes that the Gaussian reaches; may_begin: those of them in which a new slice may begin.
-// Returns the lanes in which a slice begins.
+// Advances the current slice past a Gaussian that reduces the light from `before` to `after`, equation (73) of
+// docs/pictures.md. *open: the light at the slice's start; once the slice's depth is fixed, minus the light behind the
+// Gaussian at that depth. slack: the largest error; taken: the lanes that the Gaussian reaches; may_begin: those of
+// them in which a new slice may begin. Returns the lanes in which a slice begins.
 static inline intL begins_slice(floatL *open, floatL before, floatL after, floatL slack, intL taken, intL may_begin) {
   const intL placed = taken & MASKL(*open - before > slack);
   const floatL now = placed ? -before : *open;

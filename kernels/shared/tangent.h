@@ -9,15 +9,15 @@ typedef struct {
   float a[9];               // the Gaussian's axes in the camera's axes, as columns of a 3x3 matrix
   float s[3];               // scales
   float c1[3], c2[3];       // components of the Gaussian's axes along e1 and e2
-  float m1[5], m2[5];       // the rows of M of (11), with two more columns for the low-pass
+  float m1[5], m2[5];       // the rows of M of equation (11) of docs/cameras.md, with two more columns for the low-pass
   float sxx, sxy, syy, det; // covariance with the low-pass
 #ifdef ANTIALIASED
   float det0; // determinant without the low-pass
 #endif
 } RayProjection;
 
-// Projects Gaussian i, (8) to (12): fills *p, and returns 0 if the Gaussian is culled. Conditions are written so that
-// NaN culls.
+// Projects Gaussian i, equations (8) to (12) of docs/cameras.md: fills *p, and returns 0 if the Gaussian is culled.
+// Conditions are written so that NaN culls.
 static inline int project_ray(size_t i, __global const float *means, __global const float *quaternions,
                               __global const float *log_scales, __constant float *camera, RayProjection *p) {
   const float x = means[3 * i], y = means[3 * i + 1], z = means[3 * i + 2];
@@ -31,8 +31,8 @@ static inline int project_ray(size_t i, __global const float *means, __global co
   if (!is_shown(p->f, camera)) return 0;
   tangent_of(p->f, camera, &p->t);
 
-  // (11), (12): M = e A S / distance, with two more columns for the low-pass. The determinant is the sum of the squared
-  // minors.
+  // Equations (11), (12) of docs/cameras.md: M = e A S / distance, with two more columns for the low-pass. The
+  // determinant is the sum of the squared minors.
   const Tangent t = p->t;
   __global const float *raw = quaternions + 4 * i;
   float norm2 = 0.0f, r[9];

@@ -176,7 +176,7 @@ def test_frames_made_otherwise_are_told_and_rendered_again(shot: list[str], tmp_
         assert render(shot, tmp_path, "--skip-existing", *change) == 0
         count = 4 if "half" in change else COUNT
         said = capsys.readouterr()
-        assert f"warning: --skip-existing: {count} of the existing frames were made of another model" in said.err
+        assert f"warning: --skip-existing: {count} of the existing frames were rendered from another model" in said.err
         rendered = re.findall(
             r"  \d+\.\d\d s(?:  \d+:\d\d left)?$", said.out, re.MULTILINE
         )  # slow ones tell what is left

@@ -256,7 +256,7 @@ def test_a_frame_of_other_settings_is_not_what_is_wanted(
     assert render_shot(second, tmp_path, more) == 0
     assert (tmp_path / "a.0001.exr").stat().st_mtime_ns == written
     told = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
-    again = [line for line in told if "1 of the existing frames were made of another model, or with" in line]
+    again = [line for line in told if "1 of the existing frames were rendered from another model, or with" in line]
     assert len(again) == (0 if kept else 1)
     assert all(line.endswith("flags without effect on .exr files: --quality") for line in told if line not in again)
 
@@ -278,15 +278,15 @@ def test_files_without_attributes_say_how_they_were_made(
     (tmp_path / "moved.json").write_text(json.dumps(document))
     moved = [*shot[:2], str(tmp_path / "moved.json")]
     (line,) = ran(capsys, render_shot, moved, tmp_path, "--frames 1,2 --skip-existing", pattern).err.splitlines()
-    assert "1 of the existing frames were made of another model, or with other cameras or settings" in line
+    assert "1 of the existing frames were rendered from another model, or with other cameras or settings" in line
     changed = {path.name for path, stamp in before.items() if path.stat().st_mtime_ns != stamp}
     assert changed == {f"a.0002.{extension}"}
     other = {"jpg": "--quality 50"}.get(extension, "--bits 16")
     assert render_shot(moved, tmp_path, f"--frames 1,2 --skip-existing {other}", pattern) == 0
-    assert "2 of the existing frames were made of another model, or with other" in capsys.readouterr().err
+    assert "2 of the existing frames were rendered from another model, or with other" in capsys.readouterr().err
     replace(hidden_model(), sh=0.9 * hidden_model().sh).save(tmp_path / "other.ply")
     assert render_shot([str(tmp_path / "other.ply"), *moved[1:]], tmp_path, f"--skip-existing {other}", pattern) == 0
-    assert "2 of the existing frames were made of another model" in capsys.readouterr().err
+    assert "2 of the existing frames were rendered from another model" in capsys.readouterr().err
 
 
 def test_frames_that_do_not_say_how_they_were_made(shot: list[str], tmp_path: Path, capsys: Capture) -> None:

@@ -157,7 +157,7 @@ def test_only_frames_whose_files_changed_are_made_again(folder: Path, capsys: Ca
     assert render(folder, "capture.####.ply", "all", "--exr half --skip-existing") == 0
     after = {path.name: path.stat().st_mtime_ns for path in (folder / "all").iterdir()}
     assert [name for name in sorted(before) if before[name] != after[name]] == ["0002.exr"]
-    assert "1 of the existing frames were made of another model" in capsys.readouterr().err
+    assert "1 of the existing frames were rendered from another model" in capsys.readouterr().err
 
 
 def test_one_of_several_models(folder: Path) -> None:

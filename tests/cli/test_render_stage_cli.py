@@ -201,4 +201,4 @@ def test_only_frames_in_which_something_moves_are_made_again(stage: Usd.Stage, t
     UsdGeom.Xformable(stage.GetPrimAtPath("/Asset")).GetOrderedXformOps()[1].Set(30.0, 2)
     capsys.readouterr()
     lines = ran(capsys, render, stage, tmp_path, "--frames 1-3 --skip-existing")
-    assert "2 of the existing frames were made of another model" in lines.err  # 3 is between 2 and 5
+    assert "2 of the existing frames were rendered from another model" in lines.err  # 3 is between 2 and 5

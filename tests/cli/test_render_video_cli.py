@@ -55,7 +55,7 @@ def test_a_video_says_how_it_was_made(name: str, flags: str, shot: list[str], tm
         video.write_bytes(content)
         assert render_shot(shot, tmp_path, f"{flags} --skip-existing {change}", name) == 0
         assert (
-            f"--skip-existing: {video} is incomplete, or was made of another model or frames" in capsys.readouterr().err
+            f"--skip-existing: {video} is incomplete, or was rendered from another model or" in capsys.readouterr().err
         )
     assert video.read_bytes() == whole
     video.write_bytes(b"precious")

@@ -113,7 +113,7 @@ def check_folder(output: Path, *, overwrite: bool) -> None:
 def _take_all(
     result: Path, config: TownConfig, planned: Sequence[TownPhotograph], workers: int, progress: Progress
 ) -> list[Observations]:
-    """Ray-cast and write all photographs. Returns the points that each shows."""
+    """Ray-cast and write all photographs. Returns the points that each photograph shows."""
     for i, j in sorted({(shot.i, shot.j) for shot in planned}):
         for folder in ("images", "masks") if config.cars else ("images",):
             (result / folder / f"{i:04d}_{j:04d}").mkdir(parents=True)

@@ -61,7 +61,7 @@ def cache_folder() -> Path:
 
 
 def memory_path() -> Path:
-    """The file of the driver records."""
+    """Return the path of the file with the driver records."""
     return cache_folder() / "drivers.json"
 
 

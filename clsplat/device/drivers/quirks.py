@@ -105,9 +105,9 @@ def subgroup_ways(device: cl.Device) -> list[dict[str, object]]:
     work-items exchange the right values before it uses the defines.
     """
     extensions = device.extensions.split()
-    if "cl_nv_device_attribute_query" in extensions:  # exchange by inline PTX: NVIDIA's OpenCL has no functions for it
+    if "cl_nv_device_attribute_query" in extensions:  # lanes exchange values by inline PTX
         return [{"SUBGROUP": 32, "SHUFFLE_PTX": True}]
-    if "cl_amd_device_attribute_query" in extensions:  # exchange by built-in functions of the compiler
+    if "cl_amd_device_attribute_query" in extensions:  # lanes exchange values by built-in functions
         return [{"SUBGROUP": 32, "SHUFFLE_AMD": True}]
     functions = {"cl_khr_subgroup_shuffle": "SHUFFLE_KHR", "cl_intel_subgroups": "SHUFFLE_INTEL"}
     offered = [define for extension, define in functions.items() if extension in extensions]

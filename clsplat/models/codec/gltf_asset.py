@@ -113,8 +113,8 @@ class Asset:
             assert isinstance(index, int)
             if index in seen or len(seen) >= MAX_SCENE_NODES:
                 raise InputError(
-                    f"{self.path}: node {index} is used twice or one too many, expected a tree of at most "
-                    f"{MAX_SCENE_NODES:,} nodes"
+                    f"{self.path}: node {index} is used twice, or the scene has more than {MAX_SCENE_NODES:,} nodes; "
+                    "expected a smaller tree of nodes"
                 )
             seen.add(index)
             matrix = parent @ self.matrix(node, index)

@@ -201,8 +201,10 @@ def _masks(scene: Scene, use: MaskUse) -> Finding | None:
     inside, border = np.mean(kept, axis=0)
     text = f"{len(found):,} of {len(scene.views):,} photographs have masks, which are not used"
     if border <= 1 - CUT_OUT_BORDER_FRACTION and inside < 0.5:
-        return Finding("cut out", f"{text}; they cut out an object that covers {100 * inside:.0f} % of the pictures")
-    return Finding("masks", f"{text}; they leave out {100 - 100 * inside:.0f} % of the pictures")
+        return Finding(
+            "cut out", f"{text}; they cut out an object that covers {100 * inside:.0f} % of a picture on average"
+        )
+    return Finding("masks", f"{text}; they leave out {100 - 100 * inside:.0f} % of the pixels on average")
 
 
 def _strange_masks(scene: Scene, reason: str) -> Finding | None:

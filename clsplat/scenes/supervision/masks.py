@@ -30,7 +30,7 @@ MASK_THRESHOLD = 0.5
 """Minimum mask value of a pixel that counts. In a resized mask, also the minimum fraction of a pixel's area that must
 count."""
 COMPARED_MASKS = 12
-"""Approximate number of a folder's masks that are read to interpret an ambiguous one; at most twice as many are."""
+"""Number of a folder's masks that are read, up to twice as many, to find out what an ambiguous mask means."""
 VOID_LABEL = 255
 """Label of undefined pixels, as at the object borders in VOC and Cityscapes."""
 MAX_LABEL = 40

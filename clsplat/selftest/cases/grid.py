@@ -71,11 +71,8 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
     seen, terms = reference.apply(image, own), reference.apply(np.abs(image), np.abs(own))
     by_image, by_grid = reference.gradient(image, own, by_seen)
     by_grid += given.weight * reference.variation_gradient(own)
-    step = (
-        got["by grid"].astype(np.float64),
-        given.visit,
-        given.rate,
-    )  # the device's gradient: its error does not count again
+    # Adam's twin gets the device's gradient, so that its error is compared only once, in "by grid".
+    step = (got["by grid"].astype(np.float64), given.visit, given.rate)
     got |= {f"{name} of another": got[name][0] for name in ("first", "second")}
     held[at], first[at], second[at] = reference.step(own, first[at], second[at], *step)
     level = image @ reference.LUMINANCE_WEIGHTS * (GRID_SHAPE[0] - 1)

@@ -132,7 +132,11 @@ def _rotation(keys: Keys) -> Float64:
 
 
 def _focal(keys: Keys, projection: Projection, width: int, height: int) -> tuple[float, float]:
-    """Focal lengths fx and fy, in pixels per unit, from the key, or from the file if the key gives none."""
+    """Return fx and fy of a key, or of the whole file if the key gives none.
+
+    They are in pixels: per scene unit of an orthographic camera, per radian of a camera that wraps around, otherwise at
+    depth 1.
+    """
     source = keys.frame if any(name in keys.frame for name in FOCAL_PROPERTIES) else keys.document
     given = [name for name in FOCAL_PROPERTIES if name in source]
     values = Keys(keys.path, None, source, {})

@@ -29,7 +29,7 @@ WORLD_UNITS_PER_APERTURE_UNIT = 0.1
 """World units per unit of apertures and focal lengths, in USD."""
 
 SUPPORTED_PROJECTIONS = names_of("usd")
-"""Accepted projections of a camera. Any other is a lens that distorts, and is refused."""
+"""Accepted projections of a camera. Others are lenses with distortion, which are refused."""
 
 
 def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), prim: str | None = None) -> Shot:

@@ -17,9 +17,9 @@ from clsplat.optimisation.density_rules import MarkRules
 class StatisticsNeeds(NamedTuple):
     """Statistics that a strategy needs.
 
-    gradients: True for sums of screen-space gradients, number of views, and radii.
-    absolute: True if the gradients are sums of the absolute values per pixel (AbsGS).
-    contributions: True for contributions to the pictures of an epoch.
+    gradients: True if it needs sums of screen-space gradients, numbers of views, and radii.
+    absolute: True if it needs gradients as sums of absolute values per pixel (AbsGS).
+    contributions: True if it needs contributions to the pictures of an epoch.
     """
 
     gradients: bool = False
@@ -28,10 +28,7 @@ class StatisticsNeeds(NamedTuple):
 
 
 class RowList(Protocol):
-    """Rows of a model after density control, on the device or the host.
-
-    halves: number of halves at the end: first one half of each split Gaussian, then the other halves.
-    """
+    """List of the rows of a model after density control, on the device or the host."""
 
     @property
     def count(self) -> int:
@@ -39,34 +36,35 @@ class RowList(Protocol):
 
     @property
     def halves(self) -> int:
-        """Number of rows that are halves."""
+        """Number of rows that are halves of split Gaussians, two of each."""
 
 
 class Marker(Protocol):
     """Marks the Gaussians of a model by rules, on the device or host of its arrays."""
 
     def scores(self, rules: MarkRules) -> Float32:
-        """Mean gradients (n,) of the Gaussians that may be densified; negative for the rest."""
+        """Return the mean gradient norms (n,) of the Gaussians that may be densified; negative for the others."""
 
     def rows(self, rules: MarkRules) -> RowList:
-        """List the rows that the rules produce: retained rows, clones, first halves, second halves."""
+        """List the rows of the model after the rules are applied: remaining rows, clones and halves."""
 
 
 class HostCopy(Protocol):
     """An array on the device or the host."""
 
     def get(self) -> NDArray[Any]:
-        """Copy on the host."""
+        """Return a copy on the host."""
 
 
 @dataclass(frozen=True, eq=False)
 class ModelState:
     """The model as a strategy sees it: `count` Gaussians after `step` steps.
 
-    length_unit, extent: the scene's, in world units.
+    length_unit, extent: length unit and extent of the scene, in world units.
     parameters: parameter arrays by group.
-    statistics: arrays by their names in a checkpoint.
-    marker: compares the Gaussians with rules.
+    statistics: arrays by name (`stages.density.DensityStatistics`).
+    rng: random generator of the training.
+    marker: applies rules to the Gaussians.
     """
 
     count: int
@@ -80,20 +78,21 @@ class ModelState:
 
 
 SPLIT_GROUPS = ("means", "quaternions", "log_scales")
-"""Parameter groups that halves are computed from, by default."""
+"""Parameter groups that halves of split Gaussians are computed from, by default."""
 
 
 @dataclass(frozen=True, eq=False)
 class RowPlan:
-    """Planned rows of the model.
+    """Plan of a strategy: the rows of the new model, and changes of values.
 
     rows: (m,) uint32, the source row of each new row; None if all rows stay.
     fresh: (m,) bool, True for rows whose moments start at zero and whose contributions are unknown.
-    listed: list from the model's marker, which takes the place of `rows` and `fresh`.
-    values: by parameter group, the indices (k,) of new rows whose values change, and these values (k, ...).
-    halves: function that computes the values of halves from the groups `halved` of split Gaussians. It is called with
-        split Gaussians of one part after the other and False, for their first halves, then again with all and True.
-    changes: by group, function that computes new values of rows from those of these rows alone.
+    listed: list of rows from the model's marker, in place of `rows` and `fresh`.
+    values: by parameter group, the indices (k,) of new rows whose values change, and their new values (k, ...).
+    halves: function that computes the values of one half of each split Gaussian, from the groups `halved`. It is called
+        part by part with False, for the first halves of all split Gaussians, then with True for the second halves.
+    halved: parameter groups that `halves` reads.
+    changes: by parameter group, function from values of rows to new values of the same rows.
     restarted: groups whose moments start at zero in every row.
     new_statistics: True if all statistics except contributions start from zero.
     forget_contributions: True if contributions become unknown in every row.
@@ -116,34 +115,31 @@ class Strategy:
     optional."""
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
-        """Statistics that this step has to gather.
-
-        step: from 1; 0 for the statistics that any step needs.
-        """
+        """Return the statistics that step number `step` has to gather; for 0, those that any step needs."""
         raise NotImplementedError
 
     def is_due(self, step: int) -> bool:
-        """True if `before_step` may have a plan after `step` steps. The model is repaired before `before_step` runs."""
+        """True if `before_step` may return a plan after `step` steps. Before it, non-finite values are repaired."""
         raise NotImplementedError
 
     def before_step(self, model: ModelState) -> RowPlan | None:
-        """Plan after `model.step` steps. It is carried out when the next step begins."""
+        """Return a plan after `model.step` steps, which is carried out when the next step begins."""
         raise NotImplementedError
 
     def after_gradient(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002  # most have none
-        """Plan at the end of step number `model.step`, after Adam's step."""
+        """Return a plan at the end of step number `model.step`, after Adam's step."""
         return None
 
     def at_end(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002
-        """Plan for a model at the end of its training."""
+        """Return a plan for the model at the end of its training."""
         return None
 
     def rearranged(self, rows: NDArray[np.uint32], fresh: NDArray[np.bool_]) -> None:
-        """Called after this strategy's plan, or a repair, has moved rows: row j of the model is the old row rows[j]."""
+        """Update state by row after a plan or a repair has moved rows: row j of the model is the old row rows[j]."""
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """State of the strategy by name, for a checkpoint."""
+        """Return the state of the strategy by name, for a checkpoint."""
         return {}
 
     def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load the state from a checkpoint."""
+        """Load the state that `arrays` has returned, from a checkpoint."""

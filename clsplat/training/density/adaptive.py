@@ -24,7 +24,7 @@ They are the distance of the halves' means from the original mean, in standard d
 of that axis, on the scales of the other axes, and on the opacity.
 """
 SCORED_ROWS = 1 << 16
-"""Rows of which those with a given score are listed at a time."""
+"""Number of scores that are compared with a given score at a time, which limits the size of copies."""
 
 
 class Adaptive(Strategy):
@@ -34,7 +34,7 @@ class Adaptive(Strategy):
         self.config, self.white, self.sky = config.density, config.background == "white", config.sky > 0
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
-        """The statistics that the rules use after `step` steps.
+        """Return the statistics that the rules use after `step` steps.
 
         Gradients are needed while Gaussians are densified, and contributions while a pruning that uses them is still to
         come.
@@ -96,7 +96,7 @@ def plan(config: DensityConfig, model: ModelState, *, sky: bool = False) -> RowP
     sky: True if the model has sky Gaussians. The size limit of all Gaussians is then relative to the extent.
     In the plan the remaining Gaussians come first, in their order. Clones and halves are marked as fresh.
     """
-    # Each rule compares like NumPy: a float32 array with a Python number, in float32.
+    # Each rule compares as NumPy compares a float32 array with a Python number: in float32.
     size = SKY_RADIUS_RATIO * model.extent if sky else model.length_unit
     too_large = config.max_world_fraction * size
     dense = config.dense_fraction * model.length_unit
@@ -121,7 +121,7 @@ def plan(config: DensityConfig, model: ModelState, *, sky: bool = False) -> RowP
 
 
 def plan_pruning(config: DensityConfig, model: ModelState) -> RowPlan:
-    """Only prune Gaussians that are transparent or contribute little."""
+    """Plan a pruning without densification: of Gaussians that are transparent or contribute little."""
     return RowPlan(listed=model.marker.rows(_pruning(config, model)))
 
 
@@ -141,7 +141,7 @@ def _pruning(config: DensityConfig, model: ModelState) -> MarkRules:
 
 
 def _cut_off(config: DensityConfig, model: ModelState, rules: MarkRules) -> tuple[float, int]:
-    """Score and row of the weakest Gaussian that may still be cloned or split, for `MarkRules.cut_off`.
+    """Return score and row of the weakest Gaussian that may still be cloned or split, for `MarkRules.cut_off`.
 
     Scores are computed only if max_gaussians may leave too little room for all Gaussians that pass the other rules.
     """
@@ -159,9 +159,9 @@ def _cut_off(config: DensityConfig, model: ModelState, rules: MarkRules) -> tupl
 
 
 def weakest(scores: Float32, count: int) -> tuple[float, int]:
-    """Score and row of the last of the `count` Gaussians with the largest scores. Of equal ones the first rows count.
+    """Score and row of the weakest of the `count` Gaussians with the largest scores.
 
-    Makes one copy of the scores.
+    Gaussians with equal scores are taken in the order of their rows. Makes one copy of the scores.
     """
     value = np.partition(scores, len(scores) - count)[len(scores) - count]
     equal = count - np.count_nonzero(scores > value)
@@ -177,8 +177,8 @@ def budget(config: DensityConfig, step: int, count: int) -> int:
     """Number of Gaussians after this step's densification, from `count` before it.
 
     Taming 3DGS (Mallick et al. 2024): A(x) = (B - S - k N)/N^2 x^2 + k x + S with k = 2 (B - S)/N, from S to B in N
-    densifications. That is B - (B - S)(1 - x/N)^2, so each densification reduces the gap to B by a known ratio,
-    whatever was pruned since the last densification. The last densification reaches B.
+    densifications. This equals B - (B - S)(1 - x/N)^2. So each densification reduces the gap to B by a known ratio,
+    even if Gaussians were pruned since the last densification. The last densification reaches B.
     """
     last = (config.stop - 1) // config.every * config.every
     before = max(step - config.every, config.start)
@@ -193,14 +193,18 @@ def draw_halves(
     *,
     rng: np.random.Generator,
 ) -> dict[str, Float32]:
-    """New means and log scales of a half of each split Gaussian, from the groups SPLIT_GROUPS."""
+    """Draw the means and log scales of one half of each split Gaussian, for `RowPlan.halves`.
+
+    split: the groups SPLIT_GROUPS of the split Gaussians.
+    """
     means, log_scales = split_halves(config, split, rng)
     return {"means": means, "log_scales": log_scales}
 
 
 def long_halves(split: Mapping[str, Float32], second: bool) -> dict[str, Float32]:
-    """Means, log scales and opacity logits of halves on one side of the mean along the longest axis, or with `second`
-    on the other (docs/gradients.md, (102)).
+    """Compute one half of each split Gaussian, moved along its longest axis: equation (102) of docs/gradients.md.
+
+    Returns means, log scales and opacity logits. With `second` the halves are moved in the opposite direction.
 
     split: the groups SPLIT_GROUPS and opacity_logits of the split Gaussians.
     """
@@ -211,7 +215,7 @@ def long_halves(split: Mapping[str, Float32], second: bool) -> dict[str, Float32
     turned = rotated(split["quaternions"], offsets)
     log_scales += np.log(SHORT_AXIS_HALF_RATIO)
     log_scales[rows, longest] += np.log(LONG_AXIS_HALF_RATIO) - np.log(SHORT_AXIS_HALF_RATIO)
-    # The logit of a fraction p of an opacity is ln p - ln(e^-o' + 1 - p).
+    # If an opacity has the logit o', the fraction p of it has the logit ln p - ln(e^-o' + 1 - p).
     part, logits = HALF_OPACITY_RATIO, split["opacity_logits"].astype(np.float64)
     opacities = np.log(part) - np.logaddexp(-logits, np.log(1 - part))
     means = split["means"] - turned if second else split["means"] + turned
@@ -225,7 +229,7 @@ def long_halves(split: Mapping[str, Float32], second: bool) -> dict[str, Float32
 def split_halves(
     config: DensityConfig, split: Mapping[str, Float32], rng: np.random.Generator
 ) -> tuple[Float32, Float32]:
-    """Means (m, 3) and log scales (m, 3) of halves, which are drawn from their original Gaussians and smaller.
+    """Return means (m, 3), drawn from the split Gaussians, and smaller log scales (m, 3): one half of each.
 
     split: the groups SPLIT_GROUPS of the split Gaussians.
     """
@@ -241,7 +245,7 @@ def draw_offsets(quaternions: Float32 | Float64, log_scales: Float32 | Float64, 
 
 
 def rotated(quaternions: Float32 | Float64, offsets: Float64) -> Float64:
-    """Offsets (m, 3), turned by quaternions (m, 4) from the Gaussians' own axes to the world's."""
+    """Rotate offsets (m, 3) by quaternions (m, 4) from the Gaussians' own axes to the world's."""
     q = quaternions.astype(np.float64)
     q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-300)  # a zero quaternion is not drawn
     w, axis = q[:, :1], q[:, 1:]
@@ -251,6 +255,6 @@ def rotated(quaternions: Float32 | Float64, offsets: Float64) -> Float64:
 
 
 def reset_opacities(config: DensityConfig, opacity_logits: Float32) -> Float32:
-    """Opacity logits, lowered where the opacity is over `opacity_reset_to`."""
+    """Return the opacity logits, lowered to the logit of `opacity_reset_to` where they are above it."""
     ceiling = np.log(config.opacity_reset_to / (1 - config.opacity_reset_to))
     return np.minimum(opacity_logits, np.float32(ceiling))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choice of the density control strategy."""
+"""Choice of the density control strategy by --density.growth."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ from clsplat.training.density.mcmc import Mcmc
 
 
 def strategy_of(config: TrainConfig) -> Strategy:
-    """New strategy for one training."""
+    """Make the strategy that the settings name, for one training."""
     return Mcmc(config) if config.density.growth == "mcmc" else Adaptive(config)

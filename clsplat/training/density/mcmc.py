@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Density control as sampling: dead Gaussians move to live ones, the model grows to a given number, and noise is added.
+"""MCMC density control: dead Gaussians are relocated to live ones, and the model grows to a given number.
 
-Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". The model grows by halving the Gaussians
-with the largest gradients, which is not as published (docs/decisions/0029-mcmc-grows-by-halves.md). Policy only: no
-device.
+Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". Unlike there, the model grows by halving
+the Gaussians with the largest gradients (docs/decisions/0029-mcmc-grows-by-halves.md). `optimisation.step_noise` has
+the noise of each step. Policy only: no device.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from clsplat.training.density.adaptive import draw_offsets, is_due, long_halves
 MAX_GAUSSIANS_PER_PLACE = 51
 """Maximum number of Gaussians that together replace one Gaussian."""
 MAX_SHARED_OPACITY = 1 - 1e-7
-"""Upper limit of opacities in computations, because above it a float32 logit has no precision left."""
+"""Upper limit of opacities in computations: above it a float32 logit has no precision left."""
 MIN_DRAWN_OPACITY = 1 / 255
 """Opacity up to which a Gaussian is invisible in every picture."""
 SCORE_ALL_RULES = MarkRules(gradient=-inf, large=-inf)
@@ -42,7 +42,7 @@ class Mcmc(Strategy):
         self.config = config.density
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
-        """Gradients while the model grows or dead Gaussians are relocated."""
+        """Return the statistics that a step gathers: gradients, until the last growth."""
         config = self.config
         return StatisticsNeeds(gradients=step < config.stop, absolute=config.absolute_gradients)
 
@@ -51,7 +51,7 @@ class Mcmc(Strategy):
         return is_due(self.config, step)
 
     def before_step(self, model: ModelState) -> RowPlan:
-        """Halve the Gaussians with the largest gradients. Second halves take the rows of dead Gaussians, then new rows.
+        """Plan to halve the Gaussians with the largest gradients. Second halves take rows of dead ones, then new rows.
 
         A Gaussian is dead if it is nearly transparent, has no valid rotation, or is too large on the screen.
         """
@@ -93,10 +93,10 @@ class Mcmc(Strategy):
     def _moved(
         self, groups: dict[str, Float32], rows: NDArray[np.int64], left: NDArray[np.int64], rng: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Move the remaining dead Gaussians as published: to live ones, drawn in proportion to opacity.
+        """Relocate the dead Gaussians `left` as published: to live ones, drawn in proportion to opacity.
 
-        groups, rows: updated in place.
-        Returns the rows that change.
+        groups, rows: values and source rows of the new model, updated in place.
+        Returns the rows whose values change.
         """
         if len(left) == 0:
             return left
@@ -119,19 +119,19 @@ class Mcmc(Strategy):
         return changed
 
     def at_end(self, model: ModelState) -> RowPlan | None:
-        """Drop Gaussians that are invisible in every picture."""
+        """Plan to drop the Gaussians that are invisible in every picture."""
         logits = model.parameters["opacity_logits"].get().astype(np.float64)
         drawn = 1 / (1 + np.exp(-logits)) > MIN_DRAWN_OPACITY
         return None if drawn.all() or not drawn.any() else RowPlan(rows=np.flatnonzero(drawn).astype(np.uint32))
 
 
 def last_growth(config: DensityConfig) -> int:
-    """Step of the last growth, at which the number reaches max_gaussians."""
+    """Return the step of the last growth, at which the number reaches max_gaussians."""
     return (config.stop - 1) // config.every * config.every
 
 
 def wanted(config: DensityConfig, step: int, count: int) -> int:
-    """Number of Gaussians after this step's growth, from `count` before it.
+    """Return the number of Gaussians after this step's growth, from `count` before it.
 
     The number grows by the same factor each time, so that the last growth reaches max_gaussians.
     """
@@ -141,13 +141,13 @@ def wanted(config: DensityConfig, step: int, count: int) -> int:
 
 
 def strongest(scores: Float32, count: int) -> NDArray[np.int64]:
-    """Indices of the largest scores, in order of the rows: `count` of them, or all positive ones if there are fewer."""
+    """Return rising indices of the `count` largest scores, or of all positive scores if these are fewer."""
     order = np.argsort(-scores, kind="stable")[:count]
     return np.sort(order[scores[order] > 0])
 
 
 def draw(weights: Float64, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Indices (count,) drawn with replacement, with probabilities proportional to the weights."""
+    """Draw indices (count,) with replacement, with probabilities proportional to the weights."""
     sums = np.cumsum(weights)
     found: NDArray[np.int64] = np.searchsorted(sums, rng.random(count) * sums[-1], side="right")
     last = int(np.flatnonzero(weights)[-1])  # a random number rounded up to the total would select the index after it
@@ -156,13 +156,13 @@ def draw(weights: Float64, count: int, rng: np.random.Generator) -> NDArray[np.i
 
 
 def shared(opacities: Float64, numbers: NDArray[np.int64], least: float) -> tuple[Float64, Float64]:
-    """Opacities of the Gaussians that together replace one Gaussian, and the increments of their log scales. Equation
-    (94) of docs/gradients.md, (9) of Kheradmand et al. 2024.
+    """Compute the opacity of the Gaussians that together replace one Gaussian, and the increment of their log scales.
+
+    Equation (94) of docs/gradients.md, equation (9) of Kheradmand et al. 2024. All arrays are (n,).
 
     opacities: opacities of the replaced Gaussians.
-    numbers: for each of these, the number of Gaussians that replace it.
+    numbers: number of Gaussians that replace each of them.
     least: lower limit of the new opacities.
-    All arrays are (n,).
     """
     whole = np.minimum(opacities, MAX_SHARED_OPACITY)
     parts = np.clip(-np.expm1(np.log1p(-whole) / numbers), least, MAX_SHARED_OPACITY)
@@ -173,8 +173,7 @@ def shared(opacities: Float64, numbers: NDArray[np.int64], least: float) -> tupl
 
 @cache
 def _factors() -> Float64:
-    """(-1)^(j - 1) C(N, j) / sqrt(j) at row N and column j - 1, (MAX_GAUSSIANS_PER_PLACE + 1,
-    MAX_GAUSSIANS_PER_PLACE)."""
+    """Table of (-1)^(j - 1) C(N, j) / sqrt(j) at row N and column j - 1, for N and j up to MAX_GAUSSIANS_PER_PLACE."""
     rows = np.zeros((MAX_GAUSSIANS_PER_PLACE + 1, MAX_GAUSSIANS_PER_PLACE))
     binomials = [1.0]
     for number in range(1, MAX_GAUSSIANS_PER_PLACE + 1):

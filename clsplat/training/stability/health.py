@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Policy for non-finite values: which Gaussians are removed, when training returns to a checkpoint. No OpenCL.
+"""Policy for non-finite values: which Gaussians are removed, and when training returns to a checkpoint. No OpenCL.
 
 docs/decisions/0016-never-a-nan.md gives the reasons.
 """
@@ -25,7 +25,7 @@ MAX_CHECKPOINT_RETURNS = 3
 RETURN_RATE_FACTOR = 0.5
 """Factor on the learning rates at each return to a checkpoint, for the rest of the run."""
 MAX_BROKEN_FRACTION = 0.5
-"""Fraction of broken Gaussians above which a model is not repaired: training goes back at once."""
+"""Fraction of broken Gaussians above which a model is not repaired: training returns to the last checkpoint at once."""
 EXAMINED_ROWS = 1 << 16
 """Number of Gaussians that are examined at a time, which limits the size of copies."""
 MAX_INCIDENT_GAUSSIANS = 1000

@@ -23,9 +23,9 @@ from clsplat.stages.project import Projected, Screen, Slots
 class PlacedChunks:
     """Chunks that a step runs over, ready for its kernels.
 
-    model: the arrays that the kernels get: the whole model, or the pool's rows for chunks of a streamed model.
-    in_model: the chunks by their numbers in `model`. They are ChunkNumbers if they come to the pool one after the
-        other; then `model` is the streamed model.
+    model: arrays for the kernels: of the whole model, or of the pool of a streamed model.
+    in_model: the chunks in `model`. If the pool has no room for all of them, it is `ChunkNumbers`, and `model` is the
+        streamed model, whose chunks come to the pool in parts.
     """
 
     model: tuple[AnyGaussians, ...]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Probe of a training step: non-finite values, trials of kernels in the sandbox, statistics for density control."""
+"""Observer of a training step: non-finite values, trials of kernels in the sandbox, statistics for density control."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from clsplat.training.step.speculative_steps import SpeculativeSteps
 
 @dataclass(eq=False)
 class StepMonitor(StepProbe):
-    """Probe that notices non-finite values, tries the kernels that change the state, and adds statistics for density
-    control.
+    """Observer of a step: finds non-finite values, tries the kernels that change the state, and adds the statistics of
+    density control.
 
     number: number of views that training has used so far, this one included.
     tried: keys of the steps whose kernels were tried; this step's key is added.

@@ -14,9 +14,10 @@ static inline floatL sinL(floatL x) {
 static inline floatL absL(floatL x) { return x < 0.0f ? -x : x; }
 
 #ifdef NEEDS_TANGENTS
-// The tangent plane at a direction, for images whose radius depends only on the angle from the axis: fills *t, (9),
-// (10), (19) and (30). f: the unit direction; across: the distance of f from the axis; along / slope: the angle in
-// radians that fx pixels cover away from the axis; around: the angle that they cover around the axis.
+// The tangent plane at a direction, for images whose radius depends only on the angle from the axis: fills *t by
+// equations (9), (10), (19) and (30) of docs/cameras.md. f: the unit direction; across: the distance of f from the
+// axis; along / slope: the angle in radians that fx pixels cover away from the axis; around: the angle that they cover
+// around the axis.
 static inline void tangent_around_axis(const float *f, float across, float along, float slope, float around,
                                        __constant float *camera, Tangent *t) {
   const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];
@@ -34,9 +35,10 @@ static inline void tangent_around_axis(const float *f, float across, float along
 }
 
 // The gradient `by` through the low-pass part of the covariance, with respect to a move of the mean's direction along
-// e1 and e2, for the images of tangent_around_axis: (27) and (28). r: the distance of the direction f from the axis; p,
-// q: along / slope and around of tangent_around_axis; dp, dq: the derivatives of p and q with respect to the angle from
-// the axis; g: the gradient with respect to the covariance's xx, xy (as one variable) and yy.
+// e1 and e2, for the images of tangent_around_axis: equations (27) and (28) of docs/cameras.md. r: the distance of the
+// direction f from the axis; p, q: along / slope and around of tangent_around_axis; dp, dq: the derivatives of p and q
+// with respect to the angle from the axis; g: the gradient with respect to the covariance's xx, xy (as one variable)
+// and yy.
 static inline void low_pass_around_axis(const float *f, float r, float p, float q, float dp, float dq,
                                         __constant float *camera, const float *g, float *by) {
   const float wide = 1.0f / (camera[CAMERA_FX] * camera[CAMERA_FX]), z = f[2];

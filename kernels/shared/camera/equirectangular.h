@@ -2,7 +2,8 @@
 // to docs/cameras.md.
 #define WRAPS
 
-// The unit direction (x, y, z) of the pixels (px, py), (5); (0, 0, 0) for pixels that have no direction.
+// The unit direction (x, y, z) of the pixels (px, py), equation (5) of docs/cameras.md; (0, 0, 0) for pixels that have
+// no direction.
 static inline void ray_of(floatL px, floatL py, CAMERA_SPACE float *camera, floatL *x, floatL *y, floatL *z) {
   const floatL a = (px - camera[CAMERA_CX]) / camera[CAMERA_FX], b = (py - camera[CAMERA_CY]) / camera[CAMERA_FY];
   // The longitude, moved by whole turns to within half a turn of the axis.
@@ -21,7 +22,7 @@ static inline void ray_of(floatL px, floatL py, CAMERA_SPACE float *camera, floa
 #define NEAR_DEPTH(z, distance) (distance)
 #define is_shown(f, camera) 1
 
-// The tangent plane at the unit direction f, (9) and (10): fills *t.
+// The tangent plane at the unit direction f, equations (9) and (10) of docs/cameras.md: fills *t.
 static inline void tangent_of(const float *f, __constant float *camera, Tangent *t) {
   const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];
   const float level = sqrt(fma1(f[0], f[0], f[2] * f[2]));
@@ -39,8 +40,9 @@ static inline void tangent_of(const float *f, __constant float *camera, Tangent 
   t->k[3] = 1.0f / fy;
 }
 
-// The gradient `by` through the low-pass part of the covariance, (26), with respect to a move of the mean's direction f
-// along e1 and e2. g: the gradient with respect to the covariance's xx, xy (as one variable) and yy.
+// The gradient `by` through the low-pass part of the covariance, equation (26) of docs/cameras.md, with respect to a
+// move of the mean's direction f along e1 and e2. g: the gradient with respect to the covariance's xx, xy (as one
+// variable) and yy.
 static inline void low_pass_gradient(const float *f, __constant float *camera, const float *g, float *by) {
   const float wide = 1.0f / (camera[CAMERA_FX] * camera[CAMERA_FX]);
   const float level = sqrt(fma1(f[0], f[0], f[2] * f[2])), least = 0.5f / camera[CAMERA_FY];
@@ -90,7 +92,7 @@ static inline void motion_of(__constant float *camera, __constant float *after, 
   const float grown = sum > 0.0f ? fma1(d[0], p[0] + q[0], d[2] * (p[2] + q[2])) / sum : 0.0f;
   const float turned = signed_atan(fma1(d[0], p[2], -(d[2] * p[0])), fma1(p[0], q[0], p[2] * q[2]));
   const float risen = signed_atan(fma1(d[1], level, -(grown * p[1])), fma1(p[1], q[1], level * level_there));
-  // (6): the mean is drawn at the longitude nearest to the middle of the frame.
+  // Equation (6) of docs/cameras.md: the mean is drawn at the longitude nearest to the middle of the frame.
   const float middle = 0.5f * (camera[CAMERA_XMIN] + camera[CAMERA_XMAX]), longitude = signed_atan(p[0], p[2]);
   const float turns = floorL(fma1(longitude - middle, 0.5f / HALF_TURN, 0.5f));
   const float a = fma1(turns, -2.0f * HALF_TURN, longitude), b = signed_atan(p[1], level);

@@ -13,7 +13,8 @@
 #define is_shown(f, camera) 1
 #endif
 
-// The unit direction (x, y, z) of the pixels (px, py), (4); (0, 0, 0) for pixels outside the lens's picture.
+// The unit direction (x, y, z) of the pixels (px, py), equation (4) of docs/cameras.md; (0, 0, 0) for pixels outside
+// the lens's picture.
 static inline void ray_of(floatL px, floatL py, CAMERA_SPACE float *camera, floatL *x, floatL *y, floatL *z) {
   const floatL a = (px - camera[CAMERA_CX]) / camera[CAMERA_FX], b = (py - camera[CAMERA_CY]) / camera[CAMERA_FY];
   const floatL radius = sqrt(fmaL(a, a, b * b));
@@ -29,7 +30,7 @@ static inline void ray_of(floatL px, floatL py, CAMERA_SPACE float *camera, floa
 #ifdef NEEDS_TANGENTS
 #define NEAR_DEPTH(z, distance) (distance)
 
-// The tangent plane at the unit direction f, (9), (10) and (19): fills *t.
+// The tangent plane at the unit direction f, equations (9), (10) and (19) of docs/cameras.md: fills *t.
 static inline void tangent_of(const float *f, __constant float *camera, Tangent *t) {
   const float across = sqrt(fma1(f[0], f[0], f[1] * f[1]));
   const float theta = half_atan(across, f[2]), radius = radius_of(theta, camera);
@@ -39,8 +40,9 @@ static inline void tangent_of(const float *f, __constant float *camera, Tangent 
   tangent_around_axis(f, across, 1.0f, slope_of(theta, camera), around, camera, t);
 }
 
-// The gradient `by` through the low-pass part of the covariance, (27) and (28), with respect to a move of the mean's
-// direction f along e1 and e2. g: the gradient with respect to the covariance's xx, xy (as one variable) and yy.
+// The gradient `by` through the low-pass part of the covariance, equations (27) and (28) of docs/cameras.md, with
+// respect to a move of the mean's direction f along e1 and e2. g: the gradient with respect to the covariance's xx, xy
+// (as one variable) and yy.
 static inline void low_pass_gradient(const float *f, __constant float *camera, const float *g, float *by) {
   const float r = sqrt(fma1(f[0], f[0], f[1] * f[1])), z = f[2], theta = half_atan(r, z);
   const float radius = radius_of(theta, camera), slope = slope_of(theta, camera);

@@ -1,5 +1,5 @@
-// The orthographic camera model: the image is linear in x and y, (3) and (15) to (17). Equation numbers refer to
-// docs/cameras.md.
+// The orthographic camera model: the image is linear in x and y, equations (3) and (15) to (17). Equation numbers refer
+// to docs/cameras.md.
 #define ON_PLANE
 #define PARALLEL_RAYS
 
@@ -13,7 +13,7 @@ static inline floatL clamped_rest(floatL ratio, floatL x, floatL x_low, floatL z
   return (floatL)(0.0f);
 }
 
-// The Jacobian's row for x or y, (16). The arguments are those of perspective.h.
+// The Jacobian's row for x or y, equation (16) of docs/cameras.md. The arguments are those of perspective.h.
 static inline void jacobian_row(floatL x, floatL z, float focal, float low, float high, floatL *rx, floatL *jx) {
   *rx = (floatL)(0.0f);
   *jx = (floatL)(focal);
@@ -21,7 +21,8 @@ static inline void jacobian_row(floatL x, floatL z, float focal, float low, floa
 #endif
 
 #ifdef NEEDS_GRADIENT
-// The gradient with respect to the mean in the camera's axes, (20). The arguments are those of perspective.h.
+// The gradient with respect to the mean in the camera's axes, equation (20) of docs/cameras.md. The arguments are those
+// of perspective.h.
 static inline void mean_gradient(const floatL *at, const floatL *limited, floatL jx, floatL jy, floatL d_mx,
                                  floatL d_my, floatL by_j02, floatL by_j12, floatL d_size, floatL *d, floatL *beyond) {
   d[0] = jx * d_mx;

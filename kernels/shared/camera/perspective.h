@@ -15,8 +15,8 @@ static inline floatL clamped_rest(floatL ratio, floatL x, floatL x_low, floatL z
   return ratio == high ? (floatL)(high_rest) : above;
 }
 
-// Computes rx and jx of the Jacobian's row for x, jx (1, 0, -rx), (3) and (4). For y the row is jy (0, 1, -ry). low,
-// high: limits of x/z.
+// Computes rx and jx of the Jacobian's row for x, jx (1, 0, -rx), equations (3) and (4) of docs/gradients.md. For y the
+// row is jy (0, 1, -ry). low, high: limits of x/z.
 static inline void jacobian_row(floatL x, floatL z, float focal, float low, float high, floatL *rx, floatL *jx) {
   *rx = clampL(x / z, low, high);
   *jx = focal / z;
@@ -25,10 +25,11 @@ static inline void jacobian_row(floatL x, floatL z, float focal, float low, floa
 
 #ifdef NEEDS_GRADIENT
 // The gradient d (3) with respect to the mean in the camera's axes, through the image position and through the Jacobian
-// J, (52). Where x/z or y/z is clamped, J depends only on z. at: the mean; limited: rx, ry; jx, jy: as in (4); d_mx,
-// d_my: the gradient with respect to the image position; by_j02, by_j12: the gradient with respect to J's last column,
-// divided by -jx and -jy; d_size: the gradient with respect to the log of the size. Also sets beyond (2), the part of
-// (145) for a clamped x/z or y/z, whose limit is a fixed image position.
+// J, equation (52) of docs/gradients.md. Where x/z or y/z is clamped, J depends only on z. at: the mean; limited: rx,
+// ry; jx, jy: as in equation (4) of docs/gradients.md; d_mx, d_my: the gradient with respect to the image position;
+// by_j02, by_j12: the gradient with respect to J's last column, divided by -jx and -jy; d_size: the gradient with
+// respect to the log of the size. Also sets beyond (2), the part of equation (145) of docs/gradients.md for a clamped
+// x/z or y/z, whose limit is a fixed image position.
 static inline void mean_gradient(const floatL *at, const floatL *limited, floatL jx, floatL jy, floatL d_mx,
                                  floatL d_my, floatL by_j02, floatL by_j12, floatL d_size, floatL *d, floatL *beyond) {
   const floatL z = at[2], rx = at[0] / z, ry = at[1] / z;

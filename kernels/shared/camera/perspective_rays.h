@@ -6,7 +6,7 @@
 #define RATIO(x, z) ((x) / (z))
 #define ratio_rest slope_rest
 
-// The unit direction (x, y, z) of the pixels (px, py), (2).
+// The unit direction (x, y, z) of the pixels (px, py), equation (2) of docs/cameras.md.
 static inline void ray_of(floatL px, floatL py, CAMERA_SPACE float *camera, floatL *x, floatL *y, floatL *z) {
   const floatL a = (px - camera[CAMERA_CX]) / camera[CAMERA_FX], b = (py - camera[CAMERA_CY]) / camera[CAMERA_FY];
   const floatL shrunk = 1.0f / sqrt(fmaL(a, a, fmaL(b, b, (floatL)(1.0f))));
@@ -19,14 +19,15 @@ static inline void ray_of(floatL px, floatL py, CAMERA_SPACE float *camera, floa
 #define NEAR_DEPTH(z, distance) (z)
 #define is_shown(f, camera) 1
 
-// The tangent plane at the unit direction f, (9) and (30): fills *t.
+// The tangent plane at the unit direction f, equations (9) and (30) of docs/cameras.md: fills *t.
 static inline void tangent_of(const float *f, __constant float *camera, Tangent *t) {
   const float across = sqrt(fma1(f[0], f[0], f[1] * f[1]));
   tangent_around_axis(f, across, f[2] * f[2], 1.0f, f[2], camera, t);
 }
 
-// The gradient `by` through the low-pass part of the covariance, (31), with respect to a move of the mean's direction f
-// along e1 and e2. g: the gradient with respect to the covariance's xx, xy (as one variable) and yy.
+// The gradient `by` through the low-pass part of the covariance, equation (31) of docs/cameras.md, with respect to a
+// move of the mean's direction f along e1 and e2. g: the gradient with respect to the covariance's xx, xy (as one
+// variable) and yy.
 static inline void low_pass_gradient(const float *f, __constant float *camera, const float *g, float *by) {
   const float r = sqrt(fma1(f[0], f[0], f[1] * f[1])), z = f[2];
   low_pass_around_axis(f, r, z * z, z, -2.0f * (z * r), -r, camera, g, by);
@@ -38,8 +39,8 @@ static inline void low_pass_gradient(const float *f, __constant float *camera, c
 #define LEAST_AHEAD 1e-4f // least z of a unit direction that can be in a picture
 
 // The range [*low, *high] on one axis of the image, in focal lengths, of all directions within an angle of a given
-// direction, (32). sine: the sine of the angle; along, z: the given direction's coordinates along the axis and forward.
-// An end of the range that is behind the plane z = 0 becomes NO_END.
+// direction, equation (32) of docs/cameras.md. sine: the sine of the angle; along, z: the given direction's coordinates
+// along the axis and forward. An end of the range that is behind the plane z = 0 becomes NO_END.
 static inline void side_of(float along, float z, float sine, float *low, float *high) {
   const float level = sqrt(fma1(along, along, z * z));
   *low = -NO_END;

@@ -2,8 +2,8 @@
 // Image positions are linear functions of RATIO. Equation numbers refer to docs/gradients.md.
 
 #if defined(NEEDS_PROJECTION) || defined(NEEDS_MOTION)
-// Computes a coordinate on the image, focal * RATIO + centre, (2), as whole pixels relative to the window and a
-// fraction (`rest`) in [0, 1). The fraction has the same bits in every window of a frame.
+// Computes a coordinate on the image, focal * RATIO + centre, equation (2) of docs/gradients.md, as whole pixels
+// relative to the window and a fraction (`rest`) in [0, 1). The fraction has the same bits in every window of a frame.
 static inline void image_position(floatL x, floatL x_low, floatL z, floatL z_low, float focal, float focal_low,
                                   float centre, float centre_low, float window, floatL *whole, floatL *rest) {
   const floatL ratio = RATIO(x, z);
@@ -48,8 +48,8 @@ static inline void motion_of(__constant float *camera, __constant float *after, 
 #endif
 
 #ifdef NEEDS_PIXEL_WIDTH
-// The width of a pixel in world units at the point (x, y, z) in the camera's axes, (88) for one view; 1e30 if the
-// camera does not see the point.
+// The width of a pixel in world units at the point (x, y, z) in the camera's axes, equation (88) of docs/gradients.md
+// for one view; 1e30 if the camera does not see the point.
 static inline float pixel_width(float x, float y, float z, CAMERA_SPACE float *camera) {
   const int seen = z > camera[CAMERA_NEAR] && x > camera[CAMERA_XMIN] * z && x < camera[CAMERA_XMAX] * z &&
                    y > camera[CAMERA_YMIN] * z && y < camera[CAMERA_YMAX] * z;
