@@ -272,7 +272,7 @@ class Camera:
         return replace(self, translation=self.translation + self.rotation @ origin)
 
     def moved(self, motion: Float64) -> Camera:
-        """The camera that sees what this camera would see if the world moved: (140) of docs/gradients.md.
+        """The camera that sees what this camera would see if the world moved: equation (140) of docs/gradients.md.
 
         motion: (6,), a rotation of the world about this camera's centre, as a rotation vector in radians, and then a
         translation of the world in world units.

@@ -155,7 +155,7 @@ class Gaussians:
 MAX_SH_COEFFICIENT = 1e7
 """Largest magnitude of an SH coefficient. Up to it, colours stay small enough for project.cl to draw the Gaussian."""
 MAX_PARAMETER = 1e19
-"""Largest magnitude of other parameters, so that their squares fit in float32."""
+"""Largest magnitude of parameters other than SH coefficients, so that their squares fit in float32."""
 
 
 class GaussiansOfFile(Gaussians):

@@ -64,13 +64,13 @@ class Perspective(CameraModel):
     ) -> Float64:
         """Return the gradient (N, 3) with respect to the points: eqs. (36), (37) of docs/gradients.md."""
         x, y, z = points.T
-        # (36): gradient with respect to z and the ratios, through the Jacobian. A clamped ratio is constant.
+        # Equation (36): gradient with respect to z and the ratios, through the Jacobian. A clamped ratio is constant.
         d00, d02, d11, d12 = d_jacobian[:, 0, 0], d_jacobian[:, 0, 2], d_jacobian[:, 1, 1], d_jacobian[:, 1, 2]
         d_z = (-view.fx * d00 + view.fx * plane.ratios[:, 0] * d02) / z**2
         d_z += (-view.fy * d11 + view.fy * plane.ratios[:, 1] * d12) / z**2
         d_ratio_x = np.where(plane.unclamped[:, 0], -view.fx * d02 / z, 0.0)
         d_ratio_y = np.where(plane.unclamped[:, 1], -view.fy * d12 / z, 0.0)
-        # (37): gradient through the mean on the image, which is not clamped.
+        # Equation (37): gradient through the mean on the image, which is not clamped.
         d_ratio_x = d_ratio_x + view.fx * d_means2d[:, 0]
         d_ratio_y = d_ratio_y + view.fy * d_means2d[:, 1]
         d_z -= (d_ratio_x * x + d_ratio_y * y) / z**2

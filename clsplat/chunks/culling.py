@@ -67,8 +67,8 @@ class PictureBorders:
     """The borders of a camera's picture and its limits of depth, which culling compares chunks with.
 
     culls: False if every chunk counts as visible.
-    square: True if Gaussians are listed in the square of their longest half axis, which is at most the root of the sum
-        of both half axes' squares.
+    square: True if a Gaussian is listed in all tiles of a square, whose half side is the ellipse's longest half axis.
+        This axis is at most the root of the sum of the squared half width and half height.
     reach: standard deviations at which a Gaussian ends.
     stretch: largest factor by which the camera's matrix changes a length; 1 for an exact rotation.
     low, high: (2,), borders of the tiles in pixels, from the principal point.

@@ -3,7 +3,8 @@
 
 A driver's compiler may abort or hang when it builds a kernel, or, like PoCL's code generator, at the launch. So a
 kernel is first built in another process, and launched there on zero-filled arrays of the same sizes. The outcome is
-recorded (`driver_records`), so that the trial is not repeated with the same driver.
+recorded (`driver_records`), so that the trial is not repeated with the same driver. A driver that does not answer for
+`worker_process.driver_timeout` seconds has failed.
 """
 
 from __future__ import annotations

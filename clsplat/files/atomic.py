@@ -24,7 +24,7 @@ from clsplat.files.names import ON_WINDOWS
 
 TEMPORARY_SUFFIX = ".clsplat-tmp"
 ABANDONED_FILE_SECONDS = 600.0
-"""Seconds without a write after which a temporary file from another machine counts as abandoned."""
+"""Seconds without a write after which another machine's temporary file, or claim of a file, counts as abandoned."""
 DISK_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT)
 DISK_PROBE_BYTES = 1 << 16
 """Size in bytes of the file that tests whether a disk has room."""

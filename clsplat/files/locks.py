@@ -20,6 +20,7 @@ from clsplat.files.names import ON_WINDOWS
 EMPTY_CLAIM_SECONDS = 20
 """Age in seconds at which a claim with an empty marker file counts as abandoned."""
 CLAIM_SUFFIX = ".clsplat-claim"
+"""End of the name of a claim's marker file, which is .NAME.clsplat-claim beside the file NAME."""
 _PROCESS_TOKEN = secrets.token_hex(4)
 """Random digits that distinguish this process from others with the same process id, earlier or on another machine."""
 

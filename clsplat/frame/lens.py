@@ -170,7 +170,10 @@ class Warp:
 
 
 def distorted_places(lens: Lens, straight: Camera) -> Float64:
-    """Return positions (height, width, 2) of a distorted picture's pixels in the undistorted one; NaN without a ray."""
+    """Return positions (height, width, 2) of a distorted picture's pixels in the undistorted picture.
+
+    NaN where a pixel has no ray.
+    """
     grid = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     rays = lens.cam_from_img(np.stack([axis.ravel() for axis in grid], axis=1))
     places = rays * (straight.fx, straight.fy) + (straight.cx, straight.cy)

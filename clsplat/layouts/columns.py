@@ -155,7 +155,7 @@ DEEP_SLICE = ("RED", "GREEN", "BLUE", "ALPHA", "DEPTH")
 """A slice of a deep picture at a pixel: premultiplied colour, alpha, and depth."""
 
 DEEP_LEVELS = 64
-"""Number of values of the slack s, (74) of docs/pictures.md, that are tried to cut a pixel into slices."""
+"""Number of values of the slack s, equation (74) of docs/pictures.md, that are tried to cut a pixel into slices."""
 
 DEEP_PICTURES = 16
 """Maximum number of deep pictures that are merged at once."""
@@ -180,7 +180,7 @@ class SlotFields(NamedTuple):
 
     @property
     def defines(self) -> dict[str, object]:
-        """Defines for the kernels that write and read slots; empty for the plain slots."""
+        """Preprocessor defines of kernels that write and read slots with these fields; empty for SLOT_PLAIN alone."""
         wanted = {
             "ABSOLUTE_GRADIENTS": self.absolute,
             "CONTRIBUTIONS": self.contributions,

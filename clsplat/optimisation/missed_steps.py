@@ -32,7 +32,7 @@ class MissedSteps:
         self._decays = np.array([config.beta1, config.beta2], np.float32).astype(np.float64)
 
     def add(self, scales: Mapping[str, float]) -> None:
-        """Add a step to the factors (docs/gradients.md, (190) and (191)).
+        """Add a step to the factors (equations (190) and (191) of docs/gradients.md).
 
         scales: rate sqrt(1 - beta2^t) / (1 - beta1^t) of each group that the step updates.
         """

@@ -71,7 +71,7 @@ def exploration_of(config: TrainConfig, step: int, means_rate: float, count: int
 def _penalties(opacity: float, scale: float, count: int, length_unit: float) -> Exploration:
     """Weights for sums over the visible Gaussians, from weights for means over all `count` Gaussians.
 
-    Scales are relative to the scene's length unit (docs/gradients.md, (91)).
+    Scales are relative to the scene's length unit (equation (91) of docs/gradients.md).
     """
     return Exploration(opacity=opacity / count, scale=scale / (3 * count * length_unit))
 

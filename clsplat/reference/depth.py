@@ -22,7 +22,9 @@ def depth_loss(nearness: Float64, aims: Float64, weights: Float64, factor: float
 
 
 def nearness_grad(means: Float64, camera: Camera, d_nearness: Float64) -> Float64:
-    """Return the gradient (N, 3) of a loss with respect to the means, through nearness: (122) of docs/gradients.md.
+    """Return the gradient (N, 3) of a loss with respect to the means, through nearness.
+
+    Equation (122) of docs/gradients.md.
 
     d_nearness: (N,), the gradient with respect to 1 / depth, or to 1 / distance for camera models along rays.
     """

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gradient with respect to a camera's pose: float64 twin of kernels/pose.cl, (140) to (142) of docs/gradients.md."""
+"""Gradient with respect to a camera's pose: float64 twin of kernels/pose.cl.
+
+Equations (140) to (142) of docs/gradients.md.
+"""
 
 from __future__ import annotations
 

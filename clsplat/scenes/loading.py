@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loading of scenes (`load_scene`): pictures with cameras at the working size, held-out views, checks, and points."""
+"""Loading of scenes (`load_scene`): pictures with cameras at the working size, held-out views, checks, and points.
+
+`folder_layouts.detect` decides which layout a folder has, also if several would fit.
+"""
 
 from __future__ import annotations
 

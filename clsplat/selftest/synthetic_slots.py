@@ -46,7 +46,7 @@ class MadeUpSlots:
         return cls(Slots(upload(bench.device, values), bench.counted.first_slots), slot_sums(bench, values))
 
     def d_means(self, bench: CaseBench) -> Float64:
-        """Gradients (n, 2) with respect to the means' image positions, per pixel: docs/gradients.md, (50)."""
+        """Gradients (n, 2) with respect to image positions, per pixel: equation (50) of docs/gradients.md."""
         l11, l12, l22 = (WHITENING_FACTOR * bench.splats().whitening).T
         _, u, v, *_ = self.sums[:, SLOT_MOMENTS].T
         found: Float64 = -np.stack([l11 * u, l12 * u + l22 * v], axis=1) / WHITENING_FACTOR**2

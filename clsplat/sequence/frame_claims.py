@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames shared by jobs that run at the same time. Before a job renders a frame, it checks the frame's file again, and
-claims the frame by a file next to it."""
+claims the frame by a file next to it.
+
+`clsplat.files.locks` decides when the claim of a job that was killed is taken over: at once on the same machine, and
+after ABANDONED_FILE_SECONDS without an update if the job ran on another machine.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +23,7 @@ from clsplat.sequence.finished_frames import is_complete
 from clsplat.sequence.task import RenderOptions, Task
 
 CLAIM_HEARTBEAT_SECONDS = 60.0
-"""Seconds between updates of a claim's modification time."""
+"""Seconds between updates of a claim's modification time, which is to stay younger than ABANDONED_FILE_SECONDS."""
 CLAIM_POLL_SECONDS = 0.25
 """Seconds between checks of frames that other jobs have claimed."""
 CLAIM_WARNING_SECONDS = 10.0

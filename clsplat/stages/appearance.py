@@ -94,7 +94,7 @@ class Gains:
 
     @classmethod
     def on(cls, device: Device, logs: NDArray[np.float32], pull: csr_array | None = None) -> Gains:
-        """Gains with these initial logs, and zero moments. pull: the sparse matrix of `Gains`; None for zeros."""
+        """Make gains from initial logs, with zero moments. pull: the sparse matrix of `Gains`; None for zeros."""
         zeros = np.zeros_like(logs)
         gains = np.exp2(logs.astype(np.float64)).astype(np.float32)
         held, start, first, second, factors = (upload(device, value) for value in (logs, logs, zeros, zeros, gains))
@@ -153,8 +153,8 @@ def entry_gradient(
 ) -> DeviceArray:
     """Column sums (model.sums, stride) of the gradient with respect to colour entries of 0, applied to the render.
 
-    The sum over the columns, multiplied by ln 2 for logarithms, is the gradient (docs/gradients.md, (184) to (186)).
-    place: index of the view in the batch; the result of each view is in an array of its own.
+    The sum over the columns, multiplied by ln 2 for logarithms, is the gradient (equations (184) to (186) of
+    docs/gradients.md). place: index of the view in the batch; the result of each view is in an array of its own.
     """
     _, rows, stride = image.shape
     down = rows // TILE

@@ -112,7 +112,11 @@ def frame_items(device: Device, tiles: int) -> int:
 
 
 def items_for(tiles: int, units: int, items: int, most: int) -> int:
-    """The result of `frame_items` on a GPU with `units` compute units: `items` or more, and at most `most`."""
+    """Return the work-items of a group for `frame_items`, on a GPU: `items` times a power of two, at most `most`.
+
+    tiles: number of tiles of the picture.
+    units: number of the GPU's compute units.
+    """
     while 2 * items <= most and 2 * items * tiles <= _BUSY_ITEMS * units:
         items *= 2
     return items
@@ -128,7 +132,13 @@ def gradient_items(device: Device, tiles: int) -> int:
 
 
 def gradient_items_for(tiles: int, units: int, items: int, most: int) -> int:
-    """The result of `gradient_items` on a GPU with `units` compute units and groups of at most `most`."""
+    """Return the work-items of a group for `gradient_items`, on a GPU.
+
+    tiles: number of tiles of the picture.
+    units: number of the GPU's compute units.
+    items: work-items of a group by the kernel shape.
+    most: maximum number of work-items in a group.
+    """
     return TILE * TILE if tiles <= _GRADIENT_TILES * units and most >= TILE * TILE else items
 
 

@@ -311,8 +311,7 @@ def project_step(
 
 
 class _Build(NamedTuple):
-    """Gaussians per work-item in the gradient's kernel, and its define LANES if this is not the kernel shape's
-    number."""
+    """Gaussians per work-item of the gradient's kernel, and the define LANES if the kernel shape has another number."""
 
     lanes: int
     defines: dict[str, object]

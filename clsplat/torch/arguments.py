@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of tensor arguments, and conversions between tensors and arrays."""
+"""Checks and refusals of arguments (InputError), and conversions between tensors and arrays."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""gsplat's `rasterization`: images of Gaussians, with their gradient."""
+"""gsplat's `rasterization`: images of Gaussians, with their gradient. Arguments of gsplat that clsplat does not support
+raise InputError."""
 
 from __future__ import annotations
 
@@ -278,6 +279,7 @@ def _refuse_settings(global_z_order: Any, renderer_config: Any, render_mode: str
 
 
 def _refuse_missing(**given: Any) -> None:
+    """Raise InputError for an argument of gsplat that is not supported, unless it is None or False."""
     for name, value in given.items():
         if value is not None and value is not False:
             found = str(value) if isinstance(value, bool) else "given"

@@ -1,5 +1,5 @@
-// Adam, (42) of docs/gradients.md (Kingma and Ba 2015, algorithm 1), for one element and for ABREAST consecutive
-// elements.
+// Adam, equation (42) of docs/gradients.md (Kingma and Ba 2015, algorithm 1), for one element and for ABREAST
+// consecutive elements.
 //
 // Adam writes no NaN, and no infinity except as a mark of refusal. It refuses the step of an element if the new values
 // would be NaN or infinite, or if the square of the new parameter would reach `limit2`. The last four entries of

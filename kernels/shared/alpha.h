@@ -1,7 +1,7 @@
 // A Gaussian's alpha in a tile's pixels. blend.cl and blend_grad.cl must compute the same bits, because the gradient
 // recovers the image's transmittance by division.
 
-// A Gaussian's nearness, 1 / depth, is blended like a colour (docs/gradients.md, (120)).
+// A Gaussian's nearness, 1 / depth, is blended like a colour (equation (120) of docs/gradients.md).
 #ifdef NEARNESS
 #define NEAR_PARAMETER , float c_near
 #define NEAR_ARGUMENT , c_near

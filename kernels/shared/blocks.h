@@ -69,7 +69,7 @@ static inline uint blocks_of(const float *splat, int tile_x, int tile_y) { retur
 #else
 #define ALL_REACHED 0
 // The right edge of an ellipse in the rows whose offsets from the mean are in [d0, d1], relative to the mean
-// (docs/gradients.md, (47)). The square root, and so the edge, may be up to 0.2 % too large.
+// (equation (47) of docs/gradients.md). The square root, and so the edge, may be up to 0.2 % too large.
 static inline float block_edge(float d0, float d1, float tangent, float half_w, float l12, float l22, float inverse_l11,
                                float budget) {
   const float dy = tangent < d0 ? d0 : d1, v = l22 * dy;

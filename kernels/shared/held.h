@@ -2,8 +2,8 @@
 //
 // held_starts (pixels of a plane + 1): the index of each pixel's first surface, then the number of all surfaces.
 // held_surfaces (surfaces, HELD_SIZE): the depths of front and back, the transmitted fraction, and log2 of this
-// fraction divided by the thickness. Each pixel's surfaces are sorted by the depth of their fronts. Equations:
-// docs/pictures.md, (75).
+// fraction divided by the thickness. Each pixel's surfaces are sorted by the depth of their fronts. Equation (75)
+// of docs/pictures.md.
 #ifdef HOLDOUT
 // State of a cell while depth increases. through: the transmittance of the surfaces passed as a whole; at: the index of
 // the pixel's first surface that is not; next: the depth of the front of that surface; end: the end of the pixel's

@@ -8,7 +8,7 @@ static inline uint mixed(uint x) {
   return x ^ (x >> 16);
 }
 
-// The random word of a row in a step with the key (key0, key1): docs/gradients.md, (101).
+// The random word of a row in a step with the key (key0, key1): equation (101) of docs/gradients.md.
 static inline uint random_word(const uint row, const uint key0, const uint key1) {
   return mixed(mixed(row ^ key0) + key1);
 }

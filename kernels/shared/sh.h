@@ -103,8 +103,9 @@ static inline float4 sh_fma(float a, float4 b, float4 c) {
 #define SH_OF_GAUSSIAN(i, coefficients) SH_USED(coefficients)
 #endif
 
-// A Gaussian's colour before it is clamped at 0, (12) of docs/gradients.md, from one lane of the basis. dc (3), rest
-// (coefficients - 1, 3): the Gaussian's SH coefficients, of which the first `used` are evaluated, dc included.
+// A Gaussian's colour before it is clamped at 0, equation (12) of docs/gradients.md, from one lane of the basis. dc
+// (3), rest (coefficients - 1, 3): the Gaussian's SH coefficients, of which the first `used` are evaluated, dc
+// included.
 static inline float4 sh_colour(const Lanes *basis, uint lane, int used, int coefficients, __global const float *dc,
                                __global const shT *rest) {
   float4 colour = sh_fma(SH_CONSTANT, (float4)(dc[0], dc[1], dc[2], 0.0f), (float4)(0.5f));

@@ -1,6 +1,6 @@
-// Divides a pixel's light into slices by depth, for deep pictures: (73) and (74) of docs/pictures.md. A slice begins
-// where the error of the transmittance would exceed a slack. Two walks over the list of Gaussians search the least
-// slack that gives few enough slices: first coarse, then fine. A third walk makes the slices.
+// Divides a pixel's light into slices by depth, for deep pictures: equations (73) and (74) of docs/pictures.md. A slice
+// begins where the error of the transmittance would exceed a slack. Two walks over the list of Gaussians search the
+// least slack that gives few enough slices: first coarse, then fine. A third walk makes the slices.
 #define STEPS 8                          // number of steps that divide the slack in each of the two searches
 #define TRIED (STEPS - 1)                // number of slacks tried in a walk
 #define WALKS 3                          // number of walks over the list

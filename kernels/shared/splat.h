@@ -1,7 +1,7 @@
 // Units of splats and slots, and the number of floats per slot. Their columns are in layouts.h.
 
-// A splat's L11, L12 and L22 are the whitening W (docs/gradients.md, (44)) times WHITEN = sqrt(log2(e) / 2). Moments in
-// slots use WHITEN W too.
+// A splat's L11, L12 and L22 are the whitening W (equation (44) of docs/gradients.md) times WHITEN = sqrt(log2(e) / 2).
+// Moments in slots use WHITEN W too.
 #define WHITEN 0.84932180028801904f
 #define INVERSE_WHITEN2 1.38629436111989062f // 1 / WHITEN^2 = 2 ln 2
 

@@ -34,8 +34,8 @@
 #define FOR_FIELDS(field) _Pragma("unroll") for (int field = 0; field < SLOT_STRIDE; ++field)
 #define FOR_STRIP(c) _Pragma("unroll") for (int c = 0; c < STRIP_CELLS; ++c)
 
-// Rows of a pair in local memory: one for each field. If several warps share the strip, the same memory first holds
-// LEFT rows for each block, with what leave_pixel stores.
+// Rows of a pair in local memory: one for each field of its slot. If several warps share the strip, the same memory
+// first holds LEFT rows for each block: the values that leave_pixel stores.
 #ifdef RAYS
 #define LEFT 4 // g, weight, u and v
 #else

@@ -109,7 +109,7 @@ static inline Ellipse ellipse_of(__global const float *splat, int tiles_x, int t
 }
 
 // The ellipse's right edge, relative to the mean, in the rows whose offsets from the mean are in [d0, d1]; the left
-// edge follows by symmetry (docs/gradients.md, (47)).
+// edge follows by symmetry (equation (47) of docs/gradients.md).
 static inline float right_edge(const Ellipse *e, float d0, float d1) {
   if (e->tangent >= d0 && e->tangent <= d1) return e->half_w;
   const float dy = e->tangent < d0 ? d0 : d1;

@@ -199,5 +199,5 @@ def test_all_primitives_decide_together(tmp_path: Path) -> None:
     """One has logs that are all over 0, as a coarse level of detail does."""
     path = tmp_path / "model.gltf"
     stored = generated(path, "another", 0.5, -3.0)
-    told = f"{path}: primitive 1 of node 0: Gaussian .* of 200 have a negative one: all are read as logs of scales"
+    told = f"{path}: primitive 1 of node 0: Gaussian .* of 200 have a negative scale: all are read as logs of scales"
     np.testing.assert_array_equal(warned(told, formats.load, path).log_scales, np.concatenate(stored))

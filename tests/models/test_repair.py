@@ -320,7 +320,7 @@ def test_negative_scales_are_logs(tmp_path: Path, file: str, offset: float, monk
     read, texts = told(path)
     np.testing.assert_array_equal(read.log_scales, model.log_scales)
     assert len(texts) == 1
-    assert "have a negative one: all are read as logs of scales, although this format stores scales" in texts[0]
+    assert "have a negative scale: all are read as logs of scales, although this format stores scales" in texts[0]
     few = np.exp(model.log_scales)
     few[7, 2] = -1
     with pytest.raises(InputError, match=r"Gaussian 7 has the scales .* -1, expected .* at least 0; 1 of 300 has"):

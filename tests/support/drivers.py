@@ -3,6 +3,9 @@
 
 CLSPLAT_TEST_DRIVERS, words separated by commas, selects the devices whose platform, version or name contains one of
 them.
+
+The extra `test` brings PoCL, so that there is a device everywhere. Without any, pytest skips the tests of the fixtures
+`device` and `shaped_device`, which have a parameter for each device, and tests of `default_device` fail.
 """
 
 from __future__ import annotations

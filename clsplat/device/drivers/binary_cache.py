@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cache of built OpenCL programs (binaries) in files, for a driver that has no cache of its own.
 
+The files are in the folder CLSPLAT_BINARIES, or else in `binaries` of `driver_records.cache_folder`.
+
 A file begins with a digest of its contents, as a driver may crash on a truncated binary. The file's name is a digest of
 everything that the binary depends on: the text, the options, the driver and its settings, and the processor.
 """

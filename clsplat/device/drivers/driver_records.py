@@ -53,7 +53,7 @@ class Entry:
 
 
 def cache_folder() -> Path:
-    """The folder of clsplat in the user's cache. For a user without a home folder, the path cannot be written to."""
+    """Return $XDG_CACHE_HOME/clsplat or ~/.cache/clsplat; without a home folder, a path that cannot be written to."""
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clsplat"
     except RuntimeError:

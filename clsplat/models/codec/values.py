@@ -119,7 +119,7 @@ def all_to_log_scales(parts: Sequence[tuple[Path | str, Gaussians]], writer: str
         (where, gaussians), rows = next(each for each in zip(parts, negative, strict=True) if each[1].any())
         at = int(rows.argmax())
         found = f"Gaussian {at} has the scales {' '.join(f'{value:g}' for value in gaussians.log_scales[at])}"
-        many = f"{count:,} of {total:,} {have(count)} a negative one"
+        many = f"{count:,} of {total:,} {have(count)} a negative scale"
         if count < LOG_SCALES_MIN_NEGATIVE_SHARE * total:
             raise InputError(f"{where}: {found}, expected numbers of at least 0; {many}")
         warn(f"{where}: {found}, and {many}: all are {logs}")

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Model formats, a module for each. The file's suffix selects the format, unless its first bytes say otherwise.
 
+`models.codec.repair` repairs or drops Gaussians with NaN, infinities or zero quaternions when a file is read.
+
 MODEL_FORMATS is the only place that lists the formats, one row each. The docstring of a format's module cites the
 specification and lists the conventions that differ from clsplat's (docs/conventions.md).
 """

@@ -144,10 +144,13 @@ class Instancer:
         return any(map(_varies, above)) or (self.outer is not None and self.outer.instancer.moves)
 
     def of(self, key: Key, code: Any) -> tuple[Any, bool]:
-        """USD's matrix from the prototype's parent to the world, and visibility, of the instance `key`.
+        """Return an instance's matrix from the prototype's parent to the world, and True if it is visible.
 
-        An instance that does not exist at that time is invisible. It keeps its last matrix, or has its next one if it
-        has not existed before. Raises InputError.
+        An instance that does not exist at this time is invisible. Its matrix is then that of the last time at which it
+        existed, or else of the first. Raises InputError.
+
+        key: the instance.
+        code: USD's time code.
         """
         places, hidden = self._at(code)
         if key in places:

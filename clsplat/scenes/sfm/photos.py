@@ -28,7 +28,7 @@ from clsplat.scenes.sfm.copies import Thumb, thumb_of, to_compare
 SFM_PHOTO_EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 """Extensions that pycolmap's wheel reads and writes. The wheel's OpenImageIO has no WebP, JPEG 2000 or HEIF."""
 SFM_IMAGE_FORMATS = frozenset({"jpeg", "png", "tiff", "bmp"})
-"""OpenImageIO's names of the formats that pycolmap's wheel reads. They tell a file's contents despite its extension."""
+"""OpenImageIO's names of the formats that pycolmap's wheel reads. They are found from the file's contents."""
 UNREADABLE_PHOTO_EXTENSIONS = frozenset(
     {".webp", ".heic", ".heif", ".avif", ".jp2", ".gif", ".exr", ".dng", ".cr2", ".nef", ".arw"}
 )

@@ -2,7 +2,8 @@
 """The core stages of the self-test: arithmetic, projection, tile lists, blending, and their gradients with Adam. Each
 is compared with its float64 reference on a frozen scene.
 
-The reference of a stage gets the device's output of the previous stage, so that errors do not add up.
+The reference of a stage gets the device's output of the previous stage, so that errors do not add up. The bounds of the
+errors are STAGE_BOUNDS_ULP of `selftest.result`.
 """
 
 from __future__ import annotations
@@ -200,7 +201,7 @@ def _blend_grad(bench: CaseBench) -> StageOutcome:
 
 
 def _moments(splats: reference_project.ProjectedTwin, wanted: reference_blend.BlendGradients) -> Float64:
-    """Compute the moments (n, 6) of a slot, docs/gradients.md, (49), from the twin's gradients, (25) to (29)."""
+    """Compute the moments (n, 6) of a slot from the twin's gradients: equations (49) and (25) to (29)."""
     l11, l12, l22 = (WHITENING_FACTOR * splats.whitening).T
     gx, gy = -(WHITENING_FACTOR**2) * wanted.means2d.T
     u = gx / l11

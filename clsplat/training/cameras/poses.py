@@ -89,7 +89,7 @@ def axes_of(matrix: Float64) -> tuple[Float64, Float64]:
 
 
 def descend(first: Float64, second: Float64, by: Float64, visit: int) -> Float64:
-    """Adam's step (6,) at rate 1, in the axes of the gradients' second moments: docs/gradients.md, (143).
+    """Adam's step (6,) at rate 1, in the axes of the gradients' second moments: equation (143) of docs/gradients.md.
 
     first, second: moments (6,) and (6, 6), updated in place.
     by: the gradient (6,).

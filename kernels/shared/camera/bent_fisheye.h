@@ -1,5 +1,5 @@
 // The Kannala-Brandt fisheye, a fisheye with coefficients: the radius on the image as a function of the angle from the
-// axis, (18) of docs/cameras.md. fisheye.h includes this file.
+// axis, equation (18) of docs/cameras.md. fisheye.h includes this file.
 #define FARTHEST_ANGLE(camera) (camera)[CAMERA_FOLD]
 #define IS_IN_PICTURE(radius, camera) ((radius) < (camera)[CAMERA_FOLD_RADIUS])
 #define SERIES(camera) (2.0f * (camera)[CAMERA_K1])

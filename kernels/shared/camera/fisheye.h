@@ -89,8 +89,8 @@ static inline void box_of(const float *f, float reach, __constant float *camera,
 #endif
 
 #ifdef NEEDS_MOTION
-// The motion of a mean on the image, in pixels, (75) of docs/channels.md. The change of the angles is computed from the
-// change of the coordinates, because a difference of two angles would lose small motions by rounding.
+// The motion of a mean on the image, in pixels, equation (75) of docs/channels.md. The change of the angles is computed
+// from the change of the coordinates, because a difference of two angles would lose small motions by rounding.
 static inline void motion_of(__constant float *camera, __constant float *after, float x, float y, float z,
                              __global const float *to, __global const float *splat, __global float *motion) {
   Moved m;
