@@ -138,7 +138,7 @@ def settings(count: int, steps: int) -> list[str]:
     return [
         *("--iterations", str(steps), "--points-limit", str(count), "--test-every", "0", "--no-report"),
         *("--sh-degree", str(SH_DEGREE), "--sh-degree-every", at(0.2), "--warmup", f"{at(0.1)},{at(0.3)}"),
-        *("--checkpoint-every", at(0.13), "--density.start", at(0.2), "--density.every", at(0.15)),
+        *("--checkpoint-every", at(0.17), "--density.start", at(0.2), "--density.every", at(0.15)),
         *("--density.stop", at(0.9), "--density.opacity-reset-every", at(0.4), "--density.opacity-reset-to", "0.1"),
         *("--density.max-gaussians", str(count + count * GROWTH_PERCENT // 100)),
     ]

@@ -4,6 +4,8 @@
     tools/stress/run sizes [--gaussians 2e5,6e5,2e6,6e6,20e6] [--degree 3] [--steps 60] [--dense]
         [--before CHECKOUT] [--before-gaussians 6e6] [--device DEVICE] [--json] [--plot FILE]
 
+By default each of 60 views comes once, so that a model in a file has nearly all chunks of a view to fetch.
+
 Times are medians: wall time, and in brackets and in the plot the processor time of all threads, which other load
 changes less. A model is all in memory once, and once 0.3 of its parameters and moments are, and the others in a scratch
 file (--max-host-mem). --before: the folder of another version, whose steps are measured on the same scene, up to
@@ -32,7 +34,7 @@ from clsplat.gaussians import floats_of
 from clsplat.progress import aligned
 from clsplat.rendering.memory_needs import MODELS
 
-IN_MEMORY, IN_A_FILE, BEFORE = "all in memory", "0.3 in memory", "before"
+IN_MEMORY, IN_A_FILE, BEFORE = "all in memory", "0.3 in memory, the rest in a file", "before"
 SHARE_IN_MEMORY = 0.3
 LEAST_LIMIT = 32 << 20
 """Bytes of a limit that are enough for the photographs and some chunks."""
@@ -74,6 +76,12 @@ def both(times: dict[str, float]) -> str:
     return f"{times['median_ms']:.1f} ({times['processor_ms']:.1f})"
 
 
+def draw(path: Path, rows: Sequence[dict[str, Any]], ways: Sequence[str], title: str) -> None:
+    """Plot the processor times."""
+    lines = {way: [(row["gaussians"] / 1e6, row[way]["processor_ms"]) for row in rows if way in row] for way in ways}
+    plot_growth(path, [Panel("million Gaussians", "processor ms a step, median", lines)], title)
+
+
 @tool("stress_sizes")
 def main(arguments: Sequence[str]) -> int:
     """Measure, and print the table. Returns the exit status."""
@@ -100,9 +108,6 @@ def main(arguments: Sequence[str]) -> int:
     cells = [(f"{row['gaussians']:,}", *(both(row[way]) if way in row else "" for way in ways)) for row in rows]
     print(json.dumps(rows) if options.json else "\n".join(aligned([("Gaussians", *ways), *cells])))
     if options.plot is not None:
-        lines = {
-            way: [(row["gaussians"] / 1e6, row[way]["processor_ms"]) for row in rows if way in row] for way in ways
-        }
-        title = f"A training step of SH degree {options.degree}, {'dense' if options.dense else 'sparse'} Adam"
-        plot_growth(options.plot, [Panel("million Gaussians", "processor ms a step", lines)], title)
+        kind = "dense" if options.dense else "sparse"
+        draw(options.plot, rows, ways, f"A training step, SH degree {options.degree}, {kind} Adam")
     return 0
