@@ -27,6 +27,9 @@ _VECTOR = 4
 _MAX_CROSSING = 32
 """Most chunks whose records cross at once. More gain nothing."""
 
+Cull = Callable[[Camera], NDArray[np.integer[Any]]]
+"""Function that returns the chunks that a camera may show."""
+
 
 @stage("chunk_records")
 def copy_chunks(
@@ -60,25 +63,36 @@ class ChunkPool:
     store: records of all chunks. Those on the device may be newer there, until `write_back`.
     arrays: by field, the rows of the slots.
     caught: (slots,) uint32, the last step up to which the chunk in each slot has been caught up (`stages.catch_up`).
+    cull: function that returns the chunks that a camera may show; None if that is not known.
+    before_view: called with the number of a view's chunks before any of them comes, so that the pool may be resized.
     """
 
-    def __init__(self, device: Device, work: Workspace, store: ChunkStore, rows: int) -> None:
+    def __init__(self, device: Device, work: Workspace, store: ChunkStore, rows: int, cull: Cull | None = None) -> None:
         self._device, self._work, self.store = device, work, store
-        self.slots = min(max(rows // CHUNK_ROWS, 1), store.chunks)
-        self.arrays = {
-            name: allocate(device, (CHUNK_ROWS * self.slots, *shape), np.float32)
-            for name, shape in store.fields.items()
-        }
-        self.caught = allocate(device, (self.slots,), np.uint32)
-        self.caught.fill(0)
         self._caught = np.zeros(store.chunks, np.uint32)
         """By chunk, `caught` of those that are not on the device."""
-        self._residency = Residency(self.slots, store.chunks)
-        self._changed = np.zeros(self.slots, np.bool_)
-        self.cull: Callable[[Camera], NDArray[np.integer[Any]]] | None = None
-        """The chunks that a camera may show; None if that is not known."""
+        self.cull = cull
+        self.before_view: Callable[[int], None] = lambda _: None
         self.moved_bytes = 0
         """Bytes of the records that have been fetched or written back."""
+        self._allocate(rows)
+
+    def _allocate(self, rows: int) -> None:
+        self.slots = min(max(rows // CHUNK_ROWS, 1), self.store.chunks)
+        self.arrays = {
+            name: allocate(self._device, (CHUNK_ROWS * self.slots, *shape), np.float32)
+            for name, shape in self.store.fields.items()
+        }
+        self.caught = allocate(self._device, (self.slots,), np.uint32)
+        self.caught.fill(0)
+        self._residency = Residency(self.slots, self.store.chunks)
+        self._changed = np.zeros(self.slots, np.bool_)
+
+    def resize(self, rows: int) -> None:
+        """Have room for `rows` Gaussians from now on. No chunk is on the device then. Raises WriteError."""
+        self.release()
+        self.free()
+        self._allocate(rows)
 
     def free(self) -> None:
         """Free the device's memory. The pool cannot be used any longer."""
