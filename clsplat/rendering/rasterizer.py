@@ -268,7 +268,6 @@ class Rasterizer:
         if pool.cull is None:
             return gaussians, None
         numbers = pool.cull(camera)
-        pool.before_view(len(numbers))
         if len(numbers) > pool.slots:
             return gaussians, ChunkNumbers(numbers)
         slots = send_chunks(self.work, "chunk_slots", pool.place(numbers, changes=False), pool.rows)

@@ -64,7 +64,8 @@ class ChunkPool:
     arrays: by field, the rows of the slots.
     caught: (slots,) uint32, the last step up to which the chunk in each slot has been caught up (`stages.catch_up`).
     cull: function that returns the chunks that a camera may show; None if that is not known.
-    before_view: called with the number of a view's chunks before any of them comes, so that the pool may be resized.
+    before_view: function that is called before a step with the number of chunks that its view may show, which have yet
+        to come, and may resize the pool.
     """
 
     def __init__(self, device: Device, work: Workspace, store: ChunkStore, rows: int, cull: Cull | None = None) -> None:

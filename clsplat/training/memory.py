@@ -40,6 +40,10 @@ POOL_QUARTERS = 3
 """Quarters that the model's chunks get of the main memory which is left after what every step needs. The photographs
 get the rest."""
 
+MOST_VIEWS_LOOKED_AT = 200
+"""Most views of which the chunks in view are found before the first step. For one of 20 million Gaussians it takes some
+7 ms; a step whose view shows more than these is planned for when it comes."""
+
 
 def model_bytes(config: TrainConfig) -> int:
     """Bytes per Gaussian: parameters, moments and statistics, and with a batch also gradients and their sums."""
@@ -214,14 +218,16 @@ class MemoryPlanner:
         self.begins, self._warned, self.rows_in_view = True, False, 0
 
     def look(self, local: Callable[[Camera], Camera], initial: Gaussians) -> None:
-        """Find the most rows that a view of a model shows, if a limit may have it streamed by chunk.
+        """Find the most rows that a view of a model shows, by an even sample of the views, if a limit may have it
+        streamed by chunk.
 
         local: function that gives a camera in the coordinates of the model.
         initial: the model at the start, in the order of its chunks.
         """
-        device, cameras = self._rasterizer.device, (local(view.camera) for view in self._scene.views)
+        device, views = self._rasterizer.device, self._scene.views
         self.rows_in_view = 0
         if device.memory.limit is not None and streams_by_chunk(self._config, device, len(initial)):
+            cameras = [local(view.camera) for view in views[:: -(-len(views) // MOST_VIEWS_LOOKED_AT)]]
             self.rows_in_view = CHUNK_ROWS * most_in_view(initial, cameras, self._config)
 
     def plan(self, count: int, needs: StatisticsNeeds, components: Sequence[Component], turns: int) -> Plan:

@@ -407,8 +407,8 @@ class TrainedModel:
         self.statistics = pooled_statistics(pool)
 
     def _before_view(self, chunks: int) -> None:
-        """Plan for a view of so many chunks, and let the pool become smaller if its arrays need the memory. No bit
-        depends on it. Raises CapacityError, before any change, and WriteError."""
+        """Plan for a step whose view shows so many chunks, and let the pool become smaller if the view's arrays need
+        the memory. No bit depends on it. Raises CapacityError, before any change, and WriteError."""
         assert self._pool is not None
         self.plan = self._plan_view(self.plan, chunks)
         if self.plan.rows < self._pool.rows:
