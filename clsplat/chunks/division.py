@@ -23,6 +23,13 @@ def chunks_of(rows: int) -> int:
     return -(-rows // CHUNK_ROWS)
 
 
+def listed_chunks(chunks: int) -> int:
+    """Length of a list of up to so many chunks: one of few, at most a quarter more than needed, or 1."""
+    wanted = max(chunks, 1)
+    unit = 1 << max(wanted.bit_length() - 3, 0)
+    return -(-wanted // unit) * unit
+
+
 def even_starts(count: int) -> NDArray[np.int64]:
     """Return `Division.starts` for `count` rows, if all chunks but the last are full."""
     return np.append(np.arange(0, count, CHUNK_ROWS), count)

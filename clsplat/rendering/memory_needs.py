@@ -11,7 +11,7 @@ from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import floats_of
 from clsplat.layouts.columns import POSE_ROWS, TILE, SlotFields
-from clsplat.rendering.memory_plan import Need, Plan, plan
+from clsplat.rendering.memory_plan import Need, Plan, plan, plan_by_chunk
 from clsplat.stages import append, blend, density, duplicate, loss, loss_terms, project, ranges, target
 from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.duplicate import MAX_PAIRS_PER_BAND
@@ -39,6 +39,7 @@ class StepMemory:
     pixel_bytes: bytes per pixel of the training's components.
     by_chunk: True if a step may run over the chunks in view.
     pool: bytes for parameters and moments of the Gaussians on the device; None leaves it to the plan.
+    in_view: number of rows of the chunks that a view shows at most, as far as known.
     """
 
     fields: SlotFields
@@ -49,6 +50,7 @@ class StepMemory:
     pixel_bytes: int = 0
     by_chunk: bool = False
     pool: int | None = None
+    in_view: int = 0
 
 
 def plan_frame(
@@ -111,8 +113,14 @@ def plan_step(
         statistics=statistics,
         held=step.row_bytes if step.by_chunk else None,
         pool=step.pool,
+        in_view=step.in_view,
     )
     return _plan(device, need)
+
+
+def plan_view(device: Device, made: Plan, in_view: int) -> Plan:
+    """The plan `made` of steps over the chunks in view, for views of up to `in_view` rows. Raises CapacityError."""
+    return plan_by_chunk(replace(made.need, in_view=in_view), made.allowed, device.max_allocation)
 
 
 def frame_pixels(device: Device, features: int = 0, planes: int = 0) -> int:

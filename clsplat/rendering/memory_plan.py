@@ -6,8 +6,11 @@ Policy only: no OpenCL.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass
+from math import ceil
 
+from clsplat.chunks.division import listed_chunks
 from clsplat.chunks.residency import CROSSING_SHARE
 from clsplat.errors import CapacityError, amount
 from clsplat.layouts.columns import CHUNK_ROWS
@@ -36,6 +39,7 @@ class Need:
     held: bytes of `row` that every Gaussian needs, in view or not, in a step over the chunks in view; None if steps
     take all chunks.
     pool: bytes for parameters, moments and statistics of the Gaussians on the device; None leaves it to the plan.
+    in_view: number of rows of the chunks that a view shows at most, in a step over the chunks in view, as far as known.
     """
 
     gaussians: int
@@ -51,6 +55,7 @@ class Need:
     statistics: int = 0
     held: int | None = None
     pool: int | None = None
+    in_view: int = 0
 
     @property
     def pairs(self) -> int:
@@ -148,7 +153,7 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
     if need.pool is None and need.gaussians * need.widest <= max_allocation and whole.pairs >= enough:
         return whole
     if need.held is not None:
-        return _plan_by_chunk(need, need.held, budget, max_allocation)
+        return plan_by_chunk(need, budget, max_allocation)
     for_rows = min(room // 4, room - need.gaussians * need.pair)  # a tile may contain all Gaussians
     rows = max(min(for_rows // need.model, max_allocation // need.widest, need.gaussians), alignment)
     rows -= rows % alignment
@@ -160,26 +165,48 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
 
 
 def _too_little(need: Need, least: int, budget: int) -> CapacityError:
+    in_view = min(need.in_view, need.gaussians)
+    shown = f", with {in_view:,} of them in chunks that one view shows," if in_view else ""
     return CapacityError(
-        f"{need.gaussians:,} Gaussians at this size of image need at least about {mebibytes(least)} of device memory, "
-        f"or {mebibytes(need.total)} to be processed at once, but {mebibytes(budget)} are allowed: allow more "
+        f"{need.gaussians:,} Gaussians at this size of image{shown} need at least about {_rounded_up(least)} of device "
+        f"memory, or {mebibytes(need.total)} to be processed at once, but {mebibytes(budget)} are allowed: allow more "
         "(--max-device-mem), or use a smaller resolution or fewer Gaussians"
     )
 
 
-def _plan_by_chunk(need: Need, held: int, budget: int, max_allocation: int) -> Plan:
-    """Plan steps over the chunks in view, such that a view may show all Gaussians that are on the device at once.
+def _rounded_up(nbytes: int) -> str:
+    """A number of bytes as `mebibytes` writes it, but never less: a limit of so much does."""
+    unit = 2**20 / 10 if nbytes >= 10 * 2**20 else 2**10 if nbytes >= 10 * 2**10 else 1
+    return mebibytes(ceil(ceil(nbytes / unit) * unit))
+
+
+def plan_by_chunk(need: Need, budget: int, max_allocation: int) -> Plan:
+    """Plan steps over the chunks in view, such that a view may show all Gaussians that are on the device at once, and
+    at least `need.in_view`: of what a view takes by row, it may take more than the device has slots.
 
     Raises CapacityError if not even one chunk fits.
     """
-    room = budget - need.planes - need.scratch - need.gaussians * held - CHUNK_ROWS * need.record
-    in_view = need.record + need.record // CROSSING_SHARE + need.row - need.statistics - held + need.banded
-    rows = room // (in_view + PAIRS_IN_VIEW * need.pair)
+    assert need.held is not None, "steps over the chunks in view"
+    room = budget - need.planes - need.scratch - need.gaussians * need.held - CHUNK_ROWS * need.record
+    by_slot = CHUNK_ROWS * (need.record + need.record // CROSSING_SHARE)
+    by_row = need.row - need.statistics - need.held + need.banded
+
+    def without_pairs(slots: int) -> int:
+        """Bytes for so many slots and the rows in view."""
+        return slots * by_slot + max(CHUNK_ROWS * listed_chunks(slots), need.in_view) * by_row
+
+    def wanted(slots: int) -> int:
+        """Bytes with the pairs of so many slots, and at least a pair for each row in view: a tile may contain all."""
+        return without_pairs(slots) + max(PAIRS_IN_VIEW * CHUNK_ROWS * slots, need.in_view) * need.pair
+
+    most = min(max_allocation // need.widest, need.gaussians + CHUNK_ROWS - 1)
     if need.pool is not None:
-        rows = min(rows, need.pool // need.record)
-    rows = min(rows, max_allocation // need.widest, need.gaussians + CHUNK_ROWS - 1) // CHUNK_ROWS * CHUNK_ROWS
-    if rows < CHUNK_ROWS:
-        least = budget - room + CHUNK_ROWS * (in_view + PAIRS_IN_VIEW * need.pair)
-        raise _too_little(need, least, budget)
-    pairs = min((room - rows * in_view) // need.pair, need.most_pairs)
-    return Plan(need, rows, streamed=True, pairs=pairs, gathers=False, allowed=budget, bands=1)
+        most = min(most, need.pool // need.record)
+    most //= CHUNK_ROWS
+    slots = bisect_right(range(1, most + 1), room, key=wanted)
+    if slots == 0 and most > 0 and without_pairs(1) + PAIRS_IN_VIEW * CHUNK_ROWS * need.pair <= room:
+        slots = 1  # few views have a tile that contains all rows
+    if slots == 0:
+        raise _too_little(need, budget - room + wanted(1), budget)
+    pairs = min((room - without_pairs(slots)) // need.pair, need.most_pairs)
+    return Plan(need, CHUNK_ROWS * slots, streamed=True, pairs=pairs, gathers=False, allowed=budget, bands=1)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.chunks.division import listed_chunks
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.layouts.columns import CHUNK_ROWS, NO_CHUNK
 
@@ -44,13 +45,8 @@ class ChunkList:
 
 
 def padded_chunks(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Pad numbers of chunks with NO_CHUNK to one of few lengths, so that arrays and command buffers are reused.
-
-    The length is at least 1, and at most a quarter more than needed.
-    """
-    wanted = max(len(numbers), 1)
-    unit = 1 << max(wanted.bit_length() - 3, 0)
-    padded = np.full(-(-wanted // unit) * unit, NO_CHUNK, np.uint32)
+    """Pad numbers of chunks with NO_CHUNK to one of few lengths, so that arrays and command buffers are reused."""
+    padded = np.full(listed_chunks(len(numbers)), NO_CHUNK, np.uint32)
     padded[: len(numbers)] = numbers
     return padded
 

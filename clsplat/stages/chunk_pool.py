@@ -28,6 +28,9 @@ _VECTOR = 4
 _MAX_CROSSING = 32
 """Maximum number of records that cross the bus at a time. More are not faster."""
 
+Cull = Callable[[Camera], NDArray[np.integer[Any]]]
+"""Function that returns the chunks that a camera may show."""
+
 
 @stage("chunk_records")
 def copy_chunks(
@@ -62,25 +65,37 @@ class ChunkPool:
     store: records of all chunks. Until `write_back`, chunks on the device may be newer than their records.
     arrays: arrays on the device by field, with CHUNK_ROWS rows for each slot.
     caught: (slots,) uint32, the last step up to which the chunk in each slot has been caught up (`stages.catch_up`).
+    cull: function that returns the chunks that a camera may show; None if that is not known.
+    before_view: function that is called before a step with the number of chunks that its view may show, which have yet
+        to come, and may resize the pool.
     """
 
-    def __init__(self, device: Device, work: Workspace, store: ChunkStore, rows: int) -> None:
+    def __init__(self, device: Device, work: Workspace, store: ChunkStore, rows: int, cull: Cull | None = None) -> None:
         self._device, self._work, self.store = device, work, store
-        self.slots = min(max(rows // CHUNK_ROWS, 1), store.chunks)
-        self.arrays = {
-            name: allocate(device, (CHUNK_ROWS * self.slots, *shape), np.float32)
-            for name, shape in store.fields.items()
-        }
-        self.caught = allocate(device, (self.slots,), np.uint32)
-        self.caught.fill(0)
         self._caught = np.zeros(store.chunks, np.uint32)
         """(chunks,), the value of `caught` of each chunk that is not on the device."""
-        self._residency = Residency(self.slots, store.chunks)
-        self._changed = np.zeros(self.slots, np.bool_)
-        self.cull: Callable[[Camera], NDArray[np.integer[Any]]] | None = None
-        """Function from a camera to the numbers of the chunks that it may show; None if all count as visible."""
+        self.cull = cull
+        self.before_view: Callable[[int], None] = lambda _: None
         self.moved_bytes = 0
         """Bytes of all records that have crossed the bus so far, in both directions."""
+        self._allocate(rows)
+
+    def _allocate(self, rows: int) -> None:
+        self.slots = min(max(rows // CHUNK_ROWS, 1), self.store.chunks)
+        self.arrays = {
+            name: allocate(self._device, (CHUNK_ROWS * self.slots, *shape), np.float32)
+            for name, shape in self.store.fields.items()
+        }
+        self.caught = allocate(self._device, (self.slots,), np.uint32)
+        self.caught.fill(0)
+        self._residency = Residency(self.slots, self.store.chunks)
+        self._changed = np.zeros(self.slots, np.bool_)
+
+    def resize(self, rows: int) -> None:
+        """Allocate slots for `rows` Gaussians in place of the present ones. They are empty. Raises WriteError."""
+        self.release()
+        self.free()
+        self._allocate(rows)
 
     def free(self) -> None:
         """Free the device's memory. The pool is unusable afterwards."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -144,9 +144,9 @@ class HostGaussians(_ByGroup[Any]):
     kind: str = ""
     culls: bool = True
 
-    @cached_property
+    @property
     def in_pool(self) -> DeviceGaussians:
-        """The arrays of the pool, with the rows of all slots."""
+        """The arrays of the pool, with the rows of all slots that it has now."""
         assert self.pool is not None
         return self.first_in_pool(self.pool.rows)
 

@@ -3,20 +3,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+from clsplat.camera import Camera
 from clsplat.chunks.order import ORDERED_ROWS
 from clsplat.config.checks import parse_bytes
 from clsplat.config.masks import NO_MASKS
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError, amount, warn
-from clsplat.gaussians import floats_of
+from clsplat.gaussians import Gaussians, floats_of
 from clsplat.layouts.columns import CHUNK_ROWS
-from clsplat.rendering.memory_needs import MODELS, StepMemory, plan_step
+from clsplat.rendering.memory_needs import MODELS, StepMemory, plan_step, plan_view
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.runs.run import Run
@@ -27,7 +28,7 @@ from clsplat.training.batch import OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PE
 from clsplat.training.density import StatisticsNeeds
 from clsplat.training.step.component import Component
 from clsplat.training.step.gradient_step import slot_fields
-from clsplat.training.step.visible_chunks import settings_of_whole_steps, streams_by_chunk
+from clsplat.training.step.visible_chunks import most_in_view, settings_of_whole_steps, streams_by_chunk
 from clsplat.training.supervision.decoded_store import DecodedStore, remove_decoded
 from clsplat.training.supervision.decoding import Decoder
 from clsplat.training.supervision.host_photographs import HostPhotographs
@@ -39,6 +40,10 @@ NO_CACHE = "none"
 POOL_QUARTERS = 3
 """Quarters of the main memory beyond the least that photographs need, which go to the model's chunks. The photographs
 get the rest."""
+
+MOST_VIEWS_LOOKED_AT = 200
+"""Most views of which the chunks in view are found before the first step. For one of 20 million Gaussians it takes some
+7 ms; a step whose view shows more than these is planned for when it comes."""
 
 
 def model_bytes(config: TrainConfig) -> int:
@@ -202,6 +207,7 @@ class MemoryPlanner:
     """Plans the memory of a training before it begins and at each densification, and sets the limits of its parts.
 
     begins: True until the first step. Until then too little main memory is an error, afterwards a warning.
+    rows_in_view: largest number of rows in the chunks of one view so far, if the model is streamed by chunk.
     """
 
     def __init__(
@@ -215,7 +221,20 @@ class MemoryPlanner:
     ) -> None:
         self._scene, self._config, self._rasterizer = scene, config, rasterizer
         self._photographs, self._memory, self._batch = photographs, memory, batch
-        self.begins, self._warned = True, False
+        self.begins, self._warned, self.rows_in_view = True, False, 0
+
+    def look(self, local: Callable[[Camera], Camera], initial: Gaussians) -> None:
+        """Find the most rows that a view of a model shows, by an even sample of the views, if a limit may have it
+        streamed by chunk.
+
+        local: function that gives a camera in the coordinates of the model.
+        initial: the model at the start, in the order of its chunks.
+        """
+        device, views = self._rasterizer.device, self._scene.views
+        self.rows_in_view = 0
+        if device.memory.limit is not None and streams_by_chunk(self._config, device, len(initial)):
+            cameras = [local(view.camera) for view in views[:: -(-len(views) // MOST_VIEWS_LOOKED_AT)]]
+            self.rows_in_view = CHUNK_ROWS * most_in_view(initial, cameras, self._config)
 
     def plan(self, count: int, needs: StatisticsNeeds, components: Sequence[Component], turns: int) -> Plan:
         """Plan the memory for `count` Gaussians with their final number of SH coefficients.
@@ -238,6 +257,7 @@ class MemoryPlanner:
             pool=self._memory.pool(self._photographs.host, count, record, begins=self.begins)
             if by_chunk and on_host
             else None,
+            in_view=self.rows_in_view,
         )
         models = max(component.models for component in components)
         usual = MODELS if self._batch is None else OWNER_ARRAYS_PER_PARAMETER
@@ -249,6 +269,18 @@ class MemoryPlanner:
             replicas = [replica.device for replica in self._batch.replicas]
             self._batch.follow([self._plan(each, count, memory, REPLICA_ARRAYS_PER_PARAMETER) for each in replicas])
         return made
+
+    def plan_view(self, made: Plan, chunks: int) -> Plan:
+        """The plan for views of up to so many chunks, if they are more than any view has shown; else `made`, by which
+        the model is streamed by chunk. Raises CapacityError, and then `made` holds."""
+        rows = CHUNK_ROWS * chunks
+        if rows <= max(self.rows_in_view, made.rows):
+            return made
+        wider = plan_view(self._rasterizer.device, made, rows)
+        self.rows_in_view = rows
+        self._rasterizer.follow(wider)
+        self._share_host(wider, wider.need.gaussians)
+        return wider
 
     def scratch_file(self, nbytes: int) -> Path | None:
         """Return the path of a new scratch file; None if main memory has room (`HostMemory.scratch_file`)."""

@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -53,16 +52,13 @@ from clsplat.stages.device_gaussians import (
     HostGaussians,
     Models,
     ReadableArray,
-    SavedArray,
     allocate_gaussians,
     by_field,
     change_rows,
     fields_of,
     host_gaussians,
-    host_model,
     host_zeros,
     pooled,
-    saved_models,
     set_rows_at,
     to_device,
     to_host,
@@ -83,6 +79,7 @@ class TrainedModel:
     """Parameters, first and second moments and statistics, on the device or streamed from the host.
 
     make_plan: function that plans the device's memory for a number of Gaussians.
+    plan_view: function that returns the plan in place of another for a view of so many chunks (`MemoryPlanner`).
     scratch: function from bytes of chunks to the path of a new scratch file, or None to keep them in main memory.
     files: the training's scratch files; None if there is no folder for them.
     sh_degree: final SH degree.
@@ -100,20 +97,26 @@ class TrainedModel:
         device: Device,
         work: Workspace,
         make_plan: Callable[[int], Plan],
+        plan_view: Callable[[Plan, int], Plan],
         scratch: Callable[[int], Path | None],
         files: ScratchFiles | None,
         *,
         sh_degree: int,
         counts_contributions: bool,
     ) -> None:
-        self._device, self._work, self._make_plan, self._scratch, self._files = device, work, make_plan, scratch, files
+        self._device, self._work, self._scratch, self._files = device, work, scratch, files
+        self._make_plan, self._plan_view = make_plan, plan_view
         self._pool: ChunkPool | None = None
         self._sh_degree, self._counts_contributions = sh_degree, counts_contributions
 
-    def begin(self, initial: Gaussians) -> None:
-        """Start from a model on the host. The rows of a large model are sorted along a curve through space."""
+    def begin(self, initial: Gaussians, look: Callable[[Gaussians], None]) -> None:
+        """Start from a model on the host. The rows of a large model are sorted along a curve through space.
+
+        look: function that is called with the sorted model before memory is planned.
+        """
         if len(initial) > ORDERED_ROWS:
             initial = take(initial, space_order(initial.means).astype(np.int64))
+        look(initial)
         self.plan = self._make_plan(len(initial))
         if self.plan.streamed:  # a large model is copied into a store of chunks
             initial = initial if len(initial) > ORDERED_ROWS else copy.deepcopy(initial)
@@ -121,30 +124,8 @@ class TrainedModel:
         else:
             self.set(upload_gaussians(self._device, initial))
 
-    @contextmanager
-    def saved(self, checkpoint: Checkpoint) -> Iterator[tuple[list[HostGaussians], Checkpoint]]:
-        """Context manager that yields a checkpoint's parameters and moments, and the checkpoint with all its arrays.
-
-        A scratch file that has some of the arrays is open inside the context. Raises InputError for wrong arrays.
-        """
-        saved: Mapping[str, Any] = {}
-        with ExitStack() as reading:
-            try:
-                if checkpoint.manifest is not None:
-                    store = reading.enter_context(closing(ChunkStore.opened(checkpoint.manifest, writable=False)))
-                    models = saved_models(store)
-                    saved = {name: SavedArray(store, name) for name in store.fields}
-                else:
-                    models = [host_model(checkpoint.arrays, kind) for kind in KINDS]
-                n, most = max(model.coefficients for model in models), (self._sh_degree + 1) ** 2
-                if n > most:
-                    raise ValueError(f"has {n} SH coefficients, more than the {most} of --sh-degree {self._sh_degree}")
-            except ValueError as error:
-                raise unusable(checkpoint, str(error)) from None
-            yield models, replace(checkpoint, arrays={**checkpoint.arrays, **saved})
-
     def load(self, models: Sequence[HostGaussians], checkpoint: Checkpoint) -> None:
-        """Continue with the models and the statistics of a checkpoint (`saved`).
+        """Continue with the models and the statistics of a checkpoint (`saved_model`).
 
         Statistics that the checkpoint does not have get their initial values.
         Raises InputError for statistics of another model.
@@ -335,10 +316,11 @@ class TrainedModel:
             return
         self._pool.release()
         store.move(move.rows, move.values, move.changes, self._fields(move.coefficients) if move.rows is None else None)
+        cull = self._pool.cull if move.rows is None else None
         self._pool.free()
         self._pool = None
         self._free_models()
-        self._use(ChunkPool(self._device, self._work, store, self.plan.rows), move.coefficients)
+        self._use(ChunkPool(self._device, self._work, store, self.plan.rows, cull), move.coefficients)
 
     def _fields(self, coefficients: int) -> dict[str, tuple[int, ...]]:
         """Return the fields of a store of this model."""
@@ -400,9 +382,18 @@ class TrainedModel:
         """Set parameters, moments and statistics to those of a pool's store."""
         if self._files is not None and pool.store.path is not None:
             self._files.follow(pool.store)
-        self._pool = pool
+        self._pool, pool.before_view = pool, self._before_view
         self.parameters, self.first, self.second = pooled(pool, coefficients)
         self.statistics = pooled_statistics(pool)
+
+    def _before_view(self, chunks: int) -> None:
+        """Plan for a step whose view shows so many chunks, and let the pool become smaller if the view's arrays need
+        the memory. No bit depends on it. Raises CapacityError, before any change, and WriteError."""
+        assert self._pool is not None
+        self.plan = self._plan_view(self.plan, chunks)
+        if self.plan.rows < self._pool.rows:
+            self._pool.resize(self.plan.rows)
+            self.parameters, self.first, self.second = pooled(self._pool, self.parameters.coefficients)
 
     @property
     def in_file(self) -> bool:

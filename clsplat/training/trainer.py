@@ -34,6 +34,7 @@ from clsplat.training.density.choice import strategy_of
 from clsplat.training.learning_rates import rates_at
 from clsplat.training.memory import UNLIMITED, HostMemory, MemoryPlanner
 from clsplat.training.mip_filter import MipFilter
+from clsplat.training.saved_model import saved_model
 from clsplat.training.stability.health import finite_or_zero
 from clsplat.training.stability.non_finite import NonFiniteMonitor, Repair
 from clsplat.training.step.component import Component
@@ -120,11 +121,11 @@ class Trainer:
         self.components: tuple[Component, ...] = (*late, mip_filter, self.appearance, self.cameras, self.depths, chunks)
         self._active = [component for component in self.components if component.on]
         of, files = (self.device, self.rasterizer.work), (self.planner.scratch_file, self.planner.scratch_files)
-        contributions = self.strategy.needs().contributions
+        plans, contributions = (self._make_plan, self.planner.plan_view), self.strategy.needs().contributions
         self.model = TrainedModel(
-            *of, self._make_plan, *files, sh_degree=self.config.sh_degree, counts_contributions=contributions
+            *of, *plans, *files, sh_degree=self.config.sh_degree, counts_contributions=contributions
         )
-        self.model.begin(initial)
+        self.model.begin(initial, partial(self.planner.look, self.local))
 
     def _make_plan(self, count: int) -> Plan:
         return self.planner.plan(count, self.strategy.needs(), self.components, self.pending.turns)
@@ -184,9 +185,8 @@ class Trainer:
         result: Loss | Losses
         if self.batch is None:
             run = partial(self._run, step, inputs[0], needs, reads_loss)
-            exactly = self._looks_at_steps or (inputs[0].chunks is not None and inputs[0].chunks.one_by_one)
             counted = (self.rasterizer, (factor, self.rasterizer), self.parameters.count)
-            room = 0 if exactly else self.pending.room(*counted)
+            room = 0 if self._looks_at_steps else self.pending.room(*counted)
             result = self.pending.launch(run, room, number=self.step, reads_loss=reads_loss)
             if self.position.queue:  # upload the next step's photograph, at this resolution
                 self.photographs.ahead(self.position.queue[-1], factor)
@@ -485,7 +485,7 @@ class Trainer:
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continue from a checkpoint. Raises InputError for a checkpoint of another training."""
-        with self.model.saved(checkpoint) as (models, saved):
+        with saved_model(checkpoint, self.config.sh_degree) as (models, saved):
             self.monitor.retries, self.mark = self.position.load(checkpoint, len(self.views)), None
             self.monitor.forget()
             self.pending.forget()

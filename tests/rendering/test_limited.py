@@ -237,7 +237,7 @@ def test_the_plan_in_words() -> None:
     assert planned(1000) == "about 211.6 MiB of device memory needed, 1,000.0 MiB allowed: all at once"
     assert planned(190).endswith("190.0 MiB allowed: the image is rendered in about 2 bands of tiles")
     assert "allowed: parameters are streamed, 20,128 Gaussians at a time, the image" in planned(140)
-    refuses(r"at least about 68.3 MiB of device memory, or 211.6 MiB to be processed", planned, 65, error=CapacityError)
+    refuses(r"at least about 68.4 MiB of device memory, or 211.6 MiB to be processed", planned, 65, error=CapacityError)
     small = Need(gaussians=40, **ROW, planes=50_000, scratch=1024)
     with pytest.raises(CapacityError, match=r"about [0-9]+ KiB .* KiB to be processed at once, but 4,000 bytes are"):
         plan(small, 4000, 2**31, 32)

@@ -35,11 +35,6 @@ class PlacedChunks:
 class ChunksInView(Protocol):
     """Chunks of the model that a step runs over."""
 
-    @property
-    def one_by_one(self) -> bool:
-        """True if the device has no memory for all of these chunks at once."""
-        return False
-
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> PlacedChunks | None:
         """Make the chunks ready for the step. Returns None if the step runs over the whole model instead."""
 

@@ -19,6 +19,7 @@ from clsplat.errors import switched_on
 from clsplat.layouts.columns import READBACK
 from clsplat.rendering.rasterizer import MAX_COUNTED_PASSES, ForwardPass, PairCapacity, Rasterizer
 from clsplat.stages.append import MAX_LIST_PAIRS
+from clsplat.stages.duplicate import Totals
 from clsplat.stages.loss import Loss
 from clsplat.training.stability.non_finite import LastStep, NonFiniteMonitor
 
@@ -76,7 +77,8 @@ class SpeculativeSteps:
         self._of: tuple[object, int] = (None, 0)
         self._appends = True
         self._turn = 0
-        self._frame: ForwardPass | None = None
+        self._counted: Totals | None = None
+        """Counts of the latest step by capacity."""
         self.redone = 0
 
     @property
@@ -91,9 +93,10 @@ class SpeculativeSteps:
 
     def seen(self, frame: ForwardPass) -> None:
         """Record the forward pass of a step that has just been launched."""
-        self._frame = frame
-        if frame.listed.counted.arriving is None:
-            self._count(frame.listed.counted.pairs if len(frame.bands) == 1 else None)
+        counted = frame.listed.counted
+        self._counted = counted if counted.arriving is not None else None  # else the memory is free for the next step
+        if self._counted is None:
+            self._count(counted.pairs if len(frame.bands) == 1 else None)
 
     def _count(self, pairs: int | None) -> None:
         self._most = None if pairs is None else max(pairs, self._most or 0)
@@ -133,8 +136,8 @@ class SpeculativeSteps:
         before, result = self._monitor.last, run(turn, PairCapacity(room, turn, self._appends) if room else None)
         if not room:
             return result
-        assert self._frame is not None, "each step has a frame"
-        counted, under_way = self._frame.listed.counted, self._device.under_way
+        counted, under_way = self._counted, self._device.under_way
+        assert counted is not None, "it was launched by capacity"
         assert counted.arriving is not None, "it was launched by capacity"
         assert counted.on_device is not None, "it was launched by capacity"
         step = _Step(run, turn, number, result, counted.on_device, counted.arriving, before, list(under_way))

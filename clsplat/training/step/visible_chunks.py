@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from math import isfinite
@@ -22,7 +22,7 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import DEFAULT_GROUP_ITEMS
-from clsplat.gaussians import PARAMETER_GROUPS
+from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
 from clsplat.optimisation.dropout import thinning_of
 from clsplat.rendering.rasterizer import MAX_COUNTED_PASSES, Rasterizer
 from clsplat.stages.adam import AdamStep
@@ -71,6 +71,16 @@ def runs_by_chunk(config: TrainConfig, device: Device) -> bool:
 def streams_by_chunk(config: TrainConfig, device: Device, count: int) -> bool:
     """True if a model of `count` Gaussians may be streamed by chunks."""
     return count > ORDERED_ROWS and runs_by_chunk(config, device)
+
+
+def most_in_view(gaussians: Gaussians, cameras: Iterable[Camera], config: TrainConfig) -> int:
+    """Number of chunks of an ordered model that one of the cameras may show, at most."""
+    bounds, still = ChunkBounds.measured(gaussians.means, gaussians.log_scales), np.zeros((2, 1))
+    table, updates = BoundsTable(len(bounds)), MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT
+    measured = np.hstack([bounds.lowest, bounds.highest, bounds.largest[:, None]])
+    table.measure(np.arange(len(bounds), dtype=np.uint32), measured.astype(np.float32))
+    pictures = (PictureBorders.of(camera, config.rasterizer, 1.0) for camera in cameras)
+    return max(len(table.seen(partial(visible, each), lambda _: still, still, updates)) for each in pictures)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +170,7 @@ class VisibleChunks(Component):
         if isinstance(gaussians, HostGaussians) and pool is None:
             return
         self._divide(pool)
-        self._streamed, self._slots = pool is not None, len(self._last) if pool is None else pool.slots
+        self._before_view = None if pool is None else pool.before_view
         if pool is not None:
             pool.cull = self.in_view
         self._since = 0
@@ -199,14 +209,16 @@ class VisibleChunks(Component):
             self._begin_table(step - 1, len(self._last))
         hidden, most_hidden = self._hidden_movement(step)
         numbers = self._shown(of_view, step, hidden, most_hidden)
-        whole = not self._streamed and len(numbers) > MAX_SHARE_IN_VIEW * len(self._last)
+        if self._before_view is not None:
+            self._before_view(len(numbers))
+        whole = self._before_view is None and len(numbers) > MAX_SHARE_IN_VIEW * len(self._last)
         self._since += 1
         if whole:
             numbers = np.arange(len(self._last), dtype=np.uint32)
         self._note_movement(numbers, hidden(numbers))
         self._found.move(numbers, self._step_limit * self._mean_and_scale_rates(range(step, step + 1)))
         missed = self._missed(numbers, step - 1)
-        return [replace(of_view, chunks=_ChunksInView(self, numbers, missed, self._found, self._slots, whole=whole))]
+        return [replace(of_view, chunks=_ChunksInView(self, numbers, missed, self._found, whole=whole))]
 
     def in_view(self, camera: Camera) -> NDArray[np.uint32]:
         """The chunks that a camera may show, as they are after the last step."""
@@ -262,7 +274,7 @@ class VisibleChunks(Component):
         if chunks.of_rows is not self._found:  # rows have moved since, and all have taken every step
             self._divide(_pool_of(model))
             everything = np.arange(len(self._last), dtype=np.uint32)
-            chunks = _ChunksInView(self, everything, None, self._found, len(everything), whole=True)
+            chunks = _ChunksInView(self, everything, None, self._found, whole=True)
         if chunks.missed is not None:
             self._catch_up(model, chunks.missed)
         older = {number: last for number, last in self._before.items() if number >= step.number - MAX_COUNTED_PASSES}
@@ -374,7 +386,6 @@ class _ChunksInView(ChunksInView):
     """The chunks of a step's view, and the steps that some of them have missed.
 
     of_rows: bounds of the chunks that are listed, an array of its own for each order of the model's rows.
-    slots: number of chunks for which the device has room.
     whole: True if the step runs over the whole model, of which all chunks are listed.
     """
 
@@ -382,13 +393,7 @@ class _ChunksInView(ChunksInView):
     numbers: NDArray[np.uint32]
     missed: Missed | None
     of_rows: BoundsTable
-    slots: int
     whole: bool
-
-    @property
-    def one_by_one(self) -> bool:
-        """True if not all of them have room on the device at once."""
-        return len(self.numbers) > self.slots
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> PlacedChunks | None:
         """Catch up these chunks, and send their list."""
