@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -52,13 +53,16 @@ from clsplat.stages.device_gaussians import (
     HostGaussians,
     Models,
     ReadableArray,
+    SavedArray,
     allocate_gaussians,
     by_field,
     change_rows,
     fields_of,
     host_gaussians,
+    host_model,
     host_zeros,
     pooled,
+    saved_models,
     set_rows_at,
     to_device,
     to_host,
@@ -221,7 +225,7 @@ class TrainedModel:
             self._move_chunks(Move(coefficients=coefficients))
             return
         if not self.plan.gathers:
-            self._take_down()
+            self.parameters, self.first, self.second = [to_host(model) for model in self.with_moments]
         self._place([widen(self._device, model, coefficients) for model in self.with_moments])
 
     def rearrange(self, plan: RowPlan, changes: Callable[[], None]) -> DeviceArray | HostArray | None:
@@ -416,10 +420,6 @@ class TrainedModel:
             return host_zeros(count, coefficients, self.parameters.rows)
         return allocate_gaussians(self._device, count, coefficients, zero=True)
 
-    def _take_down(self) -> None:
-        """Move parameters, first and second moments to the host, and free them on the device."""
-        self.parameters, self.first, self.second = [to_host(model) for model in self.with_moments]
-
     def _placed(self, model: AnyGaussians) -> AnyGaussians:
         """Move a model to the device or to the host, as the plan assigns, if it is not there yet."""
         if isinstance(model, HostGaussians):
@@ -456,7 +456,7 @@ class TrainedModel:
         if on_device:
             rows = rows if isinstance(rows, DeviceArray) else upload(self._device, rows)
         else:
-            self._take_down()
+            self.parameters, self.first, self.second = [to_host(model) for model in self.with_moments]
         to_gather = rows if on_device else _on_host(rows)
         moved = [
             gather(self._device, to_gather, model, renews=index > 0) for index, model in enumerate(self.with_moments)
@@ -465,6 +465,30 @@ class TrainedModel:
         self._free_models()
         self._place(moved)
         return rows
+
+
+@contextmanager
+def saved_model(checkpoint: Checkpoint, sh_degree: int) -> Iterator[tuple[list[HostGaussians], Checkpoint]]:
+    """Context manager that yields a checkpoint's parameters and moments, and the checkpoint with all its arrays.
+
+    A scratch file that has some of the arrays is open inside the context. Raises InputError for wrong arrays.
+    sh_degree: final SH degree of the training.
+    """
+    saved: Mapping[str, Any] = {}
+    with ExitStack() as reading:
+        try:
+            if checkpoint.manifest is not None:
+                store = reading.enter_context(closing(ChunkStore.opened(checkpoint.manifest, writable=False)))
+                models = saved_models(store)
+                saved = {name: SavedArray(store, name) for name in store.fields}
+            else:
+                models = [host_model(checkpoint.arrays, kind) for kind in KINDS]
+            n, most = max(model.coefficients for model in models), (sh_degree + 1) ** 2
+            if n > most:
+                raise ValueError(f"has {n} SH coefficients, more than the {most} of --sh-degree {sh_degree}")
+        except ValueError as error:
+            raise unusable(checkpoint, str(error)) from None
+        yield models, replace(checkpoint, arrays={**checkpoint.arrays, **saved})
 
 
 def _host_arrays(arrays: Mapping[str, NDArray[Any]]) -> dict[str, AnyArray]:

@@ -170,7 +170,9 @@ def no_opacity(head: bytes, data: bytes) -> tuple[bytes, str]:
 
 
 def all_nan(head: bytes, data: bytes) -> tuple[bytes, str]:
-    return head + np.full(len(data) // 4, np.nan, "<f4").tobytes(), "with a position; expected some that are finite"
+    return head + np.full(
+        len(data) // 4, np.nan, "<f4"
+    ).tobytes(), "the first is a position of Gaussian 0; expected some"
 
 
 def no_gaussians(head: bytes, data: bytes) -> tuple[bytes, str]:
