@@ -289,7 +289,7 @@ DEFAULT_VIDEO_FPS = 24.0
 
 @dataclass(frozen=True)
 class VideoConfig:
-    """Encoding of a video."""
+    """Settings by which a video is encoded."""
 
     fps: float | None = None
     """Frames per second. If not given: the rate of the cameras' file, or 24 if it has none. 23.976, 29.97 and the like

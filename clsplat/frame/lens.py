@@ -49,12 +49,12 @@ class Places(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ByMap:
-    """The mapping of an STMap."""
+    """The mapping by an STMap (`Places`)."""
 
     stmap: StMap
 
     def size(self, frame: Camera) -> tuple[int, int]:  # noqa: ARG002
-        """Width and height of the map."""
+        """Width and height of the STMap, which is the warped frame's size."""
         return self.stmap.width, self.stmap.height
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing of videos frame by frame: .mp4 (H.264) or .mov (ProRes), with PyAV (`pip install 'clsplat[video]'`)."""
+"""Writing of videos frame by frame: .mp4 (H.264) or .mov (ProRes), with PyAV (`pip install 'clsplat[video]'`).
+
+`VideoConfig` and DEFAULT_VIDEO_FPS in `config.pictures` have the settings.
+"""
 
 from __future__ import annotations
 

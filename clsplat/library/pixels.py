@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels from arrays of projected Gaussians, and their vector-Jacobian product."""
+"""Pixels from arrays of projected Gaussians, and their vector-Jacobian product.
+
+DEFAULT_ALPHA_MAX of `rendering.build_flags` caps a Gaussian's alpha, unless the caller gives another cap.
+"""
 
 from __future__ import annotations
 

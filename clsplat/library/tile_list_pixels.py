@@ -197,11 +197,11 @@ class _GivenSplats:
 
     @property
     def depth(self) -> int:
-        """D, the number of values of a splat."""
+        """Number D of values that each splat has."""
         return int(self.colors.shape[1])
 
     def rows(self, own: slice) -> _GivenSplats:
-        """The splats of one image."""
+        """Return the splats of one image."""
         arrays = (self.means2d[own], self.conics[own], self.colors[own], self.opacities[own])
         return _GivenSplats((len(arrays[0]),), *arrays)
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rasterizer: the forward pass of a frame and its gradient, as sequences of the stages."""
+"""The rasterizer: the forward pass of a frame and its gradient, as sequences of the stages.
+
+A frame with more than MAX_PAIRS_PER_BAND pairs (`stages.duplicate`), or more than memory allows, is rendered in bands.
+"""
 
 from __future__ import annotations
 

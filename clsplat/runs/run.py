@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The run folder: config.toml, model.ply, metrics.jsonl, eval.json, checkpoints/ and test/ (held-out renders).
 
-`clsplat.runs.scene_record` reads and writes scene.json.
+`clsplat.runs.scene_record` reads and writes scene.json. `clsplat.runs.settings` reads and writes config.toml, and has
+the size limits of these files.
 """
 
 from __future__ import annotations

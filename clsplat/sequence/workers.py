@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Threads of a render job, which render, encode and write its frames. No OpenCL here.
 
-Each device has one thread that renders; a few more threads encode and write. A frame is written under a temporary name
-and then renamed, so that a file is complete even if the job is killed. Frames of a video are prepared by these threads
-and encoded in order by the thread that waits for them.
+Each device has one thread that renders; up to MAX_FILE_THREADS of `finished_frames` encode and write. A frame is
+written under a temporary name and then renamed, so that a file is complete even if the job is killed. Frames of a video
+are prepared by these threads and encoded in order by the thread that waits for them.
 """
 
 from __future__ import annotations

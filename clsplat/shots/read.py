@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading of camera files of any format, and choice of the shot that the arguments of `clsplat render` ask for."""
+"""Reading of camera files of any format, and choice of the shot that the arguments of `clsplat render` ask for.
+
+A shot has at most MAX_SHOT_FRAMES frames (`shots.shot`).
+"""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ class Shot:
 
     @property
     def cameras(self) -> list[Camera]:
-        """The camera of every frame."""
+        """Cameras of the frames, in their order."""
         return [frame.camera for frame in self.frames]
 
     def standing(self, numbers: Sequence[int]) -> Shot:

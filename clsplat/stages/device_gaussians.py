@@ -116,7 +116,7 @@ class SavedArray:
         return self.store.count, *self.store.fields[self.field]
 
     def get(self) -> NDArray[np.float32]:
-        """A copy of all rows."""
+        """Return a copy of all rows."""
         return self.get_rows(0, self.store.count)
 
     def get_rows(self, start: int, stop: int) -> NDArray[np.float32]:

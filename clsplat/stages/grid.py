@@ -36,7 +36,7 @@ class Grids:
 
 
 def _spans(width: int, height: int) -> tuple[float, float]:
-    """Grid columns and rows per pixel."""
+    """Return the number of columns and of rows of a grid that a pixel spans."""
     return (GRID_SHAPE[2] - 1) / width, (GRID_SHAPE[1] - 1) / height
 
 

@@ -73,7 +73,7 @@ class Projected:
         return () if self.chunks is None else (self.chunks.numbers.buffer, self.chunks.model_rows)
 
     def rows(self, start: int, stop: int) -> Projected:
-        """The projected Gaussians [start, stop)."""
+        """Return the projected Gaussians of the rows [start, stop)."""
         if (start, stop) == (0, self.tile_counts.shape[0]):
             return self
         shown = None if self.shown is None else self.shown.rows(start, stop)

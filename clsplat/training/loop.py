@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training loop: steps, reports, evaluations and checkpoints, with its output in a run's folder."""
+"""The training loop: steps, reports, evaluations and checkpoints, with its output in a run's folder.
+
+`training.stability.health` has the limits at which non-finite values lead back to a checkpoint, or end the training.
+"""
 
 from __future__ import annotations
 

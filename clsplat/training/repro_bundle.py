@@ -115,7 +115,7 @@ class Bundle:
 
 
 def recorded_camera(camera: Camera) -> RecordedCamera:
-    """Camera as it is recorded in a bundle."""
+    """Return a camera's fields as a bundle records them, without its pose."""
     return {
         "width": camera.width,
         "height": camera.height,

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Viewer of `clsplat train --view`: pictures are rendered between training steps, in a limited fraction of the time."""
+"""Viewer of `clsplat train --view`: pictures are rendered between training steps, in a limited fraction of the time.
+
+The fraction is VIEWER_TIME_FRACTIONS of `viewer.refinement`.
+"""
 
 from __future__ import annotations
 

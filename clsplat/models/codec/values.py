@@ -70,7 +70,7 @@ def to_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def opacities(logits: Float32) -> Float64:
-    """Opacities, 0 to 1, from logits."""
+    """Return opacities, 0 to 1, from logits."""
     with np.errstate(over="ignore"):  # exp overflows for very negative logits; their opacity becomes 0
         values: Float64 = 1 / (1 + np.exp(-logits.astype(np.float64)))
     return values

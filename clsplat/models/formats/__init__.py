@@ -238,7 +238,7 @@ def colour_space(path: str | os.PathLike[str]) -> str:
 
 
 def _near_of(gaussians: Gaussians) -> float:
-    """Near plane for a model whose file has none: the default, or less if the model is very small."""
+    """Near plane for a model whose file has none: DEFAULT_NEAR_PLANE of `camera`, or less for a tiny model."""
     some = gaussians.means[:: max(len(gaussians) // MODEL_SIZE_SAMPLES, 1)].astype(np.float64)
     size = float(np.median(np.linalg.norm(some - np.median(some, axis=0), axis=1)))
     return (

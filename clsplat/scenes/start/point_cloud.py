@@ -2,7 +2,8 @@
 """Points from which training starts: point clouds (--points), points on the sky (--sky), and the colours of both.
 
 Clouds are checked against the cameras and thinned to one point per voxel. Sky points lie on a sphere around the scene,
-where photographs show the sky. Points without colours take the median colour of the photographs that show them.
+where photographs show the sky; SKY_RADIUS_RATIO of `config.points` gives its radius. Points without
+colours take the median colour of the photographs that show them.
 """
 
 from __future__ import annotations

@@ -93,7 +93,8 @@ def plan(config: DensityConfig, model: ModelState, *, sky: bool = False) -> RowP
     """Clone small and split large Gaussians with a large mean gradient. Prune Gaussians that are transparent, oversized
     or contribute little.
 
-    sky: True if the model has sky Gaussians. The size limit of all Gaussians is then relative to the extent.
+    sky: True if the model has sky Gaussians. The size limit of all Gaussians is then relative to SKY_RADIUS_RATIO
+        (`config.points`) times the extent.
     In the plan the remaining Gaussians come first, in their order. Clones and halves are marked as fresh.
     """
     # Each rule compares as NumPy compares a float32 array with a Python number: in float32.

@@ -50,22 +50,22 @@ class StepProbe:
         return ()
 
     def forward(self, frame: ForwardPass) -> None:
-        """Called after the launch of the view's forward pass."""
+        """Observe the forward pass, after its kernels have been launched."""
 
     def loss(self, result: Loss) -> None:
-        """Called after the launch of the loss."""
+        """Observe the loss, after its kernels have been launched."""
 
     def pair_gradients(self, slots: Slots) -> None:
-        """Called after the launch of the gradient of blending."""
+        """Observe the pairs' gradients, after the gradient of blending has been launched."""
 
     def before_replay(self) -> None:
-        """Called before a replay of launches in which Adam changes the model."""
+        """Prepare for a replay of launches in which Adam changes the model."""
 
     def before_rows(self, rows: StepRows) -> None:
-        """Called before Adam on these rows is launched."""
+        """Observe rows of the model, before Adam on them is launched."""
 
     def after_rows(self, rows: ViewRows) -> None:
-        """Called after Adam on these rows was launched."""
+        """Observe rows of the model, after Adam on them has been launched."""
 
 
 NO_PROBE = StepProbe()

@@ -104,7 +104,7 @@ class StepRows(ViewRows):
 
     @property
     def parameters(self) -> DeviceGaussians:
-        """Parameters of the rows."""
+        """Parameters of these rows, the first of `model`."""
         return self.model[0]
 
 

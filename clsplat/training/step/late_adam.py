@@ -66,7 +66,7 @@ class LateAdam(Component):
         self._settle(rows.model, step.number - 1, last, rows.projected.tile_counts)
 
     def complete(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
-        """Settle all rows, in place."""
+        """Settle all Gaussians: take the steps of Adam that they missed, in place."""
         for start, stop, part in parts(self._rasterizer.work, parameters, first, second, keep=True):
             self._settle(part, self.step, self._last.rows(start, stop))
 

@@ -26,7 +26,10 @@ MAX_TARGET_NEARNESS = 1e6
 
 
 def weight_at(config: TrainConfig, step: int) -> float:
-    """Weight of the depth loss in step number `step`. It falls exponentially."""
+    """Return the weight of the depth loss in step number `step`.
+
+    It falls exponentially, to DEPTH_WEIGHT_END_FRACTION (`config.depth`) of the first weight.
+    """
     fall: float = DEPTH_WEIGHT_END_FRACTION ** (step / config.iterations)
     return config.depth_weight * fall
 
