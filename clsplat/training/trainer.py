@@ -34,7 +34,7 @@ from clsplat.training.density.choice import strategy_of
 from clsplat.training.learning_rates import rates_at
 from clsplat.training.memory import UNLIMITED, HostMemory, MemoryPlanner
 from clsplat.training.mip_filter import MipFilter
-from clsplat.training.saved_model import saved_model
+from clsplat.training.preparation import saved_model
 from clsplat.training.stability.health import finite_or_zero
 from clsplat.training.stability.non_finite import NonFiniteMonitor, Repair
 from clsplat.training.step.component import Component
