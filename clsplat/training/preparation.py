@@ -1,22 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Preparation of a training before its first step: checks, length unit, start points, known depths, settings."""
+"""Preparation of a training before its first step: checks, length unit, start points, depths, settings, and
+the Gaussians of a checkpoint."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+from clsplat.chunks.store import ChunkStore
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 from clsplat.images.alpha import background_colour
 from clsplat.runs import scene_record
+from clsplat.runs.checkpoints import Checkpoint, unusable
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes.analysis import sanity_checks
 from clsplat.scenes.depth_sources import length_unit_of, with_depths
 from clsplat.scenes.scene import Scene
 from clsplat.scenes.start.point_cloud import is_colourless, photographed, with_points
+from clsplat.stages.device_gaussians import KINDS, HostGaussians, SavedArray, host_model, saved_models
 from clsplat.training.cameras.refinement import check_refinable
 
 
@@ -143,3 +149,27 @@ def late_settings(config: TrainConfig) -> Iterator[str]:
             f"--warmup {','.join(map(str, late))}: the training resolution does not double after these steps, because "
             f"{ends} at 1/{2 ** len(late)} of the size; expected steps below --iterations {last}"
         )
+
+
+@contextmanager
+def saved_model(checkpoint: Checkpoint, sh_degree: int) -> Iterator[tuple[list[HostGaussians], Checkpoint]]:
+    """Context with parameters, first and second moments of a checkpoint, and the checkpoint with all its arrays.
+
+    sh_degree: final SH degree of the training.
+    A scratch file that has some of them is open in the context. Raises InputError for arrays of another model.
+    """
+    saved: Mapping[str, Any] = {}
+    with ExitStack() as reading:
+        try:
+            if checkpoint.manifest is not None:
+                store = reading.enter_context(closing(ChunkStore.opened(checkpoint.manifest, writable=False)))
+                models = saved_models(store)
+                saved = {name: SavedArray(store, name) for name in store.fields}
+            else:
+                models = [host_model(checkpoint.arrays, kind) for kind in KINDS]
+            n, most = max(model.coefficients for model in models), (sh_degree + 1) ** 2
+            if n > most:
+                raise ValueError(f"has {n} SH coefficients, more than the {most} of --sh-degree {sh_degree}")
+        except ValueError as error:
+            raise unusable(checkpoint, str(error)) from None
+        yield models, replace(checkpoint, arrays={**checkpoint.arrays, **saved})

@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -53,16 +52,13 @@ from clsplat.stages.device_gaussians import (
     HostGaussians,
     Models,
     ReadableArray,
-    SavedArray,
     allocate_gaussians,
     by_field,
     change_rows,
     fields_of,
     host_gaussians,
-    host_model,
     host_zeros,
     pooled,
-    saved_models,
     set_rows_at,
     to_device,
     to_host,
@@ -465,30 +461,6 @@ class TrainedModel:
         self._free_models()
         self._place(moved)
         return rows
-
-
-@contextmanager
-def saved_model(checkpoint: Checkpoint, sh_degree: int) -> Iterator[tuple[list[HostGaussians], Checkpoint]]:
-    """Context manager that yields a checkpoint's parameters and moments, and the checkpoint with all its arrays.
-
-    A scratch file that has some of the arrays is open inside the context. Raises InputError for wrong arrays.
-    sh_degree: final SH degree of the training.
-    """
-    saved: Mapping[str, Any] = {}
-    with ExitStack() as reading:
-        try:
-            if checkpoint.manifest is not None:
-                store = reading.enter_context(closing(ChunkStore.opened(checkpoint.manifest, writable=False)))
-                models = saved_models(store)
-                saved = {name: SavedArray(store, name) for name in store.fields}
-            else:
-                models = [host_model(checkpoint.arrays, kind) for kind in KINDS]
-            n, most = max(model.coefficients for model in models), (sh_degree + 1) ** 2
-            if n > most:
-                raise ValueError(f"has {n} SH coefficients, more than the {most} of --sh-degree {sh_degree}")
-        except ValueError as error:
-            raise unusable(checkpoint, str(error)) from None
-        yield models, replace(checkpoint, arrays={**checkpoint.arrays, **saved})
 
 
 def _host_arrays(arrays: Mapping[str, NDArray[Any]]) -> dict[str, AnyArray]:

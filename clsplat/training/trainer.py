@@ -34,6 +34,7 @@ from clsplat.training.density.choice import strategy_of
 from clsplat.training.learning_rates import rates_at
 from clsplat.training.memory import UNLIMITED, HostMemory, MemoryPlanner
 from clsplat.training.mip_filter import MipFilter
+from clsplat.training.preparation import saved_model
 from clsplat.training.stability.health import finite_or_zero
 from clsplat.training.stability.non_finite import NonFiniteMonitor, Repair
 from clsplat.training.step.component import Component
@@ -49,7 +50,7 @@ from clsplat.training.supervision.depth_targets import DepthTargets
 from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.supervision.resolution import by_doubling
 from clsplat.training.supervision.view_loader import ViewLoader
-from clsplat.training.trained_model import TrainedModel, saved_model
+from clsplat.training.trained_model import TrainedModel
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
