@@ -57,7 +57,7 @@ def test_a_training_that_fails_is_told(monkeypatch: pytest.MonkeyPatch, capsys: 
 
     status, words = told(monkeypatch, capsys, fail)
     assert status == 1
-    assert words == "DIFFERENT, no room for half the device's memory"
+    assert words == "FAILED, no room for half the device's memory"
 
 
 def test_a_row_that_is_not_there(capsys: Capture) -> None:

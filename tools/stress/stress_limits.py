@@ -7,7 +7,7 @@
 The scene is the plain of `run large`, with a point for each Gaussian to begin with. Density control, SH degrees,
 opacity resets, warm-up sizes and checkpoints come in between. Prints a table: the limit, the peak of anonymous and
 shared memory, steps a second, and a digest of model.ply and of the losses in metrics.jsonl. The exit status is 1 if a
-digest differs from that of the training without a limit on the same device, or of the same batch.
+digest differs from that of the training without a limit on the same device, or of the same batch, or if one fails.
 
 --devices: devices of clsplat devices, of which the first trains under all circumstances, others without a limit and at
 two. If not given: one of each driver. --only: rows of the table whose names have one of the words, and those that they
@@ -322,8 +322,8 @@ def main(arguments: Sequence[str]) -> int:
             found[case.name] = took.digests
             same = bool(took.digests) and took.digests == found[case.like]
             differ |= not same
-            words = "DIFFERENT" if not same else "same" if case.like != case.name else ""
-            said = ", ".join(word for word in (words, took.said) if word)
+            words = "FAILED" if not took.digests else "DIFFERENT" if not same else "same"
+            said = ", ".join(word for word in (words, took.said) if word and (case.like != case.name or not same))
             cells = [case.name, limit_of((*case.flags, *limit)), took.peak, took.rate, ", ".join(took.digests), said]
             print(f"| {' | '.join(cells)} |", flush=True)
     return 1 if differ else 0
