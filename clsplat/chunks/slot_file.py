@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from functools import cache
 from io import FileIO
 from itertools import pairwise
 from pathlib import Path
@@ -33,6 +35,8 @@ class SlotFile:
     def __init__(self, path: Path, slot_bytes: int, file: FileIO) -> None:
         self.path, self.slot_bytes, self._file = path, slot_bytes, file
         self.moved: Callable[[int, float], object] = lambda _nbytes, _seconds: None
+        self.request: Future[None] | None = None
+        """The latest request of `read_ahead`."""
 
     @classmethod
     def new(cls, path: Path, slot_bytes: int, slots: int) -> SlotFile:
@@ -122,6 +126,21 @@ class SlotFile:
         for place, slot, length in self._runs(slots, records.itemsize):
             self.write_at(slot, 0, records[place : place + length])
 
+    def read_ahead(self, slots: NDArray[np.int64]) -> None:
+        """Ask the system to read slots from the disk while other work goes on.
+
+        The request may take as long as the disk needs, so a thread makes it. Until it is done, further calls do
+        nothing.
+        """
+        if hasattr(os, "posix_fadvise") and (self.request is None or self.request.done()):
+            self.request = _reader().submit(self._request, list(runs(slots)))
+
+    def _request(self, pieces: Sequence[tuple[int, int, int]]) -> None:
+        size = self.slot_bytes
+        with suppress(OSError, ValueError):  # the file has been closed, or its disk does not support this
+            for _, slot, length in pieces:
+                os.posix_fadvise(self._file.fileno(), slot * size, length * size, os.POSIX_FADV_WILLNEED)
+
     def read_at(self, slot: int, offset: int, into: NDArray[Any]) -> None:
         """Fill an array with the bytes from an offset in a slot on. Raises ScratchError."""
         left, start, begin = into.view(np.uint8).reshape(-1).data, time.perf_counter(), slot * self.slot_bytes + offset
@@ -155,6 +174,12 @@ class SlotFile:
             step = length if nbytes == self.slot_bytes else 1
             for begin in range(0, length, step):
                 yield place + begin, slot + begin, step
+
+
+@cache
+def _reader() -> ThreadPoolExecutor:
+    """Return the thread that makes the requests of `SlotFile.read_ahead`."""
+    return ThreadPoolExecutor(1, "clsplat-read-ahead")
 
 
 def runs(slots: NDArray[np.int64]) -> Iterator[tuple[int, int, int]]:

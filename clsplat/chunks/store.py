@@ -161,6 +161,11 @@ class ChunkStore:
                 records[self._names[index]][constants[:, index] == constant] = value
         return records
 
+    def read_ahead(self, numbers: NDArray[np.integer[Any]]) -> None:
+        """Ask the system to read the records of these chunks from the scratch file, without waiting for them."""
+        if self.path is not None:
+            self.file.read_ahead(self.slots.current[numbers])
+
     def write(self, numbers: NDArray[np.integer[Any]], records: NDArray[Any]) -> None:
         """Replace the records of these chunks. Raises WriteError if they cannot be written."""
         if self.path is None:

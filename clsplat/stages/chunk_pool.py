@@ -78,6 +78,8 @@ class ChunkPool:
         self.before_view: Callable[[int], None] = lambda _: None
         self.moved_bytes = 0
         """Bytes of all records that have crossed the bus so far, in both directions."""
+        self._moved_before = 0
+        """`moved_bytes` at the latest `read_ahead`."""
         self._allocate(rows)
 
     def _allocate(self, rows: int) -> None:
@@ -130,6 +132,16 @@ class ChunkPool:
         if changes:
             self._changed[moves.slots] = True
         return moves.slots
+
+    def read_ahead(self, camera: Camera) -> None:
+        """Begin to read the chunks that a camera may show and that are not on the device from a scratch file.
+
+        If no chunk has moved since the last call, the chunks of all views may be on the device, and nothing is culled.
+        """
+        if self.moved_bytes > self._moved_before and self.cull is not None and self.store.path is not None:
+            numbers = self.cull(camera)
+            self.store.read_ahead(numbers[self.slots_of(numbers) < 0])
+        self._moved_before = self.moved_bytes
 
     def place_rows(self, start: int, stop: int) -> None:
         """Copy the rows [start, stop) of the model to the first rows of the pool, wherever chunks begin and end.

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
+from clsplat.camera import Camera
 from clsplat.chunks.manifest import Manifest
 from clsplat.chunks.order import ORDERED_ROWS, space_order
 from clsplat.chunks.store import ChunkStore, record_type
@@ -399,6 +400,11 @@ class TrainedModel:
     def in_file(self) -> bool:
         """True if the model is in a scratch file, because main memory has no room for it."""
         return self.store is not None
+
+    def read_ahead(self, camera: Camera) -> None:
+        """Begin to read the chunks that a camera may show from the scratch file."""
+        assert self._pool is not None
+        self._pool.read_ahead(camera)
 
     @property
     def moved_bytes(self) -> int:

@@ -188,8 +188,10 @@ class Trainer:
             counted = (self.rasterizer, (factor, self.rasterizer), self.parameters.count)
             room = 0 if self._looks_at_steps else self.pending.room(*counted)
             result = self.pending.launch(run, room, number=self.step, reads_loss=reads_loss)
-            if self.position.queue:  # upload the next step's photograph, at this resolution
+            if self.position.queue:  # the next step's photograph, at this resolution, and its Gaussians
                 self.photographs.ahead(self.position.queue[-1], factor)
+                if self.model.in_file:
+                    self.model.read_ahead(self.local(self.views[self.position.queue[-1]].camera))
         else:
             of = (step(), self.model.with_moments, inputs, factor, partial(self._watched_in_batch, needs))
             result = self.batch.run(*of, statistics=needs.gradients)

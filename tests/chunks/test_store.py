@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,62 @@ def test_rows_come_back(tmp_path: Path, in_file: bool) -> None:
     assert store.get_rows("none", 0, 5).shape == (5, 0, 3)
     store.close()
     assert not list(tmp_path.iterdir()), "the file is removed, as no checkpoint names it"
+
+
+Asked = list[tuple[int, int]]
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
+    """Offsets and lengths that the system is asked to read."""
+    found: Asked = []
+    monkeypatch.setattr(os, "POSIX_FADV_WILLNEED", 3, raising=False)
+    monkeypatch.setattr(os, "posix_fadvise", lambda *of: found.append(of[1:3]), raising=False)
+    return found
+
+
+def test_the_system_is_asked_for_what_is_read_next(store: ChunkStore, asked: Asked) -> None:
+    written(store, numbers=np.array([3, 4, 9]))
+    store.read_ahead(np.array([2, 3, 4, 9]))  # number 2 has never been written
+    assert store.file.request is not None
+    store.file.request.result()
+    size, slots = store.file.slot_bytes, store.slots.current
+    wanted = [(first * size, length * size) for _, first, length in runs(slots[[3, 4, 9]])]
+    assert asked == wanted
+
+
+def test_nothing_more_is_asked_before_an_answer(
+    store: ChunkStore, asked: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written(store)
+    may_go_on = Event()
+    monkeypatch.setattr(os, "posix_fadvise", lambda *_: may_go_on.wait())
+    store.read_ahead(ALL[:3])
+    first = store.file.request
+    store.read_ahead(ALL[3:])
+    assert store.file.request is first
+    may_go_on.set()
+    assert first is not None
+    first.result()
+
+
+def test_a_store_that_cannot_be_read_ahead(store: ChunkStore, asked: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One in main memory, one whose disk refuses, one that is closed, and a system that cannot."""
+    in_memory = ChunkStore(COUNT, FIELDS)
+    written(in_memory)
+    in_memory.read_ahead(ALL)
+    written(store)
+    monkeypatch.setattr(os, "posix_fadvise", full)
+    store.read_ahead(ALL)
+    assert store.file.request is not None
+    assert store.file.request.result() is None
+    store.close()
+    store.read_ahead(ALL)
+    assert store.file.request.result() is None
+    monkeypatch.delattr(os, "posix_fadvise")
+    before = store.file.request
+    store.read_ahead(ALL)
+    assert store.file.request is before
 
 
 def test_rows_of_some_chunks(tmp_path: Path) -> None:

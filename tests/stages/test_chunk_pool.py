@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import raising, refuses
+from calls import noted, raising, refuses
 from compare import assert_same_bits
 from numpy.typing import NDArray
+from tiny import cameras
 
 from clsplat.chunks.gathering import NewValues
 from clsplat.chunks.slot_file import ScratchError
@@ -283,3 +284,23 @@ def test_more_chunks_than_slots(device: Device) -> None:
 def test_no_more_slots_than_chunks(device: Device) -> None:
     pool = pool_of(device, model_of(), None, slots=40)
     assert (pool.slots, pool.rows) == (CHUNKS, CHUNKS * CHUNK_ROWS)
+
+
+def test_chunks_are_read_ahead_while_chunks_come(
+    default_device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that a camera may show and that are not on the device; none where no chunk has come since."""
+    pool, shown = pool_of(default_device, model_of(), tmp_path / "model.chunks"), np.array([1, 2, 4])
+    asked: list[list[int]] = []
+    noted(monkeypatch, ChunkStore, "read_ahead", lambda _, numbers: asked.append(numbers.tolist()))
+    camera = cameras()[0]
+    pool.place(np.array([2, 3]), changes=False)
+    pool.read_ahead(camera)
+    assert asked == [], "it is not known yet what a camera shows"
+    pool.cull = lambda _: shown
+    pool.place(np.array([3, 5]), changes=False)
+    pool.read_ahead(camera)
+    pool.place(np.array([2, 5]), changes=False)
+    pool.read_ahead(camera)
+    assert asked == [[1, 4]]
+    pool.close()

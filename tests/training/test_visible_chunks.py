@@ -23,6 +23,7 @@ from clsplat.camera import Camera
 from clsplat.chunks.bounds import ChunkBounds
 from clsplat.chunks.culling import PictureBorders
 from clsplat.chunks.order import beside_parents, space_order
+from clsplat.chunks.store import ChunkStore
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.device.selection import open_device
@@ -30,6 +31,7 @@ from clsplat.errors import DriverError
 from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.scenes.scene import Scene
 from clsplat.stages.chunk_pool import ChunkPool
+from clsplat.stages.device_gaussians import HostGaussians
 from clsplat.training import moved_rows, trained_model
 from clsplat.training.density import ModelState, RowPlan
 from clsplat.training.density.adaptive import Adaptive
@@ -168,6 +170,32 @@ def test_a_streamed_model(
     assert_same(got, wanted)
     trainer.close()
     assert not list(tmp_path.iterdir()), "the file of chunks is gone"
+
+
+def test_the_chunks_of_the_next_view_are_read_ahead(
+    scene: Scene, default_device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A step uses none that was neither on the device nor asked for, unless it begins a pass, whose first view was not
+    known before."""
+    asked: list[int] = []
+    placed: list[int] = []
+    noted(monkeypatch, ChunkStore, "read_ahead", lambda _, numbers: asked.extend(numbers))
+    noted(monkeypatch, ChunkPool, "place", lambda _, numbers, **__: placed.extend(numbers))
+    memory = HostMemory(limit=LIMITS["host 1 MiB"][1], scratch=tmp_path, owner="test")
+    trainer = Trainer(scene, SPARSE, default_device, wide_model(), memory=memory)
+    used: set[int] = set()
+    for _ in range(11):  # until the SH degree rises
+        asked.clear()
+        placed.clear()
+        begins, there = not trainer.position.queue, used
+        trainer.train_step()
+        assert begins or set(placed) <= there
+        assert bool(asked) == bool(trainer.position.queue)
+        assert isinstance(trainer.parameters, HostGaussians)
+        pool = trainer.parameters.pool
+        assert pool is not None
+        used = {*asked, *(number for number in range(pool.store.chunks) if pool.slots_of(np.array([number]))[0] >= 0)}
+    trainer.close()
 
 
 def depth_of(trainer: Trainer, camera: Camera) -> Float32:
