@@ -211,7 +211,7 @@ class Trainings:
         def keep(finished: Path) -> None:
             digests.add(digest(finished))
 
-        lifetime = self.seconds.get(case.flags, max(self.seconds.values()))
+        lifetime = self.seconds.get(case.flags, min(self.seconds.values()))
         killer = Killer(lambda path: self.start(case, path), keep, lifetime, self.options.seed)
         figures = killer.survive(run, self.options.kills)
         return Result(digests, f"{figures.kills} kills, {figures.writing} of them while a checkpoint was written")
