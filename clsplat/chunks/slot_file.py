@@ -47,7 +47,7 @@ class SlotFile:
         except OSError as error:
             raise write_error(path, error, needs=slots * slot_bytes) from None
         try:
-            made.grow(0, slots)
+            made.grow(0, slots, slots)
         except BaseException:
             made.close()
             with suppress(OSError):
@@ -94,10 +94,21 @@ class SlotFile:
             raise write_error(str(self.path), error) from None
         sync_folder(self.path.parent)
 
-    def grow(self, slots: int, more: int) -> None:
-        """Reserve disk space for `more` slots after the first `slots`, so that a full disk is found before rows are
-        written. Raises WriteError."""
-        offset, nbytes = slots * self.slot_bytes, more * self.slot_bytes
+    def grow(self, slots: int, more: int, least: int) -> int:
+        """Reserve disk space for slots after the first `slots`, so that a full disk is found before rows are written.
+
+        Returns their number: `more`, or `least` if the disk has no room for so many. Raises WriteError.
+        """
+        try:
+            self._reserve(slots * self.slot_bytes, more * self.slot_bytes)
+        except WriteError:
+            if more <= least:
+                raise
+            more = least
+            self._reserve(slots * self.slot_bytes, more * self.slot_bytes)
+        return more
+
+    def _reserve(self, offset: int, nbytes: int) -> None:
         try:
             with require_room(self.path, nbytes):
                 if hasattr(os, "posix_fallocate"):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 NO_SLOT = -1
-"""Stands for the slot of a chunk that has not been written, whose elements are all zero."""
+"""Stands for the slot of a chunk that has not been written: each of its fields has one value in all elements."""
 MAX_TENTHS = 22
 """Maximum number of slots of a file, in tenths of the number of chunks. It has room for two copies of each chunk: one
 of the latest checkpoint, and one that later steps change."""
@@ -49,7 +49,7 @@ class SlotTable:
 
     def hold(self, kept: Sequence[NDArray[np.int64]]) -> None:
         """Protect the slots that these checkpoints name from being overwritten, and no other slots."""
-        self._held = np.zeros(self.size, np.bool_)
+        self._held, self._named_end = np.zeros(self.size, np.bool_), 0
         for slots in kept:
             self._held[slots[(slots >= 0) & (slots < self.size)]] = True
         self._mark()
@@ -62,7 +62,11 @@ class SlotTable:
     @property
     def end_of_held(self) -> int:
         """One more than the last slot that a kept checkpoint names; 0 if none names one."""
-        return _end(self._held)
+        return max(_end(self._held), self._named_end)
+
+    def name_current(self) -> None:
+        """Count the present slots in `end_of_held`, as a checkpoint is about to name them. `hold` ends that."""
+        self._named_end = int(self.current.max(initial=NO_SLOT)) + 1
 
     def in_place(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
         """Return True for each chunk whose own slot may be overwritten."""
@@ -79,7 +83,11 @@ class SlotTable:
         """Return by how many slots the file should grow if `lacking` are missing; 0 if it would exceed `most`."""
         if self.size + lacking > self.most:
             return 0
-        return min(max(lacking, len(self.current) // _GROWTH_SHARE), self.most - self.size)
+        return min(self.least_growth(lacking), self.most - self.size)
+
+    def least_growth(self, lacking: int) -> int:
+        """Return by how many slots the file grows at least at a time, so that it seldom grows."""
+        return max(lacking, len(self.current) // _GROWTH_SHARE)
 
     def grow(self, slots: int) -> None:
         """Record that the file has `slots` more slots."""

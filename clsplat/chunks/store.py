@@ -25,6 +25,7 @@ from clsplat.chunks.gathering import BLOCK_CHUNKS, NewValues, OldChunks, gathere
 from clsplat.chunks.manifest import CONSTANTS, WRITTEN, ZERO, Manifest
 from clsplat.chunks.slot_file import ScratchError, SlotFile
 from clsplat.chunks.slots import NO_SLOT, SlotTable
+from clsplat.errors import WriteError
 from clsplat.files.atomic import remove
 from clsplat.layouts.columns import CHUNK_ROWS
 
@@ -43,11 +44,11 @@ class ChunkStore:
     fields: shape of a row of each field, by name. Fields without elements are not in the records.
     path: scratch file for the records, which is created; None keeps the records in main memory.
     widest: the fields with the largest shapes that they will have, which a slot of the file has room for.
-    starts: (chunks + 1,) int64, the first row of each chunk, then the number of all rows. By default all chunks but the
-        last are full.
+    starts: (chunks + 1,) int64, the chunks' first rows, then the number of rows. By default all but the last are full.
     opened: the existing scratch file and the manifest of a checkpoint, to continue from.
     release: function that is called before the file becomes larger than `SlotTable.most`. It removes the oldest
         checkpoint and returns the slots of the other checkpoints, or None if all have to stay.
+    has_checkpoints: True if manifests go into checkpoints, so that `close` keeps the slots of the latest one.
     file: the scratch file.
     Raises WriteError if the file cannot be created, or the disk has too little room.
     """
@@ -69,7 +70,7 @@ class ChunkStore:
         self.release: Callable[[], KeptSlots | None] = lambda: None
         self._memory: list[NDArray[np.uint8] | None] = [None] * self.chunks if path is None else []
         """The rows of each chunk in main memory, as bytes, one field after the other; None before they are written."""
-        self._given_back = 0
+        self._given_back, self.has_checkpoints = 0, False
         self._constants = np.full((self.chunks, len(self._names)), ZERO)
         """(chunks, fields), WRITTEN if the record has the field; ZERO or INFINITE if all elements have this value."""
         if path is None:
@@ -98,6 +99,8 @@ class ChunkStore:
         """Flush the file to the disk, and return the list of its chunks for a checkpoint. Raises WriteError."""
         assert self.path is not None
         self.file.sync()
+        if self.has_checkpoints:
+            self.slots.name_current()
         arrays = np.diff(self.starts), self.slots.current.copy(), self._checksums.copy(), self._constants.copy()
         return Manifest(self.path, self.file.slot_bytes, self.fields, *arrays)
 
@@ -113,8 +116,7 @@ class ChunkStore:
 
     def lengths(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
         """Return the number of rows of each of these chunks."""
-        lengths: NDArray[np.int64] = self.starts[numbers + 1] - self.starts[numbers]
-        return lengths
+        return np.asarray(self.starts[numbers + 1] - self.starts[numbers])
 
     def verify(self) -> None:
         """Read all chunks. Raises ScratchError if a chunk differs from what was written."""
@@ -445,9 +447,12 @@ class ChunkStore:
             if not more and (kept := self.release()) is not None:
                 self.slots.hold(kept)
                 continue
-            more = more or lacking
-            self.file.grow(self.slots.size, more)
-            self.slots.grow(more)
+            try:
+                self.slots.grow(self.file.grow(self.slots.size, more or self.slots.least_growth(lacking), lacking))
+            except WriteError:  # the disk is full, but an old checkpoint may give up slots
+                if (kept := self.release()) is None:
+                    raise
+                self.slots.hold(kept)
 
     def _check(self, number: int, names: Sequence[str], record: Any) -> None:
         """Raise ScratchError if fields of a record do not have the checksums of what was written."""

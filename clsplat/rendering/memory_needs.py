@@ -111,7 +111,7 @@ def plan_step(
         if device.shares_memory
         else (target.SOURCE_PIXEL_BYTES + step.masks * target.MASK_PIXEL_BYTES) * step.photographs,
         statistics=statistics,
-        held=step.row_bytes if step.by_chunk else None,
+        held=0 if step.by_chunk else None,  # the bounds and the lists of chunks are in main memory
         pool=step.pool,
         in_view=step.in_view,
     )

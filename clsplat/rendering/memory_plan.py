@@ -90,7 +90,7 @@ class Plan:
     """The division of a frame or training step, so that it fits the memory.
 
     rows: number of Gaussians whose parameters and moments are on the device at once.
-    streamed: True if `rows` is less than all Gaussians, so that parameters are streamed.
+    streamed: True if not all Gaussians stay on the device, so that parameters are streamed.
     pairs: largest number of (tile, Gaussian) pairs at once.
     gathers: True if the device moves rows for density control, False if the host does.
     allowed: memory limit, bytes.
@@ -181,10 +181,10 @@ def _rounded_up(nbytes: int) -> str:
 
 
 def plan_by_chunk(need: Need, budget: int, max_allocation: int) -> Plan:
-    """Plan steps over the chunks in view, such that a view may show all Gaussians that are on the device at once, and
-    at least `need.in_view`: of what a view takes by row, it may take more than the device has slots.
+    """Plan steps over the chunks in view. Raises CapacityError if not even one chunk fits.
 
-    Raises CapacityError if not even one chunk fits.
+    Arrays of a view have memory for `need.in_view` rows, even if that is more than the pool has, and for as many rows
+    as the pool.
     """
     assert need.held is not None, "steps over the chunks in view"
     room = budget - need.planes - need.scratch - need.gaussians * need.held - CHUNK_ROWS * need.record

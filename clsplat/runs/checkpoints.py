@@ -140,9 +140,14 @@ def scene_of(path: Path) -> str | None:
 
 
 def read_manifest(path: Path) -> Manifest | None:
-    """Read the manifest of a checkpoint; None if the Gaussians are among its arrays, or the file is damaged."""
+    """Read the manifest of a checkpoint; None if the Gaussians are among its arrays, or the file is damaged.
+
+    Raises OSError if the file cannot be read now. That is no damage: the checkpoint may need its scratch file.
+    """
     try:
         return manifest_of(*_part(path, *MANIFEST_ARRAYS))
+    except (OSError, MemoryError):
+        raise
     except Exception:  # noqa: BLE001  # as in load_latest_checkpoint, which reports the damage
         return None
 

@@ -227,7 +227,8 @@ class Run:
     def manifests(self) -> list[tuple[Path, Manifest]]:
         """Paths and manifests of the checkpoints whose Gaussians are in scratch files, the earliest first.
 
-        Damaged checkpoints are left out, and checkpoints later than the latest one that is known to be intact.
+        Damaged checkpoints are left out, and checkpoints later than the latest one that is known to be intact. Raises
+        OSError if a checkpoint cannot be read now.
         """
         found = []
         for step, path in self.checkpoints():

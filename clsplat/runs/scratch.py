@@ -59,6 +59,7 @@ class ScratchFiles:
         assert store.path is not None
         path = store.path
         store.release, store.file.moved = lambda: self._release(path), self._count
+        store.has_checkpoints = self._run is not None
         store.slots.hold(self._kept(path))
 
     def saved(self, store: ChunkStore | None) -> None:
@@ -79,7 +80,10 @@ class ScratchFiles:
         own = set(self.folder.glob(f"{self._owner}-*{SCRATCH_SUFFIX}")) | set(filter(self.is_own, self._named))
         if not own - {current}:
             return
-        named = {manifest.path for _, manifest in self._manifests()}
+        try:
+            named = {manifest.path for _, manifest in self._manifests()}
+        except OSError:  # a checkpoint that cannot be read now may need any of the files
+            return
         for path in own - named - {current}:
             with suppress(OSError):
                 remove(path)

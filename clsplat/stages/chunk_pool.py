@@ -19,6 +19,7 @@ from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
+from clsplat.errors import CapacityError
 from clsplat.layouts.columns import CHUNK_ROWS
 
 INVISIBLE_LOGIT = -1e9
@@ -94,10 +95,17 @@ class ChunkPool:
         self._changed = np.zeros(self.slots, np.bool_)
 
     def resize(self, rows: int) -> None:
-        """Allocate slots for `rows` Gaussians in place of the present ones. They are empty. Raises WriteError."""
+        """Allocate slots for `rows` Gaussians in place of the present ones. They are empty. Raises WriteError.
+
+        If the driver has no memory for them, against the plan, one slot is allocated.
+        """
         self.release()
         self.free()
-        self._allocate(rows)
+        try:
+            self._allocate(rows)
+        except CapacityError:
+            self.free()
+            self._allocate(CHUNK_ROWS)
 
     def free(self) -> None:
         """Free the device's memory. The pool is unusable afterwards."""

@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 
 from clsplat.camera import Camera
+from clsplat.chunks.division import listed_chunks
 from clsplat.chunks.order import ORDERED_ROWS
 from clsplat.config.checks import parse_bytes
 from clsplat.config.masks import NO_MASKS
@@ -42,8 +43,8 @@ POOL_QUARTERS = 3
 get the rest."""
 
 MOST_VIEWS_LOOKED_AT = 200
-"""Most views of which the chunks in view are found before the first step. For one of 20 million Gaussians it takes some
-7 ms; a step whose view shows more than these is planned for when it comes."""
+"""Largest number of views that are culled before the first step, to find how many rows a view shows. For one view of 20
+million Gaussians this takes some 7 ms. If a later view shows more, memory is planned again before its step."""
 
 
 def model_bytes(config: TrainConfig) -> int:
@@ -118,7 +119,7 @@ class HostMemory:
             count = len(scene.points) or config.random_points
             taken = count * model_bytes(config)
             if streams_by_chunk(config, device, count):
-                taken = _least_pool(record_bytes(config, contributions=False))
+                taken = _least_pool(record_bytes(config, contributions=config.density.min_contribution > 0))
             taken *= device.shares_memory
             photographs = replace(self, cache=None).photographs(scene, config)  # a cache would create its folder
             self.share(photographs, count, taken, begins=True)
@@ -141,14 +142,18 @@ class HostMemory:
 
         Raises InputError if there is no folder for the file.
         """
-        if self.limit is None or self.limit >= nbytes + photographs.least:
+        if not self.is_exceeded(nbytes, photographs):
             return None
         if self.files is None:
             raise InputError(
-                f"--max-host-mem {amount(self.limit)} leaves {amount(nbytes)} of Gaussians to files: name a folder for "
-                "them (--scratch DIR), or a run's folder (-o)"
+                f"--max-host-mem {amount(self.limit or 0)} leaves {amount(nbytes)} of Gaussians to files: name a "
+                "folder for them (--scratch DIR), or a run's folder (-o)"
             )
         return self.files.new_file()
+
+    def is_exceeded(self, nbytes: int, photographs: HostPhotographs) -> bool:
+        """Return True if main memory has no room for `nbytes` of chunks beside the least that photographs need."""
+        return self.limit is not None and self.limit < nbytes + photographs.least
 
     def remove_scratch(self) -> None:
         """Remove this training's scratch files that no checkpoint names, such as those of a process that was killed."""
@@ -224,10 +229,10 @@ class MemoryPlanner:
         self.begins, self._warned, self.rows_in_view = True, False, 0
 
     def look(self, local: Callable[[Camera], Camera], initial: Gaussians) -> None:
-        """Find the most rows that a view of a model shows, by an even sample of the views, if a limit may have it
-        streamed by chunk.
+        """Find the largest number of rows that a view of the initial model shows, from an even sample of the views.
 
-        local: function that gives a camera in the coordinates of the model.
+        Does nothing if no limit of the device's memory can have the model streamed by chunk.
+        local: function from a camera in world coordinates to the camera in those of the model.
         initial: the model at the start, in the order of its chunks.
         """
         device, views = self._rasterizer.device, self._scene.views
@@ -271,12 +276,18 @@ class MemoryPlanner:
         return made
 
     def plan_view(self, made: Plan, chunks: int) -> Plan:
-        """The plan for views of up to so many chunks, if they are more than any view has shown; else `made`, by which
-        the model is streamed by chunk. Raises CapacityError, and then `made` holds."""
-        rows = CHUNK_ROWS * chunks
+        """Plan for views of up to `chunks` chunks, if that is more than any view has shown; else return `made`.
+
+        made: the present plan, by which the model is streamed by chunk. It stays valid after a CapacityError.
+        """
+        device, rows = self._rasterizer.device, CHUNK_ROWS * chunks
         if rows <= max(self.rows_in_view, made.rows):
             return made
-        wider = plan_view(self._rasterizer.device, made, rows)
+        try:  # with room for a few chunks more, so that not each longer view plans again
+            padded = CHUNK_ROWS * listed_chunks(chunks)
+            wider, rows = plan_view(device, made, padded), padded
+        except CapacityError:
+            wider = plan_view(device, made, rows)
         self.rows_in_view = rows
         self._rasterizer.follow(wider)
         self._share_host(wider, wider.need.gaussians)
@@ -305,9 +316,13 @@ class MemoryPlanner:
 
     def _share_host(self, plan: Plan, count: int) -> None:
         """Limit photographs to the main memory that the Gaussians leave. Warns once if this is too little."""
-        on_host = self._rasterizer.device.shares_memory or plan.streamed
-        taken = plan.need.record * (plan.rows if plan.need.pool is not None else count) if on_host else 0
-        enough = self._memory.share(self._photographs.host, count, taken, begins=self.begins)
+        need, photographs = plan.need, self._photographs.host
+        taken = need.record * count if self._rasterizer.device.shares_memory or plan.streamed else 0
+        if need.pool is not None:
+            taken = need.record * plan.rows
+        elif plan.streamed and need.held is not None and self.scratch_files is not None:
+            taken *= not self._memory.is_exceeded(taken, photographs)  # all chunks go to a scratch file
+        enough = self._memory.share(photographs, count, taken, begins=self.begins)
         if not enough and not self._warned:
             self._warned = True
             warn(

@@ -216,11 +216,15 @@ class TrainedModel:
         """Return an object that marks the Gaussians by density rules."""
         return DeviceMarker(self._device, self._work, self.parameters, self.statistics)
 
-    def widen(self, coefficients: int) -> None:
-        """Increase the number of SH coefficients. The new ones are zero."""
+    def widen(self, coefficients: int, changes: Callable[[], None]) -> None:
+        """Increase the number of SH coefficients. The new ones are zero.
+
+        changes: function that is called before the first change.
+        """
         if self._pool is not None:
-            self._move_chunks(Move(coefficients=coefficients))
+            self._move_chunks(Move(coefficients=coefficients, changes=changes))
             return
+        changes()
         if not self.plan.gathers:
             self.parameters, self.first, self.second = [to_host(model) for model in self.with_moments]
         self._place([widen(self._device, model, coefficients) for model in self.with_moments])

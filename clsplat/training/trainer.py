@@ -388,7 +388,7 @@ class Trainer:
         coefficients = (degree + 1) ** 2
         if coefficients > self.parameters.coefficients:
             self.settle()
-            self.model.widen(coefficients)
+            self.model.widen(coefficients, self._unmark)
 
     def _control_density(self) -> None:
         """Run the density control that is due after one of the last step's views."""
@@ -417,7 +417,7 @@ class Trainer:
             self.batch.changed()
         if moved is None:
             for component in self.components if plan.values or plan.changes else ():
-                component.rows_changed()
+                component.rows_changed({*plan.values, *plan.changes})
             return
         for component in self.components:
             component.rows_moved(moved)

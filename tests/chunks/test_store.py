@@ -308,6 +308,64 @@ def test_a_full_disk_is_known_before_anything_is_written(
     assert [path.name for path in (tmp_path / "scratch").iterdir()] == ["x.chunks"]
 
 
+def test_a_checkpoint_that_is_being_written_keeps_its_slots(store: ChunkStore) -> None:
+    """A training may end, as by Ctrl-C, after a checkpoint was written and before its slots are protected."""
+    store.has_checkpoints = True
+    records, manifest = written(store), store.manifest()
+    store.close()
+    again = ChunkStore.opened(manifest, writable=False)
+    assert again.read(ALL).tobytes() == records.tobytes()
+    again.close()
+
+
+def test_without_checkpoints_a_manifest_keeps_no_file(store: ChunkStore) -> None:
+    written(store)
+    path = store.manifest().path
+    store.close()
+    assert not path.exists()
+
+
+def nearly_full(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
+    """Let the disk have room for `room` bytes at a time."""
+
+    def allocate(_: int, __: int, nbytes: int) -> None:
+        if nbytes > room:
+            full()
+
+    monkeypatch.setattr(os, "posix_fallocate", allocate, raising=False)
+
+
+def test_a_nearly_full_disk_has_room_for_what_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file grows by a sixteenth of its chunks, but two slots are enough for two chunks."""
+    many = 64
+    store = ChunkStore(many * CHUNK_ROWS, FIELDS, tmp_path / "x.chunks")
+    written(store, numbers=np.arange(many))
+    store.slots.hold([store.manifest().slots])
+    nearly_full(monkeypatch, 2 * store.file.slot_bytes)
+    assert store.slots.growth(2) > 2
+    records = written(store, 1.0, np.array([3, 5]))
+    assert store.read(np.array([3, 5])).tobytes() == records.tobytes()
+    assert store.slots.size == many + 2
+    store.close()
+
+
+def test_on_a_full_disk_an_old_checkpoint_gives_up_its_slots(
+    store: ChunkStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written(store)
+    first = store.manifest().slots
+    store.slots.hold([first])
+    written(store, 1.0, np.array([0, 1]))
+    second = store.manifest().slots
+    store.slots.hold([first, second])
+    nearly_full(monkeypatch, 0)
+    answers = iter([[second], None])
+    store.release = lambda: next(answers)
+    records = written(store, 2.0, np.array([7, 8]))
+    assert store.read(np.array([7, 8])).tobytes() == records.tobytes()
+    assert next(answers) is None, "one checkpoint was asked to give up its slots"
+
+
 def test_a_write_that_fails_gives_no_wrong_row(store: ChunkStore, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a slot of its own the chunk stays what it was; in place half of it is new, and reading says so."""
     records = written(store)

@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from scratch_runs import go, starts_wide, whole  # noqa: F401  # fixtures
 from tiny import write_scene
 
 from clsplat.scenes.loading import load_scene

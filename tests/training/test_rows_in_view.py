@@ -15,6 +15,7 @@ from test_visible_chunks import assert_same, state
 from tiny import cameras, run_steps, short
 from wide import let_small_models_have_chunks, wide_model
 
+from clsplat.chunks.division import listed_chunks
 from clsplat.config.checks import parse_bytes
 from clsplat.device.context import Device
 from clsplat.device.selection import open_device
@@ -89,7 +90,7 @@ def test_the_pool_shrinks_before_a_view_of_more_chunks(
     trainer = limited(scene, limit)
     before = slots_of(trainer)
     run_steps(7, trainer)
-    assert trainer.planner.rows_in_view == CHUNK_ROWS * IN_VIEW
+    assert trainer.planner.rows_in_view == CHUNK_ROWS * listed_chunks(IN_VIEW)
     trainer.model._before_view(IN_VIEW + 4)  # as if a later view showed more
     run_steps(STEPS - 7, trainer)
     assert len(sizes) > 1

@@ -14,111 +14,28 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny import run_steps, short
-from wide import flip, full, let_small_models_have_chunks, start_training, start_wide
+from scratch_runs import DENSE, LIMIT, SETTINGS, SPARE, STEADY, KilledError, Train, files_of, steps_of
+from tiny import run_steps
+from wide import flip, full
 
 from clsplat.api import train
 from clsplat.chunks import gathering, slot_file
-from clsplat.chunks.manifest import Manifest, manifest_of
+from clsplat.chunks.manifest import manifest_of
 from clsplat.chunks.slots import MAX_TENTHS, SlotTable
-from clsplat.config.training import OptimiserConfig, TrainConfig
+from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError, WriteError
-from clsplat.files import atomic, mounts
+from clsplat.files import atomic
 from clsplat.gaussians import GaussiansOfFile
 from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.runs.checkpoints import Checkpoint, read_manifest
-from clsplat.runs.run import Run, owned_files
-from clsplat.runs.scratch import owner_of
+from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
 from clsplat.stages import chunk_pool
 from clsplat.training.memory import HostMemory
 from clsplat.training.trainer import Trainer
 
-LIMIT = 4 << 20
-"""Bytes of main memory with which `wide_model` is in a scratch file."""
-DENSE = short(
-    iterations=26, report=False, warmup=(), sh_degree_every=1, checkpoint_every=4, density={"max_gaussians": 16_000}
-)
-SPARSE = replace(DENSE, optimiser=OptimiserConfig(sparse=True))
-STEADY = replace(DENSE, density=replace(DENSE.density, every=0))
-"""A training whose rows do not move, so that all checkpoints are in one file."""
-SPARE = replace(SPARSE, density=STEADY.density)
-SETTINGS = {"dense": DENSE, "sparse": SPARSE, "rows that stay": STEADY, "chunks that stay": SPARE}
-
-
-@pytest.fixture(autouse=True)
-def _starts_wide(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every training starts from a model with chunks, most of which no view shows."""
-    let_small_models_have_chunks(monkeypatch)
-    start_wide(monkeypatch, around=False)
-
-
-Train = Callable[..., Run]
-
-
-@pytest.fixture
-def go(scene: Scene, default_device: Device, tmp_path: Path) -> Train:
-    """Function that trains in tmp_path/run, or another folder there, and returns the run.
-
-    until: step before which the training is stopped without a word, as by a kill; None for its end.
-    each: called before each step with the trainer.
-    """
-
-    def train_run(
-        config: TrainConfig = STEADY,
-        *,
-        until: int | None = None,
-        name: str = "run",
-        limit: int | None = LIMIT,
-        each: Callable[[Trainer], object] = lambda _: None,
-        **options: Any,
-    ) -> Run:
-        folder = tmp_path / name
-        run = Run.create(folder, config, resume=folder.exists())
-
-        def between(trainer: Trainer, _: object) -> None:
-            each(trainer)
-            if trainer.step == until:
-                trainer.model.close = lambda: None  # type: ignore[method-assign]  # a killed process removes nothing
-                raise _KilledError
-
-        options = {"max_host_mem": limit, "between": between, **options}
-        try:
-            train(scene, config, device=default_device, run=run, resume=run.resuming, **options)
-        except _KilledError:
-            assert until is not None
-        return run
-
-    return train_run
-
-
-class _KilledError(Exception):
-    """The end of a process."""
-
-
-@pytest.fixture
-def whole(go: Train) -> Callable[[TrainConfig], bytes]:
-    """Bytes of model.ply of a training without a limit."""
-
-    def model(config: TrainConfig) -> bytes:
-        if repr(config) not in _MODELS:
-            _MODELS[repr(config)] = go(config, name="whole", limit=None).model_path.read_bytes()
-        return _MODELS[repr(config)]
-
-    return model
-
-
-_MODELS: dict[str, bytes] = {}
-"""Models of trainings that others are compared with, by their settings."""
-
-
-def files_of(run: Run) -> list[Path]:
-    return sorted(run.scratch_path.glob("*"))
-
-
-def steps_of(run: Run) -> list[int]:
-    return [step for step, _ in run.checkpoints()]
+pytestmark = pytest.mark.usefixtures("starts_wide")  # each training begins with a model of chunks
 
 
 @pytest.mark.parametrize("name", SETTINGS)
@@ -405,7 +322,7 @@ def test_density_control_that_does_not_end(
         nonlocal taken
         taken += 1
         if ends == "killed" and taken == 2:
-            raise _KilledError
+            raise KilledError
         if ends == "full" and taken == 1:
             monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
         return real(slots, count)
@@ -456,117 +373,3 @@ def test_the_least_limit_is_told(go: Train, whole: Callable[[TrainConfig], bytes
     assert run.model_path.read_bytes() == wanted
     assert least == 1, "a tenth of the state"
     assert files_of(run)
-
-
-def test_scratch_may_be_elsewhere(go: Train, whole: Callable[[TrainConfig], bytes], tmp_path: Path) -> None:
-    """A resume with another folder takes the file's content there."""
-    wanted = whole(STEADY)
-    folders = [tmp_path / name for name in ("one", "two")]
-    for folder in folders:
-        (folder / "sub").mkdir(parents=True)
-        (folder / "theirs.txt").write_text("")
-    go(until=10, scratch=folders[0])
-    (first,) = folders[0].glob("*.chunks")
-    go(until=11, scratch=folders[1])
-    assert first.exists(), "its checkpoint is the latest"
-    run = go(scratch=folders[1])
-    assert run.model_path.read_bytes() == wanted
-    assert not first.exists(), "no checkpoint names it"
-    assert len(list(folders[1].glob("*.chunks"))) == 1
-    assert all((folder / "theirs.txt").exists() for folder in folders)
-
-
-def test_a_run_that_has_been_moved(go: Train, whole: Callable[[TrainConfig], bytes], tmp_path: Path) -> None:
-    wanted = whole(STEADY)
-    go(until=10, name="old").path.rename(tmp_path / "run")
-    assert go().model_path.read_bytes() == wanted
-
-
-def test_the_file_of_another_run_is_only_read(go: Train, whole: Callable[[TrainConfig], bytes], tmp_path: Path) -> None:
-    """As after a copy of a run whose files are elsewhere."""
-    wanted, scratch = whole(STEADY), tmp_path / "scratch"
-    run = go(until=10, name="first", scratch=scratch)
-    (theirs,) = scratch.glob("*.chunks")
-    before = theirs.read_bytes()
-    shutil.copytree(run.path, tmp_path / "run")
-    assert go(scratch=scratch).model_path.read_bytes() == wanted
-    assert theirs.read_bytes() == before
-    assert len(list(scratch.glob("*.chunks"))) == 2
-    assert go(name="first", scratch=scratch).model_path.read_bytes() == wanted
-
-
-def test_a_new_run_where_a_renamed_one_was(go: Train, whole: Callable[[TrainConfig], bytes], tmp_path: Path) -> None:
-    """It leaves the other's file alone, although both runs have had one path."""
-    wanted, scratch = whole(STEADY), tmp_path / "scratch"
-    go(until=10, scratch=scratch).path.rename(tmp_path / "earlier")
-    go(until=5, scratch=scratch)
-    assert go(name="earlier", scratch=scratch).model_path.read_bytes() == wanted
-
-
-def test_what_a_killed_training_left_is_removed(go: Train, tmp_path: Path) -> None:
-    run = go(until=10)
-    (named,) = files_of(run)
-    owner, theirs = owner_of(run), run.scratch_path / ("0" * 12 + "-00000000.chunks")
-    left = run.scratch_path / f"{owner}-ffffffff.chunks"
-    for path in (left, theirs):
-        path.write_bytes(b"x")
-    run = go(until=14)
-    assert set(files_of(run)) == {named, theirs}
-    assert set(owned_files(run.path)) >= {named, theirs}
-    Run.create(run.path, STEADY, overwrite=True)
-    assert not files_of(run)
-
-
-def test_a_checkpoint_that_names_another_file(go: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A hostile one must not have any file written that it names."""
-    precious = tmp_path / "precious"
-    real = Manifest.state
-
-    def state(manifest: Manifest) -> dict[str, Any]:
-        return real(replace(manifest, path=precious))
-
-    monkeypatch.setattr(Manifest, "state", state)
-    (path,) = files_of(go(until=10))
-    path.rename(precious)
-    before = precious.read_bytes()
-    with (
-        pytest.warns(UserWarning, match="precious, expected a scratch file"),
-        pytest.raises(InputError, match="no intact checkpoint"),
-    ):
-        go()
-    assert precious.read_bytes() == before
-
-
-def test_a_network_disk_is_told_once(go: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    table = tmp_path / "mounts"
-    table.write_text(f"disk / ext4 rw 0 0\nserver:/a {str(tmp_path).replace(' ', chr(92) + '040')} nfs4 rw 0 0\n")
-    monkeypatch.setattr(mounts, "MOUNTS", table)
-    with pytest.warns(UserWarning, match=r"is on a network disk \(nfs4\)") as caught:
-        go(DENSE)
-    told = [str(each.message) for each in caught if "network disk" in str(each.message)]
-    assert len([text for text in told if "--scratch DIR" in text]) == 1
-
-
-@pytest.mark.slow
-def test_two_trainings_in_one_folder(
-    folder: Path, go: Train, whole: Callable[[TrainConfig], bytes], tmp_path: Path
-) -> None:
-    """At once, one of them killed and resumed: each has files of its own."""
-    wanted = whole(SPARE)
-    processes = [start_training(folder, Run.create(tmp_path / name, SPARE).path) for name in ("one", "two")]
-    for process in processes:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
-    for process in processes:
-        print(file=process.stdin, flush=True)
-    while not list((tmp_path / "one" / "checkpoints").glob("step-*.npz")) and processes[0].poll() is None:
-        pass
-    processes[0].kill()
-    for process in processes:
-        process.communicate()
-    assert processes[1].returncode == 0
-    again = start_training(folder, tmp_path / "one")
-    again.communicate("\n")
-    assert again.returncode == 0
-    for name in ("one", "two"):
-        assert (tmp_path / name / "model.ply").read_bytes() == wanted

@@ -85,8 +85,8 @@ class Component:
         """Return the parameters with all postponed changes, but leave the arrays unchanged."""
         return parameters
 
-    def rows_changed(self) -> None:
-        """Forget data that depends on Gaussians' values. Called if density control or a repair has changed values."""
+    def rows_changed(self, groups: set[str]) -> None:
+        """Forget data that depends on parameter groups whose values density control or a repair has changed."""
 
     def rows_moved(self, listed: DeviceArray | HostArray) -> None:
         """Move data of individual Gaussians along with their rows, or forget it.

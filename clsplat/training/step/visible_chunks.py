@@ -354,9 +354,10 @@ class VisibleChunks(Component):
         self._note_movement(missed.numbers, hidden(missed.numbers))
         self._last[missed.numbers] = missed.step
 
-    def rows_changed(self) -> None:
-        """Measure all bounds again."""
-        self._begin(self._count, self.step)
+    def rows_changed(self, groups: set[str]) -> None:
+        """Measure all bounds again if means or scales have changed."""
+        if not groups.isdisjoint(_BOUNDED_GROUPS):
+            self._begin(self._count, self.step)
 
     def rows_moved(self, listed: DeviceArray | HostArray) -> None:
         """Measure all bounds again."""
