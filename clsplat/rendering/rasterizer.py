@@ -146,7 +146,8 @@ class Rasterizer:
         self.capacity = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS_PER_BAND)
 
     def antialias(self, *, on: bool) -> None:
-        """Use the kernels for antialiased models (`Gaussians.antialiased`) if `on`, otherwise those for the others."""
+        """Use the kernels for antialiased models (`Gaussians.antialiased`) if `on`, otherwise those for models that are
+        not."""
         if on == self._antialiased:
             return
         defines = kernel_defines(self.config, antialiased=on)

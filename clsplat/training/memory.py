@@ -42,8 +42,8 @@ POOL_QUARTERS = 3
 get the rest."""
 
 MOST_VIEWS_LOOKED_AT = 200
-"""Most views of which the chunks in view are found before the first step. For one of 20 million Gaussians it takes some
-7 ms; a step whose view shows more than these is planned for when it comes."""
+"""Maximum number of views whose chunks in view are counted before the first step. With 20 million Gaussians a view
+takes about 7 ms. If a later view shows more chunks than all of these, memory is planned again before its step."""
 
 
 def model_bytes(config: TrainConfig) -> int:
@@ -79,7 +79,7 @@ class HostMemory:
         run: Run | None,
         scratch: str | Path | None = None,
     ) -> HostMemory:
-        """Make it from the arguments of `clsplat.train`. Raises InputError.
+        """Make the memory that these arguments of `clsplat.train` ask for. Raises InputError.
 
         cache: a folder, or "none". None takes RUN/cache if there is a limit, otherwise no cache.
         scratch: a folder. None takes RUN/scratch.
@@ -224,8 +224,8 @@ class MemoryPlanner:
         self.begins, self._warned, self.rows_in_view = True, False, 0
 
     def look(self, local: Callable[[Camera], Camera], initial: Gaussians) -> None:
-        """Find the most rows that a view of a model shows, by an even sample of the views, if a limit may have it
-        streamed by chunk.
+        """Set `rows_in_view` from an even sample of the training views. It stays 0 if the model cannot be streamed by
+        chunk.
 
         local: function that gives a camera in the coordinates of the model.
         initial: the model at the start, in the order of its chunks.
@@ -271,8 +271,11 @@ class MemoryPlanner:
         return made
 
     def plan_view(self, made: Plan, chunks: int) -> Plan:
-        """The plan for views of up to so many chunks, if they are more than any view has shown; else `made`, by which
-        the model is streamed by chunk. Raises CapacityError, and then `made` holds."""
+        """Return a new plan for a view of `chunks` chunks if it has more rows than `made.rows` and than any earlier view;
+        otherwise `made`.
+
+        made: the current plan, of a model that is streamed by chunk. It stays valid if this raises CapacityError.
+        """
         rows = CHUNK_ROWS * chunks
         if rows <= max(self.rows_in_view, made.rows):
             return made

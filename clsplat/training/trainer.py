@@ -295,7 +295,8 @@ class Trainer:
             component.after_adam(self.parameters)
 
     def _watched(self, needs: StatisticsNeeds, inputs: ViewInputs, step: GradientStep, number: int) -> StepMonitor:
-        """Return the observer of a view's step. number: of views that training has used so far, this one included."""
+        """Return the probe of a view's step. number: number of views that training has used so far, this one
+        included."""
         return StepMonitor(
             step, number, inputs, needs, self.statistics.on_device, self.monitor, self.pending, self.tried, self._unmark
         )
@@ -304,7 +305,8 @@ class Trainer:
         self.mark = None
 
     def _watched_in_batch(self, needs: StatisticsNeeds, inputs: ViewInputs, step: GradientStep) -> StepProbe:
-        """Return the observer of a batch's view. If the view begins an epoch, begin it; so call in the views' order."""
+        """Return the probe of a view of a batch, and begin an epoch if the view is its first. Call it in the order of
+        the views."""
         if inputs.begins:
             self._turn_epoch()
         return self._watched(needs, inputs, step, self.step)

@@ -122,7 +122,8 @@ class SpeculativeSteps:
         return wanted if wanted <= rasterizer.capacity else 0
 
     def launch(self, run: Run, room: int, *, number: int, reads_loss: bool) -> Loss:
-        """Run a step with capacity `room`, or with an exact count if that is 0. Then check the step before.
+        """Run a step with capacity `room`, or with an exact count if `room` is 0. Then check if the previous step had
+        enough capacity.
 
         number: number of the step's last view.
         reads_loss: True to check this step too, because its loss will be read.
@@ -147,7 +148,7 @@ class SpeculativeSteps:
         return step.result if reads_loss else result.copied(lambda: self._sums(step))
 
     def _sums(self, step: _Step) -> NDArray[Any]:
-        """Sums of a step's loss. The step is checked before, and repeated if it is incomplete."""
+        """Return the sums of a step's loss, after checking the step and repeating it if it is incomplete."""
         self.settle()
         copy = step.result.copy
         return copy() if copy is not None else step.result.sums.get()
