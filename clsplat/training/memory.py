@@ -271,8 +271,8 @@ class MemoryPlanner:
         return made
 
     def plan_view(self, made: Plan, chunks: int) -> Plan:
-        """Return a new plan for a view of `chunks` chunks if it has more rows than `made.rows` and than any earlier view;
-        otherwise `made`.
+        """Return a new plan for a view of `chunks` chunks, if these have more rows than `made.rows` and than any
+        earlier view showed; otherwise `made`.
 
         made: the current plan, of a model that is streamed by chunk. It stays valid if this raises CapacityError.
         """
