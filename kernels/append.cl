@@ -155,7 +155,7 @@ GROUP __kernel void count_tiles(const uint n, const int tiles_x, const int tiles
 // of their lists' lengths, longest first, because these take longest to sort.
 //
 // readback gets the entries that compact_visible in duplicate.cl writes, with keys of 0, and in addition the length of
-// the longest list. Under the conditions of compact_visible, a pass stops, and then it has empty lists.
+// the longest list. A pass stops under the conditions that compact_visible names; a stopped pass has empty lists.
 GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint capacity, __global uint *counts,
                                  __global uint *sums, __global uint *ranges, __global uint *order,
                                  __global uint *readback) {

@@ -9,7 +9,7 @@
 //   FEATURE_NORMAL on are normalised); then median depth and first depth, in world units. whole (2, height, width): the
 //   number of Gaussians, and the index of the Gaussian with the largest weight (the first of equals), or -1. All other
 //   values are 0 in padding and in pixels without Gaussians. With HOLDOUT, weights are multiplied by the fraction of
-//   light that passes the surfaces of shared/held.h; Gaussians that are fully hidden do not count.
+//   light that passes the surfaces of shared/held.h; fully hidden Gaussians are left out.
 // Equations: docs/channels.md, (60) to (67); with HOLDOUT docs/pictures.md, (75); with RAYS docs/cameras.md, (14).
 #include "shared/math.h"
 #include "shared/lanes.h"

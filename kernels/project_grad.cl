@@ -11,11 +11,11 @@
 //   contributions (n): each Gaussian's blending weights, summed over all pixels. With LENS by_lens (n, 4): each
 //   Gaussian's gradient with respect to the logs of the focal lengths and, per pixel, to the principal point.
 //   project_grad writes gradients in the parameters' shapes, but no rows of invisible Gaussians. project_step, with
-//   ADAM, updates parameters and moments `first` and `second`; `readback` (READBACK_SIZE); the scalars are those of
-//   Step, one per parameter group where they differ. Invisible Gaussians count with zero gradients, but do not change
-//   with VISIBLE. With SPARSE, elements with a zero gradient do not change. After a stopped pass (duplicate.cl) nothing
-//   changes. PENALTIES adds the gradient of opacity_weight o + scale_weight (s_0 + s_1 + s_2). CHUNKS of project_step:
-//   see shared/chunks.h.
+//   ADAM, updates parameters and moments `first` and `second`; `readback` (READBACK_SIZE) counts refusals; the scalars
+//   are those of Step, one per parameter group where they differ. Invisible Gaussians are updated with gradients of
+//   zero; with VISIBLE they do not change. With SPARSE, elements with a zero gradient do not change. After a stopped
+//   pass (duplicate.cl) nothing changes. PENALTIES adds the gradient of opacity_weight o + scale_weight (s_0 + s_1 +
+//   s_2). CHUNKS of project_step: see shared/chunks.h.
 // Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91); (144) and
 //   (145). With RAYS docs/cameras.md, (22) to (29).
 #include "shared/math.h"

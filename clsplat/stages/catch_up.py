@@ -69,8 +69,7 @@ def catch_up(
     pass has stopped.
 
     model: parameters, first and second moments of the whole model.
-    last: (entries of chunks,) uint32, the last step in which each chunk was updated with gradients, because the view
-        showed it.
+    last: (entries of chunks,) uint32, the last step that updated each chunk with its gradients.
     caught: (chunks of the model,) uint32, the step up to which each chunk has caught up. The call writes `step` for
     these chunks, so that a second call for the same step changes nothing.
     table: must contain all missed steps.

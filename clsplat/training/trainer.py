@@ -304,7 +304,7 @@ class Trainer:
         self.mark = None
 
     def _watched_in_batch(self, needs: StatisticsNeeds, inputs: ViewInputs, step: GradientStep) -> StepProbe:
-        """Return the probe of a batch's view. Call it in the order of the views: the first of an epoch begins the epoch."""
+        """Return the probe of a batch's view. Call it in the order of views: the first of an epoch begins the epoch."""
         if inputs.begins:
             self._turn_epoch()
         return self._watched(needs, inputs, step, self.step)
