@@ -4,10 +4,12 @@
 //
 // Owner: A work-item owns a column of TILE rows.
 // Launch: A grid of stride x rows / TILE work-items.
-// Buffers: stops (rows, stride) of blend.cl, which is negative in padding and, after target.cl, in masked pixels;
-//     transmittance, alpha (rows, stride); scale: the weight divided by the number of pixels that no mask excludes
+// Buffers: stops (rows, stride) of blend.cl, negative in padding and, after target.cl, in masked pixels.
+//   transmittance, alpha (rows, stride).
+//   scale: the weight divided by the number of pixels that no mask excludes.
 //   -> gradient (rows, stride) with respect to the transmittance, 0 where `stops` is negative; sums (rows / TILE,
-//     stride) of |A - alpha|. alpha and gradient are the fourth planes of their buffers, after the colours.
+//     stride) of |A - alpha|.
+//   alpha and gradient are the fourth planes of their buffers, after the colours.
 // Equations: docs/gradients.md, (81).
 #include "shared/math.h"
 

@@ -8,7 +8,8 @@
 // Buffers: logs, start, first, second, moved, gains (photographs, entries): the first three entries are base-2 logs of
 //     gains, the rest are colour mixes (ppisp.cl).
 //   begins (photographs + 1), others, weights: a sparse matrix in CSR form, which pulls gains towards `start`.
-//   partials (sums, tiles_y, stride); columns (sums, stride): the gradient's sums; the photograph's begin at row `at`.
+//   partials (sums, tiles_y, stride), columns (sums, stride): partial sums of the gradient. In `columns` the
+//     photograph's entries begin at row `at`.
 // Equations: docs/gradients.md, "Appearance".
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -7,9 +7,10 @@
 //   groups. In sort_lists a group owns a tile.
 // Launch: count_tiles and append_pairs: one work-item for each Gaussian, in groups of ITEMS; list_offsets: two groups;
 //   sort_lists: one group for each tile.
-// Buffers: splats (n, SPLAT_SIZE) in pixels, depth in world units; tile_counts (n) -> slots (n): each Gaussian's first
-//   slot; ranges (tiles, 2): a list's begin and end; gaussian_from_sorted, slot_from_sorted (pairs): the lists. The
-//   other shapes are above each kernel.
+// Buffers: splats (n, SPLAT_SIZE): in pixels, depth in world units. tile_counts (n).
+//   -> slots (n): each Gaussian's first slot; ranges (tiles, 2): a list's begin and end; gaussian_from_sorted,
+//     slot_from_sorted (pairs): the lists.
+//   The other shapes are above each kernel.
 // Equations: docs/gradients.md, (47), through shared/tile.h; Batcher's bitonic network.
 #include "shared/math.h"
 #include "shared/group.h"

@@ -5,10 +5,10 @@
 //   needs no atomics.
 // Launch: As in blend.cl, one group of ITEMS work-items for each tile from first_tile on. An item owns pixels; with
 //   BY_GAUSSIAN it owns one Gaussian after another.
-// Buffers: blend.cl's inputs; blend.cl's outputs transmittance and stops; image_gradient (3, height, width): the loss's
-//   gradient with respect to colour; with ALPHA_GRADIENT a fourth plane, with respect to the final transmittance; with
-//   NEARNESS a last plane, with respect to nearness; slot_from_sorted (pairs) -> slots (pairs, SLOT_STRIDE): sums over
-//   the tile's pixels, in the whitened units of (49); every slot is written.
+// Buffers: blend.cl's inputs; blend.cl's outputs transmittance and stops; slot_from_sorted (pairs).
+//   image_gradient (3, height, width): the loss's gradient with respect to colour. ALPHA_GRADIENT adds a fourth plane,
+//     with respect to the final transmittance. NEARNESS adds a last plane, with respect to nearness.
+//   -> slots (pairs, SLOT_STRIDE): sums over the tile's pixels, in the whitened units of (49); every slot is written.
 // Equations: docs/gradients.md, (14), (22) to (26), (48), (49), (55) and (122); with RAYS docs/cameras.md, (21).
 //
 // Each pixel visits its Gaussians from the last to the first, and recovers the transmittance by division. `behind` is

@@ -4,13 +4,15 @@
 // Owner: If LANES > 1, a group owns ROWS rows of a chunk. Otherwise a group owns ITEMS vectors of one array of a chunk.
 // Launch: If LANES > 1, groups of one item, CHUNK_ROWS / ROWS for each entry of `chunks`. Otherwise groups of ITEMS
 //   items; for each entry of `chunks`, PIECES groups for each float of a row.
-// Buffers: chunks (entries): numbers of chunks, or NO_CHUNK. last (entries): the last step that updated the chunk with
-//   its gradients. caught (chunks of the model): the step up to which each chunk has been caught up. table (steps,
-//   TABLE_NUMBERS), a row for each step from `first_step` on: the field `root` of Step, first for all groups but
-//   sh_rest, then for sh_rest (0 if the step does not update sh_rest); then the rates of the six parameter groups.
-//   Parameters and both moments (model_rows rows): updated up to step `step`. readback (READBACK_SIZE): counts
-//   refusals. After a stopped pass (duplicate.cl) nothing changes. The other scalars are fields of Step
-//   (shared/adam.h).
+// Buffers: chunks (entries): numbers of chunks, or NO_CHUNK.
+//   last (entries): the last step that updated the chunk with its gradients.
+//   caught (chunks of the model): the step up to which each chunk has been caught up.
+//   table (steps, TABLE_NUMBERS), a row for each step from `first_step` on: the field `root` of Step, first for all
+//     groups but sh_rest, then for sh_rest (0 if the step does not update sh_rest); then the rates of the six parameter
+//     groups.
+//   Parameters and both moments (model_rows rows): updated up to step `step`.
+//   readback (READBACK_SIZE): counts refusals. After a stopped pass (duplicate.cl) nothing changes.
+//   The other scalars are fields of Step (shared/adam.h).
 // Equations: docs/gradients.md, (42); (193) tells when a parameter no longer changes, so that further steps only
 //   multiply its moments.
 #include "shared/math.h"

@@ -2,8 +2,9 @@
 //
 // Owner: A work-item owns a Gaussian; in gather_rows, an output row.
 // Launch: One work-item for each Gaussian or row, in groups of 64; work-items past the end do nothing.
-// Buffers: tile_counts (n): 0 if not visible; screen (n, 2): gradient with respect to the mean's image position, per
-//   pixel; splats (n, SPLAT_SIZE) in pixels. Statistics (n) are updated in place. Other shapes are above each kernel.
+// Buffers: tile_counts (n): 0 if not visible. splats (n, SPLAT_SIZE): in pixels.
+//   screen (n, 2): gradient with respect to the mean's image position, per pixel.
+//   Statistics (n) are updated in place. Other shapes are above each kernel.
 //   density_statistics and contribution_statistics can run over listed chunks only (CHUNKS, as in chunks.h).
 // Equations: docs/gradients.md, (43) and (55); Kerbl et al. 2023, section 5.
 #include "shared/math.h"
