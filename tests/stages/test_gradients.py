@@ -29,8 +29,8 @@ STEP = 1e-8
 """Next to the near plane a step of 1e-6 moves a Gaussian by a hundredth of a pixel, and some across the band. The loss,
 of a size of 100, is rounded to 1e-14, a slope so to 1e-6 of gradients of a size of 1 to 1000."""
 SLOPE_TOLERANCE = 1e-4
-"""Error allowed of a kernel's gradient along a random direction, relative to the gradient's norm, as in the tests of the
-twins. A random direction sees this norm times a normal number."""
+"""Error allowed of a kernel's gradient along a random direction, as in the tests of the twins. It is relative to the
+gradient's norm: a random direction sees this norm times a normal number."""
 GRADIENT_TOLERANCE = 1e-4
 """Error allowed of a parameter group's gradient, relative to the twin's (`assert_close_gradients`)."""
 GAUSSIAN_TOLERANCE = 1e-3
