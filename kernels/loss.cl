@@ -2,10 +2,10 @@
 // with zeros outside the image. The window is separable: it is applied vertically, into local memory, then
 // horizontally. A second pair of passes, the adjoint of the first pair, convolves SSIM's three partial derivatives.
 //
-// Owner: A group owns blocks of one channel. With ITEMS == 1 it processes a block from the top, ROWS rows at a time,
-//   and keeps the derivatives of LOSS_RING rows; it recomputes rows shared with other blocks. Otherwise a block is ROWS
-//   x COLUMNS pixels in PARTS parts, and an item has one or several parts. A first launch (loss_ssim) writes the
-//   derivatives of the whole image, and a second one (loss_grad) reads them.
+// Owner: A group owns blocks of one channel. With ITEMS == 1 a group processes a block from the top, ROWS rows at a
+//   time, and keeps the derivatives of LOSS_RING rows. Rows shared with other blocks are computed again. Otherwise a
+//   block is ROWS x COLUMNS pixels in PARTS parts, and an item has one or several parts. A first launch (loss_ssim)
+//   writes the derivatives of the whole image, and a second one (loss_grad) reads them.
 // Launch: With ITEMS == 1 any number of groups, which share the blocks. Otherwise a grid of groups of at most PARTS
 //   items: blocks across x blocks down x channels. Blocks are numbered in this order.
 // Buffers: image, target (3, rows, stride): colour, padded to whole tiles with zeros. With PHOTOGRAPH the target is

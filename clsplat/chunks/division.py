@@ -84,7 +84,8 @@ def divided(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> Division:
 
 
 def _changes(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return, by old chunk, the number of new rows that come from it, and True if they are not just its own rows."""
+    """Return two arrays by old chunk: the number of new rows whose source is in the chunk, and True if these rows are
+    not exactly the chunk's old rows."""
     lengths = np.diff(starts)
     counts, stay, before = np.zeros_like(lengths), np.zeros_like(lengths), -1
     for begin in range(0, len(entries), _COUNTED_ROWS):

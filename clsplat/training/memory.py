@@ -81,8 +81,9 @@ class HostMemory:
     ) -> HostMemory:
         """Make the memory that these arguments of `clsplat.train` ask for. Raises InputError.
 
-        cache: a folder, or "none". None takes RUN/cache if there is a limit, otherwise no cache.
-        scratch: a folder. None takes RUN/scratch.
+        cache: a folder, or "none" for no cache. If it is None, the cache is RUN/cache with a limit, and there is no
+            cache without one.
+        scratch: a folder; None stands for RUN/scratch.
         """
         limit = parse_bytes(max_host_mem, "--max-host-mem")
         memory = cls._with_cache(limit, cache, run)

@@ -29,7 +29,8 @@ BY_CAPACITY_VARIABLE = "CLSPLAT_BY_CAPACITY"
 _STOPPED, _PAIRS, _LONGEST = (READBACK.index(name) for name in ("STOPPED", "PAIRS", "LONGEST"))
 
 Run = Callable[[int, PairCapacity | None], Loss]
-"""Function that runs one step. It takes the number of the array for the loss's sums, and a capacity or None."""
+"""Function that runs one step. Its arguments are the number of the array for the loss's sums, and a capacity or
+None."""
 
 
 @dataclass(eq=False)

@@ -147,7 +147,7 @@ class VisibleChunks(Component):
             self._begin(self._count, self.step, chunks)
 
     def _begin_table(self, step: int, chunks: int) -> None:
-        """Begin an empty table of steps, after a step number `step` that all `chunks` chunks have taken."""
+        """Begin an empty table of steps. All `chunks` chunks have taken step number `step`."""
         self.step, self._first_step = step, step + 1
         self._last = np.full(chunks, step, np.uint32)
 
