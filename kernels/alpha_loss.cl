@@ -1,12 +1,15 @@
 // The alpha loss and its gradient with respect to the render's transmittance T. The loss is a weight times the mean of
-// |A - alpha| over the pixels that count, where A = 1 - T is the render's alpha and `alpha` is the photograph's.
+// |A - alpha| over the pixels that no mask excludes, where A = 1 - T is the render's alpha and `alpha` the
+// photograph's.
 //
 // Owner: A work-item owns a column of TILE rows.
 // Launch: A grid of stride x rows / TILE work-items.
-// Buffers: stops (rows, stride), negative where a pixel does not count; transmittance, alpha (rows, stride); scale: the
-//   weight divided by the number of pixels that count -> gradient (rows, stride) with respect to the transmittance, 0
-//   in pixels that do not count; sums (rows / TILE, stride) of |A - alpha|. alpha and gradient are the fourth planes of
-//   their buffers, after the colours.
+// Buffers: stops (rows, stride) of blend.cl, negative in padding and, after target.cl, in masked pixels.
+//   transmittance, alpha (rows, stride).
+//   scale: the weight divided by the number of pixels that no mask excludes.
+//   -> gradient (rows, stride) with respect to the transmittance, 0 where `stops` is negative; sums (rows / TILE,
+//     stride) of |A - alpha|.
+//   alpha and gradient are the fourth planes of their buffers, after the colours.
 // Equations: docs/gradients.md, (81).
 #include "shared/math.h"
 

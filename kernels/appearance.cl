@@ -6,9 +6,10 @@
 // Launch: A grid of stride x sums work-items (column_sums); one work-item for each of the `count` entries (move_gains,
 //   centre_gains).
 // Buffers: logs, start, first, second, moved, gains (photographs, entries): the first three entries are base-2 logs of
-//   gains, the rest are colour mixes (ppisp.cl). begins (photographs + 1), others, weights: a sparse matrix in CSR
-//   form, which pulls gains towards `start`. partials (sums, tiles_y, stride); columns (sums, stride), where the
-//   photograph's entries begin at row `at`. Shapes are above each kernel.
+//     gains, the rest are colour mixes (ppisp.cl).
+//   begins (photographs + 1), others, weights: a sparse matrix in CSR form, which pulls gains towards `start`.
+//   partials (sums, tiles_y, stride), columns (sums, stride): partial sums of the gradient. In `columns` the
+//     photograph's entries begin at row `at`.
 // Equations: docs/gradients.md, "Appearance".
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -42,7 +43,7 @@ __kernel void move_gains(const int count, const int entries, const int photograp
   if (c < 3) g *= LN2;
   const int begin = begins[photograph], end = begins[photograph + 1];
   if (i / entries == photograph && end > begin) {
-    // `apart` sums the offsets from `start` of the `told` pulled photographs.
+    // apart: the sum over all pulled photographs of logs - start; told: the number of these photographs.
     float told = 0.0f, apart = 0.0f, pull = 0.0f;
     for (int k = 0; entries * k < count; ++k)
       if (begins[k + 1] > begins[k]) told += 1.0f, apart = added(apart, logs[entries * k + c] - start[entries * k + c]);
@@ -58,8 +59,8 @@ __kernel void move_gains(const int count, const int entries, const int photograp
   moved[i] = logs[i] - (c < 3 ? rate : slow * rate) * m / fma1(sqrt(v), root, epsilon);
 }
 
-// Centres and limits the entries: moved -> logs, where with `centred` each entry has mean 0 over the photographs;
-// gains: 2^logs.
+// Subtracts each entry's mean over the photographs, if `centred`, and then limits the entries: moved -> logs; gains:
+// 2^logs.
 __kernel void centre_gains(const int count, const int entries, const int centred, __global const uint *readback,
                            __global const float *moved, __global float *logs, __global float *gains) {
   const int i = get_global_id(0), c = i % entries;

@@ -7,9 +7,10 @@
 //   groups. In sort_lists a group owns a tile.
 // Launch: count_tiles and append_pairs: one work-item for each Gaussian, in groups of ITEMS; list_offsets: two groups;
 //   sort_lists: one group for each tile.
-// Buffers: splats (n, SPLAT_SIZE) in pixels, depth in world units; tile_counts (n) -> slots (n): each Gaussian's first
-//   slot; ranges (tiles, 2): a list's begin and end; gaussian_from_sorted, slot_from_sorted (pairs): the lists. The
-//   other shapes are above each kernel.
+// Buffers: splats (n, SPLAT_SIZE): in pixels, depth in world units. tile_counts (n).
+//   -> slots (n): each Gaussian's first slot; ranges (tiles, 2): a list's begin and end; gaussian_from_sorted,
+//     slot_from_sorted (pairs): the lists.
+//   The other shapes are above each kernel.
 // Equations: docs/gradients.md, (47), through shared/tile.h; Batcher's bitonic network.
 #include "shared/math.h"
 #include "shared/group.h"
@@ -155,7 +156,7 @@ GROUP __kernel void count_tiles(const uint n, const int tiles_x, const int tiles
 // of their lists' lengths, longest first, because these take longest to sort.
 //
 // readback gets the entries that compact_visible in duplicate.cl writes, with keys of 0, and in addition the length of
-// the longest list. Under the conditions of compact_visible, a pass stops, and then it has empty lists.
+// the longest list. A pass stops under the conditions that compact_visible names; a stopped pass has empty lists.
 GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint capacity, __global uint *counts,
                                  __global uint *sums, __global uint *ranges, __global uint *order,
                                  __global uint *readback) {

@@ -7,12 +7,14 @@
 //   and GPU give the same bits.
 // Launch: One group of ITEMS work-items for each tile of a band or of the whole image, in row-major order from
 //   first_tile on.
-// Buffers: ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE) in pixels, background (3), with RAYS
-//   camera -> image (3, height, width): colour; transmittance (height, width): after all Gaussians, 0 to 1; stops
-//   (height, width): the sorted index of the first pair that is not added to the pixel, -1 in padding; with NEARNESS
-//   nearness (height, width): the sum of weight / depth, 0 in padding; with RECORD_CELLS cells_from_sorted (pairs):
-//   bits of the cells to which the Gaussian contributes, for the backward pass. Planes are padded with black to whole
-//   tiles.
+// Buffers: ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE) in pixels, background (3); with RAYS
+//     camera.
+//   -> image (3, height, width): colour. transmittance (height, width): after all Gaussians, 0 to 1.
+//   stops (height, width): the sorted index of the first pair that is not added to the pixel; -1 in padding.
+//   nearness (height, width), with NEARNESS: the sum of weight / depth; 0 in padding.
+//   cells_from_sorted (pairs), with RECORD_CELLS: bits of the cells to which the Gaussian contributes, for
+//     blend_grad.cl.
+//   Planes are padded with black to whole tiles.
 // Equations: docs/gradients.md, (14) to (16), (45) and (120); with RAYS docs/cameras.md, (14); Kerbl et al. 2023,
 //   section 6 and algorithm 2.
 #include "shared/widened.h"

@@ -5,10 +5,10 @@
 //   needs no atomics.
 // Launch: As in blend.cl, one group of ITEMS work-items for each tile from first_tile on. An item owns pixels; with
 //   BY_GAUSSIAN it owns one Gaussian after another.
-// Buffers: blend.cl's inputs, and its outputs transmittance and stops; image_gradient (3, height, width): the loss's
-//   gradient with respect to colour; with ALPHA_GRADIENT a fourth plane, with respect to the final transmittance; with
-//   NEARNESS a last plane, with respect to nearness; slot_from_sorted (pairs) -> slots (pairs, SLOT_STRIDE): sums over
-//   the tile's pixels, in the whitened units of (49); every slot is written.
+// Buffers: blend.cl's inputs; blend.cl's outputs transmittance and stops; slot_from_sorted (pairs).
+//   image_gradient (3, height, width): the loss's gradient with respect to colour. ALPHA_GRADIENT adds a fourth plane,
+//     with respect to the final transmittance. NEARNESS adds a last plane, with respect to nearness.
+//   -> slots (pairs, SLOT_STRIDE): sums over the tile's pixels, in the whitened units of (49); every slot is written.
 // Equations: docs/gradients.md, (14), (22) to (26), (48), (49), (55) and (122); with RAYS docs/cameras.md, (21).
 //
 // Each pixel visits its Gaussians from the last to the first, and recovers the transmittance by division. `behind` is
@@ -61,8 +61,8 @@ typedef struct {
 
 #include "shared/behind.h"
 
-// Removes a pair from a cell's pixels, and returns its g and weight there. `uncapped` is the pair's alpha before the
-// cap, 0 in lanes whose pixel did not take the pair.
+// Removes a pair from a cell's pixels, and returns its g and weight there. uncapped: the pair's alpha before the cap, 0
+// in lanes to whose pixel the pair was not added.
 static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red, float c_green,
                              float c_blue NEAR_PARAMETER) {
 #if ITEMS == 1
@@ -149,8 +149,8 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
 #include "shared/strips.h"
 #endif
 
-// ALPHA_IN defines u, v, the log2 of the alpha (`power`) and the lanes that took the tile's i-th pair (`taken`), in a
-// cell's pixels.
+// ALPHA_IN defines for a cell's pixels: u and v; power, the log2 of the alpha; and taken, the lanes to which the tile's
+// i-th pair was added.
 #ifdef RAYS
 #define WHITENING_HERE                                                                                                 \
   float whitening[3];                                                                                                  \
@@ -452,7 +452,7 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
 #if TEAM_WARPS == 1
           float sums[SLOT_STRIDE];
           BEGIN_SUMS(sums)
-          // `taken` is not tested here, nor in cell 0 below: alpha is 0 in pixels that do not take the pair.
+          // `taken` is not tested here, nor in cell 0 below: alpha is 0 in pixels to which the pair was not added.
           if (IS_WHOLE(reach)) {
             FOR_STRIP(c) ADD_PIXEL(k * BLOCK_COLUMNS + c, 1);
           } else {

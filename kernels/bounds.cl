@@ -3,9 +3,11 @@
 // Owner: A group owns a chunk. Each item reads every ITEMS-th row of it; the first BOUNDS items then combine the
 //   results of all items.
 // Launch: Groups of ITEMS items, one for each entry of `chunks`.
-// Buffers: `chunks` (entries): numbers of chunks; means, log_scales (model_rows, 3) -> bounds (entries, BOUNDS): least
-//   and greatest coordinates of the means, and the greatest log scale. NaN is ignored, because a Gaussian with NaN is
-//   never drawn. A chunk without any other value has an empty box, from INFINITY to -INFINITY.
+// Buffers: chunks (entries): numbers of chunks.
+//   means, log_scales (model_rows, 3).
+//   -> bounds (entries, BOUNDS): least and greatest coordinates of the means, and the greatest log scale. NaN is
+//     ignored, because a Gaussian with NaN is never drawn. A chunk with only NaN has an empty box, from INFINITY to
+//     -INFINITY.
 // Equations: none.
 #include "shared/math.h"
 

@@ -1,16 +1,20 @@
-// Catches up chunks of a model that no view of the last steps showed: it takes the steps of Adam that they missed, in
-// which all gradients are zero. The result has the same bits as if each step had updated all rows.
+// Catches up chunks of a model that the views of the last steps did not show: takes the steps of Adam that these chunks
+// missed, with gradients of zero. The result has the same bits as if each step had updated all rows.
 //
 // Owner: If LANES > 1, a group owns ROWS rows of a chunk. Otherwise a group owns ITEMS vectors of one array of a chunk.
 // Launch: If LANES > 1, groups of one item, CHUNK_ROWS / ROWS for each entry of `chunks`. Otherwise groups of ITEMS
 //   items; for each entry of `chunks`, PIECES groups for each float of a row.
-// Buffers: chunks (entries): numbers of chunks, or NO_CHUNK; last (entries): the last step that each of them took with
-//   its gradients; caught (chunks of the model): the step up to which each has been caught up; table (steps,
-//   TABLE_NUMBERS): numbers of each step from `first_step` on: Step's root for all groups but sh_rest, Step's root for
-//   sh_rest (0 if the step does not update sh_rest), and the rates of the six parameter groups; parameters and both
-//   moments of the model's model_rows rows, updated up to step `step`; readback (READBACK_SIZE) counts refusals. The
-//   other scalars are fields of Step. After a stopped pass (duplicate.cl) nothing changes.
-// Equations: docs/gradients.md, (42), and (193) for the steps that only the moments take.
+// Buffers: chunks (entries): numbers of chunks, or NO_CHUNK.
+//   last (entries): the last step that updated the chunk with its gradients.
+//   caught (chunks of the model): the step up to which each chunk has been caught up.
+//   table (steps, TABLE_NUMBERS), a row for each step from `first_step` on: the field `root` of Step, first for all
+//     groups but sh_rest, then for sh_rest (0 if the step does not update sh_rest); then the rates of the six parameter
+//     groups.
+//   Parameters and both moments (model_rows rows): updated up to step `step`.
+//   readback (READBACK_SIZE): counts refusals. After a stopped pass (duplicate.cl) nothing changes.
+//   The other scalars are fields of Step (shared/adam.h).
+// Equations: docs/gradients.md, (42); (193) tells when a parameter no longer changes, so that further steps only
+//   multiply its moments.
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/adam.h"
@@ -56,7 +60,7 @@ RARE void catch_up_element(size_t i, uint from, Missed missed, Stepped model) {
   }
 }
 
-// Takes the missed steps of ABREAST elements from i on, with the bits of step_vector.
+// Takes the missed steps of ABREAST elements from i on. The result has the same bits as steps by step_vector.
 __attribute__((always_inline)) static inline void catch_up_vector(size_t i, Missed missed, Stepped model) {
   const Step s = missed.constants;
   const floatA beta1 = s.beta1, beta2 = s.beta2, none = 0.0f;

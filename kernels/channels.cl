@@ -4,12 +4,15 @@
 //
 // Owner: A group owns a tile, as in blend.cl; the transmittance has the same bits as in blend.cl.
 // Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
-// Buffers: blend's ranges, gaussian_from_sorted, splats and stops; features (n, FEATURES) of features.cl; with RAYS
-//   camera -> planes (PLANES, height, width): weighted means of the features, in their units (the three planes from
-//   FEATURE_NORMAL on are normalised); then median depth and first depth, in world units. whole (2, height, width): the
-//   number of Gaussians, and the index of the Gaussian with the largest weight (the first of equals), or -1. All other
-//   values are 0 in padding and in pixels without Gaussians. With HOLDOUT, weights are multiplied by the fraction of
-//   light that passes the surfaces of shared/held.h; Gaussians that are fully hidden do not count.
+// Buffers: blend's ranges, gaussian_from_sorted, splats and stops.
+//   features (n, FEATURES): of features.cl.
+//   camera: with RAYS.
+//   -> planes (PLANES, height, width): weighted means of the features, in their units (the three planes from
+//     FEATURE_NORMAL on are normalised); then median depth and first depth, in world units.
+//   whole (2, height, width): the number of Gaussians, and the index of the Gaussian with the largest weight (the first
+//     of equals), or -1 in padding and in pixels without Gaussians, where all other values are 0.
+//   With HOLDOUT, weights are multiplied by the fraction of light that passes the surfaces of shared/held.h, and fully
+//     hidden Gaussians are left out.
 // Equations: docs/channels.md, (60) to (67); with HOLDOUT docs/pictures.md, (75); with RAYS docs/cameras.md, (14).
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -2,9 +2,10 @@
 //
 // Owner: An item copies a vector of four words as integers, so that every bit of a NaN stays.
 // Launch: entries * block / 4 items.
-// Buffers: slots (entries): the pool's slot of each record; records (entries, record): a record of `record` words has
-//   all fields of a chunk, this field from word `offset` on; array (slots of the pool, block): the field in each slot,
-//   in `block` words for CHUNK_ROWS rows. With TO_RECORDS, array -> records; without it, records -> array.
+// Buffers: slots (entries): the pool's slot of each record.
+//   records (entries, record): `record` words with all fields of a chunk. The copied field begins at word `offset`.
+//   array (slots of the pool, block): the copied field in each slot, `block` words for CHUNK_ROWS rows.
+//   With TO_RECORDS, array -> records; without TO_RECORDS, records -> array.
 // Equations: none.
 __kernel void copy_chunks(const ulong vectors, const ulong record, const ulong offset, const ulong block,
                           __global const uint *slots, __global uint4 *records, __global uint4 *array) {

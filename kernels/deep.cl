@@ -3,9 +3,10 @@
 //
 // Owner: A group owns a tile, as in blend.cl; the transmittance has the same bits as in blend.cl.
 // Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
-// Buffers: share: 1 / (DEEP_LEVELS * bins); blend's ranges, gaussian_from_sorted, splats, transmittance and stops; with
-//   RAYS camera -> planes (bins, DEEP_SIZE, height, width): premultiplied colour, alpha, and the slice's depth in world
-//   units. All values are 0 after a pixel's last slice.
+// Buffers: share: 1 / (DEEP_LEVELS * bins).
+//   blend's ranges, gaussian_from_sorted, splats, transmittance and stops; with RAYS camera.
+//   -> planes (bins, DEEP_SIZE, height, width): premultiplied colour, alpha, and the slice's depth in world units. All
+//     values are 0 after a pixel's last slice.
 // Equations: docs/pictures.md, (70) to (74).
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -3,10 +3,12 @@
 //
 // Owner: A work-item owns a pixel.
 // Launch: One work-item for each pixel.
-// Buffers: share: 1 / (DEEP_LEVELS * bins); lists (pictures, bins, DEEP_SIZE, pixels), laid out like the planes of
-//   deep.cl; weights (pictures, pixels), whose sum over the pictures is 1 -> sources (pictures * bins, pixels): the
-//   picture of each slice, front to back; left (pictures * bins, pixels): the transmittance behind each of these
-//   slices; planes (bins, DEEP_SIZE, pixels), laid out like the planes of deep.cl.
+// Buffers: share: 1 / (DEEP_LEVELS * bins).
+//   lists (pictures, bins, DEEP_SIZE, pixels): laid out like the planes of deep.cl.
+//   weights (pictures, pixels): their sum over the pictures is 1.
+//   -> sources (pictures * bins, pixels): the picture of each slice, front to back.
+//   left (pictures * bins, pixels): the transmittance behind each of these slices.
+//   planes (bins, DEEP_SIZE, pixels): laid out like the planes of deep.cl.
 // Equations: docs/pictures.md, (73), (74) and (187).
 #include "shared/math.h"
 #include "shared/lanes.h"

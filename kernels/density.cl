@@ -2,8 +2,9 @@
 //
 // Owner: A work-item owns a Gaussian; in gather_rows, an output row.
 // Launch: One work-item for each Gaussian or row, in groups of 64; work-items past the end do nothing.
-// Buffers: tile_counts (n): 0 if not visible; screen (n, 2): gradient with respect to the mean's image position, per
-//   pixel; splats (n, SPLAT_SIZE) in pixels. Statistics (n) are updated in place. Other shapes are above each kernel.
+// Buffers: tile_counts (n): 0 if not visible. splats (n, SPLAT_SIZE): in pixels.
+//   screen (n, 2): gradient with respect to the mean's image position, per pixel.
+//   Statistics (n) are updated in place. Other shapes are above each kernel.
 //   density_statistics and contribution_statistics can run over listed chunks only (CHUNKS, as in chunks.h).
 // Equations: docs/gradients.md, (43) and (55); Kerbl et al. 2023, section 5.
 #include "shared/math.h"
@@ -50,9 +51,9 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
   radii[row] = radii[row] > radius ? radii[row] : radius;
 }
 
-// Adds a view to the statistics of contributions. contributions (n): those to this view, in pixels; area: number of
-// full-size pixels in a pixel of this view -> totals, largest (n): sum and maximum over the views. Contributions that
-// are not finite are ignored.
+// Adds a view to the statistics of contributions. contributions (n): the Gaussians' contributions to this view, in
+// pixels; area: number of full-size pixels in a pixel of this view -> totals, largest (n): sum and maximum over the
+// views. Contributions that are not finite are ignored.
 __kernel void contribution_statistics(const uint n, const float area, __global const uint *tile_counts,
                                       __global const float *contributions, __global float *totals,
                                       __global float *largest CHUNK_PARAMETERS) {
@@ -83,7 +84,8 @@ __kernel void density_scores(const uint n, const float gradient_edge, const floa
 
 // Marks the Gaussians that remain, that are cloned and that are split. Gaussian i is row first + i of the model.
 // scores, radii, logits (n); log_scales (n, 3); cut_off, cut_off_row: a Gaussian may be cloned or split if its score is
-// above `cut_off`, or equals it up to row cut_off_row -> marks (3, n), 0 or 1: remains, is cloned, is split.
+// above cut_off, or if its score equals cut_off and its row is at most cut_off_row -> marks (3, n), 0 or 1: remains, is
+// cloned, is split.
 __kernel void density_marks(const uint n, const uint first, const float cut_off, const uint cut_off_row,
                             const float large_edge, const float transparent_edge, const float oversized_edge,
                             const float oversized_half_edge, const float radius_edge, __global const float *scores,

@@ -3,10 +3,12 @@
 //
 // Owner: A work-item owns a column of TILE rows.
 // Launch: A grid of stride x rows / TILE work-items.
-// Buffers: stops (rows, stride), negative where a pixel does not count; nearness (rows, stride), in 1 / world units;
-//   aims (2, rows, stride): target nearness, and weight (0 where the target is unknown); factor: multiplies the
-//   gradient -> gradient: plane number `gradient_plane` (rows, stride), 0 where the target is unknown; sums (rows /
-//   TILE, stride) of weight * |N - aim|.
+// Buffers: stops (rows, stride) of blend.cl, negative in padding and, after target.cl, in masked pixels.
+//   nearness (rows, stride): in 1 / world units.
+//   aims (2, rows, stride): target nearness, and weight, which is 0 where the target is unknown.
+//   factor: multiplies the gradient.
+//   -> gradient: plane number `gradient_plane` (rows, stride), 0 where the target is unknown or `stops` is negative;
+//     sums (rows / TILE, stride) of weight * |N - aim|.
 // Equations: docs/gradients.md, (121).
 #include "shared/math.h"
 

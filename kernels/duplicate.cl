@@ -44,7 +44,8 @@ GROUP __kernel void visible_sums(const uint n, const uint chunk, __global const 
 // Lists the visible Gaussians with their depths as sort keys. shown, tile_counts (n), sums (2, groups) -> slots (n):
 // exclusive scan of the tile counts; gaussian_from_visible, depth_keys (visible). The first four entries of readback,
 // zero before, become the numbers of visible Gaussians and of pairs, the complement of the smallest key, and the
-// largest key. A key is the bits of a depth: those of positive floats sort like the floats. A group owns a chunk.
+// largest key. A key has the bits of a depth, because the bits of positive floats, as integers, have the order of the
+// floats. A group owns a chunk.
 //
 // With BY_CAPACITY, a pass stops if it has more than `capacity` pairs, or if Adam has refused an element in an earlier
 // step. All later passes stop too, until the host has reacted. A stopped pass has no visible Gaussians, and its step

@@ -2,10 +2,12 @@
 //
 // Owner: A work-item owns LANES Gaussians.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
-// Buffers: means (n, 3) in world units. quaternions (n, 4) w x y z, not normalised, and scales (n, 3) in world units;
-//   or with COVARIANCES the upper triangles (n, 6) xx, xy, xz, yy, yz, zz. camera (EWA_SIZE); with OPACITIES opacities
-//   (n), 0 to 1 -> radii (n, 2) in whole pixels, 0 where culled; means2d (n, 2) in pixels; depths (n) in world units;
-//   conics (n, 3) a, b, c in 1 / px^2; with COMPENSATED compensations (n), 0 to 1. Rows of culled Gaussians are zero.
+// Buffers: means (n, 3): in world units.
+//   quaternions (n, 4): w x y z, not normalised; scales (n, 3): in world units. With COVARIANCES, their place is taken
+//     by upper triangles (n, 6): xx, xy, xz, yy, yz, zz.
+//   camera (EWA_SIZE); with OPACITIES opacities (n): 0 to 1.
+//   -> radii (n, 2): in whole pixels, 0 where culled; means2d (n, 2): in pixels; depths (n): in world units; conics (n,
+//     3): a, b, c in 1 / px^2; with COMPENSATED compensations (n): 0 to 1. Rows of culled Gaussians are zero.
 // Equations: docs/gradients.md, (150) to (158), with (56) and (57); Zwicker et al. 2001 and 2004 for the model, Ye et
 //   al. 2025 (gsplat) for its conventions.
 #include "shared/math.h"

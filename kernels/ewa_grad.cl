@@ -3,12 +3,14 @@
 //
 // Owner: A work-item owns LANES Gaussians.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
-// Buffers: ewa.cl's inputs except opacities; radii (n, 2); d_means2d (n, 2), d_depths (n), d_conics (n, 3), where b
-//   counts as one variable; with COMPENSATED d_compensations (n) -> d_means (n, 3); d_quaternions (n, 4) and d_scales
-//   (n, 3), or d_covariances (n, 6), where an off-diagonal entry holds the sum for its two places in the matrix. With
-//   ADDED the gradients are added to the arrays. Culled rows become zero, or stay unchanged with ADDED. With BY_CAMERA
-//   by_camera (BY_CAMERA_SIZE, padded): each Gaussian's gradient with respect to the camera, zero from n on, in this
-//   order: the view matrix's rotation row by row, its translation, fx, fy, cx and cy.
+// Buffers: ewa.cl's inputs except opacities; radii (n, 2).
+//   d_means2d (n, 2), d_depths (n), d_conics (n, 3), where b counts as one variable; with COMPENSATED d_compensations
+//     (n).
+//   -> d_means (n, 3); d_quaternions (n, 4) and d_scales (n, 3), or with COVARIANCES d_covariances (n, 6), where an
+//     off-diagonal entry holds the sum for its two places in the matrix. Culled rows become zero. ADDED adds the
+//     gradients to the values in these arrays, and leaves culled rows unchanged.
+//   by_camera (BY_CAMERA_SIZE, padded), with BY_CAMERA: each Gaussian's gradient with respect to the view matrix's
+//     rotation row by row, its translation, fx, fy, cx and cy, in this order; zero from n on.
 // Equations: docs/gradients.md, (159) to (166), with (58) to (60).
 #include "shared/math.h"
 #define NEEDS_GRADIENT

@@ -3,11 +3,14 @@
 //
 // Owner: A work-item owns a Gaussian. Built with one lane; LANES and ITEMS do not change its bits.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
-// Buffers: camera: the frame's camera; after, before: the cameras at the ends of forward and backward motion;
-//   tile_counts (n): 0 for an invisible Gaussian; means, quaternions, log_scales as in project.cl; means_after,
-//   means_before (n, 3): the means at the times of `after` and `before`, or the same array as means in a static model;
-//   splats (n, SPLAT_SIZE), from the projection that wrote tile_counts -> features (n, FEATURES), written for visible
-//   Gaussians: depth and position in world units, a unit normal, motion in pixels.
+// Buffers: camera: the frame's camera; after, before: the cameras at the ends of forward and backward motion.
+//   tile_counts (n): 0 for an invisible Gaussian.
+//   means, quaternions, log_scales: as in project.cl.
+//   means_after, means_before (n, 3): the means at the times of `after` and `before`; in a static model the array
+//     `means`.
+//   splats (n, SPLAT_SIZE): from the projection that wrote tile_counts.
+//   -> features (n, FEATURES), written for visible Gaussians: depth and position in world units, a unit normal, motion
+//     in pixels.
 // Equations: docs/channels.md, (61) to (64), (74) and (75).
 #include "shared/math.h"
 #if defined(FEATURE_MOTION) || defined(FEATURE_BACKWARD)

@@ -6,9 +6,11 @@
 //   same order on every device. Built with one lane.
 // Launch: Grids of work-items. slice: stride x rows; slice_gradient: width x height; line_sums: GRID_COLUMNS x height x
 //   3; the others: one work-item for each coefficient.
-// Buffers: image, seen, gradient (3, rows, stride): colour, or the loss's gradient with respect to it; grids, first,
-//   second (photographs, GRID_LEVELS, GRID_ROWS, GRID_COLUMNS, 3, 4); lines (height, GRID_COLUMNS, 3, 4, GRID_LEVELS);
-//   by_grid: the gradient with respect to one photograph's grid. Shapes are above each kernel.
+// Buffers: image, seen, gradient (3, rows, stride): colour, or the loss's gradient with respect to it.
+//   grids, first, second (photographs, GRID_LEVELS, GRID_ROWS, GRID_COLUMNS, 3, 4).
+//   lines (height, GRID_COLUMNS, 3, 4, GRID_LEVELS).
+//   by_grid: the gradient with respect to one photograph's grid.
+//   What each kernel reads and writes is above the kernel.
 // Equations: docs/gradients.md, "Bilateral grids".
 #include "shared/math.h"
 #include "shared/lanes.h"

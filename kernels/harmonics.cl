@@ -3,11 +3,12 @@
 //
 // Owner: A work-item owns LANES Gaussians. It computes the SH bases in vectors, and the colours one Gaussian at a time.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
-// Buffers: directions (n, 3) of any length, or with CAMERA means (n, 3) in world units and centre (6), high parts
-//   before low parts; sh (n, coefficients, 3): the first `used` coefficients are read, with DEGREE_4 up to 25; with
-//   MASKED mask (n, mask_width): rows whose first entry is not positive are skipped -> colours (n, 3), zero in skipped
-//   rows; with CAMERA, 0.5 is added and the colour is clamped at 0. A direction of length 0 uses only the first
-//   coefficient.
+// Buffers: directions (n, 3): of any length. With CAMERA, their place is taken by means (n, 3) in world units and
+//     centre (6), high parts before low parts.
+//   sh (n, coefficients, 3): the first `used` coefficients are read, up to 25 with DEGREE_4.
+//   mask (n, mask_width), with MASKED: rows whose first entry is not positive are skipped.
+//   -> colours (n, 3): zero in skipped rows. With CAMERA, 0.5 is added and the colour is clamped at 0. A direction of
+//     length 0 uses only the first coefficient.
 // Equations: docs/gradients.md, (12) and (167); the basis is in docs/conventions.md.
 #include "shared/math.h"
 #include "shared/lanes.h"

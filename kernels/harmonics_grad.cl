@@ -3,11 +3,14 @@
 //
 // Owner: A work-item owns LANES Gaussians.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
-// Buffers: harmonics.cl's inputs; d_colours (n, 3); with CAMERA colours (n, 3), as harmonics.cl wrote them: a channel
-//   whose colour is 0 has no gradient -> d_sh (n, coefficients, 3), zero from `used` on, added to the array with ADDED;
-//   with BY_DIRECTION d_directions (n, 3): the gradients with respect to the directions, or with CAMERA to the means,
-//   added to the array with ADDED_DIRECTIONS. Masked rows become zero; where gradients are added, they stay unchanged.
-//   With BY_CENTRE by_centre (3, padded): each Gaussian's gradient with respect to the camera's centre, zero from n on.
+// Buffers: harmonics.cl's inputs; d_colours (n, 3).
+//   colours (n, 3), with CAMERA: as harmonics.cl wrote them; a channel whose colour is 0 has no gradient.
+//   -> d_sh (n, coefficients, 3): zero from coefficient `used` on.
+//   d_directions (n, 3), with BY_DIRECTION: the gradients with respect to the directions, or with CAMERA to the means.
+//   Masked rows become zero. ADDED adds the gradients to the values in d_sh, ADDED_DIRECTIONS to those in d_directions;
+//     masked rows then stay unchanged.
+//   by_centre (3, padded), with BY_CENTRE: each Gaussian's gradient with respect to the camera's centre, zero from n
+//     on.
 // Equations: docs/gradients.md, (38) to (40), (168).
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -3,8 +3,9 @@
 // Owner: A group owns a tile, as in blend.cl; the transmittance has the same bits as in blend.cl.
 // Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
 // Buffers: blend's ranges, gaussian_from_sorted, splats, background and stops; the surfaces of shared/held.h; with RAYS
-//   camera -> image (3, height, width) and transmittance (height, width) of blend, overwritten by the colour and 1
-//   minus the visible alpha. Pixels without a surface in front of a Gaussian keep their bits.
+//     camera.
+//   -> image (3, height, width), transmittance (height, width): those of blend, overwritten by the colour and by 1
+//     minus the visible alpha. Pixels without a surface in front of a Gaussian keep their bits.
 // Equations: docs/pictures.md, (75) to (77).
 #define HOLDOUT
 #include "shared/math.h"

@@ -2,22 +2,20 @@
 // with zeros outside the image. The window is separable: it is applied vertically, into local memory, then
 // horizontally. A second pair of passes, the adjoint of the first pair, convolves SSIM's three partial derivatives.
 //
-// Owner: A group owns blocks of one channel. With ITEMS == 1 it processes a block from the top, ROWS rows at a time,
-//   and keeps the derivatives of LOSS_RING rows; it recomputes rows shared with other blocks. Otherwise a block is ROWS
-//   x COLUMNS pixels in PARTS parts, and an item has one or several parts. A first launch (loss_ssim) writes the
-//   derivatives of the whole image, and a second one (loss_grad) reads them.
+// Owner: A group owns blocks of one channel. With ITEMS == 1 a group processes a block from the top, ROWS rows at a
+//   time, and keeps the derivatives of LOSS_RING rows. Rows shared with other blocks are computed again. Otherwise a
+//   block is ROWS x COLUMNS pixels in PARTS parts, and an item has one or several parts. A first launch (loss_ssim)
+//   writes the derivatives of the whole image, and a second one (loss_grad) reads them.
 // Launch: With ITEMS == 1 any number of groups, which share the blocks. Otherwise a grid of groups of at most PARTS
 //   items: blocks across x blocks down x channels. Blocks are numbered in this order.
-// Buffers: image, target (3, rows, stride): colour, padded to whole tiles with zeros; with PHOTOGRAPH the target is
-//   (height, width, 3), bytes or floats; partials: with ITEMS == 1 (groups, LOSS_RING, 3, field), otherwise (3
-//   channels, strips of COLUMNS columns, height, 3 derivatives, COLUMNS), so that addresses within a column differ by
-//   constants; gradient (3, rows, stride), 0 right of the image; sums (3, ...) of SSIM, of |image - target| and of its
-//   square: one sum per block, or with ITEMS == 1 per row of a block.
+// Buffers: image, target (3, rows, stride): colour, padded to whole tiles with zeros. With PHOTOGRAPH the target is
+//     (height, width, 3), bytes or floats.
+//   partials: with ITEMS == 1 (groups, LOSS_RING, 3, field); otherwise (3 channels, strips of COLUMNS columns, height,
+//     3 derivatives, COLUMNS), so that addresses within a column differ by constants.
+//   -> gradient (3, rows, stride): 0 right of the image.
+//   sums (3, ...), of SSIM, of |image - target| and of its square: one sum per row of a block with ITEMS == 1,
+//     otherwise per block.
 // Equations: docs/gradients.md, (17) to (21) in the forms (78) and (79); with several items (188) and (189).
-//
-// In bright, flat pictures the variance E[x^2] - E[x]^2 would lose its digits by cancellation. So a window sums
-// differences from one of its own pixels (docs/gradients.md, section 12). Variances are then sums of small squares, and
-// the gradient is a sum of differences.
 #if ITEMS == 1 && LANES == 8 && defined(FMA_BY_CONTRACTION)
 #undef LANES // two vectors at a time, because a window's sum is a chain of dependent additions
 #define LANES 16
@@ -27,6 +25,9 @@
 #include "shared/group.h"
 #include "shared/photograph.h"
 
+// In bright, flat pictures the variance E[x^2] - E[x]^2 would lose its digits by cancellation. So a window sums
+// differences from one of its own pixels (docs/gradients.md, section 12). Variances are then sums of small squares, and
+// the gradient is a sum of differences.
 #define TAPS 11
 #define REACH 5
 #define C1 1e-4f

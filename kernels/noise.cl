@@ -3,10 +3,12 @@
 //
 // Owner: A work-item owns a Gaussian. Built with one lane; LANES and ITEMS do not change its bits.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
-// Buffers: quaternions (n, 4), log_scales (n, 3), opacity_logits (n) -> means (n, 3), world units. first_row: the first
-//   Gaussian's row in the model; key0, key1: the step's random key; amount: in 1 / world units; dead: opacity at which
-//   half of the noise is added; highest: Gaussians with this logit or more do not move; readback (READBACK_SIZE). After
-//   a stopped pass (duplicate.cl) nothing changes.
+// Buffers: quaternions (n, 4), log_scales (n, 3), opacity_logits (n).
+//   first_row: the first Gaussian's row in the model. key0, key1: the step's random key.
+//   amount: in 1 / world units. dead: opacity at which half of the noise is added. highest: Gaussians with this logit
+//     or more do not move.
+//   readback (READBACK_SIZE): after a stopped pass (duplicate.cl) nothing changes.
+//   -> means (n, 3): in world units.
 // Equations: docs/gradients.md, (92) and (93).
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -4,8 +4,9 @@
 // Owner: A work-item owns OWNED cells of pixels, whose values are not stored; in limit_copy it owns COPIED elements.
 // Launch: As many groups of ITEMS work-items as keep the device busy; limit_copy: one work-item for each COPIED
 //   elements.
-// Buffers: splats (LIMIT_SPLATS, SPLAT_SIZE) in pixels -> sums (items), which keep compilers from removing the
-//   arithmetic. limit_copy: from (n) -> to (n).
+// Buffers: limit_blend, limit_blend_grad: splats (LIMIT_SPLATS, SPLAT_SIZE) in pixels -> sums (items), which keep
+//     compilers from removing the arithmetic.
+//   limit_copy: from (n) -> to (n).
 // Equations: those of blend.cl and blend_grad.cl, without branches.
 #define SUMS_OF_LANES // the bits of the sums do not matter
 #include "shared/widened.h"

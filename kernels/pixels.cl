@@ -3,10 +3,10 @@
 // Owner: A work-item owns a pixel.
 // Launch: One work-item for each pixel of the image, row by row, in groups of 64; work-items past the end do nothing.
 // Buffers: pixels_from_planes: image (3, rows, stride), transmittance (rows, stride) -> pixels (height, width, depth),
-//   of which at most the first three values of each pixel are written; alpha (height, width), 0 to 1.
+//     of which at most the first three values of each pixel are written; alpha (height, width), 0 to 1.
 //   planes_from_pixels: d_pixels (height, width, depth), with ALPHA_GRADIENT d_alpha (height, width) -> image_gradient
-//   (3, rows, stride) of blend_grad.cl, 0 in planes for which there is no value; with ALPHA_GRADIENT a fourth plane,
-//   the gradient with respect to the transmittance. Padding is not written.
+//     (3, rows, stride) of blend_grad.cl, 0 in planes for which there is no value; with ALPHA_GRADIENT a fourth plane,
+//     the gradient with respect to the transmittance. Padding is not written.
 // Equations: docs/gradients.md, (177).
 #include "shared/layouts.h"
 

@@ -5,10 +5,11 @@
 //   (pose_sums). Built with one lane; LANES and ITEMS do not change its bits.
 // Launch: One work-item for each POSE_ROWS Gaussians; then one for each POSE_ROWS sums of each of `width` columns,
 //   until one row is left.
-// Buffers: tile_counts (n), means (n, 3), quaternions (n, 4), sh_rest (n, coefficients - 1, 3); d_means, d_quaternions,
-//   d_sh_dc: the gradients in the same shapes, not read for Gaussians without tiles -> sums (ceil(n / POSE_ROWS), 6),
-//   from row first_block on: the gradient with respect to rotation about the world's axes, then to translation along
-//   them. by_lens (n, 4) of project_grad.cl -> sums (ceil(n / POSE_ROWS), 4).
+// Buffers: tile_counts (n), means (n, 3), quaternions (n, 4), sh_rest (n, coefficients - 1, 3).
+//   d_means, d_quaternions, d_sh_dc: the gradients in the parameters' shapes, not read for Gaussians without tiles.
+//   -> sums (ceil(n / POSE_ROWS), 6), from row first_block on: the gradient with respect to rotation about the world's
+//     axes, then to translation along them.
+//   lens_rows: by_lens (n, 4) of project_grad.cl -> sums (ceil(n / POSE_ROWS), 4).
 // Equations: docs/gradients.md, (140) to (142), (144).
 #include "shared/math.h"
 #include "shared/lanes.h"

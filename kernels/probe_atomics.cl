@@ -2,8 +2,9 @@
 //
 // Owner: A work-item owns an element.
 // Launch: Any number of groups of ITEMS work-items.
-// Buffers: counters (PROBED), zeroed before -> counters; places (2, items of all groups): the values that each item got
-//   from a global counter and from a local counter of its group. Item i uses counter i % PROBED.
+// Buffers: counters (PROBED): zeroed before.
+//   -> counters; places (2, items of all groups): the values that each item got from a global counter, and from a local
+//     counter of its group. Item i uses counter i % PROBED.
 // Equations: none.
 #include "shared/group.h"
 

@@ -3,13 +3,14 @@
 // Owner: A work-item owns LANES Gaussians. It projects in vectors, and computes tiles and colours one visible Gaussian
 //   at a time.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
-// Buffers: means (n, 3) in world units; quaternions (n, 4) w x y z; log_scales (n, 3); opacity_logits (n); sh_dc (n,
-//   3); sh_rest (n, coefficients - 1, 3) -> splats (n, SPLAT_SIZE) in pixels, depth in world units, written where
-//   visible; tile_counts (n): 0 where culled. With NO_FRUSTUM_CULL shown (n): 1 where a splat is written, including
-//   Gaussians without a tile. With SH_DEGREES sh_degrees (n): the highest SH degree that each Gaussian uses. With
-//   THINNED a Gaussian is left out if its random word is under `threshold`, and `factor` multiplies the opacities of
-//   the others; model_row: the first Gaussian's row in the model; key0, key1: the step's random key. CHUNKS and
-//   FIRST_ROWS: see shared/chunks.h.
+// Buffers: means (n, 3): in world units. quaternions (n, 4): w x y z. log_scales (n, 3). opacity_logits (n). sh_dc (n,
+//     3). sh_rest (n, coefficients - 1, 3).
+//   sh_degrees (n), with SH_DEGREES: the highest SH degree that each Gaussian uses.
+//   -> splats (n, SPLAT_SIZE): in pixels, depth in world units, written where visible. tile_counts (n): 0 where culled.
+//   shown (n), with NO_FRUSTUM_CULL: 1 where a splat is written, including Gaussians without a tile.
+//   THINNED leaves out each Gaussian whose random word is under `threshold`, and multiplies the opacities of the others
+//     by `factor`. model_row: the first Gaussian's row in the model; key0, key1: the step's random key.
+//   CHUNKS and FIRST_ROWS: see shared/chunks.h.
 // Equations: docs/gradients.md, (1) to (13), (44) to (47) and (53) to (57); orthographic docs/cameras.md, (15) to (17);
 //   Kerbl et al. 2023, section 4.
 #include "shared/math.h"

@@ -5,17 +5,15 @@
 //   project_step owns ROWS Gaussians, and processes one array of the model after another.
 // Launch: One work-item for each LANES Gaussians, in add_slots for each Gaussian, in groups of 64; work-items past the
 //   end do nothing. project_step: groups of one item; if LANES is 1, of ROWS items.
-// Buffers: slots (pairs, SLOT_STRIDE) of blend_grad.cl, or with ADDED_UP their sums (n, SLOT_STRIDE); tile_counts (n),
-//   and first_slots (n), the prefix sums of tile_counts; parameters, splats and camera as in project.cl -> screen (n,
-//   2): the gradient, plain or absolute, with respect to the mean's image position, per pixel. With CONTRIBUTIONS
-//   contributions (n): each Gaussian's blending weights, summed over all pixels. With LENS by_lens (n, 4): each
-//   Gaussian's gradient with respect to the logs of the focal lengths and, per pixel, to the principal point.
-//   project_grad writes gradients in the parameters' shapes, but no rows of invisible Gaussians. project_step, with
-//   ADAM, updates parameters and moments `first` and `second`; `readback` (READBACK_SIZE); the scalars are those of
-//   Step, one per parameter group where they differ. Invisible Gaussians count with zero gradients, but do not change
-//   with VISIBLE. With SPARSE, elements with a zero gradient do not change. After a stopped pass (duplicate.cl) nothing
-//   changes. PENALTIES adds the gradient of opacity_weight o + scale_weight (s_0 + s_1 + s_2). CHUNKS of project_step:
-//   see shared/chunks.h.
+// Buffers: slots (pairs, SLOT_STRIDE): of blend_grad.cl; or with ADDED_UP their sums (n, SLOT_STRIDE).
+//   tile_counts (n); first_slots (n): the prefix sums of tile_counts. Parameters, splats and camera are those of
+//     project.cl.
+//   -> screen (n, 2): the gradient, plain or absolute, with respect to the mean's image position, per pixel.
+//   contributions (n), with CONTRIBUTIONS: each Gaussian's blending weights, summed over all pixels.
+//   by_lens (n, 4), with LENS: each Gaussian's gradient with respect to the logs of the focal lengths and, per pixel,
+//     to the principal point.
+//   project_grad writes gradients in the parameters' shapes, but no rows of invisible Gaussians.
+//   PENALTIES adds the gradient of opacity_weight o + scale_weight (s_0 + s_1 + s_2).
 // Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91); (144) and
 //   (145). With RAYS docs/cameras.md, (22) to (29).
 #include "shared/math.h"
@@ -176,6 +174,11 @@ typedef struct {
 } GroupStep;
 #endif
 
+// Computes the gradients, and updates the parameters and their moments `first` and `second` by Adam. Invisible
+// Gaussians are updated with gradients of zero; with VISIBLE they do not change. With SPARSE, elements with a zero
+// gradient do not change. readback (READBACK_SIZE) counts refusals; after a stopped pass (duplicate.cl) nothing
+// changes. The other scalars are those of Step (shared/adam.h), one per parameter group where they differ. CHUNKS: see
+// shared/chunks.h.
 __kernel void project_step(
     const uint n, const int coefficients, __constant float *camera, __global const uint *tile_counts,
     __global const uint *first_slots, __global const float *slots, __global const float *splats, __global float *screen

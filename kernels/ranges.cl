@@ -3,8 +3,9 @@
 // Owner: A work-item owns a pair of the sorted list. It writes the start or end of a range where the neighbouring pair
 //   has another tile.
 // Launch: One work-item for each pair, in groups of 64; work-items past the end do nothing.
-// Buffers: tile_keys, pair_from_sorted (pairs), in sorted order; pair_ids (pairs): slot and Gaussian, by depth ->
-//   ranges (tiles, 2), zeroed before; slot_from_sorted, gaussian_from_sorted (pairs). All are indices.
+// Buffers: tile_keys, pair_from_sorted (pairs): in sorted order.
+//   pair_ids (pairs): slot and Gaussian, by depth.
+//   -> ranges (tiles, 2), zeroed before; slot_from_sorted, gaussian_from_sorted (pairs). All are indices.
 // Equations: none.
 #include "shared/math.h"
 #include "shared/count.h"

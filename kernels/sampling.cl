@@ -3,9 +3,11 @@
 //
 // Owner: A work-item owns a Gaussian.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
-// Buffers: cameras (views, CAMERA_SIZE), each as in project.cl, all of one camera model; means (n, 3) -> least (n):
-//   natural log of the smallest standard deviation in world units; with `more`, the smaller of this and the value
-//   already stored. limit_scales: log_scales (n, 3) below `least` are raised to it.
+// Buffers: cameras (views, CAMERA_SIZE): each as in project.cl, all of one camera model.
+//   means (n, 3).
+//   -> least (n): natural log of the smallest standard deviation that the pictures resolve, in world units. With
+//     `more`, a smaller value that is already stored stays.
+//   limit_scales: log_scales (n, 3) below `least` are raised to `least`.
 // Equations: docs/gradients.md, (88).
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -4,10 +4,12 @@
 //
 // Owner: A work-item owns a Gaussian. Built with one lane; LANES and ITEMS do not change its bits.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
-// Buffers: last (n): the last step that a Gaussian took, at most `step`, set to `mark`; with VISIBLE tile_counts (n):
-//   rows where it is 0 do not change; missed (MOST_MISSED + 1, 6, 3): for each number of missed steps up to `step` and
-//   each parameter group, the factors of (190) and (191); readback (READBACK_SIZE) -> parameters and moments `first`
-//   and `second`, updated in place. After a stopped pass (duplicate.cl) nothing changes.
+// Buffers: last (n): the last step that a Gaussian took, at most `step`; the kernel sets it to `mark`.
+//   tile_counts (n), with VISIBLE: rows with a tile count of 0 do not change.
+//   missed (MOST_MISSED + 1, 6, 3): the factors of (190) and (191), by the number of missed steps up to `step` and by
+//     parameter group.
+//   Parameters and their moments `first` and `second`: updated in place.
+//   readback (READBACK_SIZE): after a stopped pass (duplicate.cl) nothing changes.
 // Equations: docs/gradients.md, (190) to (192).
 #include "shared/math.h"
 

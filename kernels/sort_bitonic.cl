@@ -3,8 +3,9 @@
 //
 // Owner: The group owns the array; a work-item compares every ITEMS-th pair.
 // Launch: One group of ITEMS work-items.
-// Buffers: keys (n) -> keys_out, values_out (n): sorted; a value is the position in keys. k, v (padded) in local
-//   memory; padded: a power of two, at least n.
+// Buffers: keys (n).
+//   -> keys_out, values_out (n): sorted; a value is the position in keys.
+//   k, v (padded): in local memory; padded is a power of two, at least n.
 // Equations: none; Batcher's bitonic network.
 #include "shared/math.h"
 #include "shared/group.h"

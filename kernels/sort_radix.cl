@@ -5,7 +5,7 @@
 // Owner: A group owns a chunk, and in radix_offsets `rows` digits. In the scatter, a group of one item moves its keys
 //   one by one. A larger group loads TILE keys at a time, sorts them by digit in local memory, and writes the keys of a
 //   digit side by side. Such a batch of keys is called a tile in this file.
-// Launch: One group of ITEMS work-items for each chunk; radix_offsets: for each `rows` digits.
+// Launch: One group of ITEMS work-items for each chunk; in radix_offsets one group for each `rows` digits.
 // Buffers: keys, values (n), histograms (digits, groups), totals (digits) -> keys_out, values_out (n); counters
 //   (digits) in local memory.
 // Equations: none; docs/decisions/0001-split-sort.md.

@@ -4,10 +4,11 @@
 // Owner: A work-item owns LANES Gaussians. It computes splats in vectors, and counts tiles and writes splats one
 //   visible Gaussian at a time.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
-// Buffers: radii (n, 2) in whole pixels, a radius of 0 culls; means2d (n, 2) in pixels; conics (n, 3): a, b, c of the
-//   inverse covariance; opacities (n) in [0, 1]; depths (n); values (n, width): the first three are the colour; missing
-//   ones count as 0 -> splats (n, SPLAT_SIZE), written where visible; tile_counts (n): 0 where culled. With LISTED the
-//   caller makes the tile lists, so every splat is written; a culled Gaussian's splat has alpha 0.
+// Buffers: radii (n, 2): in whole pixels; a radius of 0 culls. means2d (n, 2): in pixels.
+//   conics (n, 3): a, b, c of the inverse covariance. opacities (n): in [0, 1]. depths (n).
+//   values (n, width): the first three are the colour, with 0 in place of missing values.
+//   -> splats (n, SPLAT_SIZE), written where visible; tile_counts (n): 0 where culled. With LISTED the caller makes the
+//     tile lists, so every splat is written; a culled Gaussian's splat has alpha 0.
 // Equations: docs/gradients.md, (170) to (172), with (44) to (47).
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -3,12 +3,13 @@
 //
 // Owner: A work-item owns one Gaussian.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
-// Buffers: slots (pairs, FIELDS) of blend_grad.cl or values_grad.cl: sums of g and its moments, gradients with respect
-//   to VALUES values, with ABSOLUTE_GRADIENTS absolute gradients with respect to the mean; tile_counts (n), and
-//   first_slots (n), the prefix sums of tile_counts; splats of splats.cl -> d_means2d (n, 2), d_conics (n, 3),
-//   d_opacities (n), in loss per unit; d_values (n, width): up to VALUES columns, from `first` on; absolute (n, 2):
-//   absolute gradients with respect to means2d. Rows of Gaussians without tiles are zero. add_values turns slots
-//   (pairs, VALUES) of a further pass into d_values only.
+// Buffers: slots (pairs, FIELDS) of blend_grad.cl or values_grad.cl: sums of g and its moments; gradients with respect
+//     to VALUES values; with ABSOLUTE_GRADIENTS absolute gradients with respect to the mean.
+//   tile_counts (n); first_slots (n), the prefix sums of tile_counts; splats of splats.cl.
+//   -> d_means2d (n, 2), d_conics (n, 3), d_opacities (n), in loss per unit. Rows of Gaussians without tiles are zero.
+//   d_values (n, width): up to VALUES columns, from column `first` on. absolute (n, 2): absolute gradients with respect
+//     to means2d.
+//   add_values turns slots (pairs, VALUES) of a further pass into d_values only.
 // Equations: docs/gradients.md, (173) to (176).
 #include "shared/math.h"
 #include "shared/lanes.h"

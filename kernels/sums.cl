@@ -3,8 +3,9 @@
 //
 // Owner: A work-item owns SUM_ROWS adjacent numbers of a row.
 // Launch: One work-item for each SUM_ROWS numbers of each row, in groups of 64; work-items past the end do nothing.
-// Buffers: parts (rows, padded), padded a multiple of SUM_ROWS -> sums (rows, stride), stride at least padded /
-//   SUM_ROWS; elements of sums from padded / SUM_ROWS on are zero in each row.
+// Buffers: parts (rows, padded): padded is a multiple of SUM_ROWS.
+//   -> sums (rows, stride): stride is at least padded / SUM_ROWS; elements from padded / SUM_ROWS on are zero in each
+//     row.
 // Equations: docs/gradients.md, section 23.
 #include "shared/math.h"
 

@@ -3,10 +3,11 @@
 //
 // Owner: A work-item owns OWNED pixels of a row of the padded planes: if LANES > 1 a row of a tile, otherwise a pixel.
 // Launch: A grid of stride / OWNED x rows work-items, which covers whole tiles.
-// Buffers: source (height, width, channels), bytes or floats, interleaved; background (3) -> planes (3, rows, stride):
-//   colour, in [0, 1] for bytes, 0 in padding; with ALPHA a fourth plane, alpha. With MASKED the source's fifth channel
-//   is 0 in pixels that do not count. In these pixels the planes and the render's image (3, rows, stride) become 0, and
-//   the render's stops (rows, stride) become -1, as in padding, so that blend_grad skips them.
+// Buffers: source (height, width, channels): bytes or floats, interleaved. background (3).
+//   -> planes (3, rows, stride): colour, in [0, 1] for bytes, 0 in padding. With ALPHA a fourth plane, alpha.
+//   With MASKED the source's fifth channel is 0 in pixels that the loss leaves out. In these pixels the planes and the
+//     render's image (3, rows, stride) become 0, and the render's stops (rows, stride) become -1, as in padding, so
+//     that blend_grad skips them.
 // Equations: alpha c + (1 - alpha) background.
 #include "shared/math.h"
 #include "shared/photograph.h"

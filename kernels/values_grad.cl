@@ -4,12 +4,13 @@
 // Owner: A group owns a tile and writes one slot for each of its pairs, as in blend_grad.cl; in gradient_by_cell a
 //   group owns a tile's pixels.
 // Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
-// Buffers: gradient_by_cell: d_pixels (height, width, depth), background (depth), with ALPHA_GRADIENT d_alpha (height,
-//   width) -> by_cell (tiles, (depth + 1) * TILE * TILE): for each cell, the gradients with respect to all values, then
-//   with respect to the final transmittance (background included); 0 in padding. values_grad: blend_grad's lists and
-//   planes, value_rows (n, depth), by_cell -> slots (pairs, FIELDS), all written: sums over the tile's pixels of the
-//   gradients with respect to VALUES values, from `first` on. With GEOMETRY, these follow g and its moments, which are
-//   computed from all values. With ABSOLUTE_GRADIENTS, absolute gradients with respect to the mean come last.
+// Buffers: gradient_by_cell reads d_pixels (height, width, depth), background (depth), and with ALPHA_GRADIENT d_alpha
+//     (height, width). -> by_cell (tiles, (depth + 1) * TILE * TILE): for each cell, the gradients with respect to all
+//     values, then with respect to the final transmittance (background included); 0 in padding.
+//   values_grad reads blend_grad's lists and planes, value_rows (n, depth) and by_cell. -> slots (pairs, FIELDS), all
+//     written: sums over the tile's pixels of the gradients with respect to VALUES values, from `first` on. With
+//     GEOMETRY, g and its moments, computed from all values, come before these sums. With ABSOLUTE_GRADIENTS, absolute
+//     gradients with respect to the mean come last.
 // Equations: docs/gradients.md, (178) to (180), with (22) to (26), (48) and (49).
 #include "shared/math.h"
 #include "shared/splat.h"

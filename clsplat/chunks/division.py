@@ -13,7 +13,7 @@ from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.optimisation.density_rules import FRESH
 
 NEW = -1
-"""Value of `Division.kept` for a chunk that is not an old one."""
+"""Value of `Division.kept` for a chunk that equals no old chunk."""
 _COUNTED_ROWS = 1 << 14
 """Number of list entries that are counted at a time, which limits the size of copies."""
 
@@ -24,7 +24,8 @@ def chunks_of(rows: int) -> int:
 
 
 def listed_chunks(chunks: int) -> int:
-    """Length of a list of up to so many chunks: one of few, at most a quarter more than needed, or 1."""
+    """Return the padded length of a list of `chunks` chunks: at least 1, and at most a quarter more than `chunks`. Few
+    lengths occur, so that arrays of a length can be reused."""
     wanted = max(chunks, 1)
     unit = 1 << max(wanted.bit_length() - 3, 0)
     return -(-wanted // unit) * unit
@@ -56,8 +57,8 @@ def divided(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> Division:
     """Divide rows into chunks after density control.
 
     An old chunk is kept if all its rows stay and none was added. The rows of consecutive chunks that are not kept are
-    divided into as few chunks as possible, of equal lengths. A kept chunk beside them is merged into these if this
-    needs no further chunk.
+    divided into as few chunks as possible, of equal lengths. If the rows of a kept chunk beside them fit into these
+    chunks too, they are divided together with them.
 
     entries: source row of each new row in rising order, plus FRESH if new.
     starts: first rows of the old chunks, as in `Division`.
@@ -83,7 +84,8 @@ def divided(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> Division:
 
 
 def _changes(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return, by old chunk, the number of new rows that come from it, and True if they are not just its own rows."""
+    """Return two arrays by old chunk: the number of new rows whose source is in the chunk, and True if these rows are
+    not exactly the chunk's old rows."""
     lengths = np.diff(starts)
     counts, stay, before = np.zeros_like(lengths), np.zeros_like(lengths), -1
     for begin in range(0, len(entries), _COUNTED_ROWS):

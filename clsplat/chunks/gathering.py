@@ -29,7 +29,8 @@ class SourceList:
     """The rows of a model after density control, on the host, in the order of their sources.
 
     rows: (m,) uint32, the source row of each row, plus FRESH if the row is new.
-    seconds: (k,) uint32, positions in the list of the second halves of split Gaussians. Each is behind its first half.
+    seconds: (k,) uint32, indices into `rows` of the second halves of split Gaussians. Each second half directly follows
+        its first half.
     """
 
     rows: NDArray[np.uint32]
@@ -42,7 +43,7 @@ class SourceList:
 
     @property
     def halves(self) -> int:
-        """Number of rows that are halves."""
+        """Number of rows that are halves of split Gaussians."""
         return 2 * len(self.seconds)
 
     def by_kind(self) -> NDArray[np.uint32]:
@@ -66,7 +67,7 @@ def in_source_order(parts: Iterable[NDArray[np.uint32]]) -> SourceList:
     rows, seconds, count = [], [], 0
     for part in parts:
         entries = part[beside_parents(part & ~FRESH)]
-        twice = entries[1:] == entries[:-1]  # only halves are two new rows of one source
+        twice = entries[1:] == entries[:-1]  # only a split Gaussian has two equal entries
         seconds.append((np.flatnonzero(twice) + (count + 1)).astype(np.uint32))
         rows.append(entries)
         count += len(entries)
@@ -92,8 +93,8 @@ Reader = Callable[[NDArray[np.int64]], NDArray[Any]]
 class NewValues:
     """Values of fields that are not copied from the source row.
 
-    fresh: value in FRESH rows, by the beginning of the field's name, such as "first" for first moments. Fields of other
-        kinds are copied.
+    fresh: the value of a field in FRESH rows, by the field's kind, the part of its name before "/": for example "first"
+        for first moments. Fields of kinds that are not listed are copied.
     initial: values of new fields, and of the fields `anew`; 0 if a field is not listed.
     anew: fields that get their initial value in every row.
     """
@@ -132,8 +133,8 @@ def gathered(
     records do not have are zero.
 
     record: type of the new records. Fields that it does not have are left out.
-    passed: called after each yield with the number of the first old chunk that may still be read, if the sources of
-        `rows` rise.
+    passed: function that is called after each yield with the number of the first old chunk that may still be read. The
+        number is valid only if the sources in `rows` rise.
     """
     new = np.flatnonzero(to.kept == NEW)
     for begin in range(0, len(new), BLOCK_CHUNKS):

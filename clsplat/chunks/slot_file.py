@@ -179,7 +179,7 @@ class SlotFile:
     def _runs(self, slots: NDArray[np.int64], nbytes: int) -> Iterator[tuple[int, int, int]]:
         """Yield (index, slot, length) of records of `nbytes` bytes that are read or written together.
 
-        Records that are shorter than a slot are taken one by one.
+        Records that are shorter than a slot are read or written one by one.
         """
         for place, slot, length in runs(slots):
             step = length if nbytes == self.slot_bytes else 1

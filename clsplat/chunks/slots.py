@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 NO_SLOT = -1
-"""Stands for the slot of a chunk that has not been written: each of its fields has one value in all elements."""
+"""Slot number of a chunk that has not been written. Each field of such a chunk has one value in all elements."""
 MAX_TENTHS = 22
 """Maximum number of slots of a file, in tenths of the number of chunks. It has room for two copies of each chunk: one
 of the latest checkpoint, and one that later steps change."""

@@ -43,13 +43,13 @@ class ChunkStore:
 
     fields: shape of a row of each field, by name. Fields without elements are not in the records.
     path: scratch file for the records, which is created; None keeps the records in main memory.
-    widest: the fields with the largest shapes that they will have, which a slot of the file has room for.
+    widest: the largest shapes that the fields will have, by name. Slots of the file have room for fields of these shapes.
     starts: (chunks + 1,) int64, the chunks' first rows, then the number of rows. By default all but the last are full.
     opened: the existing scratch file and the manifest of a checkpoint, to continue from.
     release: function that is called before the file becomes larger than `SlotTable.most`. It removes the oldest
         checkpoint and returns the slots of the other checkpoints, or None if all have to stay.
     has_checkpoints: True if manifests go into checkpoints, so that `close` keeps the slots of the latest one.
-    file: the scratch file.
+    file: the open scratch file; missing if records are kept in main memory.
     Raises WriteError if the file cannot be created, or the disk has too little room.
     """
 
@@ -125,7 +125,8 @@ class ChunkStore:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all rows, or of the chunks' slots in the file."""
+        """Bytes that the store takes: in main memory those of all rows, in a scratch file those of all chunks'
+        slots."""
         if self.path is None:
             return self.count * self.record.itemsize // CHUNK_ROWS
         return self.chunks * self.file.slot_bytes
@@ -194,8 +195,8 @@ class ChunkStore:
 
         rows: source rows in rising order, plus FRESH for new rows.
         values: values of fields that are not copied.
-        changes: called before the first row changes. For a file this is after all chunks have been written to free
-            slots, so that an error changes nothing.
+        changes: function that is called before the first row changes. With a scratch file, all new chunks have then
+            been written to free slots, so that an error changes nothing.
         fields: new shapes of the fields, for more SH coefficients. Then all rows stay, and all chunks are written.
         Raises WriteError and ScratchError.
         """
@@ -406,7 +407,8 @@ class ChunkStore:
         return held
 
     def _field(self, number: int, field: str) -> NDArray[np.float32]:
-        """Return a field of a chunk: a copy (CHUNK_ROWS, ...) from the file, or the memory itself, (rows, ...)."""
+        """Return a field of a chunk. With a scratch file it is a copy (CHUNK_ROWS, ...); in main memory it is a view
+        (rows, ...) of the stored values."""
         kind, offset = self.record.fields[field][:2]  # type: ignore[index]  # it has fields
         of_field = number, self._names.index(field)
         constant = int(self._constants[of_field])
@@ -426,7 +428,8 @@ class ChunkStore:
         return rows
 
     def _set_field(self, number: int, field: str, rows: NDArray[np.float32]) -> None:
-        """Write a changed field that `_field` returned. In main memory it is changed already."""
+        """Write a changed field that `_field` returned. In main memory nothing is left to do, because `_field` returned
+        a view."""
         if self.path is None:
             return
         numbers = np.array([number])
@@ -440,7 +443,8 @@ class ChunkStore:
         self._checksums[of_field], self._constants[of_field] = zlib.crc32(rows.data), WRITTEN
 
     def _make_room(self, needed: Callable[[], int]) -> None:
-        """Grow the file until it has `needed()` free slots, or remove old checkpoints first. Raises WriteError."""
+        """Grow the file until it has `needed()` free slots. If it would exceed `SlotTable.most`, remove old checkpoints
+        first. Raises WriteError."""
         assert self.path is not None
         while (lacking := needed() - self.slots.free) > 0:
             more = self.slots.growth(lacking)
@@ -482,7 +486,7 @@ def _carried(values: NDArray[Any], to: Division, shape: tuple[int, int]) -> NDAr
 
 
 def _packed(record: NDArray[Any], rows: int) -> NDArray[np.uint8]:
-    """Return the first rows of each field of a record (1,) as bytes, one field after the other."""
+    """Return the first `rows` rows of each field of a record (1,) as bytes, one field after the other."""
     if rows == CHUNK_ROWS:
         return np.array(record).view(np.uint8)
     return np.concatenate([record[name][0, :rows].reshape(-1) for name in record.dtype.names or ()]).view(np.uint8)

@@ -60,7 +60,8 @@ def form_of(device: Device, size: tuple[int, ...], local: tuple[int, ...] | None
     """Return the suffix that names the kind of a launch in the record of a kernel's sandbox trials; "" as a rule.
 
     Drivers that compile a kernel anew for some launch sizes have one kind for many items, and one for group sizes that
-    the driver chooses. Each kind has its own trial. Given group sizes have none: each width of an image would need one.
+    the driver chooses. Each kind has its own trial. Launches whose group size is given have no kind for it, because
+    each width of an image would need one.
     """
     if not device.compiles_by_size:
         return ""

@@ -29,10 +29,10 @@ class MarkRules:
 
     - Its opacity logit is at most `transparent`.
     - The log of its largest scale is over `oversized`; of a half of a split Gaussian, over `oversized_half`.
-    - It is not new and its radius is over `radius`.
+    - It is not new and its radius on an image, in pixels, is over `radius`.
     - It contributes at most `contribution` to every view.
 
-    cut_off: (value, row). A Gaussian passes if its score is over `value`; a score equal to `value` passes up to `row`.
+    cut_off: (value, row). A Gaussian passes if its score is over `value`, or equals `value` in a row up to `row`.
     """
 
     gradient: float = inf

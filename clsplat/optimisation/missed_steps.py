@@ -11,8 +11,9 @@ from clsplat.arrays import Float32, Float64
 from clsplat.config.training import OptimiserConfig
 
 MOST_MISSED = 256
-"""Largest number of steps that a Gaussian may miss. Every 256 steps all take the steps that they missed, which costs
-one step of Adam over all rows. The 256th missed step moves a parameter by 2e-12 of the first one's movement."""
+"""Largest number of steps that a Gaussian may miss. Every 256 steps all Gaussians make up for the steps that they
+missed, which takes as long as one step of Adam over all rows. The 256th missed step moves a parameter by 2e-12 of the
+first one's movement."""
 
 
 class MissedSteps:

@@ -69,7 +69,7 @@ def exploration_of(config: TrainConfig, step: int, means_rate: float, count: int
 
 
 def _penalties(opacity: float, scale: float, count: int, length_unit: float) -> Exploration:
-    """Weights for sums over the visible Gaussians, from weights for means over all `count` Gaussians.
+    """Convert weights of penalties: from means over all `count` Gaussians to sums over the visible Gaussians.
 
     Scales are relative to the scene's length unit (equation (91) of docs/gradients.md).
     """

@@ -283,7 +283,8 @@ def compensation(det0: Float64, det: Float64) -> Float64:
 
 
 def compensation_grad(plain: Float64, filtered: Float64, d_logs: Float64) -> tuple[Float64, Float64]:
-    """Return the gradients (N, 2, 2) with respect to both covariances that `compensation` adds: eq. (84).
+    """Return the parts (N, 2, 2) of the gradients with respect to both covariances that come from the compensation: eq.
+    (84).
 
     plain, filtered: (N, 2, 2), the covariances without and with the low-pass.
     d_logs: (N,), gradient of the loss with respect to ln(opacity).

@@ -31,14 +31,14 @@ _SMALL_ARRAYS_BYTES = 4096
 class StepMemory:
     """Memory of a training step in addition to a frame's, by its settings.
 
-    fields: the columns of a slot.
+    fields: the fields of a slot, which holds the gradient of a pair.
     photographs: number of pixels of all photographs that may stay on the device.
     turns: number of arrays for the partial sums of the loss, which successive steps use in turn (`stages.loss.loss`).
     masks: True if photographs have masks, or there is an alpha loss.
     row_bytes: bytes per Gaussian of the training's components.
     pixel_bytes: bytes per pixel of the training's components.
     by_chunk: True if a step may run over the chunks in view.
-    pool: bytes for parameters and moments of the Gaussians on the device; None leaves it to the plan.
+    pool: bytes for parameters and moments of the Gaussians on the device; if None, the plan chooses the number.
     in_view: number of rows of the chunks that a view shows at most, as far as known.
     """
 
@@ -119,7 +119,8 @@ def plan_step(
 
 
 def plan_view(device: Device, made: Plan, in_view: int) -> Plan:
-    """The plan `made` of steps over the chunks in view, for views of up to `in_view` rows. Raises CapacityError."""
+    """Return a copy of the plan `made`, of steps over the chunks in view, that allows views of up to `in_view` rows.
+    Raises CapacityError."""
     return plan_by_chunk(replace(made.need, in_view=in_view), made.allowed, device.max_allocation)
 
 

@@ -36,9 +36,10 @@ class Need:
     scratch: bytes of all other arrays.
     photographs: bytes of the photographs, which the device keeps between steps if it has room.
     statistics: bytes of `row` that are part of a chunk's record, where Gaussians are streamed by chunk.
-    held: bytes of `row` that every Gaussian needs, in view or not, in a step over the chunks in view; None if steps
-    take all chunks.
-    pool: bytes for parameters, moments and statistics of the Gaussians on the device; None leaves it to the plan.
+    held: bytes of `row` that every Gaussian needs, in view or not, in a step over the chunks in view; None if steps run
+    over all chunks.
+    pool: bytes for parameters, moments and statistics of the Gaussians on the device; if None, the plan chooses the
+        number.
     in_view: number of rows of the chunks that a view shows at most, in a step over the chunks in view, as far as known.
     """
 
@@ -175,7 +176,7 @@ def _too_little(need: Need, least: int, budget: int) -> CapacityError:
 
 
 def _rounded_up(nbytes: int) -> str:
-    """A number of bytes as `mebibytes` writes it, but never less: a limit of so much does."""
+    """A number of bytes as text, like `mebibytes`, but rounded up, so that a memory limit of this size is enough."""
     unit = 2**20 / 10 if nbytes >= 10 * 2**20 else 2**10 if nbytes >= 10 * 2**10 else 1
     return mebibytes(ceil(ceil(nbytes / unit) * unit))
 
@@ -192,11 +193,12 @@ def plan_by_chunk(need: Need, budget: int, max_allocation: int) -> Plan:
     by_row = need.row - need.statistics - need.held + need.banded
 
     def without_pairs(slots: int) -> int:
-        """Bytes for so many slots and the rows in view."""
+        """Bytes of `slots` slots and of the arrays by row in view, without pairs."""
         return slots * by_slot + max(CHUNK_ROWS * listed_chunks(slots), need.in_view) * by_row
 
     def wanted(slots: int) -> int:
-        """Bytes with the pairs of so many slots, and at least a pair for each row in view: a tile may contain all."""
+        """Bytes of `without_pairs` and of the pairs. There is at least a pair for each row in view, as a tile may
+        contain all."""
         return without_pairs(slots) + max(PAIRS_IN_VIEW * CHUNK_ROWS * slots, need.in_view) * need.pair
 
     most = min(max_allocation // need.widest, need.gaussians + CHUNK_ROWS - 1)

@@ -146,7 +146,8 @@ class Rasterizer:
         self.capacity = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS_PER_BAND)
 
     def antialias(self, *, on: bool) -> None:
-        """Use the kernels for antialiased models (`Gaussians.antialiased`) if `on`, otherwise those for the others."""
+        """Use the kernels for antialiased models (`Gaussians.antialiased`) if `on`, otherwise those for models that are
+        not."""
         if on == self._antialiased:
             return
         defines = kernel_defines(self.config, antialiased=on)
@@ -219,8 +220,8 @@ class Rasterizer:
         no effect (docs/decisions/0025-launch-by-capacity.md). None counts the pairs first.
         thinning: random dropout of the model's Gaussians in this pass.
         nearness: like `nearness` of `blend`.
-        chunks: the only chunks of the model that may be in view. None takes the whole model; if the model is streamed
-            and its pool finds the chunks in view, only these. ChunkNumbers cannot be given together with `room`.
+        chunks: the only chunks of the model that may be in view. None: the whole model or, if it is streamed and its
+            pool can find the chunks in view, these chunks. ChunkNumbers cannot be given together with `room`.
         """
         device, work = self.device_of(camera), self.work
         if chunks is None and isinstance(gaussians, HostGaussians) and gaussians.pool is not None and gaussians.culls:

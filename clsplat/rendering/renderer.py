@@ -277,20 +277,20 @@ class Renderer:
     def _motion(
         self, gaussians: Gaussians | AnyGaussians, on_device: AnyGaussians, ahead: _MotionEnd, back: _MotionEnd
     ) -> Motion:
-        """The cameras and means at the ends of motion and of backward motion; means are on the device or the host, like
-        the model."""
+        """The cameras and means at the moments to which motion and backward motion lead. The means are on the device or
+        the host, like the model."""
         cameras = self._sent(ahead, gaussians), self._sent(back, gaussians)
         return Motion(*cameras, self._moved(on_device, ahead), self._moved(on_device, back))
 
     def _sent(self, end: _MotionEnd, gaussians: Gaussians | AnyGaussians) -> DeviceArray:
-        """The packed camera of an end of motion on the device, relative to the origin of the means at that end."""
+        """Upload the packed camera of the moment `end`, relative to the origin of the means at this moment."""
         counted = gaussians if end.gaussians is None else end.gaussians
         local = counted.local(end.camera) if isinstance(counted, Gaussians) else end.camera
         return upload(self.device, pack_camera(local))
 
     def _moved(self, gaussians: AnyGaussians, end: _MotionEnd) -> AnyGaussians | None:
-        """The means at an end of motion, on the device or the host like the Gaussians. Raises ValueError if there are
-        more or fewer than in the model."""
+        """The means at the moment `end`, on the device or the host like `gaussians`; None if they do not move. Raises
+        ValueError if their number is not that of the model."""
         moved = end.gaussians
         if moved is None:
             return None
@@ -342,7 +342,7 @@ class Renderer:
 
 @dataclass(frozen=True, eq=False)
 class _MotionEnd:
-    """The moment that motion or backward motion leads to.
+    """The moment before or after a frame to which one of the channels of motion leads.
 
     camera: in world coordinates.
     gaussians: the Gaussians with their means at that moment; None if they do not move, or the channel is not wanted.
@@ -355,7 +355,8 @@ class _MotionEnd:
 def _motion_end(
     name: str, camera: Camera, other: Camera | None, gaussians: Gaussians | None, *, asked: bool
 ) -> _MotionEnd:
-    """The end of the motion that a channel shows: from `camera` to `other`, or to `camera` itself if `other` is None.
+    """Return the moment to which a channel of motion leads. Motion is from `camera` to `other`, or to `camera` if
+    `other` is None.
 
     name: name of the channel, for the InputError that this may raise.
     asked: True if the channel is wanted.
@@ -370,7 +371,8 @@ def _motion_end(
 
 
 def _pixels_of(planes: Channels, camera: Camera, *, contiguous: bool) -> tuple[NDArray[Any], NDArray[Any]]:
-    """The planes `means` and `whole` on the host, without padding and with the plane axis last."""
+    """The planes of `Channels` on the host, first `means`, then `whole`, without padding and with the plane axis
+    last."""
     arrays = (planes.means, planes.whole)
     means, whole = (array.get()[:, : camera.height, : camera.width].transpose(1, 2, 0) for array in arrays)
     return (np.ascontiguousarray(means), np.ascontiguousarray(whole)) if contiguous else (means, whole)

@@ -75,7 +75,8 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
 
 
 def looks_of_run(run: Run | None) -> Look:
-    """Function of `held_out_looks` for a run. Without appearance.json renders stay unchanged. Raises InputError."""
+    """Function that gives renders the appearance of held-out photographs, as a run's appearance.json records it. In a
+    run without this file renders stay unchanged. Raises InputError."""
     path = run.appearance_path if run is not None else None
     return _looks({} if path is None or not path.exists() else _read(path, _document(path), "held_out"))
 

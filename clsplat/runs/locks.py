@@ -76,7 +76,7 @@ def _take(path: Path, folder: Path) -> IO[bytes]:
                 file.close()
                 raise
             why = error.strerror or str(error)
-            warn(f"{folder}: is on a file system without locks ({why}), others may write there too")
+            warn(f"{folder}: is on a file system without locks ({why}), so other processes may write there too")
             return file
         with suppress(OSError):
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):

@@ -137,7 +137,8 @@ def own_cameras(run: Run | None) -> list[Camera]:
 def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
     """Short descriptions of the differences between a run's recorded scene and the scene as it is now.
 
-    If --resolution has changed, other sizes do not count, nor do other photographs that come from another file.
+    If --resolution has changed, two differences are left out: changed sizes, and changed pixels of a photograph that is
+    now read from another file.
     """
     was, new, resized = earlier["views"], now["views"], earlier["resolution"] != now["resolution"]
     held_out = "held out in one and not in the other"
@@ -188,7 +189,7 @@ def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool =
     if changes and not accept:
         raise InputError(
             f"{path}: is not the scene that {run.path} began with: {'; '.join(changes)}; expected the same views and "
-            "photographs; --accept-changes goes on with these"
+            "photographs; give --accept-changes to go on with the changed scene"
         )
     if earlier["origin"] != now["origin"]:
         raise InputError(
@@ -199,7 +200,8 @@ def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool =
 
 
 def keep(run: Run, scene: Scene, *, resuming: bool) -> None:
-    """Write scene.json, unless a resumed run has one for its resolution. Warns if a resumed run has none."""
+    """Write scene.json, unless the run is resumed and its scene.json was made at the same --resolution. Warns if a
+    resumed run has no scene.json."""
     known = read(run) if resuming else None
     if known is not None and known["resolution"] == run.config.resolution:
         return

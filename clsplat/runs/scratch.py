@@ -18,10 +18,11 @@ from clsplat.runs.run import OWNER_DIGITS, SCRATCH_SUFFIX, Run
 
 
 def owner_of(run: Run | None) -> str:
-    """Return the beginning of the names of a run's scratch files, or of a training's without a run.
+    """Return the digits with which the names of a training's scratch files begin. run: None for a training without a
+    run.
 
-    It includes the folder's inode. So it differs from that of another run that had the same path before it was renamed,
-    or has it in another container.
+    For a run they are a digest of the folder's path and inode. The inode tells two runs apart that have the same path:
+    one that was renamed, or one in another container.
     """
     of = f"{run.path.resolve()} {run.path.stat().st_ino}" if run is not None else f"{machine_mark()} {os.getpid()}"
     return hashlib.sha256(of.encode("utf-8", "surrogatepass")).hexdigest()[:OWNER_DIGITS]

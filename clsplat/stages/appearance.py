@@ -77,9 +77,9 @@ class Gains:
     first, second: Adam's moments.
     gains: 2^logs.
     moved: scratch array for the update.
-    begins (photographs + 1,), others, weights (n,): row starts, column indices and values of a sparse matrix, as in
-    SciPy's `csr_array`. The matrix times `logs - start` is added to the gradient, so that the gains are pulled towards
-    their initial values.
+    begins: (photographs + 1,), row starts of a sparse matrix, as in SciPy's `csr_array`. The matrix times `logs -
+    start` is added to the gradient, which pulls the gains towards their initial values.
+    others, weights: (n,), column indices and values of this matrix.
     """
 
     logs: DeviceArray
@@ -151,7 +151,8 @@ def entry_gradient(
     size: tuple[int, int],
     place: int = 0,
 ) -> DeviceArray:
-    """Column sums (model.sums, stride) of the gradient with respect to colour entries of 0, applied to the render.
+    """Column sums (model.sums, stride) of the gradient with respect to colour entries that are applied to the render
+    and are 0.
 
     The sum over the columns, multiplied by ln 2 for logarithms, is the gradient (equations (184) to (186) of
     docs/gradients.md). place: index of the view in the batch; the result of each view is in an array of its own.

@@ -35,7 +35,8 @@ LOCAL_PAIRS = 2048
 a power of two, 16 or more."""
 
 _OFFSET_ITEMS = 1024
-"""Work-items in each of the two groups of `list_offsets`: one for all tiles, one for all groups of `count_tiles`."""
+"""Number of work-items in each of the two groups of `list_offsets`. The first group handles the lengths of all tiles'
+lists, the second the sums of all groups of `count_tiles`."""
 
 
 def appends(device: Device) -> bool:

@@ -75,7 +75,8 @@ def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[De
 _MIN_STRIP_ITEMS = 32
 """Number of work-items per tile from which sums over a tile's pixels are in the order of kernels/shared/strips.h."""
 _MIN_TILE_ITEMS = 8
-"""Minimum number of work-items per tile, unless one has it alone: a row of a pixel block (kernels/shared/blocks.h)."""
+"""Minimum number of work-items that share a tile: those of one row of a pixel block (kernels/shared/blocks.h). A tile
+that is not shared has one work-item."""
 
 
 def tile_items(device: Device) -> int:
@@ -144,7 +145,8 @@ def gradient_items_for(tiles: int, units: int, items: int, most: int) -> int:
 
 _GRADIENT_REGISTERS = {64: 96}
 """Maximum registers per work-item of `blend_grad`, by the number of work-items that share a tile, where the driver
-accepts a limit. Without it NVIDIA's assembler uses only 80, so few that loads have to wait for one another."""
+accepts a limit. Without a limit NVIDIA's assembler uses only 80 registers, so few that loads have to wait for one
+another."""
 
 
 def launch_tiles(

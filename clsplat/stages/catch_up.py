@@ -69,11 +69,12 @@ def catch_up(
     pass has stopped.
 
     model: parameters, first and second moments of the whole model.
-    last: (entries of chunks,) uint32, the last step that each chunk has taken with its gradients.
+    last: (entries of chunks,) uint32, the last step that updated each chunk with its gradients.
     caught: (chunks of the model,) uint32, the step up to which each chunk has caught up. The call writes `step` for
     these chunks, so that a second call for the same step changes nothing.
     table: must contain all missed steps.
-    readback: (READBACK_SIZE,) uint32. Its last four entries count refused updates of elements, one for each step.
+    readback: (READBACK_SIZE,) uint32. Its last four entries count the refused updates; an element counts once for each
+        step that refuses it.
     """
     if step > table.last_step:
         raise ValueError(f"table: has steps {table.first_step} to {table.last_step}, but step {step} is needed")

@@ -61,7 +61,10 @@ class Features:
         return {"FEATURES": self.floats, **{f"FEATURE_{name.upper()}": at for name, at in self.offsets.items()}}
 
     def named(self, means: NDArray[Any], whole: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Channels by name, (H, W) or (H, W, floats), from the planes of `Channels` on the host, plane axis last."""
+        """Return channels by name, (H, W) or (H, W, floats).
+
+        means, whole: the planes of `Channels` on the host, with the plane axis last.
+        """
         planes = {name: means[:, :, at : at + FEATURE_WIDTHS[name]] for name, at in self.offsets.items()}
         planes = {name: plane if plane.shape[2] > 1 else plane[:, :, 0] for name, plane in planes.items()}
         planes |= {name: means[:, :, at] for at, name in enumerate(DEPTH_PLANES, self.floats)}

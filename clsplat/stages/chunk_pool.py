@@ -67,8 +67,8 @@ class ChunkPool:
     arrays: arrays on the device by field, with CHUNK_ROWS rows for each slot.
     caught: (slots,) uint32, the last step up to which the chunk in each slot has been caught up (`stages.catch_up`).
     cull: function that returns the chunks that a camera may show; None if that is not known.
-    before_view: function that is called before a step with the number of chunks that its view may show, which have yet
-        to come, and may resize the pool.
+    before_view: function that is called before the chunks of a step's view are fetched, with their number. It may
+        resize the pool.
     """
 
     def __init__(self, device: Device, work: Workspace, store: ChunkStore, rows: int, cull: Cull | None = None) -> None:
@@ -95,9 +95,9 @@ class ChunkPool:
         self._changed = np.zeros(self.slots, np.bool_)
 
     def resize(self, rows: int) -> None:
-        """Allocate slots for `rows` Gaussians in place of the present ones. They are empty. Raises WriteError.
+        """Replace the slots by empty slots for `rows` Gaussians, after writing changed chunks back. Raises WriteError.
 
-        If the driver has no memory for them, against the plan, one slot is allocated.
+        If the driver has no memory for them, although the plan has, one slot is allocated.
         """
         self.release()
         self.free()
@@ -144,7 +144,8 @@ class ChunkPool:
     def read_ahead(self, camera: Camera) -> None:
         """Begin to read the chunks that a camera may show and that are not on the device from a scratch file.
 
-        If no chunk has moved since the last call, the chunks of all views may be on the device, and nothing is culled.
+        If no chunk has crossed the bus since the last call, nothing is read: the chunks of all views are probably on
+        the device, and finding those in view would take time for nothing.
         """
         if self.moved_bytes > self._moved_before and self.cull is not None and self.store.path is not None:
             numbers = self.cull(camera)
@@ -222,7 +223,8 @@ class ChunkPool:
             self._to_slots(slots[some], values)
 
     def _close(self, numbers: NDArray[np.int64], records: NDArray[Any]) -> None:
-        """Fill the rows past the end of chunks with copies of the last row that no view shows and no step moves."""
+        """Fill the rows past the end of each chunk with copies of its last row. The opacity of these copies is so low
+        that no view shows them, and their moments are 0, so that no step moves them."""
         lengths = self.store.lengths(numbers)
         for place in np.flatnonzero(lengths < CHUNK_ROWS).tolist():
             rows = int(lengths[place])

@@ -172,7 +172,7 @@ def parts(
     Models on the device have a single part. Each part of a streamed model is valid until the next part is requested.
 
     models: all on the device, or all streamed. Streamed models in a pool come first, and share one pool; the others are
-        in main memory. A part of a pool has as many rows as the pool's slots.
+        in main memory. With a pool, each part has as many rows as all slots of the pool.
     keep: True if the caller changes the parts. They are then copied back to main memory, or to the pool's store.
     """
     on_device = tuple(model for model in models if isinstance(model, DeviceGaussians))
@@ -253,7 +253,8 @@ def by_field(models: Models) -> dict[str, AnyArray]:
 class CopiedRows:
     """A copy of Gaussians that is made chunk by chunk.
 
-    arrays: arrays to copy from, by field: all of one pool's store, or none.
+    arrays: arrays to copy from, by field. Either all of them are fields of one pool's store, or none of them is in a
+        store.
     rows: row j of the copy is row rows[j]; None copies all rows.
     values: values of new rows, and of fields that are not among `arrays`.
     """

@@ -76,7 +76,8 @@ class Totals:
     arriving: Callable[[], NDArray[Any]] | None = None
 
     def elements(self, most: int, name: str) -> Elements:
-        """The number of elements that a kernel processes: `most`, or in a pass by capacity field `name` of READBACK.
+        """The number of elements that a kernel processes: `most`. In a pass by capacity it is field `name` of READBACK
+        instead.
 
         most: the number. In a pass by capacity, an upper bound of the number that the kernel reads from READBACK.
         """
@@ -126,8 +127,8 @@ def count(
     Waits for the device.
 
     all_bits: assume that depths differ in all 32 bits.
-    readback: (READBACK_SIZE,) uint32, the array that the host reads. Elements that `adam` refused and counted in it are
-    in the result; None for an array without counts.
+    readback: (READBACK_SIZE,) uint32, the array that the host reads. Its counts of elements that `adam` refused become
+    part of the result. None uses an array without these counts.
     """
     readback = readback or work.array("readback", (len(COUNTED),), np.uint32)
     first_slots, gaussian_from_visible, depth_keys = _compact(device, work, projected, readback)

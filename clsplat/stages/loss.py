@@ -31,7 +31,8 @@ class _Blocks:
     """Blocks of pixels that groups of the loss kernel process.
 
     rows, columns: size of a block in pixels.
-    groups: number of groups; if each block has its own group: the numbers of blocks across and down, and of channels.
+    groups: the number of groups, if they share the blocks. If each block has a group of its own: a tuple of the numbers
+        of blocks across, of blocks down, and of channels.
     field: floats that a row of one of the three partial derivatives takes; 0 in groups of several items.
     partials, sums: lengths in floats of two arrays, the partial derivatives and the partial sums.
 
@@ -76,7 +77,7 @@ class Loss:
     sums: (3, ...), partial sums of SSIM, of |x - y| and of (x - y)^2. With further terms the array has one axis, and
     the partial sums of these terms follow.
     samples: number of colour samples, three per pixel, that no mask excludes.
-    masked: number of masked samples; their windows still count in SSIM.
+    masked: number of masked samples. The mean of SSIM still includes the windows around them.
     copy: function that waits for a copy of the sums to the host and returns it; None if no copy has been started.
     further: weight, divisor and number of partial sums of each loss term other than L1 and D-SSIM.
     """
@@ -130,7 +131,8 @@ def loss(
     target: planes like the image's; or a photograph (height, width, 3), uint8 or float32, if several items share a
     tile (`tile_items`).
     sums_index: index of the array for the loss's sums. A call's sums can be read until the next call with this index.
-    kept: number of pixels that no mask excludes, over which the means are taken. The others are zero in both images.
+    kept: number of pixels that no mask excludes, over which the means are taken. Excluded pixels are zero in both
+        images.
     blended: the render; needed only if there are terms.
     terms: loss terms to add. Each has a plane of the gradient, after the colours, and its own partial sums.
     """

@@ -13,7 +13,8 @@ from clsplat.stages.device_camera import padded_size
 
 @stage("pixels")
 def pixels_from_planes(device: Device, blended: Blended, pixels: DeviceArray, alpha: DeviceArray) -> None:
-    """Fill alpha (height, width) and the first three values, or fewer, of pixels (height, width, depth)."""
+    """Fill alpha (height, width), and of pixels (height, width, depth) the first three values, or all if depth is
+    less."""
     height, width, depth = pixels.shape
     kernel, stride = device.kernels("pixels").pixels_from_planes, blended.transmittance.shape[1]
     planes = (blended.image, blended.transmittance)

@@ -67,7 +67,8 @@ def lens_rows(
 def sum_of(device: Device, work: Workspace, sums: DeviceArray) -> DeviceArray:
     """Add the rows of partial sums (m, numbers) to one row (1, numbers).
 
-    The row is the gradient with respect to the rotation and translation of `Camera.moved`, or to ln fx, ln fy, cx, cy.
+    For a pose the row is the gradient with respect to the rotation and translation of `Camera.moved`; for a lens, with
+    respect to ln fx, ln fy, cx and cy.
     """
     kernel, numbers, level = device.kernels("pose", {"LANES": 1}).pose_sums, sums.shape[1], 0
     while sums.shape[0] > 1:

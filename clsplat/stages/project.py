@@ -48,8 +48,8 @@ class Projected:
 
     splats: (n, SPLAT), in the columns of `layouts.columns.SPLAT`.
     tile_counts: (n), the number of tiles that each Gaussian reaches; 0 for a culled Gaussian.
-    shown: (n), 0 for Gaussians without a splat, if frustum culling is switched off. Otherwise None, as then their tile
-    counts are 0.
+    shown: (n), 0 for Gaussians without a splat, if frustum culling is switched off. Otherwise None, because Gaussians
+    without a splat then have a tile count of 0.
     chunks: the chunks of the model whose Gaussians were projected; None for the whole model.
     """
 
@@ -318,7 +318,7 @@ class _Build(NamedTuple):
 
 
 def _build(device: Device) -> _Build:
-    """The build of the gradient. It has a single lane if Gaussians are evaluated along rays, like the projection."""
+    """The build of the gradient. If Gaussians are evaluated along rays, it has one lane, as the projection has too."""
     return _Build(1, {"LANES": 1}) if device.switched("RAYS") else _Build(device.shape.lanes, {})
 
 

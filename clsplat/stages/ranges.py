@@ -25,7 +25,7 @@ class TileLists:
     """The tile lists of a band.
 
     ranges: (tiles, 2), begin and end of each tile's pairs in gaussian_from_sorted and slot_from_sorted, (pairs) each.
-    order: (tiles), the tiles in the order in which groups take them; None for the order in the image.
+    order: (tiles), the tiles in the order in which groups process them; None for the order in the image.
     """
 
     band: Band

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Launches sort_radix.cl and sort_bitonic.cl: stable sorts of uint32 keys, with the keys' positions in the input.
 
-A frame's lists take two sorts: by depth in `stages/duplicate.py`, then of the pairs by tile in `stages/ranges.py`.
+A frame's lists need two sorts: by depth in `stages/duplicate.py`, then of the pairs by tile in `stages/ranges.py`.
 Lists by append (`stages/append.py`) are sorted tile by tile in their own kernel.
 """
 

@@ -62,8 +62,8 @@ def target(
     in_planes: False if only `stages.loss.loss` reads the result. A photograph without alpha and mask is then returned
     as it is if several items share a tile (`tile_items`).
 
-    A fifth channel is a mask, 0 where a pixel does not count. These pixels become zero in the planes, and in the render
-    `blended` too; the gradient of blending skips them. An image on the host is uploaded as `on_device` does.
+    A fifth channel is a mask, 0 in pixels that the loss leaves out. These pixels become zero in the planes, and in the
+    render `blended` too; the gradient of blending skips them. An image on the host is uploaded as `on_device` does.
     """
     source = on_device(work, image)
     device.under_way.append(source.buffer)  # a buffer may be host memory, which must exist until the kernel has run

@@ -92,7 +92,7 @@ class Losses:
 class _AddedView(GradientStep):
     """Step of one view that adds the view's gradients to the batch's sums, in place of Adam.
 
-    It takes the parameters and these sums for its `model`.
+    Its `model` consists of the parameters and the batch's sums of gradients, without moments.
 
     own: gradients of each view's parts, by the view's position in the batch.
     noise: noise that the batch adds after its last view.
@@ -292,7 +292,7 @@ class Batch:
 
         step: template for the steps of the single views; its number counts views.
         factor: divisor of the photographs' resolution.
-        probes: function that makes the observer of a view's step from its inputs and step.
+        probes: function that makes the `StepProbe` of a view from the view's inputs and its step.
         statistics: True if density control uses the views' gradients.
         """
         batch, work, device = self.config.batch, self.rasterizer.work, step.device
@@ -383,9 +383,11 @@ class Batch:
     def _take(
         self, parameters: AnyGaussians, sums: AnyGaussians, outcome: ViewOutcome, step: _AddedView, probe: StepProbe
     ) -> Loss:
-        """Add a further device's results of a view to the sums. They pass through the scratch arrays of a view here.
+        """Add a further device's results of a view to the sums. They are first copied to scratch arrays on the first
+        device.
 
-        parameters: those of the model. A pool has their statistics on the device with them.
+        parameters: the model's parameters. If they are in a pool, the density statistics of the same rows are on the
+            device too.
         """
         device, work = step.device, self.rasterizer.work
         probe.loss(outcome.loss)

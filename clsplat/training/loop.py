@@ -69,8 +69,8 @@ class StepReport:
     """Report of a training step.
 
     step: number of steps done.
-    loss, psnr: loss and PSNR of the step's view, or from the means over its batch.
-    seconds: training time so far; evaluations, checkpoints and other work do not count.
+    loss, psnr: loss and PSNR of the step's view. In a batch, the mean loss, and the PSNR of the mean squared error.
+    seconds: training time so far, without the time of evaluations, checkpoints and other work.
     """
 
     step: int
@@ -225,7 +225,7 @@ class TrainingSession:
             f"{incident}, and {MAX_CHECKPOINT_RETURNS} returns to a checkpoint with smaller learning rates did not help"
         )
         if self.run is None:
-            raise ClsplatError(f"{trouble}: with run=..., a file that reproduces it would be written there")
+            raise ClsplatError(f"{trouble}: no file that reproduces it is written, as clsplat.train had no run=...")
         path = write_bundle(self.run.path, self.trainer, incident)
         raise ClsplatError(f"{trouble}: {path} reproduces it (python -m clsplat.training.repro_bundle)")
 

@@ -43,8 +43,8 @@ POOL_QUARTERS = 3
 get the rest."""
 
 MOST_VIEWS_LOOKED_AT = 200
-"""Largest number of views that are culled before the first step, to find how many rows a view shows. For one view of 20
-million Gaussians this takes some 7 ms. If a later view shows more, memory is planned again before its step."""
+"""Maximum number of views whose chunks in view are counted before the first step. With 20 million Gaussians a view
+takes about 7 ms. If a later view shows more chunks than all of these, memory is planned again before its step."""
 
 
 def model_bytes(config: TrainConfig) -> int:
@@ -80,10 +80,11 @@ class HostMemory:
         run: Run | None,
         scratch: str | Path | None = None,
     ) -> HostMemory:
-        """Make it from the arguments of `clsplat.train`. Raises InputError.
+        """Make the memory that these arguments of `clsplat.train` ask for. Raises InputError.
 
-        cache: a folder, or "none". None takes RUN/cache if there is a limit, otherwise no cache.
-        scratch: a folder. None takes RUN/scratch.
+        cache: a folder, or "none" for no cache. If it is None, the cache is RUN/cache with a limit, and there is no
+            cache without one.
+        scratch: a folder; None stands for RUN/scratch.
         """
         limit = parse_bytes(max_host_mem, "--max-host-mem")
         memory = cls._with_cache(limit, cache, run)
@@ -229,7 +230,8 @@ class MemoryPlanner:
         self.begins, self._warned, self.rows_in_view = True, False, 0
 
     def look(self, local: Callable[[Camera], Camera], initial: Gaussians) -> None:
-        """Find the largest number of rows that a view of the initial model shows, from an even sample of the views.
+        """Set `rows_in_view` to the largest number of rows that a view of the initial model shows, from an even sample.
+
 
         Does nothing if no limit of the device's memory can have the model streamed by chunk.
         local: function from a camera in world coordinates to the camera in those of the model.

@@ -30,7 +30,7 @@ class Move:
     rows: for each new row, the old row that it copies, plus FRESH if new. None keeps all rows.
     coefficients: number of SH coefficients; 0 for as many as there are.
     changes: function that is called before the first change of the model.
-    values: of rows and fields that are new.
+    values: values of new rows, and of fields that the old records do not have.
     """
 
     rows: NDArray[np.uint32] | None = None
@@ -39,7 +39,7 @@ class Move:
     values: NewValues = field(default_factory=new_values)
 
     def count(self, before: int) -> int:
-        """Number of Gaussians after the move of so many."""
+        """Number of Gaussians after the move. before: their number before the move."""
         return before if self.rows is None else len(self.rows)
 
 
@@ -49,8 +49,9 @@ class MovedRows:
 
     rows: (m,) uint32, the source row of each row, plus FRESH if the row is new.
     halves: number of halves of split Gaussians, two of each.
-    places: new row of each entry of the plan's list; None if the order is the same, or as in `listed`.
-    listed: the plan's list in the order of the sources, of a large streamed model; else None.
+    places: the row that each entry of the plan's list has become. None if the list and the rows have the same order, or
+        if `listed` gives the order.
+    listed: the plan's list, in the order of the source rows, if the model is large and streamed; otherwise None.
     """
 
     rows: DeviceArray | NDArray[np.uint32]

@@ -76,7 +76,8 @@ def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:
 
 
 def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:
-    """Record the scene in the run. Returns the scene to train on, whose points have colours. Warns of bad findings.
+    """Record the scene in the run. Returns the scene to train on, whose points have colours. Warns of faults that
+    `sanity_checks.of_scene` finds.
 
     Raises InputError if the run has already been trained, or trained on another scene.
     """

@@ -230,7 +230,7 @@ def _bundle_of(saved: Checkpoint, path: Path) -> Bundle:
 
 
 class _Counts(StepProbe):
-    """Observer of a step that counts the non-finite values after each stage of a step."""
+    """`StepProbe` that counts the non-finite values after each stage of a step."""
 
     def __init__(self, camera: Camera) -> None:
         self.seen = (slice(None), slice(camera.height), slice(camera.width))

@@ -80,7 +80,8 @@ class TrainedModel:
     """Parameters, first and second moments and statistics, on the device or streamed from the host.
 
     make_plan: function that plans the device's memory for a number of Gaussians.
-    plan_view: function that returns the plan in place of another for a view of so many chunks (`MemoryPlanner`).
+    plan_view: function from the current plan and a view's number of chunks to the plan for this view
+        (`MemoryPlanner.plan_view`).
     scratch: function from bytes of chunks to the path of a new scratch file, or None to keep them in main memory.
     files: the training's scratch files; None if there is no folder for them.
     sh_degree: final SH degree.
@@ -170,8 +171,8 @@ class TrainedModel:
         return by_field(self.with_moments) | self.statistics.by_field()
 
     def by_kind(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Mapping[str, AnyArray]]:
-        """Return parameters and moments by kind and group: those of the arrays of a checkpoint, or of the scratch file,
-        of which a checkpoint has only a manifest."""
+        """Return the parameters and moments of a checkpoint by kind and group. They are among its `arrays`, or in the
+        scratch file if the checkpoint has only a manifest."""
         if self.in_file:
             return {kind: model.arrays for kind, model in self.kinds().items()}
         return {kind: _host_arrays({g: arrays[f"{kind}/{g}"] for g in PARAMETER_GROUPS}) for kind in KINDS}
@@ -265,7 +266,8 @@ class TrainedModel:
     ) -> None:
         """Put Gaussians where the plan assigns them: on the device, in main memory, or in a store of chunks.
 
-        models: new parameters and moments, not in a store. None keeps this model's, which are or will be in a store.
+        models: new parameters and moments, not in a store. None keeps the Gaussians of this model, which are in a store
+            now or will be.
         statistics: statistics of new models by name; others get their initial values. None keeps this model's.
         """
         parameters = self.parameters if models is None else models[0]
@@ -392,8 +394,9 @@ class TrainedModel:
         self.statistics = pooled_statistics(pool)
 
     def _before_view(self, chunks: int) -> None:
-        """Plan for a step whose view shows so many chunks, and let the pool become smaller if the view's arrays need
-        the memory. No bit depends on it. Raises CapacityError, before any change, and WriteError."""
+        """Plan the memory for a step whose view shows `chunks` chunks. Make the pool smaller if the view's arrays need
+        its memory. No bit of a result depends on the pool's size. Raises CapacityError, before any change, and
+        WriteError."""
         assert self._pool is not None
         self.plan = self._plan_view(self.plan, chunks)
         if self.plan.rows < self._pool.rows:

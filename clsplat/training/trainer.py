@@ -295,7 +295,7 @@ class Trainer:
             component.after_adam(self.parameters)
 
     def _watched(self, needs: StatisticsNeeds, inputs: ViewInputs, step: GradientStep, number: int) -> StepMonitor:
-        """Return the observer of a view's step. number: of views that training has used so far, this one included."""
+        """Return the probe of a view's step. number: number of views used so far, this one included."""
         return StepMonitor(
             step, number, inputs, needs, self.statistics.on_device, self.monitor, self.pending, self.tried, self._unmark
         )
@@ -304,7 +304,7 @@ class Trainer:
         self.mark = None
 
     def _watched_in_batch(self, needs: StatisticsNeeds, inputs: ViewInputs, step: GradientStep) -> StepProbe:
-        """Return the observer of a batch's view. If the view begins an epoch, begin it; so call in the views' order."""
+        """Return the probe of a batch's view. Call it in the order of views: the first of an epoch begins the epoch."""
         if inputs.begins:
             self._turn_epoch()
         return self._watched(needs, inputs, step, self.step)

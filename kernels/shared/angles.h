@@ -1,4 +1,4 @@
-// Angles by arctangents, as scalars, with the same bits on every driver. Include math.h before.
+// Angles by arctangents, as scalars, with the same bits on every driver. Include math.h before this file.
 #define HALF_TURN 3.14159265f
 #define QUARTER_TURN 1.57079633f
 

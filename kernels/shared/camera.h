@@ -1,5 +1,5 @@
 // Includes the camera model of this build, a header of shared/camera/. All camera models have the same functions and
-// macros, which docs/cameras.md (Adding a camera model) lists. Include math.h and lanes.h before.
+// macros, which docs/cameras.md (Adding a camera model) lists. Include math.h and lanes.h before this file.
 //
 // Before the first include, a kernel defines the macros of the parts that it needs:
 //   NEEDS_PROJECTION   a Gaussian's position on the image plane; gaussian.h and ewa.h define this macro

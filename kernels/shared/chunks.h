@@ -1,9 +1,9 @@
 // Maps the rows of a launch that covers only some chunks of a model to rows of the model. With CHUNKS, a kernel has the
 // parameters CHUNK_PARAMETERS at its end. `chunks` (n / CHUNK_ROWS): the model's chunk for each CHUNK_ROWS rows of the
 // launch, then NO_CHUNK; `model_rows`: the number of rows of the model. The chunks of a streamed model lie in the slots
-// of a pool, in any order; then `chunks` has slots, and `model_rows` counts the rows of all slots. With FIRST_ROWS, a
-// kernel over slots has the parameter `first_rows` (n / CHUNK_ROWS): for each chunk, the row of the whole model that
-// its first row is.
+// of a pool, in any order; `chunks` then lists slots, and `model_rows` is the number of rows of all slots. With
+// FIRST_ROWS, a kernel over slots has the parameter `first_rows` (n / CHUNK_ROWS): the number that the first row of
+// each chunk has in the whole model.
 //
 // Arrays of a view, such as splats and tile_counts, have the rows of the launch. Parameters, moments and statistics
 // have the rows of the model.
@@ -17,8 +17,8 @@ static inline long rows_ahead(__global const uint *chunks, uint row) {
   return (long)CHUNK_ROWS * ((long)chunks[place] - place);
 }
 
-// The end of the rows of a launch with `n` rows: n, or less if the model's last chunk is not full. `row` itself if the
-// model does not have the row.
+// The end of the rows of a launch with `n` rows that the model has: n, or less if the model's last chunk is not full.
+// Returns `row` if the model has no row for it, as in padding by NO_CHUNK.
 static inline uint end_of_rows(uint row, uint n, long ahead, uint model_rows) {
   return row + ahead >= model_rows ? row : (uint)min((long)n, model_rows - ahead);
 }

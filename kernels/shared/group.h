@@ -63,7 +63,7 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
 }
 
 // The number of a group's tile within the launch: the group's number, or tile_order[group's number] with TILE_ORDER.
-// tile_order (tiles) lists the tiles in the order in which groups take them.
+// tile_order (tiles) lists the tiles in the order in which groups process them.
 #ifdef TILE_ORDER
 #define TILE_ORDER_PARAMETER , __global const uint *tile_order
 #define LISTED_TILE tile_order[get_group_id(0)]

@@ -5,9 +5,9 @@
 // fraction divided by the thickness. Each pixel's surfaces are sorted by the depth of their fronts. Equation (75)
 // of docs/pictures.md.
 #ifdef HOLDOUT
-// State of a cell while depth increases. through: the transmittance of the surfaces passed as a whole; at: the index of
-// the pixel's first surface that is not; next: the depth of the front of that surface; end: the end of the pixel's
-// surfaces.
+// State of a cell while depth increases. at: the index of the pixel's first surface whose back has not been passed;
+// through: the transmittance of all surfaces before `at`; next: the depth of the front of surface `at`; end: one more
+// than the index of the pixel's last surface.
 typedef struct {
   Lanes through, next;
   uint at[LANES], end[LANES];

@@ -44,8 +44,8 @@ static inline float row_sum(__local const float *row) {
 
 #if SUBGROUP > 1
 // Adds up the fields of a pair over a sub-group, and stores each field's sum in the field's row, in the sub-group's
-// element; `rows` is the first row. In each step an item gives half of its fields to another item, and adds that item's
-// values to the other half, until it has one field, or a few.
+// element; `rows` is the first row. In each step two items exchange values: each gives half of its fields away, and
+// adds the values that it gets to the fields that it keeps. At the end an item has one field, or a few.
 static inline void leave_sums(const float *sums, __local float *rows) {
   float held[SLOT_STRIDE];
   int n = SLOT_STRIDE, begin = 0, end = SLOT_STRIDE; // the item holds the fields [begin, end)

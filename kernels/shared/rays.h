@@ -1,5 +1,5 @@
 // The alpha of a Gaussian along a pixel's ray, and the ray's whitened coordinates on the plane tangent to the unit
-// sphere at the mean's direction. Equation numbers refer to docs/cameras.md. Include lanes.h before.
+// sphere at the mean's direction. Equation numbers refer to docs/cameras.md. Include lanes.h before this file.
 
 // Returns log2 of the uncapped alpha along the ray (x, y, z), equation (14) of docs/cameras.md, and sets (u, v) to the
 // whitened point at which the ray meets the tangent plane at the mean's direction.

@@ -8,8 +8,8 @@
 
 // Advances the current slice past a Gaussian that reduces the light from `before` to `after`, equation (73) of
 // docs/pictures.md. *open: the light at the slice's start; once the slice's depth is fixed, minus the light behind the
-// Gaussian at that depth. slack: the largest error; taken: the lanes that the Gaussian reaches; may_begin: those of
-// them in which a new slice may begin. Returns the lanes in which a slice begins.
+// Gaussian at that depth. slack: the largest error; taken: the lanes that the Gaussian reaches; may_begin: the lanes in
+// `taken` in which a new slice may begin. Returns the lanes in which a slice begins.
 static inline intL begins_slice(floatL *open, floatL before, floatL after, floatL slack, intL taken, intL may_begin) {
   const intL placed = taken & MASKL(*open - before > slack);
   const floatL now = placed ? -before : *open;

@@ -1,6 +1,6 @@
 // Projects a Gaussian to an ellipse on the plane that touches the sphere of directions at the Gaussian's mean.
-// Projection and its gradient share this code. Built with one lane. Equation numbers refer to docs/cameras.md. Include
-// gaussian.h before, with NEEDS_TANGENTS (camera.h).
+// Projection and its gradient share this code. Built with one lane. Equation numbers refer to docs/cameras.md. Before
+// this file, define NEEDS_TANGENTS (camera.h) and include gaussian.h.
 
 typedef struct {
   float f[3], distance; // unit direction and distance of the mean, in the camera's axes

@@ -1,4 +1,5 @@
-// Code that values.cl and values_grad.cl share, which blend any number of values per Gaussian. Include cells.h before.
+// Code that values.cl and values_grad.cl share, which blend any number of values per Gaussian. Include cells.h before
+// this file.
 #ifndef VALUES
 #error "VALUES must be defined: values of a Gaussian that a pass has, 1 to 32"
 #endif

@@ -23,7 +23,7 @@ typedef float2 Passing;
 typedef float4 Fixed;
 
 // The Gaussian that an item currently processes. i: the index of the pair, less than `begin` if there is none; blocks:
-// those that the ellipse reaches; slot: the pair's slot.
+// the blocks that the ellipse reaches; slot: the pair's slot.
 typedef struct {
   float mx, my, l11, l12, l22, log2o, red, green, blue;
   int i;

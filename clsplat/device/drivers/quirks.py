@@ -202,8 +202,8 @@ def of_maker(platform_name: str, device_name: str, maker: str) -> bool:
 def driver_files(environment: Mapping[str, str] = os.environ) -> list[Path]:
     """The .icd files; each contains the name of a driver's library.
 
-    The files are in the system's folder or, instead, the folder that OCL_ICD_VENDORS names; and in pyopencl's own
-    folder of libraries.
+    They are in the folder that OCL_ICD_VENDORS names, or without this variable in the system's folder. Others are in
+    pyopencl's own folder of libraries.
     """
     folders = [Path(environment.get(_ICD_VENDORS) or "/etc/OpenCL/vendors")]
     spec = importlib.util.find_spec("pyopencl")

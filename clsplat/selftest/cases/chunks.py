@@ -370,7 +370,7 @@ def _records_of(words: NDArray[np.uint32], slots: NDArray[np.int64], coefficient
     """A pool whose slots are filled with words, and records for some of the slots.
 
     slots: the slots that are copied.
-    words: fill the pool, and in reverse order the records.
+    words: 32-bit words that fill the pool; in reverse order they fill the records.
     """
     fields: dict[str, tuple[int, ...]] = {"logit": (), "mean": (3,), "rest": (coefficients - 1, 3)}
     record = record_type(fields)

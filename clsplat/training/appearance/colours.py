@@ -77,7 +77,8 @@ _COLOUR_UPDATE = GainEntries(mix_rate=MIX_RATE_FRACTION)
 class ViewColours(ViewPart):
     """Entries of one photograph and its lens in one step.
 
-    colours, lenses: entries of all photographs, and of all lenses; None if the colour model has none of lenses.
+    colours, lenses: entries of all photographs, and of all lenses; `lenses` is None if lenses have no entries in the
+        colour model.
     taken: the photograph's row in `colours`, and its lens's row in `lenses`.
     place: the view's position in the batch.
     """

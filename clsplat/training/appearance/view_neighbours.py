@@ -43,7 +43,7 @@ def places(cameras: Sequence[Camera]) -> Float64:
 def common(cameras: Sequence[Camera], told: NDArray[np.bool_]) -> csr_array:
     """Symmetric matrix (n, n) that extracts the common part of neighbouring photographs' values.
 
-    told: (n,), True for photographs that count; rows and columns of other photographs are 0.
+    told: (n,), True for photographs that have gains from points; rows and columns of all others are 0.
 
     For a photograph with many neighbours the matrix keeps nearly all of the common part. For a photograph without
     neighbours it keeps half of the value. Its entries are w / sqrt(t t'), where w is (1 - r)^6 (6 r + 1) at a distance

@@ -130,7 +130,7 @@ class ValidationViews:
         A photograph counts if its mask keeps a pixel. If appearance is learnt, colours are fitted before the
         comparison.
 
-        look: function that gives a render the appearance of a view, if that is known.
+        look: function that gives a render the appearance of a view, for views whose appearance is known.
         """
         found = []
         for index, camera in enumerate(cameras):

@@ -128,7 +128,8 @@ class CameraGate:
         """Record the held-out PSNR after a step, in dB, and decide if refinement goes back to earlier cameras.
 
         cameras: the current cameras, as arrays of a checkpoint.
-        Returns the arrays of the cameras to go back to, or None to keep the current ones. Then a warning, or "".
+        Returns two values: the arrays of the cameras to go back to, or None to keep the current ones; and the text of a
+        warning, or "".
         """
         self.measured.append((step, psnr))
         if self.ended is not None:

@@ -51,7 +51,8 @@ class Mcmc(Strategy):
         return is_due(self.config, step)
 
     def before_step(self, model: ModelState) -> RowPlan:
-        """Plan to halve the Gaussians with the largest gradients. Second halves take rows of dead ones, then new rows.
+        """Plan to halve the Gaussians with the largest gradients. Second halves go to rows of dead Gaussians first,
+        then to new rows.
 
         A Gaussian is dead if it is nearly transparent, has no valid rotation, or is too large on the screen.
         """

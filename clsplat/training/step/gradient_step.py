@@ -33,20 +33,20 @@ R = TypeVar("R")
 
 
 class StepProbe:
-    """Observer of a training step. The step calls its methods as it launches stages; by default they do nothing.
+    """Callbacks of a training step: the step calls these methods as it launches stages. By default they do nothing.
 
-    The device may still be computing a stage when its method is called. Where launches are replayed from a command
-    buffer, `before_rows` and `after_rows` are not called, because their own launches are replayed too.
+    The device may still be computing a stage when the stage's method is called. `before_rows` and `after_rows` are not
+    called in a replay of a command buffer: it contains the launches that they made.
     """
 
     @property
     def key(self) -> tuple[object, ...]:
-        """Key of the observer's own launches in a command buffer: all that they depend on, except `numbers`."""
+        """Key of the probe's own launches in a command buffer: all that these launches depend on, except `numbers`."""
         return ()
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """Numbers that change from step to step in the observer's own launches (`LaunchParameter`), in order."""
+        """Numbers that change from step to step in the probe's own launches (`LaunchParameter`), in order."""
         return ()
 
     def forward(self, frame: ForwardPass) -> None:
@@ -69,7 +69,7 @@ class StepProbe:
 
 
 NO_PROBE = StepProbe()
-"""An observer that does nothing."""
+"""A probe whose methods do nothing."""
 
 
 @dataclass(eq=False)
@@ -244,7 +244,8 @@ class GradientStep:
         probe: StepProbe,
         placed: PlacedChunks | None,
     ) -> None:
-        """Take Adam's step for the model, in parts that the device has memory for, or for some of its chunks."""
+        """Take Adam's step for the whole model, or only for the chunks in `placed`. A streamed model comes to the
+        device in parts."""
         chunks = None if placed is None else placed.in_model
 
         def change() -> None:
@@ -286,8 +287,8 @@ class GradientStep:
         slots: Slots,
         gradients: DeviceGaussians | None,
     ) -> StepRows:
-        """Make a record of rows of the model, or of the chunks in `projected`, from `start` on, with arrays for their
-        gradients."""
+        """Make the `StepRows` of a part of the model: the rows of `projected`, of which the first is row `start` of the
+        step."""
         count = projected.tile_counts.shape[0]
         by_lens = (part.lens_gradients(count) for part in inputs.parts)
         return StepRows(

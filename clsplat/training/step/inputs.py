@@ -24,8 +24,9 @@ class PlacedChunks:
     """Chunks that a step runs over, ready for its kernels.
 
     model: arrays for the kernels: of the whole model, or of the pool of a streamed model.
-    in_model: the chunks in `model`. If the pool has no room for all of them, it is `ChunkNumbers`, and `model` is the
-        streamed model, whose chunks come to the pool in parts.
+    in_model: the chunks. Usually a `ChunkList`: their numbers in the whole model, or their slots in the pool. If the
+        pool has too few slots for all of them, their `ChunkNumbers`; `model` is then the streamed model, whose chunks
+        come to the pool in parts.
     """
 
     model: tuple[AnyGaussians, ...]
@@ -72,9 +73,10 @@ class ViewInputs:
 
 @dataclass(frozen=True, eq=False)
 class ViewRows:
-    """Rows [start, stop) of the model, or of the chunks that were projected, that are on the device at once.
+    """Rows [start, stop) of a step that are on the device at once. The rows of a step are those of the whole model or,
+    if a step runs over some chunks, those of the chunks one after the other.
 
-    projected: projection of these rows into the step's view.
+    projected: projection of the rows [start, stop) into the step's view.
     screen: screen-space gradients of these rows. They may be undefined until the kernel has run that changes the rows.
     """
 

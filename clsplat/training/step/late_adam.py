@@ -110,9 +110,10 @@ class LateAdam(Component):
         return {"late/last": self._last.get(), "late/missed": self._missed.factors.copy()}
 
     def load(self, named: Named, step: int, count: int) -> None:
-        """Continue from a checkpoint's arrays, or, without them, as if all rows had taken every step.
+        """Continue from a checkpoint's arrays. If the checkpoint has none of these arrays, continue as if all rows had
+        taken every step.
 
-        Raises ValueError.
+        Raises ValueError for arrays of another model or step.
         """
         saved, missed = named("late/"), MissedSteps(self._config, _GROUPS)
         last = saved.get("last", np.full(count, step, np.uint32))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observer of a training step: non-finite values, trials of kernels in the sandbox, statistics for density control."""
+"""Probe of a training step: non-finite values, trials of kernels in the sandbox, statistics for density control."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from clsplat.training.step.speculative_steps import SpeculativeSteps
 
 @dataclass(eq=False)
 class StepMonitor(StepProbe):
-    """Observer of a step: finds non-finite values, tries the kernels that change the state, and adds the statistics of
+    """Probe of a step: finds non-finite values, tries the kernels that change the state, and adds the statistics of
     density control.
 
     number: number of views that training has used so far, this one included.

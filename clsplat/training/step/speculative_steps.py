@@ -29,7 +29,8 @@ BY_CAPACITY_VARIABLE = "CLSPLAT_BY_CAPACITY"
 _STOPPED, _PAIRS, _LONGEST = (READBACK.index(name) for name in ("STOPPED", "PAIRS", "LONGEST"))
 
 Run = Callable[[int, PairCapacity | None], Loss]
-"""Function that runs one step. It takes the number of the array for the loss's sums, and a capacity or None."""
+"""Function that runs one step. Its arguments are the number of the array for the loss's sums, and a capacity or
+None."""
 
 
 @dataclass(eq=False)
@@ -122,7 +123,8 @@ class SpeculativeSteps:
         return wanted if wanted <= rasterizer.capacity else 0
 
     def launch(self, run: Run, room: int, *, number: int, reads_loss: bool) -> Loss:
-        """Run a step with capacity `room`, or with an exact count if that is 0. Then check the step before.
+        """Run a step with capacity `room`, or with an exact count if `room` is 0. Then check if the previous step had
+        enough capacity.
 
         number: number of the step's last view.
         reads_loss: True to check this step too, because its loss will be read.
@@ -147,7 +149,7 @@ class SpeculativeSteps:
         return step.result if reads_loss else result.copied(lambda: self._sums(step))
 
     def _sums(self, step: _Step) -> NDArray[Any]:
-        """Sums of a step's loss. The step is checked before, and repeated if it is incomplete."""
+        """Return the sums of a step's loss, after checking the step and repeating it if it is incomplete."""
         self.settle()
         copy = step.result.copy
         return copy() if copy is not None else step.result.sums.get()

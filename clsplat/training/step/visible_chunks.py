@@ -44,14 +44,14 @@ take 0.89 of the time of steps over the whole; with 0.78 of bonsai, 1.01."""
 _BOUNDED_GROUPS = ("means", "log_scales")
 """Parameter groups that the bounds of a chunk are measured from."""
 _ROWS_AT_ONCE = 1 << 16
-"""Rows of a checkpoint that are looked at together."""
+"""Number of rows of a checkpoint that are read at a time."""
 MOST_MISSED_STEPS = 1024
 """Steps after which a chunk is caught up even if no view shows it."""
 
 
 def settings_of_whole_steps(config: TrainConfig) -> list[str]:
-    """The settings with which a step runs over the whole model: it changes hidden Gaussians by more than Adam, or reads
-    their gradients."""
+    """Names of the given settings that make each step run over the whole model. With them a step changes hidden
+    Gaussians by other means than Adam, or reads their gradients."""
     wanted = {
         "--density.growth mcmc": config.density.growth == "mcmc",
         "--antialiased": config.antialiased,
@@ -104,8 +104,9 @@ class VisibleChunks(Component):
     """The chunks of a training's model: bounds, the movement of Gaussians since these were measured, and the last step
     that each chunk has taken.
 
-    A chunk that a step leaves out has no Gaussian that the view shows. Before a view shows it again, it takes the steps
-    that it has missed, with the bits that it would have. So no bit of a result depends on the bounds.
+    A chunk that a step leaves out has no Gaussian that the view shows. Before a view shows it again, the chunk takes
+    the steps that it has missed, and gets the bits that steps over the whole model would give. So no bit of a result
+    depends on the bounds.
 
     unit: the scene's length unit.
     """
@@ -140,13 +141,13 @@ class VisibleChunks(Component):
         self._caught: DeviceArray | None = None
 
     def _divide(self, pool: ChunkPool | None) -> None:
-        """Follow the number of chunks of a model whose rows have moved."""
+        """Forget all bounds and missed steps if the number of chunks has changed because rows have moved."""
         chunks = chunks_of(self._count) if pool is None else pool.store.chunks
         if chunks != len(self._last):
             self._begin(self._count, self.step, chunks)
 
     def _begin_table(self, step: int, chunks: int) -> None:
-        """Begin with the next step, as all chunks have taken step number `step`."""
+        """Begin an empty table of steps. All `chunks` chunks have taken step number `step`."""
         self.step, self._first_step = step, step + 1
         self._last = np.full(chunks, step, np.uint32)
 
@@ -205,7 +206,7 @@ class VisibleChunks(Component):
         if count <= ORDERED_ROWS or self._since is None:
             return inputs
         (of_view,) = inputs
-        if self.step < step - 1:  # the steps between ran over all rows of a model that was small or streamed
+        if self.step < step - 1:  # steps since then ran over all rows, because the model was small or streamed
             self._begin_table(step - 1, len(self._last))
         hidden, most_hidden = self._hidden_movement(step)
         numbers = self._shown(of_view, step, hidden, most_hidden)
@@ -270,7 +271,7 @@ class VisibleChunks(Component):
         return Missed(numbers, last, step, table, first)
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep, chunks: _ChunksInView) -> PlacedChunks | None:
-        """Catch up the chunks that a step's view shows, and send their list. A repeated step is the same again."""
+        """Catch up the chunks that a step's view shows, and send their list. Repeating a step gives the same bits."""
         if chunks.of_rows is not self._found:  # rows have moved since, and all have taken every step
             self._divide(_pool_of(model))
             everything = np.arange(len(self._last), dtype=np.uint32)
@@ -294,7 +295,7 @@ class VisibleChunks(Component):
         return PlacedChunks(_in_pool(model), slots)
 
     def _note(self, step: AdamStep) -> None:
-        """Put a step into the table, from which steps go that all chunks have taken."""
+        """Add a step to the table. If the table is full, first remove the steps that all chunks have taken."""
         if self._config.optimiser.sparse:
             return
         if step.number - self._first_step >= len(self._table):
@@ -386,8 +387,9 @@ class VisibleChunks(Component):
 class _ChunksInView(ChunksInView):
     """The chunks of a step's view, and the steps that some of them have missed.
 
-    of_rows: bounds of the chunks that are listed, an array of its own for each order of the model's rows.
-    whole: True if the step runs over the whole model, of which all chunks are listed.
+    of_rows: the bounds that the chunks were chosen by. A new object replaces it when rows of the model move, which
+        shows that the list is outdated.
+    whole: True if the step runs over the whole model; `numbers` then lists all its chunks.
     """
 
     of: VisibleChunks

@@ -77,8 +77,8 @@ class DepthTargets(Component):
     def aims(self, view: int, camera: Camera, step: int, photograph: NDArray[Any] | None = None) -> DepthTerm | None:
         """Depth loss of a view, with its known depths at the size of `camera`; None if the settings ask for no depths.
 
-        photograph: the view's photograph (H, W, 3 to 5). Its fifth channel is a mask; depths of masked-out pixels do
-        not count.
+        photograph: the view's photograph (H, W, 3 to 5). Its fifth channel is a mask; the loss leaves out depths of
+        masked-out pixels.
         """
         if not self._config.depth_use:
             return None

@@ -46,7 +46,7 @@ class ImageCache:
         """Photograph of view `index` at 1/factor of its size, on the host; do not write to it.
 
         It is (H, W, 3), or has a fourth channel of straight alpha, and with a mask a fifth. The mask is 0 for pixels
-        that do not count. Raises PhotographError.
+        that the loss leaves out. Raises PhotographError.
         """
         self._enter(factor)
         return self.host.get(index, factor)
