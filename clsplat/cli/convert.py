@@ -136,7 +136,7 @@ class ConvertVerb(Verb):
     file with less accurate reflections. 6,6 if not given; SPZ's own library uses 5,4."""
     scene: ScenePath = None
     """Measure PSNR on this scene's held-out views before and after, and between the two renders. For a run's own scene,
-    masked-out pixels do not count."""
+    masked-out pixels are left out."""
     test_every: int = TEST_EVERY
     """Every n-th view of --scene in name order is held out. 0: all views are measured."""
     resolution: int = 0

@@ -148,7 +148,7 @@ def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | N
 def _warn_of_doubts(
     trained: Run | None, draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: list[View]
 ) -> None:
-    """Warn of views that the run was trained on, that changed or are of another scene, and of renders that look wrong.
+    """Warn of views that the run was trained on, of changed views, of views of another scene, and of wrong renders.
 
     trained: the run of the model, or None.
     draw: function that renders a camera to (image, alpha).

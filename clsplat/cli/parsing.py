@@ -32,8 +32,7 @@ VERBS = {
     "eval": "Measure a model on a scene's held-out views: PSNR, SSIM, and LPIPS if the extra is installed.",
     "render": "Render a model from the cameras of a file or along a path made from them, an image for each frame.",
     "stmaps": "Write the lenses of a scene's photographs as STMaps, to distort a render and to undistort a photograph.",
-    "thumbnail": "Draw one picture of a model: for a run, seen from among its cameras; for a file, of the whole "
-    "object or of a scene's most detailed part.",
+    "thumbnail": "Draw one picture of a model, for lists and galleries.",
     "view": "Look at a model in the browser: the device renders, the page shows it.",
     "report": "Write a run's report: one self-contained HTML file with curves, pictures, figures and settings.",
     "compare": "Compare runs in a table: scores, Gaussians, times, and the settings that differ.",

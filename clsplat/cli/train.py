@@ -62,8 +62,9 @@ class TrainVerb(Verb):
     """Folder for decoded photographs. It stays after the training, and several trainings may share it. none: no cache.
     If not given: with --max-host-mem, cache/ in the run's folder until the training has finished; otherwise none."""
     scratch: Annotated[str | None, arg(metavar="DIR")] = None
-    """Folder, on a local disk, for Gaussians that do not fit in --max-host-mem. Checkpoints need a file in it, at most
-    2.2 times as large as parameters and moments, which stays. If not given: scratch/ in the run's folder."""
+    """Folder, on a local disk, for Gaussians that do not fit in --max-host-mem. A file in it, at most 2.2 times as
+    large as parameters and moments, stays after the training, as checkpoints need it. If not given: scratch/ in the
+    run's folder."""
     auto: Flag = False
     """Adapt settings to findings on the scene, such as --appearance exposure if the photographs' exposures differ.
     Settings given as flags stay. The findings are printed even without --auto."""
@@ -206,7 +207,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
 
 
 def _flags_of_machine(verb: TrainVerb) -> str:
-    """Return the given flags about devices and memory, as text. To resume they are needed again: no file keeps them."""
+    """Return the given flags about devices and memory, as text. No file records them, so resuming needs them again."""
     given = {
         "--device": verb.device.selector,
         "--max-device-mem": verb.device.max_device_mem,

@@ -396,7 +396,9 @@ def parse_record(text: object) -> dict[str, str]:
 
 
 def attribute_of(spec: Any, name: str) -> Any:
-    """Return an attribute from OpenImageIO's specification of a file, or from the provenance record there, or None."""
+    """Return an attribute from OpenImageIO's specification of a file.
+
+    If it is missing, it is taken from the file's provenance record; None if that lacks it too."""
     value = spec.getattribute(name)
     for place in dict.fromkeys(RECORD_TAGS.values()) if value is None else ():
         value = parse_record(spec.getattribute(place)).get(name) if value is None else value

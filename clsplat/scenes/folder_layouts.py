@@ -121,7 +121,7 @@ def read_transforms(path: Path, kind: Kind, chosen: str | Path | None, missing: 
 
 
 def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, images: Sequence[PosedImage]) -> Path:
-    """Find the folder of a COLMAP model's pictures: images/, images_2 or the like, another known name, or the scene's.
+    """Find the folder of a COLMAP model's pictures: images/, else images_2 and the like, a known name, or the scene's.
 
     If images/ has no pictures, a folder with a picture that the model lists is preferred. Warns if the folder is not
     images/. Raises InputError if there is no such folder.

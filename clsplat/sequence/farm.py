@@ -215,7 +215,7 @@ def _telling_of_no_workers(client: Any, scheduler: str | None) -> Iterator[None]
         while not stop.is_set():
             try:
                 there = bool(client.nthreads())
-            except (OSError, RuntimeError, TimeoutError):  # the loop over frames reports the loss
+            except (OSError, RuntimeError, TimeoutError):  # the loop over frames reports a lost scheduler
                 return
             now = time.monotonic()
             since = None if there else since or now

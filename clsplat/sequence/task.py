@@ -382,7 +382,7 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     used = sampling if sampling.on else None
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
-    # Frames with a far plane have another digest than files of versions that did not clip at it.
+    # A far plane changes the digest, so that frames of versions that did not clip at it are rendered again.
     made += ("far",) if task.camera.far < inf else ()
     colour = replace(pictures.colour, ocio_config=configuration_digest(pictures.colour.ocio_config))
     if task.holdout is not None:

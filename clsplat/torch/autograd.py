@@ -42,7 +42,8 @@ class Batches:
 class BatchResults:
     """Results of a call of gsplat's function: the library's result for each batch, and the splats in view.
 
-    The layout of `meta` is (..., C, N, ...), where ... are batches; with `packed` it is (nnz, ...), the splats in view.
+    In the layout of `meta`, arrays are (*batch, C, N, ...). With `packed` they are (nnz, ...), a row for each splat in
+    view.
     A splat's index is its position in a flattened array (B, C, N): by batch, then camera, then Gaussian.
     """
 

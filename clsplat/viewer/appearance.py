@@ -89,7 +89,7 @@ def _within(value: Any, low: float, high: float, usual: float) -> float:
 
 
 def edited(gaussians: Gaussians, look: Look) -> Gaussians:
-    """Apply SH degree, size, opacity and crop box of a look to a model. Unchanged arrays are shared with the input."""
+    """Apply a look's SH degree, size, opacity and crop box to a model. Unchanged arrays are shared with the input."""
     model = drop_sh(gaussians, look.degree) if look.degree < gaussians.sh_degree else replace(gaussians)
     if look.size != 1:
         model.log_scales = gaussians.log_scales + np.float32(math.log(look.size))

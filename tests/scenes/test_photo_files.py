@@ -78,7 +78,7 @@ def test_pictures_are_found_under_other_names(kind: str, tmp_path: Path) -> None
     listed, files, told = LOOSE[kind]
     scene = load_scene(write_colmap(tmp_path, listed, files))
     (warning,) = scene.warnings
-    assert "20 picture(s) have other names than listed, and are used: " in warning
+    assert "20 listed picture(s) not found by name; files with similar names are used instead: " in warning
     assert told in warning
     assert_each_has_its_picture(scene)
     assert len(scene.test_views) == 3

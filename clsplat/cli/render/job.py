@@ -202,8 +202,8 @@ def check_warps(tasks: Sequence[Task], pictures: PictureConfig) -> None:
         number, part = max(empty.items(), key=lambda item: item[1])
         advice = "" if pictures.warp.stmap else "; --lenses native renders fisheyes without undistorted pictures"
         warn(
-            f"{flag}: {100 * part:.0f} % of frame {number} stays black and transparent: these pixels lie more than a "
-            f"frame's size outside the undistorted picture, or have no place in it{advice}"
+            f"{flag}: {100 * part:.0f} % of frame {number} stays black and transparent: these pixels have no "
+            f"position in the undistorted picture, or one more than a frame's size outside it{advice}"
         )
 
 

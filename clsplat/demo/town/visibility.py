@@ -172,7 +172,7 @@ class _Rays:
 
         solid: index of the solid in its block.
         number: number of the solid across all blocks.
-        part: index of the rays, by `slices`.
+        part: index of the part's rays, as from `slices`.
         """
         solids = block.solids
         centre = (self.position - block.corner - solids.centres[solid]).astype(np.float32)

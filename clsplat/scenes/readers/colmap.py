@@ -174,7 +174,7 @@ def safe_name(name: str) -> bool:
 def _named(path: Path, name: str) -> str:
     """Return the name of a picture without a drive, root or "..".
 
-    `photo_names.match` finds a picture whose name was changed here by the end of its path. Raises InputError if the
+    `photo_names.match` finds a picture with a shortened name by the end of the path. Raises InputError if the
     remaining name is not a path inside the images' folder.
     """
     inner = name if safe_name(name) else "/".join(part for part in slashed(name).split("/") if part != "..")
