@@ -284,7 +284,7 @@ def _sh_bits(text: str | None) -> tuple[int, int] | None:
 
 
 def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:
-    """Warn if a merged model has another colour space than the source, or is far from it."""
+    """Warn if a merged model has another colour space than the source, or is far away from the source."""
     import numpy as np
 
     from clsplat.models import edit
@@ -384,7 +384,7 @@ def _measured(
 
     original: the source model.
     read: the converted model, read from the target file. It is rendered from cameras transformed by `matrix`.
-    matrix: (4, 4), the transform of the edits, or None.
+    matrix: (4, 4), the transform of the edits; None if they do not transform the model.
     """
     import numpy as np
 

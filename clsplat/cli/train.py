@@ -265,7 +265,7 @@ def _train_run(
 ) -> None:
     """Train the run with a progress bar. If training is interrupted, the error's message says how to resume.
 
-    page: context manager that serves the viewer's page, or None.
+    page: context manager that serves the viewer's page; None without --view.
     """
     from clsplat.training.forecast import Forecast
 
@@ -304,7 +304,7 @@ def _train_run(
 def _looked_at(verb: TrainVerb, services: Services, source: Path, earlier: Run | None) -> tuple[Scene, TrainConfig]:
     """Load the scene, and print the findings about it. Returns the scene and the settings to train with.
 
-    earlier: the run to continue, or None.
+    earlier: the run to continue; None for a new run.
     With --auto the settings are adapted to the findings.
     """
     from clsplat.scenes.analysis.recommendations import answered, paragraph
@@ -330,7 +330,7 @@ def _looked_at(verb: TrainVerb, services: Services, source: Path, earlier: Run |
 def _scene(services: Services, source: Path, config: TrainConfig, earlier: Run | None = None) -> Scene:
     """Load the training scene with its initial points. Raises InputError if training on it would fail.
 
-    earlier: the run to continue, or None.
+    earlier: the run to continue; None for a new run.
     """
     from clsplat.training.preparation import prepared
 

@@ -176,6 +176,6 @@ def picture_names(names: Sequence[str]) -> list[str]:
     ".png" is appended instead.
     """
     stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
-    keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]  # choose the same names everywhere
+    keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]  # the same names on every system
     uses = Counter(keys)
     return [(stem if uses[key] == 1 else name) + ".png" for stem, key, name in zip(stems, keys, names, strict=True)]

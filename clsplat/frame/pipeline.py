@@ -211,7 +211,7 @@ class FramePipeline:
         return self._sampling(frame).on or self.config.framing.supersample > 1 or frame.lens is not None
 
     def is_blank(self, planes: Planes, frame: FrameRequest) -> bool | None:
-        """True if the planes of `draw`, before conversion, show only the background. None if no channel shows that."""
+        """True if the planes of `draw`, before conversion, show only the background. None if no channel tells."""
         for name in ("alpha", "count", "depth"):
             if name in planes:
                 return not planes[name].any()

@@ -81,7 +81,7 @@ class Lens:
 
     @property
     def native(self) -> CameraModel | None:
-        """Camera model other than the pinhole that renders through this lens without undistortion, or None."""
+        """Camera model that renders through this lens without undistortion; None for a pinhole or if there is none."""
         camera_model = lens_models().get(self.model, (None, None))[1]
         return camera_model if camera_model is not None and not camera_model.is_pinhole else None
 

@@ -65,7 +65,7 @@ def detect(path: Path) -> Kind:
 def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tuple[DataSet, list[Path]]:
     """Read a COLMAP model and find its pictures. Returns the data set, and folders with downscaled copies of them.
 
-    chosen: another folder with the pictures, relative to `path`, or None.
+    chosen: folder with the pictures, relative to `path`; None searches for it.
     Raises InputError.
     """
     model_path = colmap.find_model(path)

@@ -230,7 +230,7 @@ class Scene:
 
     @cached_property
     def sampled_views(self) -> list[View]:
-        """Views that findings (`scenes.analysis`) are based on: all, or an even sample of many training views."""
+        """Views that findings (`scenes.analysis`) are based on: all views, but an even sample if there are many."""
         if self.decoded_first:
             return self.views
         count = min(MAX_SAMPLED_PHOTOGRAPHS, len(self.train_views))
@@ -299,7 +299,7 @@ class Scene:
 
     @cached_property
     def spread(self) -> tuple[Float64, float, float]:
-        """Middle of the training cameras without outliers, distance of the farthest camera from it, and largest
+        """Middle of the training cameras without outliers, distance of the farthest camera from there, and largest
         coordinate of the cameras."""
         near = [view for view in self.train_views if view.name not in self.stray_cameras]
         centres = np.stack([view.camera.position for view in near or self.train_views or self.views])
@@ -326,7 +326,7 @@ class Scene:
 
     @property
     def length_unit(self) -> float:
-        """Length in world units that learning rates and sizes of Gaussians are relative to: `unit`, or the extent."""
+        """Length in world units for learning rates and sizes of Gaussians: `unit` if it is set, else `extent`."""
         return self.extent if self.unit is None else self.unit
 
     @property

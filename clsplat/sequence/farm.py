@@ -45,7 +45,7 @@ class WorkerJob:
     model: absolute path of the model, or of the shot file.
     digest: SHA-256 of the model's content (`JobModels.digest`).
     device: name of the device, as for --device.
-    memory_limit: limit of device memory in bytes, or None.
+    memory_limit: limit of device memory in bytes; None for no limit.
     placed: True if the tasks contain placements of the models.
     version: version of clsplat.
     """

@@ -262,7 +262,7 @@ class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch ha
     ) -> tuple[Tensor, Tensor]:
         """Images (..., C, H, W, X) and alphas (..., C, H, W, 1).
 
-        values: values to blend, (..., N, D) or (..., C, N, D), or None.
+        values: values to blend, (..., N, D) or (..., C, N, D); None if only depth is rendered.
         """
         ctx.call = call
         images, alphas = call.pixels(means2d)

@@ -67,7 +67,7 @@ class Look:
 def read_look(mode: Any, degree: Any, size: Any, opacity: Any, crop: Any = None) -> Look:
     """Make a `Look` of the values of a page's controls. Numbers outside a slider's range are clamped.
 
-    crop: two corners of the box, or None.
+    crop: two corners of the box; None for no box.
     """
     box = None
     if crop is not None:
@@ -113,7 +113,7 @@ def alpha_picture(alpha: Float32) -> Image:
 
 
 def depth_picture(depth: Float32, alpha: Float32) -> tuple[Image, str]:
-    """Convert depth to a picture (H, W, 3) uint8, and describe its range. Near is bright, transparent is black."""
+    """Convert depths to a picture (H, W, 3) uint8, and describe their range. Near is bright, transparent is black."""
     seen = alpha > 0.5
     if not seen.any():
         return np.zeros((*depth.shape, 3), np.uint8), "nothing is visible"
@@ -123,7 +123,7 @@ def depth_picture(depth: Float32, alpha: Float32) -> tuple[Image, str]:
 
 
 def count_picture(count: NDArray[np.int32]) -> tuple[Image, str]:
-    """Convert numbers of Gaussians per pixel to a picture (H, W, 3) uint8, bright for many, and describe its range."""
+    """Convert counts of Gaussians per pixel to a picture (H, W, 3) uint8, bright for many, and describe their range."""
     most = max(float(np.quantile(count, 0.995)), 1.0)
     return _shaded(count / most, None), f"0 to {most:,.0f} Gaussians per pixel (bright), maximum {int(count.max()):,}"
 

@@ -116,7 +116,7 @@ def _models(flags: RenderVerb) -> JobModels:
 def _video(flags: RenderVerb, fps: float | None, path: Path, sizes: Collection[tuple[int, int]]) -> VideoConfig:
     """Return the video settings, with the shot's frame rate unless a flag sets another.
 
-    fps: the shot's frames a second, or None.
+    fps: the shot's frames a second; None if it gives no rate.
     sizes: (width, height) of the pictures, of which a video needs a single one.
     Raises InputError for a rate or sizes that no video has, and for a file that may not be replaced. With
     --skip-existing a video that clsplat wrote may be replaced.

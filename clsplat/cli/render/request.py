@@ -36,7 +36,7 @@ class Request:
     pictures: picture settings from the flags. A USD stage may still change them.
     holdout: settings for reading holdout files, or None without --holdout.
     devices: selector of each device; None for the default device.
-    memory_limit: limit of device memory in bytes, or None.
+    memory_limit: limit of device memory in bytes; None for no limit.
     resize: function that resizes a camera by --width, --height and --scale.
     """
 

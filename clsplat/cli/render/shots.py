@@ -84,7 +84,7 @@ def _stage_cameras(stereo: StereoConfig, cameras: Path | None, usd_camera: str |
 def _of_eyes(stereo: StereoConfig, shots: list[Shot], paths: dict[str, str]) -> dict[str, Shot]:
     """Return the shot of each eye by its name; without stereo a single shot, under the name "".
 
-    shots: the shot of the cameras, or the two shots of the eyes' cameras in the stage.
+    shots: the shot of the cameras; with --stereo stage, the two shots of the eyes' cameras.
     paths: path of each eye's camera in the stage.
     Raises InputError.
     """

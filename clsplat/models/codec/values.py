@@ -31,7 +31,7 @@ Nearly all logs are negative if the unit is a metre. Linear scales are negative 
 MAX_UNCHECKED_GAUSSIANS = 1 << 20
 """Number of Gaussians up to which a compressed file may have any length. Above it a file needs a byte per Gaussian.
 
-Every real file has more bytes than that, because positions take several bytes each. A decompression bomb has fewer.
+Every real file has more bytes, because the position of a Gaussian takes several. A decompression bomb has fewer.
 """
 OTHER_QUATERNION_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Row i: the components of a quaternion other than component i."""

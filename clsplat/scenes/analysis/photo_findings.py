@@ -46,7 +46,7 @@ With locked exposure, occlusion and highlights cause up to 0.1. From about 0.2, 
 DISTANCE_SPREAD_RATIO = 4.0
 """Ratio of the 90th to the 10th percentile of distance / focal length from which distances count as varying widely.
 
-At 4, a Gaussian one pixel wide in one photograph is a quarter of a pixel, or four pixels, wide in another.
+At 4, a Gaussian one pixel wide in a near photograph is a quarter of a pixel wide in a far one.
 """
 CUT_OUT_BORDER_FRACTION = 0.9
 """Masks cut an object out of its background if they leave out at least this fraction of the border pixels."""

@@ -34,7 +34,7 @@ Programs with such folders are the 3DGS authors' convert.py, Polycam, OpenSfM (u
 (dense/0/images) and others.
 """
 PLAIN_FOLDER_STAGE, UNDISTORTED_FOLDER_STAGE = 1, 2
-"""Indices in UNDISTORTION_FOLDERS of photographs in folders with other names, and of undistorted photographs."""
+"""Stages, as indices in UNDISTORTION_FOLDERS: of photographs in folders with other names, and of undistorted ones."""
 LOSSLESS_EXTENSIONS = (".png", ".tif", ".tiff", ".bmp")
 """Extensions of lossless photographs, which are preferred to their lossy copies."""
 COPY_THUMBNAIL_SIZE_PX = (96, 72)

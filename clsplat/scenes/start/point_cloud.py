@@ -203,7 +203,7 @@ def thinned(cloud: Cloud, limit: int) -> Cloud:
     side = float((points - low).max())
     if side == 0:
         return Cloud(points[:1], None if cloud.colors is None else cloud.colors[:1])
-    fine, coarse = side / MAX_VOXELS_PER_SIDE, side * 1.01  # one voxel of the coarse size holds all points
+    fine, coarse = side / MAX_VOXELS_PER_SIDE, side * 1.01  # a voxel of the coarse size would hold all points
     if (cells := _cells(points, low, fine)).max() < limit:
         coarse = fine
     while coarse > fine * (1 + VOXEL_SIZE_TOLERANCE):

@@ -372,7 +372,7 @@ def for_sfm(use: MaskUse) -> MaskUse | None:
 
 
 def after_sfm(use: MaskUse, folder: Path) -> MaskUse:
-    """Return the use of the masks that structure from motion wrote, in which white counts and alpha is included."""
+    """Return the use of the masks that structure from motion wrote: white is kept, and alpha is included."""
     if not (folder / MASK_FOLDERS[0]).is_dir():
         return replace(use, masks="none", invert=False)
     meaning: MaskMeaning = "none" if use.alpha == "blend" else use.alpha
