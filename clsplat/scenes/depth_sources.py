@@ -61,7 +61,10 @@ def with_depths(scene: Scene, use: DepthUse) -> Scene:
         known = _mapped(scene, use)
     without = [view.name for view in scene.train_views if view.name not in known]
     if use and without:
-        warn(f"{scene.name}: no depths are known for {len(without):,} photograph(s) ({examples(without)})")
+        warn(
+            f"{scene.name}: no depths are known for {len(without):,} photograph(s) ({examples(without)}), which get no "
+            "depth loss"
+        )
     views = [replace(view, depth=known.get(view.name) if view.split == "train" else None) for view in scene.views]
     return replace(scene, views=views, depth_use=use)
 

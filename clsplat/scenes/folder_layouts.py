@@ -175,7 +175,7 @@ def _held_out(data: DataSet, path: Path) -> list[PosedImage]:
     names = list(dict.fromkeys(line for line in lines if line and not line.startswith("#")))
     found = match(names, [*(image.name for image in data.images), *data.missing])
     if lost := [legible(name) for name in names if name not in found.names]:
-        none = "; the list is not used" if not found.names else ""
+        none = "; the list is not used" if not found.names else "; these lines are ignored"
         warn(f"{path}: lists {examples(lost)} to hold out, but no picture has such a name{none}")
     held_out = set(found.names.values())
     if not held_out:

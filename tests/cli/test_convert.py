@@ -318,7 +318,8 @@ def test_a_file_of_another_kind_than_its_name_says(made: str, name: str, model: 
     said = printed(capsys, ["info", wrong, "--json"])
     kind = formats.format_of(wrong).name
     assert json.loads(said.out)["format"] == kind
-    assert said.err == f"clsplat: warning: {wrong}: is {kind} by its content, in spite of its name\n"
+    told = f"{wrong}: is {kind} by its content, in spite of its name, and is read as such"
+    assert said.err == f"clsplat: warning: {told}\n"
     assert len(formats.load(model)) == 300
 
 

@@ -299,7 +299,7 @@ def _check_count(path: Path, count: int) -> None:
             if match := RECORD_COUNT_COMMENT.match(line.lstrip(b"\xef\xbb\xbf").decode("utf-8", "replace")):
                 announced = int(match[1])
     if count < announced:
-        warn(f"{path}: its header announces {announced:,} records, but it has {count:,}; was it truncated or edited?")
+        warn(f"{path}: its header announces {announced:,} records, only {count:,} are read; was it cut off or edited?")
 
 
 def _read_cameras(folder: Path) -> dict[int, Lens]:

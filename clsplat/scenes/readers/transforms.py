@@ -224,7 +224,7 @@ def _split(path: Path, readers: list[Keys], images: list[PosedImage], missing: S
         found = {name: known[name] for name in map(_plain, given) if name in known}
         found |= match([name for name in map(_plain, given) if name not in known], names).names
         if lost := [name for name in given if _plain(name) not in found]:
-            warn(f"{path}: '{key}' lists {examples(lost)}, but no frame has such a 'file_path'")
+            warn(f"{path}: '{key}' lists {examples(lost)}, but no frame has such a 'file_path'; these are ignored")
         listed.append(set(found.values()))
     train, held_out = listed[0], listed[1] | listed[2]
     if not (train or held_out):
