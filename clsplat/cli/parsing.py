@@ -104,7 +104,7 @@ _TYRO_UNION_ERROR = re.compile(
 def _trouble(arguments: Sequence[str], called: type[Verb] | None, said: str) -> str:
     """Return the message about a wrong call: unknown flags or verbs with suggestions, else tyro's message.
 
-    called: dataclass of the verb that was called, or None.
+    called: dataclass of the verb that was called; None for an unknown verb.
     said: tyro's message.
     """
     said = _TYRO_UNION_ERROR.sub("", said)

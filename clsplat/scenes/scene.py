@@ -136,7 +136,7 @@ class View:
         return [self._fitted(image, width, height) for width, height in sizes]
 
     def _masked(self, image: Float32, counts: Float32, width: int, height: int) -> Float32:
-        """Resample a picture (H, W, 3 or 4) and its mask (H, W, 1) to a picture (height, width, 5)."""
+        """Resample a picture (H, W, 3 or 4) and its mask (H, W, 1) to a picture as from `load_masked`."""
         parts = [np.where(counts > 0, image[:, :, :3], np.float32(0)), counts]
         if image.shape[2] == 4:  # alpha is averaged over the kept part, like a colour
             there = np.where(counts > 0, image[:, :, 3:], np.float32(0))
