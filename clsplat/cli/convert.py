@@ -170,10 +170,7 @@ def run(verb: ConvertVerb, services: Services) -> int:
     comments = () if space == colour.SRGB else (colour.comment(space),)
     save(verb.target, edited, comments=comments, progress=StageProgress(after=SILENT_WRITE_SECONDS), **options)
     if space != colour_space(verb.target):
-        warn(
-            f"{verb.target}: {target_format.name} cannot store the colour space, which is {space}; readers will assume "
-            "sRGB"
-        )
+        warn(f"{verb.target}: {target_format.name} cannot store the colour space, {space}; readers will assume sRGB")
     read = load(verb.target, check_encoding=False)  # warnings about encodings were printed for the source already
     if not isclose(read.near, edited.near, rel_tol=NEAR_PLANE_RELATIVE_TOLERANCE):
         warn(

@@ -339,7 +339,7 @@ def test_the_colour_space_goes_along_or_is_told(model: Path, capsys: Capture) ->
         assert colour.recorded_space(target) == "lin_rec709"
     assert not capsys.readouterr().err
     said = ran(capsys, convert, model, model.with_suffix(".splat")).err
-    assert "splat cannot store the colour space, which is lin_rec709" in said
+    assert "splat cannot store the colour space, lin_rec709; readers will assume sRGB" in said
 
 
 @pytest.mark.parametrize("suffix", sorted(s for s in formats.suffixes(writable=True) if s.startswith(".")))
