@@ -77,8 +77,8 @@ JACOBIAN_CLAMP_HALF_FRAMES = 0.3
 DEFAULT_NEAR_PLANE = 0.01
 """Default near plane in world units, for cameras and models without their own."""
 MIN_SIZE_IN_NEAR_PLANES = 100.0
-"""Ratio of a scene's length unit, or of a small model's size, to its near plane, unless the default near plane is
-smaller."""
+"""A scene's length unit, or a small model's size, divided by this is the near plane, if the default near plane is
+larger."""
 ROTATION_TOLERANCE = 1e-2
 """Largest allowed entry of |R^T R - I|. It is this large because poses may be typed with few digits or be float32."""
 MAX_FOCAL_PX = 1e12
@@ -182,7 +182,7 @@ class Camera:
     by_rays: bool = False
 
     def __getstate__(self) -> dict[str, object]:
-        """Pickle the fields only, without the cached `model`: another process takes it from its own CAMERA_MODELS."""
+        """Pickle the fields, without the cached `model`: another process uses the model of its own CAMERA_MODELS."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @cached_property
@@ -332,8 +332,8 @@ class Camera:
         return np.asarray(local[:, 2] if self.model.flat else np.linalg.norm(local, axis=1))
 
     def drawn_depths(self, offsets: Float64) -> Float64:
-        """Depths (N,) by which Gaussians are sorted. offsets: (N, 3), from the camera's centre, along the world's
-        axes."""
+        """Depths (N,) by which Gaussians are sorted. offsets: (N, 3), vectors along the world's axes from the camera's
+        centre to the means."""
         return np.asarray(
             np.linalg.norm(offsets, axis=1) if self.model.along_rays else offsets @ self.rotation[2], np.float64
         )
@@ -415,7 +415,7 @@ def focal_length(fov: float, size: float, projection: Projection = "perspective"
 
 
 def model_with(column: str, value: object) -> CameraModel | None:
-    """The camera model whose column, such as "usd", contains the name `value`; None if there is none."""
+    """The model in CAMERA_MODELS whose column, such as "usd", contains the name `value`; None if there is none."""
     return next((model for model in CAMERA_MODELS if value in getattr(model, column)), None)
 
 

@@ -65,7 +65,7 @@ class _Bar:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         if sys.stderr.isatty():
-            # Frames take similar times, so rich can estimate the remaining time. For training it is in the description.
+            # Frames take similar times, so rich can estimate the remaining time. A training's text has an estimate.
             more = [MofNCompleteColumn(), TimeRemainingColumn()] if counted else []
             columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), *more)
             self.live = Progress(

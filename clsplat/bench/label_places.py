@@ -45,7 +45,7 @@ def place_labels(points: Float64, sizes: Float64, frame: Float64, lines: Float64
     points: (n, 2), in pixels.
     sizes: (n, 2), widths and heights of the labels.
     lines: segments that labels and leader lines should not cross.
-    A point's marker covers a square around it.
+    A point's marker covers a square around the point.
     The search is greedy and starts with the points that have the most neighbours.
     Each label gets the candidate box with the smallest covered area; among equal areas, the lowest cost decides.
     Costs are for the distance, for crossings, and for other points near the label.

@@ -75,7 +75,7 @@ def plot_settings(path: Path, result: Mapping[str, Any], title: str) -> tuple[Pa
 
 
 def _draw_switches(result: Mapping[str, Any], title: str) -> Any:
-    """Draw a bar chart of the times of a frame and a step without one exact switch, relative to all switches."""
+    """Draw a bar chart of the times of a frame and a step without one exact switch, relative to those with all."""
     exact = _exact_point(result)
     rows = []
     if exact is not None:

@@ -59,7 +59,7 @@ def bench(
     say("frame", None)
     trainer = trainer_of(subject, device, config)
     rasterizer, gaussians = trainer.rasterizer, trainer.parameters
-    if held_kind(config) != held_kind(RasterizerConfig()):  # reduced SH needs a model of its own for the frame
+    if held_kind(config) != held_kind(RasterizerConfig()):  # for reduced SH, the frame needs a copy of the model
         gaussians = upload_gaussians(device, subject.gaussians, held_sh(subject.gaussians, config))
 
     def draw() -> ForwardPass:

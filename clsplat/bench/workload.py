@@ -65,8 +65,8 @@ def synthetic(count: int = 200_000, width: int = 1024, height: int = 768) -> Sub
 def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Progress | None = None) -> Subject:
     """Load the workload at a path: a run, a model file or a scene. Raises InputError.
 
-    Of a run, or a run's model file, it has the model and the first view of the run's scene. Of another model file it
-    has the model and a camera in front of the model. Of a scene it has the initial Gaussians and the first view.
+    A run, or a run's model file, gives the model and the first view of the run's scene. Another model file gives the
+    model and a camera in front of it. A scene gives the initial Gaussians and the first view.
     size: width and height of the frame in pixels; None for the camera's.
     """
     run = run_of(path)

@@ -50,8 +50,8 @@ class LensModel(NamedTuple):
     coefficients: number of distortion coefficients that `Camera.radial` takes.
     two_focal_model: for a model with one focal length, the name of its equivalent with fx and fy; "" for none.
     two_focal_coefficients: number of the equivalent's coefficients, which begin with this model's.
-    is_colmap: False for a lens that only clsplat has. Such a lens has the parameters fx, fy, cx and cy, a panorama
-        width and height.
+    is_colmap: False for a lens that only clsplat has. The parameters of such a lens are fx, fy, cx and cy, or
+        width and height for a panorama.
     """
 
     name: str
@@ -110,8 +110,8 @@ class CameraModel:
     self_tested: ClassVar[bool] = True
     """True if the self-test renders a picture with this model. Read only for models with RAYS."""
     without_motion: ClassVar[str] = ""
-    """For a model without the channel `motion`, the end of the error message: this model, and the models with the
-    channel. Empty for a model with the channel."""
+    """End of the error message for the channel `motion`, if the model lacks this channel. It names the model, and the
+    models that have the channel. Empty for these."""
     focal_keys: ClassVar[tuple[str, ...]] = ("fov_x", "fov_y")
     """Properties of a clsplat camera file that give a focal length, other than fx and fy."""
     whole_angles: ClassVar[tuple[float, float]] = (360.0, 180.0)

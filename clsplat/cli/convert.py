@@ -136,7 +136,7 @@ class ConvertVerb(Verb):
     file with less accurate reflections. 6,6 if not given; SPZ's own library uses 5,4."""
     scene: ScenePath = None
     """Measure PSNR on this scene's held-out views before and after, and between the two renders. For a run's own scene,
-    masked-out pixels do not count."""
+    masked-out pixels are left out."""
     test_every: int = TEST_EVERY
     """Every n-th view of --scene in name order is held out. 0: all views are measured."""
     resolution: int = 0
@@ -170,7 +170,7 @@ def run(verb: ConvertVerb, services: Services) -> int:
     comments = () if space == colour.SRGB else (colour.comment(space),)
     save(verb.target, edited, comments=comments, progress=StageProgress(after=SILENT_WRITE_SECONDS), **options)
     if space != colour_space(verb.target):
-        warn(f"{verb.target}: {target_format.name} cannot store the colour space, which is {space}")
+        warn(f"{verb.target}: {target_format.name} cannot store the colour space, {space}; readers will assume sRGB")
     read = load(verb.target, check_encoding=False)  # warnings about encodings were printed for the source already
     if not isclose(read.near, edited.near, rel_tol=NEAR_PLANE_RELATIVE_TOLERANCE):
         warn(
@@ -284,7 +284,7 @@ def _sh_bits(text: str | None) -> tuple[int, int] | None:
 
 
 def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:
-    """Warn if a merged model has another colour space than the source, or is far from it."""
+    """Warn if a merged model has another colour space than the source, or is far away from the source."""
     import numpy as np
 
     from clsplat.models import edit
@@ -384,7 +384,7 @@ def _measured(
 
     original: the source model.
     read: the converted model, read from the target file. It is rendered from cameras transformed by `matrix`.
-    matrix: (4, 4), the transform of the edits, or None.
+    matrix: (4, 4), the transform of the edits; None if they do not transform the model.
     """
     import numpy as np
 

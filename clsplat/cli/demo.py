@@ -74,7 +74,7 @@ class DemoVerb(Verb):
                 f"--{flag}: has no effect with --town, which trains nothing; omit --town, or give --{flag} to clsplat "
                 "train"
                 if self.town is not None
-                else f"--{flag}: expected it with --town, such as --town 2x2"
+                else f"--{flag}: has an effect only with --town, expected it too, such as --town 2x2"
             )
         return self
 

@@ -129,7 +129,7 @@ def _evaluate(verb: EvalVerb, services: Services) -> int:
 def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | None) -> tuple[Scene, list[View]]:
     """Load the scene and find its held-out views. Flags override the run's settings. Raises InputError.
 
-    trained: the run of the model, or None.
+    trained: the run of the model; None for a model without a run.
     """
     from clsplat.runs.refined_lenses import through_refined
 
@@ -148,9 +148,9 @@ def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | N
 def _warn_of_doubts(
     trained: Run | None, draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: list[View]
 ) -> None:
-    """Warn of views that the run was trained on, that changed or are of another scene, and of renders that look wrong.
+    """Warn of views that the run was trained on, of changed views, of views of another scene, and of wrong renders.
 
-    trained: the run of the model, or None.
+    trained: the run of the model; None for a model without a run.
     draw: function that renders a camera to (image, alpha).
     """
     from clsplat.runs import scene_record

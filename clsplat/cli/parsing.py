@@ -32,8 +32,7 @@ VERBS = {
     "eval": "Measure a model on a scene's held-out views: PSNR, SSIM, and LPIPS if the extra is installed.",
     "render": "Render a model from the cameras of a file or along a path made from them, an image for each frame.",
     "stmaps": "Write the lenses of a scene's photographs as STMaps, to distort a render and to undistort a photograph.",
-    "thumbnail": "Draw one picture of a model: for a run, seen from among its cameras; for a file, of the whole "
-    "object or of a scene's most detailed part.",
+    "thumbnail": "Draw one picture of a model, for lists and galleries.",
     "view": "Look at a model in the browser: the device renders, the page shows it.",
     "report": "Write a run's report: one self-contained HTML file with curves, pictures, figures and settings.",
     "compare": "Compare runs in a table: scores, Gaussians, times, and the settings that differ.",
@@ -105,7 +104,7 @@ _TYRO_UNION_ERROR = re.compile(
 def _trouble(arguments: Sequence[str], called: type[Verb] | None, said: str) -> str:
     """Return the message about a wrong call: unknown flags or verbs with suggestions, else tyro's message.
 
-    called: dataclass of the verb that was called, or None.
+    called: dataclass of the verb that was called; None for an unknown verb.
     said: tyro's message.
     """
     said = _TYRO_UNION_ERROR.sub("", said)

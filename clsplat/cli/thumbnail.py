@@ -22,10 +22,10 @@ MIN_THUMBNAIL_SIDE_PX, MAX_THUMBNAIL_SIDE_PX = 16, 8192
 
 @dataclass(frozen=True)
 class ThumbnailVerb(Verb):
-    """Draw one picture of a model: for a run, seen from among its cameras; for a file, of the whole object or of a
-    scene's most detailed part.
+    """Draw one picture of a model, for lists and galleries.
 
-    It is the first frame of `clsplat render MODEL --path turntable`.
+    A run is seen from among its cameras. A model file is seen from outside: an object as a whole, a scene at its most
+    detailed part. The picture is the first frame of `clsplat render MODEL --path turntable`.
     """
 
     model: RunOrModel

@@ -62,8 +62,9 @@ class TrainVerb(Verb):
     """Folder for decoded photographs. It stays after the training, and several trainings may share it. none: no cache.
     If not given: with --max-host-mem, cache/ in the run's folder until the training has finished; otherwise none."""
     scratch: Annotated[str | None, arg(metavar="DIR")] = None
-    """Folder, on a local disk, for Gaussians that do not fit in --max-host-mem. Checkpoints need a file in it, at most
-    2.2 times as large as parameters and moments, which stays. If not given: scratch/ in the run's folder."""
+    """Folder, on a local disk, for Gaussians that do not fit in --max-host-mem. A file in it, at most 2.2 times as
+    large as parameters and moments, stays after the training, as checkpoints need it. If not given: scratch/ in the
+    run's folder."""
     auto: Flag = False
     """Adapt settings to findings on the scene, such as --appearance exposure if the photographs' exposures differ.
     Settings given as flags stay. The findings are printed even without --auto."""
@@ -206,7 +207,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
 
 
 def _flags_of_machine(verb: TrainVerb) -> str:
-    """Return the given flags about devices and memory, as text. To resume they are needed again: no file keeps them."""
+    """Return the given flags about devices and memory, as text. No file records them, so resuming needs them again."""
     given = {
         "--device": verb.device.selector,
         "--max-device-mem": verb.device.max_device_mem,
@@ -264,7 +265,7 @@ def _train_run(
 ) -> None:
     """Train the run with a progress bar. If training is interrupted, the error's message says how to resume.
 
-    page: context manager that serves the viewer's page, or None.
+    page: context manager that serves the viewer's page; None without --view.
     """
     from clsplat.training.forecast import Forecast
 
@@ -303,7 +304,7 @@ def _train_run(
 def _looked_at(verb: TrainVerb, services: Services, source: Path, earlier: Run | None) -> tuple[Scene, TrainConfig]:
     """Load the scene, and print the findings about it. Returns the scene and the settings to train with.
 
-    earlier: the run to continue, or None.
+    earlier: the run to continue; None for a new run.
     With --auto the settings are adapted to the findings.
     """
     from clsplat.scenes.analysis.recommendations import answered, paragraph
@@ -329,7 +330,7 @@ def _looked_at(verb: TrainVerb, services: Services, source: Path, earlier: Run |
 def _scene(services: Services, source: Path, config: TrainConfig, earlier: Run | None = None) -> Scene:
     """Load the training scene with its initial points. Raises InputError if training on it would fail.
 
-    earlier: the run to continue, or None.
+    earlier: the run to continue; None for a new run.
     """
     from clsplat.training.preparation import prepared
 

@@ -120,7 +120,7 @@ class WarpConfig:
         flag = "--stmap" if self.stmap else "--distort" if self.distort else ""
         if flag and (moving := [name for name in channels if name in ("motion", "backward")]):
             raise InputError(
-                f"{flag}: {', '.join(moving)} is not defined for distorted pictures, expected no such --channels"
+                f"{flag}: {', '.join(moving)} is not defined for distorted pictures, omit it from --channels"
             )
 
 
@@ -157,8 +157,8 @@ class SamplingConfig:
     def check(self, *, whole: bool = True) -> None:
         """Raise InputError naming the first setting whose value is invalid.
 
-        whole: False for the flags alone, to which a USD stage may still add the focus. So the focus may be missing, but
-            a shutter given by two times has to be open for more than 0 frames.
+        whole: True for complete settings. False for the flags alone: the focus may then be missing, as a USD stage may
+            give it, but the flags may not give two equal shutter times, as a stage may.
         """
         rules: tuple[Rule, ...] = (
             (("samples",), lambda value: 1 <= value <= _MAX_SAMPLES_PER_FRAME, f"1 to {_MAX_SAMPLES_PER_FRAME}"),

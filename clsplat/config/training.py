@@ -239,11 +239,11 @@ class TrainConfig:
     the rays of the pixels, as for fisheyes and panoramas, which takes longer. auto: rays if the scene has fisheyes or
     panoramas, so that all photographs share a projection. The model file records this, and renders do the same."""
     masks: MaskMeaning = "none"
-    """Meaning of the photographs' masks, which are white where a pixel counts. ignore: the loss ignores black pixels,
+    """Meaning of the photographs' masks, which are white where a pixel is kept. ignore: the loss ignores black pixels,
     such as people. transparent: black pixels are empty, such as around an object on a turntable. none: masks are not
     used."""
     invert_masks: bool = False
-    """Invert masks: black pixels count, and white ones do not."""
+    """Invert masks: black pixels are kept, and white ones are ignored or transparent."""
     alpha: AlphaMeaning = "blend"
     """Meaning of the photographs' alpha channels. blend: colours are blended over the background. ignore and
     transparent: as for masks."""

@@ -133,7 +133,7 @@ def _scores(
     """Measure one view. Returns the view's record in eval.json.
 
     image, truth: the view's render, and the photograph over the same background.
-    counts: mask (H, W), True for pixels that count; None for all.
+    counts: mask (H, W), True for pixels that are compared; None for all.
     """
     try:
         record: ViewScores = {
@@ -156,7 +156,7 @@ def _scores(
 
 
 def photograph_of(view: View) -> tuple[Image, NDArray[np.bool_] | None]:
-    """Load a view's pixels, and its mask (H, W), True for pixels that count. The mask is None if the view has none.
+    """Load a view's pixels, and its mask (H, W), True for pixels to compare; None instead of a mask if it has none.
 
     Raises InputError if the mask excludes every pixel.
     """
@@ -176,6 +176,6 @@ def picture_names(names: Sequence[str]) -> list[str]:
     ".png" is appended instead.
     """
     stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
-    keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]  # choose the same names everywhere
+    keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]  # the same names on every system
     uses = Counter(keys)
     return [(stem if uses[key] == 1 else name) + ".png" for stem, key, name in zip(stems, keys, names, strict=True)]

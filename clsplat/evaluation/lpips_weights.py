@@ -55,7 +55,7 @@ def fetch() -> None:
     advice = f"curl --create-dirs -o {path} {VGG16_WEIGHTS_URL}"
     if seconds == 0:
         raise ClsplatError(f"VGG-16's weights are missing; download them: {advice}")
-    transfer = _Transfer(daemon=True)  # a thread, which can be left when name resolution hangs
+    transfer = _Transfer(daemon=True)  # in a thread, so that this call can end even if name resolution hangs
     progress = StageProgress()
     transfer.start()
     until = time.monotonic() + seconds

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Similarity of a render to its photograph: PSNR, SSIM, and LPIPS if the optional extra is installed.
 
-Images are (H, W, 3), clamped to [0, 1] and compared in float64. A mask `counts` (H, W) is True for pixels that count.
+Images are (H, W, 3), clamped to [0, 1] and compared in float64. A mask `counts` (H, W) is True for compared pixels.
 """
 
 from __future__ import annotations

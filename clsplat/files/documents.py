@@ -128,7 +128,7 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def parse_json(text: str | bytes, *, once: bool = False) -> Any:
     """The value of a JSON text. Raises ValueError if it does not parse, or is nested too deeply.
 
-    once: also raise ValueError if an object has a key twice. Otherwise the key's last value counts.
+    once: also raise ValueError if an object has a key twice. Otherwise the key's last value is used.
     """
     try:
         return json.loads(text, object_pairs_hook=_unique_keys if once else None)

@@ -135,7 +135,7 @@ class Warp:
 
     @cached_property
     def samples(self) -> int:
-        """Number of samples across and down a warped pixel: more than 1 if it is larger in the undistorted frame."""
+        """Number of samples across and down a warped pixel; 1 if none is over MAX_SINGLE_SAMPLE_PX when undistorted."""
         most = np.nanmax(self._grid[1], initial=0.0)
         return 1 if most <= MAX_SINGLE_SAMPLE_PX else min(int(np.ceil(most - 1e-3)), MAX_WARP_SAMPLES)
 

@@ -114,7 +114,7 @@ class FramePipeline:
     def draw(self, frame: FrameRequest) -> tuple[Draw, Callable[[Planes], Planes]]:
         """The Draw of a frame, and a function that converts its planes to the file's colours without the device.
 
-        The Draw uses only the size and the window of the camera that it is called with, the picture's or a strip's.
+        The Draw is called with the camera of the picture or of a strip, and uses only this camera's size and window.
         """
         draw = self._by_kernels(frame)
         for apply in self._passes(frame):
@@ -211,7 +211,7 @@ class FramePipeline:
         return self._sampling(frame).on or self.config.framing.supersample > 1 or frame.lens is not None
 
     def is_blank(self, planes: Planes, frame: FrameRequest) -> bool | None:
-        """True if the planes of `draw`, before conversion, show only the background. None if no channel shows that."""
+        """True if the planes of `draw`, before conversion, show only the background. None if no channel tells."""
         for name in ("alpha", "count", "depth"):
             if name in planes:
                 return not planes[name].any()

@@ -84,7 +84,7 @@ def camera_matrices(camera: Camera) -> dict[str, Float64]:
 
     Camera space has x right, y up and z along the view, so it is left-handed. In NDC, (0, 0) is the upper left corner
     of the display window and (1, 1) the lower right. OpenEXR does not define z in NDC. Here z is 0 at the near plane
-    and 1 at infinity. For an orthographic camera it is 1 at the far plane. Without a far plane it grows by 1 per world
+    and 1 at infinity. For an orthographic camera, z is 1 at the far plane; without a far plane, z grows by 1 per world
     unit.
     """
     display = camera.window or camera
@@ -396,7 +396,9 @@ def parse_record(text: object) -> dict[str, str]:
 
 
 def attribute_of(spec: Any, name: str) -> Any:
-    """Return an attribute from OpenImageIO's specification of a file, or from the provenance record there, or None."""
+    """Return an attribute from OpenImageIO's specification of a file.
+
+    If it is missing, it is taken from the file's provenance record; None if that lacks it too."""
     value = spec.getattribute(name)
     for place in dict.fromkeys(RECORD_TAGS.values()) if value is None else ():
         value = parse_record(spec.getattribute(place)).get(name) if value is None else value

@@ -34,9 +34,9 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_IMAGE_PIXELS = 1 << 28
 """Largest number of pixels of an image that is read."""
 MAX_UNCHECKED_CHANNEL_VALUES, MAX_CHANNEL_VALUES_PER_BYTE = 48 << 20, 4096
-"""Limits of the values (pixels times channels) to which a file may decode: a number, and a number per byte of the file.
+"""Limits of the values (pixels times channels) to which a file may decode: in all, and for each byte of the file.
 
-The larger limit counts. No real image has more per byte, as deflate expands a byte to at most 1032 bytes.
+The larger of the two limits applies. No real image has more per byte, as deflate expands a byte to at most 1032 bytes.
 """
 _DECODE_CHECK_ROWS = 64
 """Number of rows that `decodes` reads at a time."""
@@ -58,7 +58,7 @@ COMPANION_PATTERN = (
 )
 """Words in names of files and folders that accompany photographs, such as masks and depth maps."""
 FOREGROUND_PATTERN = r"(?:fg|foreground)"
-"""Words in names of masks that count only with a separator between them and the photograph's name."""
+"""Words in names of masks that are recognised only if a separator is between them and the photograph's name."""
 _COMPANION_FOLDER = re.compile(rf"(?:\w+[_-])?{COMPANION_PATTERN}(?:[_-]\w+)?", re.IGNORECASE)
 _COMPANION_AFTER = re.compile(
     rf"(?:[._-]?{COMPANION_PATTERN}|[._-]{FOREGROUND_PATTERN})(?:[._-]?(?:\d+|vis|map|raw|image))*", re.IGNORECASE
@@ -206,9 +206,9 @@ def read_image(path: Path, *, orient: bool = True) -> Float32:
 def downscale(image: Float32, width: int, height: int) -> Float32:
     """Resample an image (H, W, C) to (height, width, C): each new pixel is the mean of the area that it covers.
 
-    Pixels that are partly covered count by their fraction. The image's corners stay in place, as in `Camera.resized`.
-    An axis that grows is interpolated linearly. The mean is of premultiplied colours, so that transparent pixels do
-    not bleed in; alpha is straight in input and output.
+    A partly covered pixel is weighted by its covered fraction. The image's corners stay in place, as in
+    `Camera.resized`. An axis that grows is interpolated linearly. The mean is of premultiplied colours, so that
+    transparent pixels do not bleed in; alpha is straight in input and output.
     """
     if image.shape[:2] == (height, width):
         return image

@@ -125,7 +125,7 @@ def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # `changed` is a 
 def _oriented_share(values: Float32) -> float:
     """Return the fraction of a map's grid cells with the more common orientation, mirrored or not mirrored.
 
-    Only cells with finite and varying values count. The result is 1 for a map that is too small to judge or has no
+    Cells without finite and varying values are left out. The result is 1 for a map that is too small to judge or has no
     finite values. It is 0 for a map whose positions lie on a line or in a point.
     """
     rows, columns = (np.arange(0, side, max(side // _ORIENTATION_CELLS_PER_SIDE, 1)) for side in values.shape[:2])

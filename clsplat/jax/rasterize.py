@@ -26,7 +26,8 @@ from clsplat.library.rasterize import rasterize as rasterize_numpy
 from clsplat.stages.harmonics import MAX_SH_BASIS_DEGREE
 
 MAX_CACHED_FORWARD_PASSES = 8
-"""Maximum number of forward passes that are kept for their gradients. An older pass is computed again for them."""
+"""Maximum number of forward passes that are kept for their gradients. The gradient of an older
+pass computes the pass again."""
 
 
 class Rasterized(NamedTuple):

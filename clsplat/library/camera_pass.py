@@ -228,7 +228,7 @@ class CameraPass:
 
     @property
     def compensations(self) -> Float32 | None:
-        """Factors (N,) of the opacities for the low-pass filter, or None."""
+        """Factors (N,) of the opacities for the low-pass filter; None if opacities are not compensated."""
         return None if self.projected.arrays.compensations is None else self.splats("compensations")
 
     @property

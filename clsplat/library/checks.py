@@ -28,7 +28,7 @@ def floats(name: str, values: Any, *shapes: Shape) -> Float32:
         flat = result.reshape(-1)
         finite = np.isfinite(flat @ flat) or bool(
             np.isfinite(flat).all()
-        )  # a dot product is faster than isfinite, but may overflow
+        )  # a dot product is faster than isfinite; if it overflows, isfinite decides
     if not finite:
         at = np.unravel_index(int(np.argmin(np.isfinite(result))), result.shape)
         place = ", ".join(str(int(index)) for index in at)

@@ -51,7 +51,7 @@ class PixelGradients:
     conics: (n, 3).
     opacities: (n,).
     colours: (n, D).
-    absolute: (n, 2), sums over pixels of the absolute gradients with respect to means2d, or None.
+    absolute: (n, 2), sums over pixels of the absolute gradients with respect to means2d; None unless requested.
 
     `Hosted.array` is the array on the device; `Hosted.get` returns it on the host.
     """

@@ -340,7 +340,7 @@ def _masks(masks: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.bool_]
 
 
 def _own_of(listed: Int64, batch: tuple[int, ...], image: int) -> slice:
-    """The rows of an image's Gaussians. In packed arrays they reach from the first to the last row in its lists."""
+    """The rows of an image's Gaussians: in packed arrays, from the first to the last row in the image's lists."""
     if len(batch) > 1:
         return slice(image * batch[-1], (image + 1) * batch[-1])
     return slice(int(listed.min()), int(listed.max()) + 1) if len(listed) else slice(0, 0)

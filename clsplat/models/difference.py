@@ -26,9 +26,9 @@ ERROR_UNITS = {
 def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
     """Largest and mean error of each attribute in ERROR_UNITS, over all Gaussians.
 
-    Position errors are distances, and rotation errors angles. Otherwise the worst component counts. A scale
-    error is a fraction of the Gaussian's largest scale, because formats clamp the thickness of very thin discs. SH
-    coefficients that one model lacks count as 0.
+    Position errors are distances, and rotation errors angles. The error of any other attribute is that of its worst
+    component. A scale error is a fraction of the Gaussian's largest scale, because formats clamp the thickness of very
+    thin discs. SH coefficients that one model lacks are taken as 0.
 
     Raises ValueError for models of different sizes.
     """

@@ -43,7 +43,7 @@ class MaskedPhotograph:
 def masked_photographs(scene: Scene, *, only_files: bool) -> tuple[list[MaskedPhotograph], int]:
     """Draw evenly spaced photographs that have masks. Returns them, and the number of all photographs with masks.
 
-    only_files: do not count alpha channels as masks.
+    only_files: ignore masks that are alpha channels.
     Unreadable files are skipped.
     """
     views = [view for view in scene.views if view.mask is not None and (view.mask.path is not None or not only_files)]

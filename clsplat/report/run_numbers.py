@@ -61,7 +61,7 @@ class RunNumbers:
 
     @property
     def step(self) -> int:
-        """The last step in metrics.jsonl or of an evaluation."""
+        """The last step that metrics.jsonl or an evaluation records, whichever is later; 0 if there is none."""
         steps = [self.curves["step"][-1]] if self.curves["step"] else []
         return int(max([*steps, *(record["step"] for record in self.evaluations)], default=0))
 

@@ -49,7 +49,9 @@ class Keys:
         return float(value)
 
     def require(self, key: str, default: float | None = None) -> float:
-        """Return the number under `key`, or the default. Raises InputError for an invalid value or without both."""
+        """Return the number under `key`, else `default`.
+
+        Raises InputError for an invalid value, or if the file and the caller give none."""
         value = self.number(key)
         if (value := default if value is None else value) is None:
             raise self.wrong(key, "a number")

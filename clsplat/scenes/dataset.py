@@ -81,7 +81,7 @@ class Lens:
 
     @property
     def native(self) -> CameraModel | None:
-        """Camera model other than the pinhole that renders through this lens without undistortion, or None."""
+        """Camera model that renders through this lens without undistortion; None for a pinhole or if there is none."""
         camera_model = lens_models().get(self.model, (None, None))[1]
         return camera_model if camera_model is not None and not camera_model.is_pinhole else None
 
@@ -241,7 +241,7 @@ class DataSet:
 
     points: (N, 3) float64, world coordinates.
     colors: (N, 3) float32 in [0, 1].
-    box: corners (low, high) of instant-ngp's volume in world units, or None.
+    box: corners (low, high) of instant-ngp's volume in world units; None for other data sets.
     missing: names of listed pictures that do not exist and are left out.
     clouds: point files that the data set does not name. The first one is used if `points` is empty.
     """

@@ -38,7 +38,7 @@ In scenes that are photographed from all around, the extent is at most 1.29 time
 the length unit.
 """
 NEAR_PER_EXTENT = 1e-6
-"""Least depth at which points count for the length unit, as a fraction of the extent."""
+"""Least depth of the points that the length unit is computed from, as a fraction of the extent."""
 MAX_SAMPLED_VIEWS = 200
 """Maximum number of training photographs, evenly spaced, whose depths give the length unit."""
 MAX_SAMPLED_POINTS = 100_000
@@ -61,7 +61,10 @@ def with_depths(scene: Scene, use: DepthUse) -> Scene:
         known = _mapped(scene, use)
     without = [view.name for view in scene.train_views if view.name not in known]
     if use and without:
-        warn(f"{scene.name}: no depths are known for {len(without):,} photograph(s) ({examples(without)})")
+        warn(
+            f"{scene.name}: no depths are known for {len(without):,} photograph(s) ({examples(without)}), which get no "
+            "depth loss"
+        )
     views = [replace(view, depth=known.get(view.name) if view.split == "train" else None) for view in scene.views]
     return replace(scene, views=views, depth_use=use)
 
@@ -254,7 +257,7 @@ def _tracked_points(scene: Scene, views: Sequence[View]) -> dict[str, Float64]:
 def _nearest(points: Float64, view: View, near: float) -> Float64:
     """Return the depth of the nearest point in each cell of the view's picture that has any of the points (N, 3).
 
-    near: depth from which points count, if the camera has no near plane of its own.
+    near: least depth of a point that is used, if the camera has no near plane of its own.
     """
     camera = view.camera.before(near)
     rows, columns, inside = pixels_of(points, camera, view.lens)

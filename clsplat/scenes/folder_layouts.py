@@ -65,7 +65,7 @@ def detect(path: Path) -> Kind:
 def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tuple[DataSet, list[Path]]:
     """Read a COLMAP model and find its pictures. Returns the data set, and folders with downscaled copies of them.
 
-    chosen: another folder with the pictures, relative to `path`, or None.
+    chosen: folder with the pictures, relative to `path`; None searches for it.
     Raises InputError.
     """
     model_path = colmap.find_model(path)
@@ -121,7 +121,7 @@ def read_transforms(path: Path, kind: Kind, chosen: str | Path | None, missing: 
 
 
 def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, images: Sequence[PosedImage]) -> Path:
-    """Find the folder of a COLMAP model's pictures: images/, images_2 or the like, another known name, or the scene's.
+    """Find the folder of a COLMAP model's pictures: images/, else images_2 and the like, a known name, or the scene's.
 
     If images/ has no pictures, a folder with a picture that the model lists is preferred. Warns if the folder is not
     images/. Raises InputError if there is no such folder.
@@ -175,7 +175,7 @@ def _held_out(data: DataSet, path: Path) -> list[PosedImage]:
     names = list(dict.fromkeys(line for line in lines if line and not line.startswith("#")))
     found = match(names, [*(image.name for image in data.images), *data.missing])
     if lost := [legible(name) for name in names if name not in found.names]:
-        none = "; the list is not used" if not found.names else ""
+        none = "; the list is not used" if not found.names else "; these lines are ignored"
         warn(f"{path}: lists {examples(lost)} to hold out, but no picture has such a name{none}")
     held_out = set(found.names.values())
     if not held_out:

@@ -57,7 +57,7 @@ def find_pictures(
         if listed[index] in found.names:
             files[index] = there[found.names[listed[index]]]
     if found.how:
-        names = f"{len(found.names):,} picture(s) have other names than listed, and are used"
+        names = f"{len(found.names):,} listed picture(s) not found by name; files with similar names are used instead"
         warn(f"{listed_in}: {names}: {'; '.join(found.how)}")
     if gone := [index for index in lost if files[index] is None]:
         shown = examples(legible(str(exact[index] or listed[index])) for index in gone)

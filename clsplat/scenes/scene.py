@@ -63,7 +63,7 @@ class View:
     split: "train" or "test".
     lens: the lens that took the file, at the file's size.
     upright: True if the camera belongs to the picture rotated by its EXIF orientation, False if to the stored picture.
-    mask: mask of the pixels that count in training, None if all count.
+    mask: mask of the pixels that training uses, None if it uses all.
     depth_file: the depth map that the data set names, if any.
     depth: known depths for training.
     stamps: size in bytes and modification time in nanoseconds of each of `files` when the scene was loaded; () if
@@ -113,9 +113,9 @@ class View:
         return image if image.shape[2] < 5 else np.ascontiguousarray(image[:, :, : 3 + _has_alpha(image)])
 
     def load_masked(self, width: int | None = None, height: int | None = None) -> Float32:
-        """Read like `load`. If a mask leaves pixels out, there is a fifth channel: 1 for pixels that count, else 0.
+        """Read like `load`. If a mask leaves pixels out, there is a fifth channel: 1 for kept pixels, else 0.
 
-        A pixel counts if at least half of its area counts. Its colour is the mean over the part that counts.
+        A resized pixel is kept if the mask keeps at least half of its area. Its colour is the mean over this part.
         """
         return self.load_sizes([(width or self.camera.width, height or self.camera.height)])[0]
 
@@ -136,9 +136,9 @@ class View:
         return [self._fitted(image, width, height) for width, height in sizes]
 
     def _masked(self, image: Float32, counts: Float32, width: int, height: int) -> Float32:
-        """Resample a picture (H, W, 3 or 4) and its mask (H, W, 1) to a picture (height, width, 5)."""
+        """Resample a picture (H, W, 3 or 4) and its mask (H, W, 1) to a picture as from `load_masked`."""
         parts = [np.where(counts > 0, image[:, :, :3], np.float32(0)), counts]
-        if image.shape[2] == 4:  # alpha is averaged over the part that counts, like a colour
+        if image.shape[2] == 4:  # alpha is averaged over the kept part, like a colour
             there = np.where(counts > 0, image[:, :, 3:], np.float32(0))
             alpha = self._fitted(np.concatenate([there, there, there, counts], axis=2), width, height)
             parts[0] = parts[0] * there
@@ -230,7 +230,7 @@ class Scene:
 
     @cached_property
     def sampled_views(self) -> list[View]:
-        """Views that findings (`scenes.analysis`) are based on: all, or an even sample of many training views."""
+        """Views that findings (`scenes.analysis`) are based on: all views, but an even sample if there are many."""
         if self.decoded_first:
             return self.views
         count = min(MAX_SAMPLED_PHOTOGRAPHS, len(self.train_views))
@@ -299,7 +299,7 @@ class Scene:
 
     @cached_property
     def spread(self) -> tuple[Float64, float, float]:
-        """Middle of the training cameras without outliers, distance of the farthest camera from it, and largest
+        """Middle of the training cameras without outliers, distance of the farthest camera from there, and largest
         coordinate of the cameras."""
         near = [view for view in self.train_views if view.name not in self.stray_cameras]
         centres = np.stack([view.camera.position for view in near or self.train_views or self.views])
@@ -326,7 +326,7 @@ class Scene:
 
     @property
     def length_unit(self) -> float:
-        """Length in world units that learning rates and sizes of Gaussians are relative to: `unit`, or the extent."""
+        """Length in world units for learning rates and sizes of Gaussians: `unit` if it is set, else `extent`."""
         return self.extent if self.unit is None else self.unit
 
     @property
@@ -370,7 +370,7 @@ def _stamp(path: Path) -> FileStamp:
 
 
 def _has_alpha(image: Float32) -> bool:
-    """Return True if a masked picture (H, W, 5) is transparent in a pixel that counts."""
+    """Return True if a masked picture (H, W, 5) is transparent in a pixel that the mask keeps."""
     return bool((image[:, :, 3] < image[:, :, 4]).any())
 
 

@@ -75,7 +75,7 @@ def owned(
     """Match the sidecar files of a folder to photographs. Returns the file of each photograph, by its name.
 
     paths: the sidecar files in `folder`.
-    known: by name that a sidecar file may have, without extension, the name of its photograph.
+    known: name of the photograph for each name, without extension, that its sidecar file may have.
     what: the kind of sidecar file, such as "mask", for messages.
     example: name of a photograph, for messages.
     without: files to skip.

@@ -45,7 +45,7 @@ class WorkerJob:
     model: absolute path of the model, or of the shot file.
     digest: SHA-256 of the model's content (`JobModels.digest`).
     device: name of the device, as for --device.
-    memory_limit: limit of device memory in bytes, or None.
+    memory_limit: limit of device memory in bytes; None for no limit.
     placed: True if the tasks contain placements of the models.
     version: version of clsplat.
     """
@@ -215,7 +215,7 @@ def _telling_of_no_workers(client: Any, scheduler: str | None) -> Iterator[None]
         while not stop.is_set():
             try:
                 there = bool(client.nthreads())
-            except (OSError, RuntimeError, TimeoutError):  # the loop over frames reports the loss
+            except (OSError, RuntimeError, TimeoutError):  # the loop over frames reports a lost scheduler
                 return
             now = time.monotonic()
             since = None if there else since or now

@@ -41,11 +41,11 @@ class Sharing:
         threading.Thread(target=self._hold, name="clsplat-claims", daemon=True).start()
 
     def begin(self, task: Task) -> State:
-        """Claim a frame if possible.
+        """Claim a frame if possible. Returns one of three words:
 
-        ours: the frame is claimed, and to be rendered by this job.
-        done: the frame's file is complete by now.
-        theirs: another process is rendering the frame.
+        ours: this job now has the claim, and must render the frame.
+        done: the frame's file is complete already.
+        theirs: another process has the claim, and is rendering the frame.
         """
         if is_complete(task, self.options):
             return "done"

@@ -252,7 +252,7 @@ class FrameRenderer:
         """
         framing = self.options.pictures.framing
         rows = strip_rows(self._renderer.device, camera, self.options.channels, framing, planes)
-        floats = self._objects * camera.width * framing.supersample**2  # floats in a row of the planes of all objects
+        floats = self._objects * camera.width * framing.supersample**2  # floats in a row of all Cryptomatte planes
         most = DEEP_STRIP_FLOATS // max(floats, 1)
         return rows if most >= camera.height else min(rows, max(most // TILE, 1) * TILE)
 

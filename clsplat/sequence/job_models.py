@@ -224,7 +224,7 @@ def names_of(mattes: Mapping[str, Matte]) -> tuple[MatteNames, ...]:
 def load_job_models(path: Path, transform: KeyedTrack | None = None) -> JobModels:
     """Load the models that MODEL names: a run, a model file, one file per frame, a shot file or a USD stage.
 
-    transform: transform over time to apply to all models, or None.
+    transform: transform over time to apply to all models; None leaves them in place.
     Raises InputError for an unreadable file, and for models that differ in colour space or rendering method.
     """
     if is_layout(path):
@@ -253,9 +253,9 @@ def load_job_models(path: Path, transform: KeyedTrack | None = None) -> JobModel
 class _Opened:
     """A loaded model of a shot file.
 
-    digest: SHA-256 of the file, or of the pattern.
+    digest: SHA-256 of the file; for one file per frame, of the pattern's text.
     space: colour space of the model.
-    file: file of the model, or the pattern of the model's files.
+    file: file of the model; for one file per frame, the pattern of the files.
     numbered: files by frame number; empty for a model that does not change.
     """
 

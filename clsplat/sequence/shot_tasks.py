@@ -107,7 +107,8 @@ def make_tasks(
 def settled(flags: SamplingConfig, optics: Optics | None, camera: Camera) -> SamplingConfig:
     """Return the shutter and lens of a frame: the flags' settings, or the USD stage's settings where no flag is given.
 
-    An f-stop becomes an aperture radius, unless flags give the sensor width or the metres per unit.
+    The f-stop is converted to an aperture radius by the stage's lens and unit. If a flag gives the sensor width or the
+    metres per unit, the f-stop is kept.
     """
     if optics is None:
         return flags

@@ -117,14 +117,15 @@ class Task:
     number, name: as in `shots.Frame`.
     camera: camera of the whole frame, in its final size.
     path: path of the file.
-    after, earlier: cameras of the next and the previous frame, for motion channels, of the same size; or None.
+    after, earlier: cameras of the next and the previous frame, for motion channels, of the same size; None if
+        these channels are not requested.
     stretch: cameras while the shutter is open; None for a static camera.
     before: state of the file when the job began, by `finished_frames.stamp`.
     sampling: shutter and lens of this frame; None means the job's.
     optics: shutter and lens in a USD stage.
     eye: left or right of a stereo pair.
     right: task of the right eye, if one file holds both.
-    lens: the photograph's lens, by which the picture is distorted; or None.
+    lens: the photograph's lens, by which the picture is distorted; None for no distortion by a lens.
     holdout: absolute path of the holdout's file; None without a holdout.
     placed: placements of the models at each of the `model_times`, in frames from the frame; None for a single model
       used as it is.
@@ -382,7 +383,7 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     used = sampling if sampling.on else None
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
-    # Frames with a far plane have another digest than files of versions that did not clip at it.
+    # A far plane changes the digest, so that frames of versions that did not clip at it are rendered again.
     made += ("far",) if task.camera.far < inf else ()
     colour = replace(pictures.colour, ocio_config=configuration_digest(pictures.colour.ocio_config))
     if task.holdout is not None:

@@ -95,7 +95,7 @@ def record_of(
 
 
 def frame_bytes(task: Task, options: RenderOptions) -> int:
-    """Estimate the bytes of main memory that a frame takes until it is written: for a frame in strips, of one strip."""
+    """Estimate the bytes of main memory that a frame takes until it is written; if it is in strips, of one strip."""
     camera, framing = picture_camera(task, options.pictures), options.pictures.framing
     pixels, finer = camera.width * camera.height * len(task.views), framing.supersample**2
     if not task.is_video:

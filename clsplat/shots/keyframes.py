@@ -109,7 +109,7 @@ def tangents(times: Float64, slopes: Float64) -> Float64:
     result = np.concatenate([slopes[:1], slopes[-1:]])
     if len(slopes) > 1:
         inner = (after * slopes[:-1] + before * slopes[1:]) / (before + after)
-        # an inner tangent is the slope of the parabola through three keys, as is an end's unless it points backwards
+        # A tangent is the slope of the parabola through three keys; at an end it is 0 if it would point backwards.
         first = ((2 * before[0] + after[0]) * slopes[0] - before[0] * slopes[1]) / (before[0] + after[0])
         last = ((2 * after[-1] + before[-1]) * slopes[-1] - after[-1] * slopes[-2]) / (before[-1] + after[-1])
         first = first if first @ slopes[0] > 0 else np.zeros_like(first)

@@ -205,7 +205,7 @@ def _path(path: str, cameras: Sequence[Camera], count: int | None) -> tuple[Fram
 def _read_folder(path: Path, size: tuple[int | None, int | None], lenses: Lenses) -> Shot:
     listed = sorted(file.name for file in path.glob("transforms*.json"))
     if listed:
-        # next to a transforms.json, a model below colmap/ is nerfstudio's, and its world differs from the file's
+        # next to a transforms.json, a model below colmap/ is nerfstudio's, in another world than the transforms.json
         model = find_model(path)
         if model is None or "colmap" in model.relative_to(path).parts:
             if listed != ["transforms.json"]:

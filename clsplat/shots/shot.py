@@ -25,7 +25,7 @@ class Frame:
     """A frame of a shot.
 
     number: the number that `--frames` and `####` refer to.
-    name: the value of `{name}`: a picture's path, or the number in four digits.
+    name: the value of `{name}`: the path of the frame's photograph, else the number in four digits.
     time: seconds from the first frame, if the source gives times.
     optics: shutter and lens from a USD stage.
     lens: the photograph's lens, if the frame is to get its distortion.

@@ -189,8 +189,8 @@ class Volume:
 class PlacedModel:
     """A model of a shot.
 
-    path: its model file or run folder.
-    volumes: regions with their own mattes; where they overlap, the first one counts.
+    path: model file or run folder.
+    volumes: regions with their own mattes; a Gaussian in several of them belongs to the first.
     """
 
     name: str

@@ -42,7 +42,8 @@ class Batches:
 class BatchResults:
     """Results of a call of gsplat's function: the library's result for each batch, and the splats in view.
 
-    The layout of `meta` is (..., C, N, ...), where ... are batches; with `packed` it is (nnz, ...), the splats in view.
+    In the layout of `meta`, arrays are (*batch, C, N, ...). With `packed` they are (nnz, ...), a row for each splat in
+    view.
     A splat's index is its position in a flattened array (B, C, N): by batch, then camera, then Gaussian.
     """
 
@@ -261,7 +262,7 @@ class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch ha
     ) -> tuple[Tensor, Tensor]:
         """Images (..., C, H, W, X) and alphas (..., C, H, W, 1).
 
-        values: values to blend, (..., N, D) or (..., C, N, D), or None.
+        values: values to blend, (..., N, D) or (..., C, N, D); None if only depth is rendered.
         """
         ctx.call = call
         images, alphas = call.pixels(means2d)

@@ -67,7 +67,7 @@ class Look:
 def read_look(mode: Any, degree: Any, size: Any, opacity: Any, crop: Any = None) -> Look:
     """Make a `Look` of the values of a page's controls. Numbers outside a slider's range are clamped.
 
-    crop: two corners of the box, or None.
+    crop: two corners of the box; None for no box.
     """
     box = None
     if crop is not None:
@@ -89,7 +89,7 @@ def _within(value: Any, low: float, high: float, usual: float) -> float:
 
 
 def edited(gaussians: Gaussians, look: Look) -> Gaussians:
-    """Apply SH degree, size, opacity and crop box of a look to a model. Unchanged arrays are shared with the input."""
+    """Apply a look's SH degree, size, opacity and crop box to a model. Unchanged arrays are shared with the input."""
     model = drop_sh(gaussians, look.degree) if look.degree < gaussians.sh_degree else replace(gaussians)
     if look.size != 1:
         model.log_scales = gaussians.log_scales + np.float32(math.log(look.size))
@@ -113,7 +113,7 @@ def alpha_picture(alpha: Float32) -> Image:
 
 
 def depth_picture(depth: Float32, alpha: Float32) -> tuple[Image, str]:
-    """Convert depth to a picture (H, W, 3) uint8, and describe its range. Near is bright, transparent is black."""
+    """Convert depths to a picture (H, W, 3) uint8, and describe their range. Near is bright, transparent is black."""
     seen = alpha > 0.5
     if not seen.any():
         return np.zeros((*depth.shape, 3), np.uint8), "nothing is visible"
@@ -123,7 +123,7 @@ def depth_picture(depth: Float32, alpha: Float32) -> tuple[Image, str]:
 
 
 def count_picture(count: NDArray[np.int32]) -> tuple[Image, str]:
-    """Convert numbers of Gaussians per pixel to a picture (H, W, 3) uint8, bright for many, and describe its range."""
+    """Convert counts of Gaussians per pixel to a picture (H, W, 3) uint8, bright for many, and describe their range."""
     most = max(float(np.quantile(count, 0.995)), 1.0)
     return _shaded(count / most, None), f"0 to {most:,.0f} Gaussians per pixel (bright), maximum {int(count.max()):,}"
 

@@ -58,14 +58,14 @@ class Pose:
     def angle(self, width: int, height: int) -> float:
         """Return the vertical field of view, in radians, of a picture of this size.
 
-        It is the page's, except on an upright page: there, a picture with a larger aspect ratio than the page has the
-        page's horizontal field of view. An aspect ratio over 1 counts as 1 here.
+        It is the page's if the page's aspect ratio is at least the picture's, or at least 1. Otherwise the picture has
+        the page's horizontal field of view; a picture wider than high is treated as a square.
         """
         page, picture = self.width / self.height, min(width / height, 1.0)
         return self.fov if page >= picture else 2 * math.atan(math.tan(0.5 * self.fov) * page / picture)
 
     def same(self, other: Pose | None) -> bool:
-        """True if all values of the other pose are the same, so that it shows the same picture."""
+        """True if all values of the other pose are the same, so that both show the same picture."""
         names = [item.name for item in fields(self)]
         return other is not None and all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
 

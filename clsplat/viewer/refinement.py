@@ -71,11 +71,11 @@ class Refinement:
 
     @property
     def moving(self) -> bool:
-        """True if the displayed picture is older than the last change of camera or look."""
+        """True if the displayed picture is older than the last change of camera or `Look`."""
         return self._shown != self.changes
 
     def changed(self, now: float) -> None:
-        """Record a change of the camera or the look."""
+        """Record a change of the camera or the `Look` (appearance settings)."""
         apart = now - self._at
         usual = REST_INTERVAL_RATIO * apart if self.changes > 1 and apart < SETTLE_SECONDS_RANGE[1] else 0.0
         before = self._settle if self.changes > 1 else 0.0
@@ -97,7 +97,7 @@ class Refinement:
         return Level(2 * self._level.scale, exact=False)
 
     def wait(self, now: float, model: int = 0) -> float | None:
-        """Return the seconds until a picture is due, or None if none is due before camera, look or model change."""
+        """Return the seconds until a picture is due, or None if none is due before camera, `Look` or model change."""
         if self.moving:
             return 0.0
         if self._level.exact and self._model == model:

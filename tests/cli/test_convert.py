@@ -318,7 +318,8 @@ def test_a_file_of_another_kind_than_its_name_says(made: str, name: str, model: 
     said = printed(capsys, ["info", wrong, "--json"])
     kind = formats.format_of(wrong).name
     assert json.loads(said.out)["format"] == kind
-    assert said.err == f"clsplat: warning: {wrong}: is {kind} by its content, in spite of its name\n"
+    told = f"{wrong}: is {kind} by its content, in spite of its name, and is read as such"
+    assert said.err == f"clsplat: warning: {told}\n"
     assert len(formats.load(model)) == 300
 
 
@@ -338,7 +339,7 @@ def test_the_colour_space_goes_along_or_is_told(model: Path, capsys: Capture) ->
         assert colour.recorded_space(target) == "lin_rec709"
     assert not capsys.readouterr().err
     said = ran(capsys, convert, model, model.with_suffix(".splat")).err
-    assert "splat cannot store the colour space, which is lin_rec709" in said
+    assert "splat cannot store the colour space, lin_rec709; readers will assume sRGB" in said
 
 
 @pytest.mark.parametrize("suffix", sorted(s for s in formats.suffixes(writable=True) if s.startswith(".")))

@@ -418,7 +418,7 @@ def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Captu
         ("--video.prores 422", "a.mp4", "--video.prores 422: is for ProRes, expected the name of a .mov"),
         ("--video.crf 5", "a.mov", "--video.crf 5: is for H.264, expected the name of an .mp4"),
         ("--alpha", "a.mov", "ProRes hq cannot hold alpha, expected --video.prores 4444"),
-        ("--bits 8", "a.#.dpx", "a.#.dpx has 10 or 16 bits, expected one of them"),
+        ("--bits 8", "a.#.dpx", "--bits 8: is for PNG and TIFF, expected 10 or 16 for"),
         ("--bits 10", "a.#.png", "--bits 10: is for DPX, expected 8 or 16"),
         ("--alpha", "a.#.dpx", "DPX files of 10 bits are written without alpha, expected --bits 16"),
         ("--video.crf 99", "a.mp4", "--video.crf 99: expected 0 to 51"),

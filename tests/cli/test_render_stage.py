@@ -231,7 +231,7 @@ def test_pixels_that_a_file_shows_as_squares(model: Path, tmp_path: Path, capsys
     stage = write_stage(tmp_path / "shot.usda", settings="float pixelAspectRatio = 2")
     assert warnings_of(capsys, model, stage) == []
     (line,) = warnings_of(capsys, model, stage, f"-o {tmp_path}/c.####.png")
-    assert line.endswith(": not applied: pixelAspectRatio (2) in .png files, which show square pixels")
+    assert line.endswith(": not applied: pixelAspectRatio (2) in .png files, whose pixels viewers show as squares")
 
 
 @pytest.mark.slow

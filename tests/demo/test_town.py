@@ -305,9 +305,9 @@ def test_only_a_town_is_replaced_and_only_if_told(tmp_path: Path) -> None:
         ("--town 1x1 --seed=-1", "--seed -1: expected a whole number of at least 0"),
         ("--town 1x1 --iterations 5", "--iterations: has no effect with --town, which trains nothing"),
         ("--town 1x1 --device cpu", "--device: has no effect with --town, which trains nothing"),
-        ("--town-photos 10", "--town-photos: expected it with --town, such as --town 2x2"),
-        ("--seed 1", "--seed: expected it with --town"),
-        ("--overwrite", "--overwrite: expected it with --town"),
+        ("--town-photos 10", "--town-photos: has an effect only with --town, expected it too, such as --town 2x2"),
+        ("--seed 1", "--seed: has an effect only with --town"),
+        ("--overwrite", "--overwrite: has an effect only with --town"),
     ],
 )
 def test_a_wrong_option_is_one_line(flags: str, message: str, tmp_path: Path, capsys: Capture) -> None:

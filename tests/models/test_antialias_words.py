@@ -56,7 +56,7 @@ def test_a_line(line: str, meaning: bool | None) -> None:
 def test_the_last_counts_and_a_contradiction_is_told() -> None:
     said = of_comments(["antialiased 1", "by hand", "SplatRenderMode: default"])
     assert not said.antialiased
-    assert "'antialiased 1' and 'SplatRenderMode: default', the last of which counts" in said.contradiction
+    assert "'antialiased 1' and 'SplatRenderMode: default', the last of which is used" in said.contradiction
     assert of_comments(["rasterize_mode classic", "antialiased 1"]).antialiased
     assert of_comments(["antialiased 1", "SplatRenderMode: mip"]).contradiction == ""
     assert not of_comments([]).antialiased
@@ -76,7 +76,7 @@ def test_the_last_counts_and_a_contradiction_is_told() -> None:
 def test_words_that_are_not_understood_are_told_once(lines: list[str], named: str) -> None:
     said = of_comments(lines)
     assert not said.antialiased
-    told = f"says {named!r}, which is not understood: the model counts as not antialiased, expected words such as "
+    told = f"says {named!r}, which is not understood: the model is read as not antialiased, expected words such as "
     assert said.warning == (f"{told}'antialiased 1'" if named else "")
 
 

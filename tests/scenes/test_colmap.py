@@ -107,10 +107,10 @@ def test_text_that_is_cut_at_the_end_of_a_line_is_told(tmp_path: Path, stem: str
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("\ufeff" + "".join(lines[:kept]), "utf-8")
     counts = {"images": (3, 2), "points3D": (5, 4)}[stem]
-    told = f"{path}: its header announces {counts[0]} records, but it has {counts[1]}; was it truncated or edited?"
+    told = f"{path}: its header announces {counts[0]} records, only {counts[1]} are read; was it cut off or edited?"
     assert warnings_of(lambda: read_model(tmp_path / "txt")) == [told]
     if stem == "images":
-        warned("its header announces 3 records, but it has 2", read_cameras, tmp_path / "txt")
+        warned("its header announces 3 records, only 2 are read", read_cameras, tmp_path / "txt")
 
 
 def test_text_that_was_edited_beside_a_binary_file_is_told(tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ def test_no_masks_at_all_and_some_missing(tmp_path: Path) -> None:
     (scene / "masks").mkdir()
     write_image(scene / "masks" / "03.png", mask_of())
     read = load_scene(scene, masks=IGNORE)
-    assert any(f"{VIEWS - 1} photograph(s) have no mask and count as a whole" in text for text in read.warnings)
+    assert any(f"{VIEWS - 1} photograph(s) have no mask and are used as a whole" in text for text in read.warnings)
     assert [view.load_masked().shape[2] for view in read.views[2:4]] == [3, 5]
 
 
@@ -231,13 +231,13 @@ def test_white_may_be_what_moves(tmp_path: Path) -> None:
     read = load_scene(scene, masks=IGNORE)
     assert [view.load_masked()[:, :, 4].mean() for view in read.views] == [0.5] * VIEWS
     assert (
-        "white pixels are the ones that count, as in all masks; if white marks moving objects there, add --invert-masks"
+        "white pixels are the ones to keep, as in all masks; if white marks moving objects there, add --invert-masks"
         in only([text for text in read.warnings if "dynamic_masks" in text])
     )
     inverted = load_scene(scene, masks=MaskUse("ignore", invert=True))
     assert not [text for text in inverted.warnings if "dynamic_masks" in text]
     paths = sorted((scene / "images").iterdir())
-    warned("white pixels are the ones that count", reconstruct._masks, scene / "images", paths, IGNORE)
+    warned("white pixels are the ones to keep", reconstruct._masks, scene / "images", paths, IGNORE)
 
 
 @pytest.mark.brings("renderers, video tools", "masks/mask_0007.png for image_0007.png", "by their numbers")

@@ -78,7 +78,7 @@ def test_pictures_are_found_under_other_names(kind: str, tmp_path: Path) -> None
     listed, files, told = LOOSE[kind]
     scene = load_scene(write_colmap(tmp_path, listed, files))
     (warning,) = scene.warnings
-    assert "20 picture(s) have other names than listed, and are used: " in warning
+    assert "20 listed picture(s) not found by name; files with similar names are used instead: " in warning
     assert told in warning
     assert_each_has_its_picture(scene)
     assert len(scene.test_views) == 3
@@ -406,7 +406,8 @@ def test_a_list_of_others_is_told_and_not_used(tmp_path: Path) -> None:
     assert [view.name for view in scene.test_views] == ["view00.png", "view08.png", "view16.png"]
     path.write_text("view02.png\nview99.png\n")
     scene = load_scene(tmp_path)
-    assert scene.warnings == [f"{path}: lists view99.png to hold out, but no picture has such a name"]
+    told = f"{path}: lists view99.png to hold out, but no picture has such a name; these lines are ignored"
+    assert scene.warnings == [told]
     assert [view.name for view in scene.test_views] == ["view02.png"]
     path.write_text("")
     assert len(load_scene(tmp_path).test_views) == 3

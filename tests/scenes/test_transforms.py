@@ -203,8 +203,8 @@ def test_a_split_that_makes_no_sense(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="'val_filenames' is 'images', expected a list of file names"):
         read_transforms(make(tmp_path, val_filenames="images"))
     path = make(tmp_path, test_filenames=["images/1.png", "a.png", "b.png", "c.png", "d.png"])
-    told = f"{path}: 'test_filenames' lists a.png, b.png, c.png and 1 more, but no frame has such a 'file_path'"
-    assert warnings_of(lambda: read_transforms(path)) == [told]
+    lost = "lists a.png, b.png, c.png and 1 more, but no frame has such a 'file_path'; these are ignored"
+    assert warnings_of(lambda: read_transforms(path)) == [f"{path}: 'test_filenames' {lost}"]
 
 
 @pytest.mark.parametrize(("keys", "size"), [({"w": 24}, (24, 16)), ({"h": 4}, (6, 4))])

@@ -63,7 +63,7 @@ class RenderVerb(Verb):
     """Path made from the cameras, instead of the cameras themselves. turntable: around their common focus; spiral: two
     such turns, rising and sinking; through: along the cameras in their order, smoothed. Frames count from 1.
     Without --cameras, the path is made from the cameras of a run's photographs. For a model file it goes around the
-    model, or around a scene's most detailed part."""
+    whole model if that is an object, or around the most detailed part of a scene."""
     up: Annotated[str | None, arg(metavar="AXIS|X,Y,Z")] = None
     """Up direction of a path around a model, without --cameras: x, y, z, -x, -y, -z or three numbers. If not given: -y,
     as in a COLMAP scene. With it the path goes around a run's model too. Write --up=-z if it begins with a minus."""
@@ -76,8 +76,8 @@ class RenderVerb(Verb):
     """Path or name of the camera, for a USD stage with several."""
     lenses: Annotated[Lenses | None, arg(metavar="undistort|native")] = None
     """Rendering of fisheye cameras of photographs. undistort: as the pinhole cameras that fit into them; native:
-    through their own lens. If not given: as the run was trained; but undistort with --path, whose cameras are pinholes,
-    and without a run."""
+    through their own lens. If not given: as the run was trained. With --path, whose cameras are pinholes, and for a
+    model without a run: undistort."""
     channels: Annotated[str, arg(metavar="NAME,...", help=_CHANNELS_HELP)] = "rgb"
     ids_from: Annotated[str | None, arg(metavar="PROPERTY")] = None
     """Property of the models' PLY files with an integer for each Gaussian, for --channels semantic."""
@@ -125,8 +125,8 @@ class RenderVerb(Verb):
     """Bundle of rasterizer settings: exact and default approximate nothing, fast approximates a little. A --rasterizer
     flag overrides it. If not given: the run's own settings, else default."""
     overwrite: Flag = False
-    """Replace an existing video, and pictures that clsplat did not make. Its own frames are replaced without this flag,
-    unless --skip-existing is given."""
+    """Replace an existing video, and pictures that clsplat did not make. Frames that clsplat made are replaced
+    without this flag, unless --skip-existing is given."""
     skip_existing: Flag = False
     """Leave out frames with an intact file of the same size, channels and model. If the file records its cameras and
     settings, these must agree too."""

@@ -116,7 +116,7 @@ def _models(flags: RenderVerb) -> JobModels:
 def _video(flags: RenderVerb, fps: float | None, path: Path, sizes: Collection[tuple[int, int]]) -> VideoConfig:
     """Return the video settings, with the shot's frame rate unless a flag sets another.
 
-    fps: the shot's frames a second, or None.
+    fps: the shot's frames a second; None if it gives no rate.
     sizes: (width, height) of the pictures, of which a video needs a single one.
     Raises InputError for a rate or sizes that no video has, and for a file that may not be replaced. With
     --skip-existing a video that clsplat wrote may be replaced.
@@ -202,8 +202,8 @@ def check_warps(tasks: Sequence[Task], pictures: PictureConfig) -> None:
         number, part = max(empty.items(), key=lambda item: item[1])
         advice = "" if pictures.warp.stmap else "; --lenses native renders fisheyes without undistorted pictures"
         warn(
-            f"{flag}: {100 * part:.0f} % of frame {number} stays black and transparent: these pixels lie more than a "
-            f"frame's size outside the undistorted picture, or have no place in it{advice}"
+            f"{flag}: {100 * part:.0f} % of frame {number} stays black and transparent: these pixels have no "
+            f"position in the undistorted picture, or one more than a frame's size outside it{advice}"
         )
 
 

@@ -36,7 +36,7 @@ class Request:
     pictures: picture settings from the flags. A USD stage may still change them.
     holdout: settings for reading holdout files, or None without --holdout.
     devices: selector of each device; None for the default device.
-    memory_limit: limit of device memory in bytes, or None.
+    memory_limit: limit of device memory in bytes; None for no limit.
     resize: function that resizes a camera by --width, --height and --scale.
     """
 
@@ -134,7 +134,7 @@ def bits_of(path: str, bits: int | None, channels: Collection[str]) -> int:
     """
     extension = Path(path).suffix.lower()
     if extension == ".dpx" and bits == 8:
-        raise InputError(f"--bits 8: {path} has 10 or 16 bits, expected one of them")
+        raise InputError(f"--bits 8: is for PNG and TIFF, expected 10 or 16 for {path}")
     if extension != ".dpx" and bits == 10:
         raise InputError(f"--bits 10: is for DPX, expected 8 or 16 for {path}")
     chosen = bits or (10 if extension == ".dpx" else 8)
@@ -196,7 +196,7 @@ def _devices(flags: RenderVerb) -> tuple[str | None, ...]:
     if flags.workers is not None and flags.workers < 1:
         raise InputError(f"--workers {flags.workers}: expected at least 1")
     if flags.workers is not None and flags.scheduler is not None:
-        raise InputError("--workers and --scheduler exclude each other: a new cluster, or one that runs already")
+        raise InputError("--workers and --scheduler exclude each other: they start a cluster, or use a running one")
     words = [word.strip() for word in flags.device.split(",")] if flags.device else []
     if not words:
         return (None,)

@@ -34,7 +34,7 @@ picture 16384 pixels wide."""
 
 
 def shots_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[str, Shot]:
-    """Return the shot of each eye, with all its frames; without stereo a single shot, under "".
+    """Return the shot of each eye by its name, with all frames; without stereo a single shot, under the name "".
 
     models: function that loads the models. It is called for a path around the models, and for a single still camera,
       which shows every frame of a changing model.
@@ -82,9 +82,9 @@ def _stage_cameras(stereo: StereoConfig, cameras: Path | None, usd_camera: str |
 
 
 def _of_eyes(stereo: StereoConfig, shots: list[Shot], paths: dict[str, str]) -> dict[str, Shot]:
-    """Return the shot of each eye; without stereo a single shot, under "".
+    """Return the shot of each eye by its name; without stereo a single shot, under the name "".
 
-    shots: the shot of the cameras, or the two shots of the eyes' cameras in the stage.
+    shots: the shot of the cameras; with --stereo stage, the two shots of the eyes' cameras.
     paths: path of each eye's camera in the stage.
     Raises InputError.
     """
@@ -108,7 +108,7 @@ def with_stage(
     shot: the shot read from the stage. Its first frame gives the shutter and the lens.
     Raises InputError for a data window without a pixel.
     """
-    unapplied = (*_lens_unapplied(pictures.sampling, tasks), *_shape_unsaid(tasks[0]))
+    unapplied = (*_lens_unapplied(pictures.sampling, tasks), *_pixel_aspect_unapplied(tasks[0]))
     if (
         pictures.framing.region == ""
         and pictures.framing.overscan == "0"
@@ -123,12 +123,12 @@ def with_stage(
     return replace(pictures, sampling=tasks[0].sampling or pictures.sampling), unapplied
 
 
-def _shape_unsaid(task: Task) -> tuple[str, ...]:
-    """Return a note on the stage's pixel aspect ratio if the file format cannot store it, which then shows squares."""
+def _pixel_aspect_unapplied(task: Task) -> tuple[str, ...]:
+    """Return a note on the stage's pixel aspect ratio if it is not 1 and the picture's format cannot store it."""
     shape, kind = task.camera.fy / task.camera.fx, task.path.suffix.lower()
     if task.optics is None or kind == ".exr" or abs(shape - 1) < _STAGE_FLOAT32_TOLERANCE:
         return ()
-    return (f"pixelAspectRatio ({shape:g}) in {kind} files, which show square pixels",)
+    return (f"pixelAspectRatio ({shape:g}) in {kind} files, whose pixels viewers show as squares",)
 
 
 def _framing(
@@ -157,9 +157,9 @@ def _framing(
 
 
 def _lens_unapplied(flags: SamplingConfig, tasks: Sequence[Task]) -> tuple[str, ...]:
-    """Return a note on the stage's lens if pictures do not show its blur and no flag overrides it.
+    """Return a note on the stage's lens if no flag replaces this lens and the pictures lack its depth of field.
 
-    The blur is missing if the lens has no focus distance, or if the camera is orthographic.
+    They lack it if the stage gives no focus distance, or if the camera is orthographic.
     """
     if flags.aperture is not None or flags.f_stop is not None:
         return ()

@@ -283,7 +283,8 @@ def _on_roofs(
     """Move points of roofs to the roofs' gables and slopes, in place.
 
     roof: (n,), True for points on roofs.
-    a, b: (n,), random numbers in [-1, 1]: along the ridge or across the gable, and up.
+    a: (n,), random numbers in [-1, 1], the position along the ridge for a slope, and across for a gable.
+    b: (n,), random numbers in [-1, 1], the position from the lower edge to the ridge.
     half: (n, 3), half sizes of each point's solid.
     local, normals: (n, 3), points and normals in the solid's own axes, to be changed.
     """

@@ -143,7 +143,7 @@ def _moving_cars(config: TownConfig, photograph: TownPhotograph) -> CityBlock:
 class _Candidates:
     """Points in front of a photograph's camera. `see` marks those that no solid hides.
 
-    blocks: number of the caster's blocks with points: all but the last, of moving cars.
+    blocks: number of the caster's first blocks, which have points. The last block, of moving cars, has none.
     """
 
     def __init__(self, caster: Caster, blocks: int) -> None:

@@ -72,7 +72,7 @@ class Shader:
         return result
 
     def _faces(self, surfaces: NDArray[np.int32]) -> tuple[NDArray[np.int64], Float32, Bool]:
-        """Collect the table's rows of all faces that the rays meet, in metres relative to the camera.
+        """Collect the rows of `Solids.faces` for all faces that the rays meet, in metres relative to the camera.
 
         Returns the index (n,) of each surface's row, the rows, and a mask of the rows of balls. The row of a ball has
         centre and radius in place of the plane.

@@ -68,7 +68,7 @@ class Brush:
 
 
 def mixed(colours: tuple[Colour, ...], value: Pixels) -> Pixels:
-    """Map values (h, w) of about [-2, 2] to colours (h, w, 3), by linear interpolation between equally spaced ones."""
+    """Map values (h, w) of about [-2, 2] to colours (h, w, 3), by linear interpolation between `colours`."""
     stops = np.linspace(-1.6, 1.6, len(colours))
     channels = [np.interp(value, stops, levels) for levels in zip(*colours, strict=True)]
     return np.stack(channels, axis=-1).astype(np.float32)

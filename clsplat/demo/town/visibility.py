@@ -172,7 +172,7 @@ class _Rays:
 
         solid: index of the solid in its block.
         number: number of the solid across all blocks.
-        part: index of the rays, by `slices`.
+        part: index of the part's rays, as from `slices`.
         """
         solids = block.solids
         centre = (self.position - block.corner - solids.centres[solid]).astype(np.float32)
@@ -239,7 +239,7 @@ class _Rays:
             self._meet(part, hit, enter, face)
 
     def _turned(self, part: Slices, turn: Float32) -> tuple[Float32, Float32, Float32]:
-        """Reciprocals of the directions along a solid's own x and y axes, and the directions along its y axis."""
+        """For rays in a solid's own axes: reciprocals of the directions' x and y, and the directions' y."""
         x, y = self.x[part], self.y[part]
         if turn[1] == 0:
             return self.over_x[part], self.over_y[part], y

@@ -170,7 +170,7 @@ def _noise(config: TownConfig, shot: TownPhotograph) -> Float64:
 
 
 def _image(config: TownConfig, shot: TownPhotograph, air: Lens, error: Float64) -> ModelImage:
-    """Make the COLMAP image of a photograph, still without observations.
+    """Make the COLMAP image of a photograph, with empty lists of observations.
 
     air: lens of the photographs from the air.
     error: (3,), metres to add to the camera's position.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recognition of antialiased models, trained with Mip-Splatting's low-pass filter, by words in file headers.
 
-A header line counts if it has only a key and a value:
+A header line states whether a model is antialiased if it has only a key and a value:
 
 - `SplatRenderMode: mip` of Brush (https://github.com/ArthurBrussee/brush).
 - `antialiased 1` of Postshot.
@@ -9,10 +9,10 @@ A header line counts if it has only a key and a value:
 - `mip_filter: true` of Mip-Splatting.
 
 A colon, an equals sign or blanks separate key and value. Case, quotation marks, hyphens and underscores are ignored.
-The word `antialiased` alone counts too, and so does a command-line flag such as `--antialiasing` of the 3DGS authors'
-program. An ambiguous key, such as `model`, which may hold the name of a scene, counts only if its value is a mode word.
-A sentence that mentions antialiasing does not count; a warning reports it unless it has a negation. Of several lines
-the last counts, since programs that rewrite a file append their own.
+The word `antialiased` alone is such a statement too, and so is a command-line flag such as `--antialiasing` of the 3DGS
+authors' program. A line with an ambiguous key, such as `model`, which may hold the name of a scene, is a statement only
+if its value is a mode word. A sentence that mentions antialiasing is not used; a warning reports it unless it has a
+negation. Of several statements the last is used, since programs that rewrite a file append their own.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class AntialiasStatements:
 
     antialiased: True if the last statement says antialiased; False without statements.
     contradiction: warning, without the file's name, about statements that disagree; "" if all agree.
-    not_understood: warning about the first text that mentions antialiasing and does not count; "" if any text counts.
+    not_understood: warning about the first text that only mentions antialiasing; "" if there are statements.
     """
 
     def __init__(self, places: Iterable[tuple[str, bool | None]]) -> None:
@@ -104,7 +104,7 @@ class AntialiasStatements:
         self.antialiased = bool(said and said[-1][1])
         other = next((text for text, meaning in reversed(said) if meaning != self.antialiased), None)
         self.contradiction = (
-            f"says {other!r} and {said[-1][0]!r}, the last of which counts: the model is "
+            f"says {other!r} and {said[-1][0]!r}, the last of which is used: the model is "
             f"{'' if self.antialiased else 'not '}antialiased"
             if other is not None
             else ""
@@ -112,7 +112,7 @@ class AntialiasStatements:
         unclear = (text for text, _ in places if _MENTIONS_ANTIALIASING.search(text) and not _NEGATION.search(text))
         text = None if said else next(unclear, None)
         self.not_understood = (
-            f"says {text!r}, which is not understood: the model counts as not antialiased, expected words such as "
+            f"says {text!r}, which is not understood: the model is read as not antialiased, expected words such as "
             "'antialiased 1'"
             if text is not None
             else ""

@@ -31,8 +31,8 @@ def sh_signs(signs: Signs) -> Float32:
 def quaternion_signs(signs: Signs) -> Float32:
     """Factors (4,), 1 or -1, by which quaternions w x y z change if the axes are multiplied by `signs`.
 
-    The Gaussian's own axes change sign too, so the result is a rotation even if `signs` mirrors the world. The
-    covariance is exact.
+    The Gaussian's own axes change sign too, so the result is a rotation even if `signs` mirrors the world.
+    Covariances change exactly.
     """
     handedness = int(np.prod(signs))
     return np.array([1, *(handedness * sign for sign in signs)], np.float32)

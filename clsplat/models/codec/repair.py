@@ -168,8 +168,10 @@ def _spread(opacities: Float32) -> bool:
 
 
 def _white(logits: Float32) -> float:
-    """The stored value that stands for an opacity of 1: 1, or for whole numbers 100, 255 or the maximum of a wider
-    type."""
+    """The stored value that stands for an opacity of 1.
+
+    It is 100 for percentages, and 255 or a wider type's maximum for levels. Both are whole numbers; their largest value
+    tells them apart (PERCENTAGE_MAXIMA). For all other values it is 1."""
     whole = (
         logits.max() > LARGEST_USEFUL_LOGIT
         and bool((logits == np.rint(logits)).all())
@@ -193,7 +195,7 @@ def _seen_scales(log_scales: Float32) -> str:
 
 
 def _deactivated(gaussians: Gaussians, which: Activated, numbers: NDArray[np.intp], where: Path | str) -> Gaussians:
-    """Convert opacities (up to 1, 100 or 255) to logits, and scales to logs, in a model that stores them instead.
+    """Convert opacities (fractions, percentages or levels) to logits, and scales to logs. which: what to convert.
 
     numbers: index of each Gaussian in the file.
     Raises InputError, prefixed with `where`, for values that cannot be opacities or scales, and for whole numbers that

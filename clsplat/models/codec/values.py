@@ -31,7 +31,7 @@ Nearly all logs are negative if the unit is a metre. Linear scales are negative 
 MAX_UNCHECKED_GAUSSIANS = 1 << 20
 """Number of Gaussians up to which a compressed file may have any length. Above it a file needs a byte per Gaussian.
 
-Every real file has more bytes than that, because positions take several bytes each. A decompression bomb has fewer.
+Every real file has more bytes, because the position of a Gaussian takes several. A decompression bomb has fewer.
 """
 OTHER_QUATERNION_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Row i: the components of a quaternion other than component i."""
@@ -167,10 +167,10 @@ def full_scale(levels: NDArray[Any]) -> float:
     """Value that stands for white in stored colours of any shape and numeric dtype, guessed from the values.
 
     - 8-bit integers: 255.
-    - Wider integers: 255 if none is larger, because some programs store bytes in them. Otherwise 65535, 2^31-1 or
-      2^32-1.
-    - Floats: 1 if none is larger than 1, or if some are fractions and either none is larger than MAX_FLOAT_HIGHLIGHT
-      or UNIT_COLOUR_SHARE of them are at most 1. Otherwise 255 or 65535.
+    - Wider integers: the first of 255, 65535, 2^31-1 and 2^32-1 that no value exceeds. 255 is among them because some
+      programs store bytes in wider types.
+    - Floats: 1 if no value exceeds 1. Also 1 if some are fractions, and either none exceeds MAX_FLOAT_HIGHLIGHT or
+      UNIT_COLOUR_SHARE of them are at most 1. Otherwise 255 if no value exceeds it, else 65535.
 
     Non-finite values are ignored. Without values the result is 255 for integers, 1 for floats.
     """
@@ -250,7 +250,7 @@ def all_finite(array: NDArray[Any]) -> bool:
 
 
 def check_writable(path: Path, gaussians: Gaussians, *, least: int = 0, first: int = 0) -> None:
-    """Check a model before it is written to `path`, or its Gaussians from number `first` on.
+    """Check Gaussians before they are written to `path`. first: number of the first one in the file, for messages.
 
     Raises ValueError for invalid arrays (`Gaussians.check`), InputError for non-finite values and for fewer than
     `least` Gaussians.

@@ -200,7 +200,7 @@ def resolve(path: Path) -> tuple[Path, Format]:
     path = model_path(path)
     row = format_of(path)
     if path.suffix.lower() not in {Path(f"x{suffix}").suffix for suffix in row.suffixes}:
-        warn(f"{path}: is {row.name} by its content, in spite of its name")
+        warn(f"{path}: is {row.name} by its content, in spite of its name, and is read as such")
     return path, row
 
 

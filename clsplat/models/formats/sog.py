@@ -127,9 +127,9 @@ def _names(folder: Path) -> list[str]:
 
 
 def _match_case(name: str, names: Iterable[str]) -> str:
-    """Spelling of a file's name in the list `names`, which may differ in case, as Windows and macOS allow.
+    """The entry of `names` that equals a file's name if case is ignored, as on Windows and macOS.
 
-    Returns `name` itself unless exactly one entry matches.
+    It is `name` itself unless exactly one entry matches.
     """
     names = list(names)
     alike = [other for other in names if other.lower() == name.lower()] if name not in names else []

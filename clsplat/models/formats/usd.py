@@ -105,7 +105,7 @@ def _lives(call: str, arguments: str, path: str, *_: int) -> bool:
     )
     words = [sys.executable, "-c", code, path, arguments]
     done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, check=False)
-    return done.returncode in (0, 1)  # 1: an exception, which the caller will get too
+    return done.returncode in (0, 1)  # 1: a Python exception, which the caller will get too
 
 
 def describe(path: Path) -> dict[str, Any]:

@@ -146,8 +146,8 @@ class Instancer:
     def of(self, key: Key, code: Any) -> tuple[Any, bool]:
         """Return an instance's matrix from the prototype's parent to the world, and True if it is visible.
 
-        An instance that does not exist at this time is invisible. Its matrix is then that of the last time at which it
-        existed, or else of the first. Raises InputError.
+        An instance that does not exist at this time is invisible. It has the matrix of the last time before at which it
+        existed, or if there is none, of the first time after. Raises InputError.
 
         key: the instance.
         code: USD's time code.

@@ -46,12 +46,12 @@ With locked exposure, occlusion and highlights cause up to 0.1. From about 0.2, 
 DISTANCE_SPREAD_RATIO = 4.0
 """Ratio of the 90th to the 10th percentile of distance / focal length from which distances count as varying widely.
 
-At 4, a Gaussian one pixel wide in one photograph is a quarter of a pixel, or four pixels, wide in another.
+At 4, a Gaussian one pixel wide in a near photograph is a quarter of a pixel wide in a far one.
 """
 CUT_OUT_BORDER_FRACTION = 0.9
 """Masks cut an object out of its background if they leave out at least this fraction of the border pixels."""
 SAMPLED_MASKS = 12
-"""Number of masks that are sampled to recognise cut-outs. The sample may be up to twice as large."""
+"""Number of masks that are sampled, evenly spaced, to recognise cut-outs. Rounding of the spacing may double it."""
 TRANSPARENT_PIXEL_FRACTION = 0.02
 """Minimum fraction of transparent pixels in a photograph for its alpha to be reported. Seams and corners cover less."""
 WIDE_FISHEYE_DEGREES = 100.0
@@ -111,8 +111,8 @@ class Finding:
 
     kind: kind of the problem.
     text: a clause for the report.
-    options: alternative settings that mitigate the problem, best first. Only if they depend on the photographs; others
-        are in `recommendations.SETTINGS_BY_FINDING`.
+    options: alternative settings that mitigate the problem, best first, if they depend on the photographs.
+        `recommendations.SETTINGS_BY_FINDING` has the settings that do not.
     """
 
     kind: Kind
@@ -311,7 +311,7 @@ def _sky_part(visible: VisiblePoints, view: View) -> float:
         & (steps < MAX_SKY_PIXEL_STEP)
         & ((blue > MIN_SKY_BLUE_EXCESS) | (light > MAX_EXPOSURE_COLOUR))
     )
-    reached = np.logical_and.accumulate(likely, axis=0)  # sky in a column ends at the first pixel that is unlikely
+    reached = np.logical_and.accumulate(likely, axis=0)  # in a column, sky ends at the first pixel that is unlikely sky
     part = float(reached.mean())
     if part < MIN_SKY_PIXEL_FRACTION or not likely[0].mean() > 0.5:
         return 0.0

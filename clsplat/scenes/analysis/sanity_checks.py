@@ -65,7 +65,7 @@ def of_scene(scene: Scene, background: Background) -> list[str]:
 def of_pictures(
     draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: Sequence[View], kind: str = "training"
 ) -> str:
-    """Return a warning about a model's renders of these views: invisible or of one colour; "" if they are neither.
+    """Return a warning if a model's renders of these views show no Gaussian or only one colour, else "".
 
     draw: function that renders the image (H, W, 3) and alpha (H, W) of a camera.
     kind: name of the kind of views, for the message.

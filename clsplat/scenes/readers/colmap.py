@@ -174,7 +174,7 @@ def safe_name(name: str) -> bool:
 def _named(path: Path, name: str) -> str:
     """Return the name of a picture without a drive, root or "..".
 
-    `photo_names.match` finds a picture whose name was changed here by the end of its path. Raises InputError if the
+    `photo_names.match` finds a picture with a shortened name by the end of the path. Raises InputError if the
     remaining name is not a path inside the images' folder.
     """
     inner = name if safe_name(name) else "/".join(part for part in slashed(name).split("/") if part != "..")
@@ -299,7 +299,7 @@ def _check_count(path: Path, count: int) -> None:
             if match := RECORD_COUNT_COMMENT.match(line.lstrip(b"\xef\xbb\xbf").decode("utf-8", "replace")):
                 announced = int(match[1])
     if count < announced:
-        warn(f"{path}: its header announces {announced:,} records, but it has {count:,}; was it truncated or edited?")
+        warn(f"{path}: its header announces {announced:,} records, only {count:,} are read; was it cut off or edited?")
 
 
 def _read_cameras(folder: Path) -> dict[int, Lens]:

@@ -74,7 +74,7 @@ def read_transforms(
     gone = [_plain(keys.text("file_path")) for keys, file in zip(readers, files, strict=True) if file is None]
     data = DataSet(_images(path, there, gone), missing=gone)
     if not masks and any("mask_path" in keys.frame for keys in readers):
-        warn(f"{path}: 'mask_path' is ignored; --masks ignore or --masks transparent uses it")
+        warn(f"{path}: 'mask_path' is not used without --masks; give --masks ignore or transparent to use it")
     data.box = _ngp_box(Keys(path, None, {}, document))
     data.clouds = clouds_beside([path.parent])
     cloud = document.get("ply_file_path")
@@ -125,7 +125,7 @@ def _pictures(path: Path, readers: list[Keys], images: Path | None, missing: Mis
 def _smaller_folders(lost: list[Path], folder: Path) -> dict[Path, Path]:
     """Find downscaled copies of picture folders, such as images_2, by the folder that they replace.
 
-    The folders are those above missing pictures that hold no pictures themselves.
+    A folder is replaced if it is above a missing picture and holds no pictures itself.
 
     lost: missing pictures.
     folder: folder of the transforms.json.
@@ -136,7 +136,7 @@ def _smaller_folders(lost: list[Path], folder: Path) -> dict[Path, Path]:
 
 
 def _moved(file: Path | None, copies: Mapping[Path, Path]) -> Path | None:
-    """Return the file's path in the downscaled copy of its outermost folder that has one; else the file itself.
+    """Return the path with the outermost folder that has a downscaled copy replaced by the copy; else `file` itself.
 
     copies: downscaled copies by the folder that they replace.
     """
@@ -224,7 +224,7 @@ def _split(path: Path, readers: list[Keys], images: list[PosedImage], missing: S
         found = {name: known[name] for name in map(_plain, given) if name in known}
         found |= match([name for name in map(_plain, given) if name not in known], names).names
         if lost := [name for name in given if _plain(name) not in found]:
-            warn(f"{path}: '{key}' lists {examples(lost)}, but no frame has such a 'file_path'")
+            warn(f"{path}: '{key}' lists {examples(lost)}, but no frame has such a 'file_path'; these are ignored")
         listed.append(set(found.values()))
     train, held_out = listed[0], listed[1] | listed[2]
     if not (train or held_out):

@@ -34,7 +34,7 @@ Programs with such folders are the 3DGS authors' convert.py, Polycam, OpenSfM (u
 (dense/0/images) and others.
 """
 PLAIN_FOLDER_STAGE, UNDISTORTED_FOLDER_STAGE = 1, 2
-"""Indices in UNDISTORTION_FOLDERS of photographs in folders with other names, and of undistorted photographs."""
+"""Stages, as indices in UNDISTORTION_FOLDERS: of photographs in folders with other names, and of undistorted ones."""
 LOSSLESS_EXTENSIONS = (".png", ".tif", ".tiff", ".bmp")
 """Extensions of lossless photographs, which are preferred to their lossy copies."""
 COPY_THUMBNAIL_SIZE_PX = (96, 72)
@@ -46,7 +46,7 @@ The maximum is needed because resizing visibly changes the pixels of small pictu
 """
 MAX_COPY_RMS_LEVELS, MAX_COPY_RMS_PER_GRADIENT = 1.0, 0.2
 """Largest RMS difference of two thumbnails of one photograph: in 255ths, or as a multiple of the RMS difference of
-neighbouring pixels. The larger limit counts.
+neighbouring pixels. The larger limit applies.
 
 A shift of 0.2 thumbnail pixels, 1/480 of the picture's width, reaches the second limit. JPEG and resizing filters cause
 less in pictures of at least 240 pixels.
@@ -54,9 +54,10 @@ less in pictures of at least 240 pixels.
 MIN_FOLDER_CORRELATION, CORRELATION_SIDE_PX = 0.9, 24
 """Minimum correlation of the pictures in two related folders, and longer side to which the pictures are reduced for it.
 
-The median of FOLDER_PAIR_SAMPLES pairs counts. In the scene fox (k1 0.058, k2 -0.081), photographs correlate with their
-undistorted copies at 0.9995. In six other scenes, with k1 from 0.1 to -0.35, they do at 0.93 or more. Successive
-photographs of these scenes correlate at 0.16 to 0.87, and photographs farther apart at 0.45 or less.
+The median of FOLDER_PAIR_SAMPLES pairs is compared with the minimum. In the scene fox (k1 0.058, k2 -0.081),
+photographs correlate with their undistorted copies at 0.9995. In six other scenes, with k1 from 0.1 to -0.35,
+they do at 0.93 or more. Successive photographs of these scenes correlate at 0.16 to 0.87, and photographs farther apart
+at 0.45 or less.
 
 Frames of an almost still video correlate more than pictures and their copies after strong undistortion. So two folders
 of such frames are mistaken for copies.

@@ -111,7 +111,7 @@ def reconstruct(
     threads: all cores if None.
     overwrite: replace a result of other photographs.
     masks: use of masks and alpha. No features are found in masked pixels. The masks are written to the output too, as
-        `masks/IMAGE.jpg.png`, with white for pixels that count.
+        `masks/IMAGE.jpg.png`, with white for kept pixels.
     progress: function that is called in every stage, with a text and a fraction or None.
 
     Of several copies of a photograph, one is used (`clsplat.scenes.sfm.copies`).

@@ -203,7 +203,7 @@ def thinned(cloud: Cloud, limit: int) -> Cloud:
     side = float((points - low).max())
     if side == 0:
         return Cloud(points[:1], None if cloud.colors is None else cloud.colors[:1])
-    fine, coarse = side / MAX_VOXELS_PER_SIDE, side * 1.01  # one voxel of the coarse size holds all points
+    fine, coarse = side / MAX_VOXELS_PER_SIDE, side * 1.01  # a voxel of the coarse size would hold all points
     if (cells := _cells(points, low, fine)).max() < limit:
         coarse = fine
     while coarse > fine * (1 + VOXEL_SIZE_TOLERANCE):
@@ -290,8 +290,8 @@ def half_sphere(count: int, up: Float64) -> Float64:
 def _skyline(points: Float64, camera: Camera, view: View) -> NDArray[np.int64]:
     """Return, for each column of a picture, the row above which it shows no scene points.
 
-    The row is the same for all columns of a strip, and neighbouring strips count too. It is 0 for strips without
-    points, as they may show something too plain to have points instead of the sky.
+    The row is the same for all columns of a strip, and also lies above the points of the neighbouring strips. It is 0
+    if these strips have no points: a plain surface has none either, so the strip need not show sky.
     """
     rows, columns, _ = pixels_of(points, camera, view.lens)
     part = np.minimum(columns * SKYLINE_COLUMNS // camera.width, SKYLINE_COLUMNS - 1)
@@ -312,8 +312,8 @@ def photographed(scene: Scene, background: ArrayLike) -> Float32:
     """Return colours (N, 3) float32 in [0, 1] of the scene's points. Points with colours of their own keep them.
 
     A colour is the median per channel over the nearest COLOUR_VIEWS_PER_POINT training photographs that show the point,
-    at the training size. Masked and occluded points do not count as shown. A point that is occluded in all photographs
-    uses the photographs in which it is least occluded.
+    at the training size. A photograph does not show a point that is masked or occluded in it. A point that is occluded
+    in all photographs uses the photographs in which it is least occluded.
 
     background: colour (3,) behind transparent photographs.
     """

@@ -45,7 +45,7 @@ class KnownDepth:
 
         The results are ascending pixel indices, inverse depths in 1 / world units, and weights, each (k,).
 
-        lens: lens of the depth map, and of the camera unless it is a pinhole camera.
+        lens: lens of the depth map; also of the camera, unless the camera is a pinhole camera.
         """
         if self.path is not None:
             nearness = self._from_map(camera, lens)

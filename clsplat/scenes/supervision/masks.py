@@ -25,12 +25,12 @@ OTHER_MASK_FOLDERS = (
 )
 """More names of mask folders. They are searched if masks are requested and MASK_FOLDERS has none."""
 DYNAMIC_FOLDER_PREFIX = "dynamic"
-"""Prefix of the names of mask folders in which white may mark moving objects instead of pixels that count."""
+"""Prefix of the names of mask folders in which white may mark moving objects instead of kept pixels."""
 MASK_THRESHOLD = 0.5
-"""Minimum mask value of a pixel that counts. In a resized mask, also the minimum fraction of a pixel's area that must
-count."""
+"""Minimum mask value of a kept pixel. In a resized mask, also the minimum kept fraction of a kept pixel's area."""
 COMPARED_MASKS = 12
-"""Number of a folder's masks that are read, up to twice as many, to find out what an ambiguous mask means."""
+"""Number of a folder's masks, evenly spaced, that are read to find out what an ambiguous mask means. Rounding of the
+spacing may double it."""
 VOID_LABEL = 255
 """Label of undefined pixels, as at the object borders in VOC and Cityscapes."""
 MAX_LABEL = 40
@@ -58,8 +58,8 @@ class Mask:
     def applied(self, image: Float32, *, orient: bool) -> tuple[Float32, Float32 | None]:
         """Apply the mask to a photograph (H, W, 3 or 4).
 
-        Returns the photograph, and an array (H, W, 1) with 1 for pixels that count and 0 for others, or None if all
-        pixels count. Raises InputError for a mask that has another size or does not decode.
+        Returns the photograph, and an array (H, W, 1) with 1 for pixels that are kept and 0 for others, or None if
+        all are kept. Raises InputError for a mask that has another size or does not decode.
 
         orient: rotate the mask by its EXIF orientation.
         """
@@ -79,15 +79,15 @@ class Mask:
 
 
 def read_mask(path: Path, *, orient: bool, invert: bool) -> Float32:
-    """Read a mask (H, W, 1): 1 for pixels that count, else 0.
+    """Read a mask (H, W, 1): 1 for pixels that are kept, else 0.
 
-    Pixels count if their grey value is at least a half; if the grey is constant, alpha is used instead. In a mask of
-    labels (0 and 1, perhaps 255 for void), 1 counts, and void never does. Raises InputError if the file does not
+    Pixels are kept if their grey value is at least a half; if the grey is constant, alpha is used instead. In a mask of
+    labels (0 and 1, perhaps 255 for void), 1 is kept, and void never is. Raises InputError if the file does not
     decode, and for ambiguous labels. Also raises it if all values are below a half, and either the mask has only two
     values or the folder's other masks are dark too.
 
     orient: rotate the mask by its EXIF orientation.
-    invert: exchange pixels that count and others.
+    invert: exchange kept pixels and others.
     """
     image = read_image(path, orient=orient)
     pixels = image[:, :, :3]
@@ -109,7 +109,7 @@ def _from_labels(path: Path, values: Float32, pixels: Float32) -> Float32:
     A soft mask is returned unchanged if another mask in its folder has values of at least a half.
 
     pixels: the colours whose means are `values`.
-    Raises InputError for other labels, and for a soft mask in a folder without such values.
+    Raises InputError for other labels, and for a soft mask if no mask in its folder has values of at least a half.
     """
     most, exact = stored_range(path)
     levels = np.unique(np.rint(values * most)).astype(int).tolist()
@@ -123,7 +123,7 @@ def _from_labels(path: Path, values: Float32, pixels: Float32) -> Float32:
         return values
     raise InputError(
         f"{path}: the mask's values are {_stored(pixels, most)}, all below a half, expected 0 and {most}, where a half "
-        "or more counts (or 0 and 1); make the pixels that count white"
+        "or more is kept (or 0 and 1); make the pixels to keep white"
     )
 
 
@@ -159,7 +159,7 @@ def _without_void(path: Path, values: Float32) -> Float32:
         what = "labels of several things and void" if several else "either labels 0 and 1 with void or black and white"
         raise InputError(
             f"{path}: the mask's values are {found} and {most}, {what}, expected 0 and {most} (values of at least a "
-            "half count) or labels 0 and 1; make the pixels that count white, and all others black"
+            "half are kept) or labels 0 and 1; make the pixels to keep white, and all others black"
         )
     return _labels(np.rint(values * most), most)
 
@@ -257,7 +257,7 @@ def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path, *, strict:
                 raise _misfit(path, size, photo)
         warn_of_sense(found.values(), use, where)
         if without := sorted(name for name in files if name not in found):
-            warn(f"{where}: {len(without):,} photograph(s) have no mask and count as a whole ({examples(without)})")
+            warn(f"{where}: {len(without):,} photograph(s) have no mask and are used as a whole ({examples(without)})")
     return {image.name: Mask(use, found.get(image.name)) for image in images}
 
 
@@ -266,7 +266,7 @@ def warn_of_sense(masks: Iterable[Path], use: MaskUse, where: Path) -> None:
     folder = next((path.parent for path in masks if path.parent.name.lower().startswith(DYNAMIC_FOLDER_PREFIX)), None)
     if folder is not None and not use.invert:
         warn(
-            f"{where}: masks are in {folder.name}, and white pixels are the ones that count, as in all masks; if white "
+            f"{where}: masks are in {folder.name}, and white pixels are the ones to keep, as in all masks; if white "
             "marks moving objects there, add --invert-masks"
         )
 
@@ -336,7 +336,7 @@ def _says_mask(name: str) -> bool:
 def stage_mask(
     path: Path | None, target: Path, size: tuple[int, int], *, invert: bool, photo: Path | None = None
 ) -> None:
-    """Write a black and white mask for a photograph to `target`, with white for pixels that count.
+    """Write a black and white mask for a photograph to `target`, with white for kept pixels.
 
     path: the mask file, None for all white.
     size: the photograph's width and height.
@@ -372,7 +372,7 @@ def for_sfm(use: MaskUse) -> MaskUse | None:
 
 
 def after_sfm(use: MaskUse, folder: Path) -> MaskUse:
-    """Return the use of the masks that structure from motion wrote, in which white counts and alpha is included."""
+    """Return the use of the masks that structure from motion wrote: white is kept, and alpha is included."""
     if not (folder / MASK_FOLDERS[0]).is_dir():
         return replace(use, masks="none", invert=False)
     meaning: MaskMeaning = "none" if use.alpha == "blend" else use.alpha

@@ -39,7 +39,7 @@ KEY_FRAME_PROPERTIES = ("frame", "seconds", "position", "world_from_cam", *LENS_
 
 
 def read_keyed(path: Path, document: dict[str, Any]) -> Shot:
-    """Read a camera file: one frame for each whole number from the first key to the last, or for one period of a loop.
+    """Read a camera file: one frame for each whole number from the first key to the last; of a loop, for one period.
 
     Cameras are interpolated smoothly between the keys (`interpolate`).
 
