@@ -43,7 +43,7 @@ class ChunkStore:
 
     fields: shape of a row of each field, by name. Fields without elements are not in the records.
     path: scratch file for the records, which is created; None keeps the records in main memory.
-    widest: the largest shapes that the fields will have, by name. Slots of the file have room for fields of these shapes.
+    widest: the largest shapes that the fields will have, by name. Slots of the file have room for these.
     starts: (chunks + 1,) int64, the chunks' first rows, then the number of rows. By default all but the last are full.
     opened: the existing scratch file and the manifest of a checkpoint, to continue from.
     release: function that is called before the file becomes larger than `SlotTable.most`. It removes the oldest
@@ -125,8 +125,7 @@ class ChunkStore:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the store takes: in main memory those of all rows, in a scratch file those of all chunks'
-        slots."""
+        """Bytes of the store: those of all rows in main memory, or of all chunks' slots in a scratch file."""
         if self.path is None:
             return self.count * self.record.itemsize // CHUNK_ROWS
         return self.chunks * self.file.slot_bytes
@@ -407,8 +406,7 @@ class ChunkStore:
         return held
 
     def _field(self, number: int, field: str) -> NDArray[np.float32]:
-        """Return a field of a chunk. With a scratch file it is a copy (CHUNK_ROWS, ...); in main memory it is a view
-        (rows, ...) of the stored values."""
+        """Return a field of a chunk: from a scratch file a copy (CHUNK_ROWS, ...), in main memory a view (rows, ...)."""
         kind, offset = self.record.fields[field][:2]  # type: ignore[index]  # it has fields
         of_field = number, self._names.index(field)
         constant = int(self._constants[of_field])
@@ -428,8 +426,7 @@ class ChunkStore:
         return rows
 
     def _set_field(self, number: int, field: str, rows: NDArray[np.float32]) -> None:
-        """Write a changed field that `_field` returned. In main memory nothing is left to do, because `_field` returned
-        a view."""
+        """Write a changed field that `_field` returned. In main memory it was a view, and nothing is left to do."""
         if self.path is None:
             return
         numbers = np.array([number])
@@ -443,8 +440,7 @@ class ChunkStore:
         self._checksums[of_field], self._constants[of_field] = zlib.crc32(rows.data), WRITTEN
 
     def _make_room(self, needed: Callable[[], int]) -> None:
-        """Grow the file until it has `needed()` free slots. If it would exceed `SlotTable.most`, remove old checkpoints
-        first. Raises WriteError."""
+        """Grow the file to `needed()` free slots, up to `SlotTable.most` by removing checkpoints. Raises WriteError."""
         assert self.path is not None
         while (lacking := needed() - self.slots.free) > 0:
             more = self.slots.growth(lacking)

@@ -232,7 +232,6 @@ class MemoryPlanner:
     def look(self, local: Callable[[Camera], Camera], initial: Gaussians) -> None:
         """Set `rows_in_view` to the largest number of rows that a view of the initial model shows, from an even sample.
 
-
         Does nothing if no limit of the device's memory can have the model streamed by chunk.
         local: function from a camera in world coordinates to the camera in those of the model.
         initial: the model at the start, in the order of its chunks.
