@@ -406,7 +406,7 @@ class ChunkStore:
         return held
 
     def _field(self, number: int, field: str) -> NDArray[np.float32]:
-        """Return a field of a chunk: from a scratch file a copy (CHUNK_ROWS, ...), in main memory a view (rows, ...)."""
+        """Return a field of a chunk: a copy (CHUNK_ROWS, ...) from a file, in main memory a view (rows, ...)."""
         kind, offset = self.record.fields[field][:2]  # type: ignore[index]  # it has fields
         of_field = number, self._names.index(field)
         constant = int(self._constants[of_field])
