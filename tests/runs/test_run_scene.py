@@ -69,7 +69,7 @@ def test_a_changed_photograph_is_refused(run: Path, own: Path, capsys: Capture) 
     brighten(own / "images" / "03.png")
     line = refusal(run, own, capsys)
     assert f"{own}: is not the scene that {run} began with: 1 view with another photograph (03.png); expected" in line
-    assert "--accept-changes goes on" in line
+    assert "give --accept-changes to go on" in line
 
 
 def test_another_scene_is_refused_with_three_examples(run: Path, own: Path, capsys: Capture) -> None:
