@@ -169,7 +169,7 @@ def test_nerfstudios_split_points_and_masks(tmp_path: Path) -> None:
     header = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property float {name}\n" for name in "xyz")
     header += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
     (tmp_path / "sparse.ply").write_text(header + "1 2 3 255 0 51\n4 5 6 0 255 0\n")
-    result = warned("'mask_path' is ignored", read_transforms, path)
+    result = warned("'mask_path' is not used", read_transforms, path)
     assert [image.split for image in result.images] == ["train", "test", "train"]
     np.testing.assert_array_equal(result.points, [[1, 2, 3], [4, 5, 6]])
     np.testing.assert_allclose(result.colors, [[1, 0, 0.2], [0, 1, 0]])
