@@ -62,10 +62,11 @@ class StepProbe:
         """Prepare for a replay of launches in which Adam changes the model."""
 
     def before_rows(self, rows: StepRows) -> None:
-        """Observe rows of the model, before Adam on them is launched."""
+        """Observe the rows of the model that Adam is about to update, before Adam is launched."""
 
     def after_rows(self, rows: ViewRows) -> None:
-        """Observe rows of the model, after Adam on them has been launched."""
+        """Observe rows of the model, after Adam on them has been launched. In a batch of views, after the gradients of
+        one view have been added."""
 
 
 NO_PROBE = StepProbe()
@@ -79,7 +80,7 @@ class GradientStep:
     step: number of the step, for learning rates and Adam.
     fields: fields of a pair's gradient that the step computes.
     turn: which array receives the loss's sums (`stages.loss.loss`), so that an earlier step's sums can still be read.
-    room: capacity in pairs, if the step is launched by capacity; None to count the pairs first.
+    room: number of pairs that there is memory for, if the step is launched by capacity; None counts the pairs first.
     explore: noise and penalties of the step.
     """
 
@@ -367,7 +368,7 @@ class GradientStep:
 
 
 StepMaker = Callable[..., GradientStep]
-"""Function that makes a step from `turn` and `room`."""
+"""Function that makes a `GradientStep` from its arguments `turn` and `room`."""
 
 
 def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = False) -> DeviceGaussians:
