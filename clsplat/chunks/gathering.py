@@ -162,7 +162,10 @@ def gathered(
 def _entries(
     rows: NDArray[np.uint32] | None, starts: NDArray[np.int64], numbers: NDArray[np.int64]
 ) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
-    """Return the list's entries for the rows of some chunks, and the positions of these rows in the chunks' records."""
+    """Return the row list's entries of new chunks `numbers`, and their positions in the records of these chunks.
+
+    rows: the row list; None for all old rows. starts: first row of each new chunk, and the end of the last one.
+    """
     entries, places = [], []
     for place, number in enumerate(numbers.tolist()):
         begin, end = int(starts[number]), int(starts[number + 1])

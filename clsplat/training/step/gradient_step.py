@@ -155,7 +155,13 @@ class GradientStep:
         *,
         reads_loss: bool = False,
     ) -> tuple[ForwardPass, Loss, Slots, Sequence[DeviceArray | None]]:
-        """Run forward and backward. Returns forward pass, loss, gradients of the pairs, and the parts' gradients."""
+        """Run forward and backward. Returns forward pass, loss, gradients of the pairs, and the parts' gradients.
+
+        of: parameters of the model.
+        sent: camera and background on the device.
+        source: the photograph on the device.
+        chunks: the chunks in view; None for the whole model.
+        """
         camera = inputs.camera
         forward = partial(self.rasterizer.forward, of, camera, sent, room=self.room, thinning=self.thinning)
         frame = forward(nearness=self.fields.nearness, chunks=chunks)
@@ -204,7 +210,7 @@ class GradientStep:
         frame: ForwardPass,
         terms: Sequence[LossTerm],
     ) -> Loss:
-        """Loss between a frame and the photograph `source`."""
+        """Loss between a frame and the photograph `source`. of: parameters of the model (`Workspace.replayed`)."""
         work, size = self.rasterizer.work, (inputs.camera.width, inputs.camera.height)
         alpha = any(term.wants_alpha for term in terms)
         changed = any(part.changes_target for part in inputs.parts)
@@ -343,7 +349,8 @@ class GradientStep:
     ) -> R:
         """Result of `make`, from a command buffer (`Workspace.replayed`) if the step is launched by capacity.
 
-        A step with exact counts has new arrays each time, so its command buffer would never be reused.
+        A step with exact counts has new arrays each time, so its command buffer would never be reused. The arguments
+        are those of `Workspace.replayed`.
         """
         if self.room is None:
             return make()

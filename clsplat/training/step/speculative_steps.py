@@ -42,7 +42,7 @@ class _Step:
     number: number of the step's last view.
     readback: the step's counts on the device.
     counts: function that waits for these counts, and returns them.
-    before: the monitor's `last` before this step.
+    before: `NonFiniteMonitor.last` as it was before this step.
     kept: host memory that the device may still have to read.
     """
 
