@@ -60,7 +60,7 @@ def divided(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> Division:
     divided into as few chunks as possible, of equal lengths. If the rows of a kept chunk beside them fit into these
     chunks too, they are divided together with them.
 
-    entries: source row of each new row in rising order, plus FRESH if new.
+    entries: source row of each row after density control, in rising order, with the bit FRESH set if the row is new.
     starts: first rows of the old chunks, as in `Division`.
     """
     counts, changed = _changes(entries, starts)

@@ -21,14 +21,14 @@ from clsplat.optimisation.density_rules import FRESH
 BLOCK_CHUNKS = 16
 """Number of chunks that are read or written at a time in passes over many chunks."""
 _KEPT, _CLONE, _FIRST_HALF, _SECOND_HALF = range(4)
-"""Kinds of rows. A list by kind has the rows in the order of these numbers."""
+"""Kinds of rows after density control. A row list sorted by kind has the rows in the order of these numbers."""
 
 
 @dataclass(frozen=True, eq=False)
 class SourceList:
     """The rows of a model after density control, on the host, in the order of their sources.
 
-    rows: (m,) uint32, the source row of each row, plus FRESH if the row is new.
+    rows: (m,) uint32, the source row of each row, with the bit FRESH set if the row is new.
     seconds: (k,) uint32, indices into `rows` of the second halves of split Gaussians. Each second half directly follows
         its first half.
     """
@@ -58,12 +58,15 @@ class SourceList:
 
 
 def row_entries(rows: NDArray[np.uint32], fresh: NDArray[np.bool_] | None) -> NDArray[np.uint32]:
-    """Return source rows as entries of a list: with the flag FRESH where `fresh` is True."""
+    """Return source rows as entries of a row list: with the bit FRESH set where `fresh` is True."""
     return rows.astype(np.uint32) if fresh is None else np.where(fresh, rows | FRESH, rows).astype(np.uint32)
 
 
 def in_source_order(parts: Iterable[NDArray[np.uint32]]) -> SourceList:
-    """Merge lists into one in the order of their sources. parts: a list by kind for each range of old rows."""
+    """Merge row lists into one, in the order of their source rows.
+
+    parts: a list for each range of old rows, sorted as by `SourceList.by_kind`.
+    """
     rows, seconds, count = [], [], 0
     for part in parts:
         entries = part[beside_parents(part & ~FRESH)]
@@ -159,7 +162,10 @@ def gathered(
 def _entries(
     rows: NDArray[np.uint32] | None, starts: NDArray[np.int64], numbers: NDArray[np.int64]
 ) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
-    """Return the list's entries for the rows of some chunks, and the positions of these rows in the chunks' records."""
+    """Return the row list's entries of new chunks `numbers`, and their positions in the records of these chunks.
+
+    rows: the row list; None for all old rows. starts: first row of each new chunk, and the end of the last one.
+    """
     entries, places = [], []
     for place, number in enumerate(numbers.tolist()):
         begin, end = int(starts[number]), int(starts[number + 1])

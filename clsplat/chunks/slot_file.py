@@ -153,7 +153,7 @@ class SlotFile:
                 os.posix_fadvise(self._file.fileno(), slot * size, length * size, os.POSIX_FADV_WILLNEED)
 
     def read_at(self, slot: int, offset: int, into: NDArray[Any]) -> None:
-        """Fill an array with the bytes from an offset in a slot on. Raises ScratchError."""
+        """Fill `into` with the bytes that begin `offset` bytes after the start of `slot`. Raises ScratchError."""
         left, start, begin = into.view(np.uint8).reshape(-1).data, time.perf_counter(), slot * self.slot_bytes + offset
         try:
             self._file.seek(begin)
@@ -166,7 +166,8 @@ class SlotFile:
         self.moved(into.nbytes, time.perf_counter() - start)
 
     def write_at(self, slot: int, offset: int, values: NDArray[Any]) -> None:
-        """Write the bytes of an array from an offset in a slot on. Raises WriteError."""
+        """Write the bytes of `values` to the file, beginning `offset` bytes after the start of `slot`. Raises
+        WriteError."""
         left, start = np.ascontiguousarray(values).view(np.uint8).reshape(-1).data, time.perf_counter()
         try:
             self._file.seek(slot * self.slot_bytes + offset)
@@ -194,7 +195,11 @@ def _reader() -> ThreadPoolExecutor:
 
 
 def runs(slots: NDArray[np.int64]) -> Iterator[tuple[int, int, int]]:
-    """Yield (index, slot, length) of each run of consecutive slots, with the index of its first. Omits NO_SLOT."""
+    """Yield (index, slot, length) of each run of consecutive slot numbers.
+
+    They are the index in `slots` at which the run begins, its first slot number and its length. Entries that are
+    NO_SLOT are left out.
+    """
     ends = np.flatnonzero((np.diff(slots) != 1) | (slots[:-1] == NO_SLOT)) + 1
     for begin, end in pairwise([0, *ends.tolist(), len(slots)]):
         if begin < end and slots[begin] != NO_SLOT:

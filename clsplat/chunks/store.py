@@ -192,7 +192,7 @@ class ChunkStore:
 
         Chunks that do not change are neither read nor written.
 
-        rows: source rows in rising order, plus FRESH for new rows.
+        rows: source rows in rising order, with the bit FRESH set for new rows.
         values: values of fields that are not copied.
         changes: function that is called before the first row changes. With a scratch file, all new chunks have then
             been written to free slots, so that an error changes nothing.

@@ -157,8 +157,9 @@ class SamplingConfig:
     def check(self, *, whole: bool = True) -> None:
         """Raise InputError naming the first setting whose value is invalid.
 
-        whole: True for complete settings. False for the flags alone: the focus may then be missing, as a USD stage may
-            give it, but the flags may not give two equal shutter times, as a stage may.
+        whole: True for complete settings, which include the values of a USD stage. False for the flags alone: the focus
+            may be missing, because a stage can supply it. Equal shutter times are refused, because only a stage may
+            have them.
         """
         rules: tuple[Rule, ...] = (
             (("samples",), lambda value: 1 <= value <= _MAX_SAMPLES_PER_FRAME, f"1 to {_MAX_SAMPLES_PER_FRAME}"),

@@ -98,7 +98,11 @@ class Warp:
     frame: Camera
 
     def at(self, x: Float64, y: Float64) -> Float64:
-        """Return `Places.places` of the warped frame, with NaN where positions are too far outside."""
+        """Return the positions (h, w, 2) in the undistorted frame that belong to x (w,), y (h,) in the warped frame.
+
+        All are in pixels, the result in multiples of PLACE_STEP_PX. It is NaN where nothing is visible, and more than
+        MAX_BEYOND_EDGE_FRAMES frame sizes beyond an edge of the undistorted frame.
+        """
         places = np.round(self.source.places(self.frame, x, y) / PLACE_STEP_PX) * PLACE_STEP_PX
         size = np.array([self.frame.width, self.frame.height])
         with np.errstate(invalid="ignore"):

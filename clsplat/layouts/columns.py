@@ -164,7 +164,7 @@ DEEP_PICTURES = 16
 class SlotFields(NamedTuple):
     """Fields of a slot in addition to the plain gradients.
 
-    absolute: absolute gradients (AbsGS).
+    absolute: absolute gradients (AbsGS, `absgrad` in gsplat), in the columns ABSX and ABSY.
     contributions: the sum of blending weights.
     nearness: the gradient with respect to nearness, 1 / depth.
     """

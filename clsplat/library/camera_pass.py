@@ -166,6 +166,7 @@ class ViewGradients:
 class CameraPass:
     """The pass of one camera over the Gaussians. The object keeps device memory for the gradient until it is deleted.
 
+    given: the checked arrays of the call of `rasterize`.
     index: index of the camera.
     background: (D,), or None for black.
     """

@@ -278,7 +278,10 @@ def _pixels(
     background: Float32 | None,
     alpha_max: float,
 ) -> ListedPixels:
-    """Blend one image of these splats in the tiles of these lists."""
+    """Blend the splats `given` into one image, in the order of its tiles' lists.
+
+    size: (width, height) in pixels.
+    """
     with session.lock:
         device, n = session.device, len(given.means2d)
         arrays = (given.means2d, given.conics, given.opacities, given.opacities, given.colors)

@@ -127,7 +127,7 @@ def isect_offset_encode(isect_ids: ArrayLike, n_images: int, tile_width: int, ti
     Raises
     ------
     InputError
-        If an id belongs to another image or tile.
+        If an id names an image that is not below `n_images`, or a tile outside `tile_width` x `tile_height`.
     """
     n_images, tile_width, tile_height = _lengths(n_images=n_images, tile_width=tile_width, tile_height=tile_height)
     ids, tiles = np.asarray(isect_ids), tile_width * tile_height

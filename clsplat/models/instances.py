@@ -124,11 +124,13 @@ def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
 
 
 def extrapolated(track: Track, frame: float, end: float) -> Placement:
-    """Placement of a track at a frame beyond `end`, the last or first frame of its reach.
+    """Placement of a track at a frame. If the track has no data there, its motion at frame `end` continues.
 
-    Over the first fraction of a frame, the motion just before the end is mirrored. Over each further whole frame, the
-    motion of the last whole frame is repeated, as for cameras (`shots.motion`). Opacity and colour come from the track
-    itself. Raises InputError for a transform that is no longer invertible.
+    end: frame from which the camera is extrapolated, such as the last or the first of the shot.
+
+    If `frame` is n whole frames and a fraction beyond the end, the motion over the same fraction just before the end is
+    repeated once. Then the motion of the last whole frame is repeated n times, as for cameras (`shots.motion`). Opacity
+    and colour are those of the track at `frame`. Raises InputError for a transform that is no longer invertible.
     """
     if (reach := track.reach) is None or reach[0] <= frame <= reach[1]:
         return track.at(frame)

@@ -267,7 +267,7 @@ def _pinhole_grad(
     The correction is to be subtracted. It comes from means that are clamped in the Jacobian.
 
     points, jacobians, clamped: rows of `EwaProjectedTwin`.
-    d_means2d, d_j: as in `_fisheye_grad`.
+    d_means2d, d_j: gradients (N, 2) and (N, 2, 3) with respect to the means on the image and the Jacobians.
     """
     z = points[:, 2]
     jx, jy = jacobians[:, 0, 0], jacobians[:, 1, 1]

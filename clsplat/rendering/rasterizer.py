@@ -72,7 +72,7 @@ class PairCapacity:
 
     pairs: number of pairs that fit in the pass's arrays.
     turn: index of the host array that gets the pass's counts, below MAX_COUNTED_PASSES.
-    appends: True if the lists may be made by append (`stages.append`), if the device supports that.
+    appends: True if the lists may be made by append (`stages.append`). Only some devices support append.
     """
 
     pairs: int

@@ -148,7 +148,8 @@ _NAME_KEYS: tuple[Callable[[str], str], ...] = (
 
 
 def _unambiguous(known: Mapping[str, str], step: Callable[[str], str]) -> dict[str, str]:
-    """Return the photograph for each key that `step` makes of the names in `known`; only for unambiguous keys."""
+    """Map keys to photographs. A key is `step(name)` of a name in `known`. Keys that belong to several photographs are
+    left out."""
     if step is str:
         return dict(known)
     owners: dict[str, set[str]] = {}

@@ -157,14 +157,16 @@ def stretches(
     motion: bool = False,
     backward: bool = False,
 ) -> Callable[[int], Shot | None]:
-    """Function that returns, for a frame's number, the frames of the shot that matter while its shutter is open.
+    """Return a function that cuts out the part of a shot from which one frame's motion blur is computed.
 
-    It returns None for a shot of one frame, which does not move. The returned frames are numbered relative to the given
-    frame. The shot is extrapolated beyond its ends, as for motion channels.
+    The function's argument is the frame's number. Its result is the part of the shot from which the camera is
+    interpolated while that frame's shutter is open, numbered relative to the frame. It is None for a shot of one frame,
+    which does not move. The shot is extrapolated beyond its ends, as for motion channels.
 
     opens, closes: times at which the shutter opens and closes, in frames relative to the frame.
     motion, backward: also cover the middle of the next frame's shutter, or of the previous frame's.
-    Raises InputError if the frames' pictures differ in size or projection, between which a camera cannot move.
+    Raises InputError if the pictures of two consecutive frames differ in size or projection, because no camera can be
+    interpolated between them.
     """
     middle = 0.5 * (opens + closes)
     opens = min(opens, middle - 1) if backward else opens

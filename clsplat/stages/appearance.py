@@ -180,9 +180,12 @@ def step_gains(
     readback: DeviceArray,
     entries: GainEntries = PLAIN_GAINS,
 ) -> None:
-    """Update the gains by Adam, from their column sums. step: the number of this update, from 1.
+    """Update the colour entries `gains` in place by Adam.
 
-    Nothing changes if the step's pass has stopped (kernels/duplicate.cl).
+    photograph: row of `gains` that has a gradient, of a photograph or a lens.
+    columns: sums of its gradient over each pixel column, from `entry_gradient`.
+    step: the number of this update, from 1.
+    readback: counts of the step's pass (`READBACK`). Nothing changes if it has stopped (kernels/duplicate.cl).
     """
     kernels, (photographs, width) = device.kernels("appearance", {"LANES": 1}), gains.logs.shape
     count = photographs * width

@@ -58,7 +58,7 @@ def statistics_fields(*, contributions: bool) -> dict[str, tuple[int, ...]]:
 
 
 def new_values(*, densified: bool = False) -> NewValues:
-    """Return the values that rows get in a store when they move. FRESH rows get zero moments and infinite statistics.
+    """Return the values of moved rows in a store. Rows with the bit FRESH get zero moments and infinite statistics.
 
     densified: True if all statistics except contributions start from zero in every row.
     """
@@ -209,7 +209,7 @@ def add_contributions(
 class DeviceRowList:
     """The rows of a model after density control, listed on the device.
 
-    rows: (m,) uint32, the source row of each row, plus FRESH if the row is new.
+    rows: (m,) uint32, the source row of each row, with the bit FRESH set if the row is new.
     halves: number of halves of split Gaussians, which are the last rows: all first halves, then all second halves.
     """
 
@@ -343,7 +343,7 @@ def gather(
 ) -> AnyGaussians:
     """Return new arrays whose row j is row rows[j] of the source, on the device or on the host like the source.
 
-    renews: True sets FRESH rows to zero, for moments; False copies them too, for parameters.
+    renews: True sets rows with the bit FRESH to zero, for moments. False copies them too, for parameters.
     """
     count = rows.shape[0]
     if isinstance(rows, DeviceArray):
@@ -370,7 +370,7 @@ def carried(
     *,
     densified: bool,
 ) -> DensityStatistics:
-    """Return the statistics of moved rows: row j is row rows[j] of the source, or infinite if it is FRESH.
+    """Return the statistics of moved rows: row j is row rows[j] of the source, or infinite if its bit FRESH is set.
 
     densified: True if all statistics except contributions start from zero.
     source: arrays by name (`DensityStatistics.named`). Each is removed as soon as it is copied, so that only one array

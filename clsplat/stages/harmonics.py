@@ -109,6 +109,7 @@ def harmonics_grad(
 ) -> DeviceArray | None:
     """Compute `gradients` from d_colours (n, 3) and the colours of `harmonics`.
 
+    given: the inputs of `harmonics`.
     add: add the gradients of the coefficients to those that `gradients` has from earlier cameras. False replaces them.
     add_directions: the same for the gradients of directions or means.
     by_centre: return the gradient (3,) with respect to the camera's centre.

@@ -54,7 +54,10 @@ class LossTerm:
         return None
 
     def scale(self, pixels: float) -> tuple[float, float]:
-        """Weight and divisor of the sum of all partial sums, for `pixels` pixels that no mask excludes."""
+        """Return (weight, divisor): the sum of the partial sums is multiplied by the weight and divided by the divisor.
+
+        pixels: number of pixels that no mask excludes.
+        """
         raise NotImplementedError
 
     def launch(self, compared: Compared, plane: int, first: int) -> None:
@@ -75,7 +78,8 @@ class AlphaTerm(LossTerm):
         return self.weight
 
     def scale(self, pixels: float) -> tuple[float, float]:
-        """The weight, and the number of pixels as the divisor."""
+        """Return (weight, pixels): the sum of the partial sums is multiplied by the weight and divided by the number of
+        pixels."""
         return self.weight, pixels
 
     def launch(self, compared: Compared, plane: int, first: int) -> None:
@@ -100,7 +104,7 @@ class DepthTerm(LossTerm):
     factor: float
 
     def scale(self, pixels: float) -> tuple[float, float]:  # noqa: ARG002
-        """The factor, and a divisor of 1, as the factor already contains the division."""
+        """Return (factor, 1): the factor already contains the division by the number of pixels."""
         return self.factor, 1.0
 
     def launch(self, compared: Compared, plane: int, first: int) -> None:

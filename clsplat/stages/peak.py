@@ -41,9 +41,11 @@ class Limits:
 def measure_limits(
     device: Device, *, seconds: float = 0.1, repeat: int = 5, copy_bytes: int = _COPY_BYTES, widened: bool = True
 ) -> Limits:
-    """Measure the best rate of `repeat` runs; each run of arithmetic takes about `seconds`.
+    """Measure the device's peak rates (`Limits`): of each rate, the best of `repeat` runs.
 
-    widened: True uses vectors of 16 lanes where blending does, False always the lanes of the kernel shape.
+    seconds: approximate duration of each run of arithmetic.
+    copy_bytes: size of the array that is copied, in bytes. It is smaller if the device has too little memory.
+    widened: True uses vectors of 16 lanes where blending does. False always uses the lanes of the kernel shape.
     """
     items = tile_items(device)
     defines = {} if widened else {"NARROW": True}

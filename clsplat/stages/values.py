@@ -85,6 +85,7 @@ def values_grad(
 ) -> None:
     """Fill every row of the gradients from d_pixels (height, width, depth) and d_alpha (height, width).
 
+    of: the values that were blended, with the results of the image whose weights they have.
     first_slots: (n,), the first slot of each Gaussian.
     fields: fields of the slots; with absolute gradients if `gradients.absolute` is wanted.
     """

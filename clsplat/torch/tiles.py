@@ -141,7 +141,7 @@ def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_
     Raises
     ------
     InputError
-        If an id belongs to another image or tile.
+        If an id names an image that is not below `n_images`, or a tile outside `tile_width` x `tile_height`.
     """
     if not isinstance(isect_ids, Tensor):
         raise refuse("isect_ids", f"a {type(isect_ids).__name__}", "a tensor (n_isects,) of int64")

@@ -185,7 +185,7 @@ class Forecast:
 
 
 def _course(density: DensityConfig, step: int, peak: int = 0) -> float:
-    """Growth of the densification of step `step` by the paper's rule, as a fraction of the peak growth.
+    """Growth of the model by the densification at step `step`, as a fraction of the peak growth (the paper's rule).
 
     peak: step up to which the growth does not decay, even if it would by the density settings alone.
     """

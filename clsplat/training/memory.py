@@ -230,9 +230,10 @@ class MemoryPlanner:
         self.begins, self._warned, self.rows_in_view = True, False, 0
 
     def look(self, local: Callable[[Camera], Camera], initial: Gaussians) -> None:
-        """Set `rows_in_view` to the largest number of rows that a view of the initial model shows, from an even sample.
+        """Set `rows_in_view` to the largest number of rows of the initial model that one view shows.
 
-        Does nothing if no limit of the device's memory can have the model streamed by chunk.
+        Only an even sample of the views is counted. The number is 0 if device memory has no limit, or if a model of
+        this size is never streamed by chunk.
         local: function from a camera in world coordinates to the camera in those of the model.
         initial: the model at the start, in the order of its chunks.
         """

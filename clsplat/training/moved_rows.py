@@ -27,7 +27,8 @@ Places = NDArray[np.integer[Any]] | slice
 class Move:
     """A move of a model's Gaussians to other arrays or chunks.
 
-    rows: for each new row, the old row that it copies, plus FRESH if new. None keeps all rows.
+    rows: for each new row, the old row that it copies, with the bit FRESH set if its Gaussian is new. None keeps all
+        rows.
     coefficients: number of SH coefficients; 0 for as many as there are.
     changes: function that is called before the first change of the model.
     values: values of new rows, and of fields that the old records do not have.
@@ -47,7 +48,7 @@ class Move:
 class MovedRows:
     """The rows of a model after a plan is carried out.
 
-    rows: (m,) uint32, the source row of each row, plus FRESH if the row is new.
+    rows: (m,) uint32, the source row of each row, with the bit FRESH set if the row is new.
     halves: number of halves of split Gaussians, two of each.
     places: the row that each entry of the plan's list has become. None if the list and the rows have the same order, or
         if `listed` gives the order.

@@ -81,9 +81,9 @@ class StepRecord(TypedDict):
     view: name of its photograph.
     stage, message: the first stage with non-finite values, and the error message of the training.
     settings: text of config.toml.
-    versions, device: of the machine that trained.
+    versions, device: software versions and device of the machine that trained.
     depth_factor: factor of the depth loss (`DepthTerm`), if there is one.
-    of: numbers of Gaussians in the bundle and in the training.
+    of: (number of Gaussians in the bundle, number in the training).
     reproduced: True if the bundle reproduces the non-finite values.
     """
 

@@ -171,8 +171,8 @@ class TrainedModel:
         return by_field(self.with_moments) | self.statistics.by_field()
 
     def by_kind(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Mapping[str, AnyArray]]:
-        """Return the parameters and moments of a checkpoint by kind and group. They are among its `arrays`, or in the
-        scratch file if the checkpoint has only a manifest."""
+        """Return the arrays of a checkpoint by parameter group, for each of "parameters", "first" and "second" moments.
+        They are among `arrays`, or in the scratch file if the checkpoint has only a manifest."""
         if self.in_file:
             return {kind: model.arrays for kind, model in self.kinds().items()}
         return {kind: _host_arrays({g: arrays[f"{kind}/{g}"] for g in PARAMETER_GROUPS}) for kind in KINDS}
@@ -440,7 +440,7 @@ class TrainedModel:
     def _move(
         self, rows: DeviceArray | NDArray[np.uint32], changes: Callable[[], None], *, new_statistics: bool
     ) -> None:
-        """Rearrange all arrays: row j becomes the old row rows[j], with zero moments if it is FRESH."""
+        """Rearrange all arrays: row j becomes the old row rows[j], with zero moments if its bit FRESH is set."""
         count, before, gathers = rows.shape[0], self.parameters.count, self.plan.gathers
         with only_tried(self._device):
             try_gather(self._device, count, self.parameters)

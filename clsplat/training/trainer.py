@@ -218,7 +218,7 @@ class Trainer:
         return inputs
 
     def _gradient_step(self, needs: StatisticsNeeds) -> StepMaker:
-        """Function that makes a `GradientStep` from `turn` and `room`; without `room` it counts its pairs first."""
+        """Return a function that makes this step's `GradientStep` from its arguments `turn` and `room`."""
         rates, count, unit = self.rates(), self.parameters.count, self.scene.length_unit
         fields = slot_fields(needs, nearness=self.depths.on)
         explore = exploration_of(self.config, self.step, rates["means"], count, unit)
@@ -234,7 +234,12 @@ class Trainer:
         turn: int,
         room: PairCapacity | None,
     ) -> Loss:
-        """Run a step of one view, by capacity if `room` is given."""
+        """Run a step of one view.
+
+        make: function that makes the `GradientStep` from `turn` and `room` (`_gradient_step`).
+        needs: statistics that the step gathers for density control.
+        turn, room: which array gets the loss's sums, and the capacity in pairs; None counts the pairs first.
+        """
         step = make(turn=turn, room=room)
         model, probe = self.model.with_moments, self._watched(needs, inputs, step, step.step)
         result = step.run(model, inputs, probe, self._view_gradients(inputs), reads_loss=reads_loss)
@@ -278,7 +283,7 @@ class Trainer:
         return self.photographs.load(view, self.sizes.factor(self.step))
 
     def _view_inputs(self, place: int) -> ViewInputs:
-        """Inputs of the next view. place: its position in the step."""
+        """Inputs of the next view. place: index of the view among those of the step."""
         begins, view = not self.position.queue, self._next_view()
         inputs = self.loader.inputs(view, self.position, place, begins=begins)
         self.background = inputs.background
@@ -331,11 +336,8 @@ class Trainer:
         self.mark = self.position.mark(begun=begun)
 
     def step_back(self) -> bool:
-        """After an error, return to the last point at which a checkpoint was possible.
-
-        That point is before the current step, or after the step's density control if that is done. Returns False if the
-        model has changed since.
-        """
+        """After an error, return to `mark`, where a checkpoint is possible: before the step, or after its density
+        control if that is done. Returns False if the model has changed since."""
         if self.mark is None:
             return False
         self.position.go_back(self.mark)
@@ -458,10 +460,8 @@ class Trainer:
         return model
 
     def checkpoint(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        """All state that the remaining steps depend on: arrays by name, and JSON values.
-
-        The whole model is finite, unless `monitor.retries.lost`.
-        """
+        """All state that the remaining steps depend on: arrays by name, and JSON values. The whole model is finite,
+        unless `monitor.retries.lost`."""
         self.repair(look=True)
         arrays, state = self._arrays()
         if not self.model.changes_are_finite():  # also in Gaussians that no step has updated

@@ -210,7 +210,7 @@ def test_progress_beside_json(shot: list[str], tmp_path: Path, capsys: Capture) 
     records = json.loads(captured.out)
     lines = captured.err.splitlines()
     assert [json.loads(line)["done"] for line in lines[:2]] == [1, 2]
-    assert "the device ran kernels" in lines[2]
+    assert "the device spent " in lines[2] and "% of the time on kernels" in lines[2]
     assert all(record["kernel_ms"] > 0 and record["transfer_ms"] > 0 for record in records)
     assert ran(capsys, render, shot, tmp_path, "--progress", "none") == ("", "")
 

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparisons whose messages say what differs, where and by how much. Tests state the reasons for their tolerances."""
+"""Comparisons whose messages say what differs, where and by how much.
+
+Tests state the reasons for their tolerances. The bounds of stages are `STAGE_BOUNDS_ULP` in clsplat/selftest/result.py,
+those of gradients GRADIENT_TOLERANCE in tests/stages/test_gradients.py.
+"""
 
 from __future__ import annotations
 

@@ -367,12 +367,15 @@ def write_frames(job: Job, renderers: Sequence[Any]) -> int:
 
 
 def _print_profile(records: Iterable[Record], wall: float, devices: int) -> None:
-    """Print the percentages of the wall time in which the devices ran kernels and transfers.
+    """Print the percentages of the wall time in which a device ran kernels and transfers, on average over all devices.
 
     wall: wall time of all frames in seconds.
+    devices: number of devices.
     """
     kernels, transfers = (
         sum(getattr(record, name) or 0.0 for record in records) / (10 * max(wall, 1e-9) * max(devices, 1))
         for name in ("kernel_ms", "transfer_ms")
     )
-    print(f"in {wall:.2f} s the device ran kernels {kernels:.1f} % and transfers {transfers:.1f} %", file=sys.stderr)
+    spent = "the device spent" if devices < 2 else f"each of {devices} devices spent on average"
+    line = f"in {wall:.2f} s, {spent} {kernels:.1f} % of the time on kernels and {transfers:.1f} % on transfers"
+    print(line, file=sys.stderr)

@@ -80,7 +80,7 @@ class PlyHeader:
     format: "ascii" or a key of PLY_BYTE_ORDERS.
     size: the header's length in bytes, `end_header` included.
     origin: `Gaussians.origin`, for the means in the element `ply.LOCAL_MEANS_ELEMENT`; None if the file has none.
-    near, by_rays: as in `Gaussians`.
+    near, by_rays: `Gaussians.near` and `Gaussians.by_rays`, from the header's comments.
     """
 
     path: Path

@@ -126,7 +126,7 @@ def order(gaussians: Gaussians) -> NDArray[np.int64]:
 
 
 def _elements(header: ply_file.PlyHeader) -> tuple[ply_file.Element, ply_file.Element, ply_file.Element | None]:
-    """The elements chunk, vertex and sh, with their properties checked; None for sh if the file has none."""
+    """The PLY elements `chunk`, `vertex` and `sh`, with their properties checked. `sh` is None if the file has none."""
     path, names = header.path, [element.name for element in header.elements]
     if header.format == "ascii":
         raise InputError(f"{path}: is a compressed PLY in ascii, expected binary")

@@ -114,7 +114,7 @@ def _random_step(rng: Generator, count: int) -> Inputs:
     """Random inputs of a training step: a view of a model, and the state of Adam.
 
     numbers: the chunks that take part in the step.
-    slots: (n, SLOT_PLAIN), the values that all slots of a Gaussian have.
+    slots: (n, SLOT_PLAIN), one row for each of the n Gaussians. All slots of a Gaussian have the values of its row.
     contributions: (n,), the Gaussians' contributions to the image.
     """
     scene = random_scene(rng, count)

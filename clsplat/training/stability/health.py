@@ -133,7 +133,7 @@ class RetryBudget:
     lost: bool = False
 
     def note(self, step: int, *, lost: bool = False) -> None:
-        """Record a step with non-finite values. lost: as in `RetryBudget`."""
+        """Record a step with non-finite values. lost: True if too much of the model is broken to continue with it."""
         self.troubled = [*(earlier for earlier in self.troubled if step - TROUBLE_WINDOW_STEPS < earlier < step), step]
         self.lost = self.lost or lost
 

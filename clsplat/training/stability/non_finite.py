@@ -105,7 +105,7 @@ class NonFiniteMonitor:
     def examine(self, models: Mapping[str, AnyGaussians]) -> Repair | None:
         """Find the repair of the non-finite values that `notice` recorded; None if nothing has to be repaired.
 
-        models: arrays by kind: parameters, first and second moments.
+        models: the model under "parameters", and its moments under "first" and "second".
         """
         if self._noticed is None:
             return None
@@ -116,7 +116,7 @@ class NonFiniteMonitor:
     def examine_all(self, models: Mapping[str, Mapping[str, AnyArray]]) -> Repair | None:
         """Check all values of a model, also of Gaussians that no step has updated. Returns the repair, or None.
 
-        models: arrays by kind and group.
+        models: arrays by parameter group, of the "parameters" and of the moments "first" and "second".
         """
         if self.last is None or self.retries.lost or not np.any(health.examine(**models)):
             return None

@@ -91,7 +91,7 @@ class Component:
     def rows_moved(self, listed: DeviceArray | HostArray) -> None:
         """Move data of individual Gaussians along with their rows, or forget it.
 
-        listed: (m,), for each new row the row that it is copied from, with the bit FRESH if its Gaussian is new.
+        listed: (m,), for each new row the row that it is copied from, with the bit FRESH set if it is new.
         """
 
     def arrays(self) -> dict[str, NDArray[Any]]:

@@ -62,10 +62,11 @@ class StepProbe:
         """Prepare for a replay of launches in which Adam changes the model."""
 
     def before_rows(self, rows: StepRows) -> None:
-        """Observe rows of the model, before Adam on them is launched."""
+        """Observe the rows of the model that Adam is about to update, before Adam is launched."""
 
     def after_rows(self, rows: ViewRows) -> None:
-        """Observe rows of the model, after Adam on them has been launched."""
+        """Observe rows of the model, after Adam on them has been launched. In a batch of views, after the gradients of
+        one view have been added."""
 
 
 NO_PROBE = StepProbe()
@@ -79,7 +80,7 @@ class GradientStep:
     step: number of the step, for learning rates and Adam.
     fields: fields of a pair's gradient that the step computes.
     turn: which array receives the loss's sums (`stages.loss.loss`), so that an earlier step's sums can still be read.
-    room: capacity in pairs, if the step is launched by capacity; None to count the pairs first.
+    room: number of pairs that there is memory for, if the step is launched by capacity; None counts the pairs first.
     explore: noise and penalties of the step.
     """
 
@@ -154,7 +155,13 @@ class GradientStep:
         *,
         reads_loss: bool = False,
     ) -> tuple[ForwardPass, Loss, Slots, Sequence[DeviceArray | None]]:
-        """Run forward and backward. Returns forward pass, loss, gradients of the pairs, and the parts' gradients."""
+        """Run forward and backward. Returns forward pass, loss, gradients of the pairs, and the parts' gradients.
+
+        of: parameters of the model.
+        sent: camera and background on the device.
+        source: the photograph on the device.
+        chunks: the chunks in view; None for the whole model.
+        """
         camera = inputs.camera
         forward = partial(self.rasterizer.forward, of, camera, sent, room=self.room, thinning=self.thinning)
         frame = forward(nearness=self.fields.nearness, chunks=chunks)
@@ -203,7 +210,7 @@ class GradientStep:
         frame: ForwardPass,
         terms: Sequence[LossTerm],
     ) -> Loss:
-        """Loss between a frame and the photograph `source`."""
+        """Loss between a frame and the photograph `source`. of: parameters of the model (`Workspace.replayed`)."""
         work, size = self.rasterizer.work, (inputs.camera.width, inputs.camera.height)
         alpha = any(term.wants_alpha for term in terms)
         changed = any(part.changes_target for part in inputs.parts)
@@ -342,7 +349,8 @@ class GradientStep:
     ) -> R:
         """Result of `make`, from a command buffer (`Workspace.replayed`) if the step is launched by capacity.
 
-        A step with exact counts has new arrays each time, so its command buffer would never be reused.
+        A step with exact counts has new arrays each time, so its command buffer would never be reused. The arguments
+        are those of `Workspace.replayed`.
         """
         if self.room is None:
             return make()
@@ -367,7 +375,7 @@ class GradientStep:
 
 
 StepMaker = Callable[..., GradientStep]
-"""Function that makes a step from `turn` and `room`."""
+"""Function that makes a `GradientStep` from its arguments `turn` and `room`."""
 
 
 def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = False) -> DeviceGaussians:

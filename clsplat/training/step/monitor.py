@@ -19,11 +19,14 @@ from clsplat.training.step.speculative_steps import SpeculativeSteps
 
 @dataclass(eq=False)
 class StepMonitor(StepProbe):
-    """Probe of a step: finds non-finite values, tries the kernels that change the state, and adds the statistics of
-    density control.
+    """Probe of a step, which finds non-finite values and adds the statistics of density control.
+
+    It also launches each kernel that changes the model in the sandbox before its first use.
 
     number: number of views that training has used so far, this one included.
-    tried: keys of the steps whose kernels were tried; this step's key is added.
+    needs: the statistics that density control needs of this step.
+    tried: combinations of array sizes and build settings whose kernels have passed the sandbox; `before_rows` adds this
+        step's.
     changes: function that is called before the model changes.
     """
 
@@ -38,7 +41,7 @@ class StepMonitor(StepProbe):
     changes: Callable[[], None]
 
     def forward(self, frame: ForwardPass) -> None:
-        """Record how many elements `adam` refused in the previous step, which this pass has read back."""
+        """Record how many elements `adam` refused to update in the previous step. This pass has read that number."""
         self.monitor.notice(frame.refused)
         self.pending.seen(frame)
 

@@ -29,8 +29,8 @@ BY_CAPACITY_VARIABLE = "CLSPLAT_BY_CAPACITY"
 _STOPPED, _PAIRS, _LONGEST = (READBACK.index(name) for name in ("STOPPED", "PAIRS", "LONGEST"))
 
 Run = Callable[[int, PairCapacity | None], Loss]
-"""Function that runs one step. Its arguments are the number of the array for the loss's sums, and a capacity or
-None."""
+"""Function that runs one step. Its arguments say which array gets the loss's sums, and the capacity in pairs. None
+counts the pairs first."""
 
 
 @dataclass(eq=False)
@@ -38,11 +38,11 @@ class _Step:
     """Launched step whose number of pairs the host has not read yet.
 
     run: function that runs the step again.
-    turn: number of the array for the loss's sums.
+    turn: which of the arrays for the loss's sums this step uses (`SpeculativeSteps.turns`).
     number: number of the step's last view.
     readback: the step's counts on the device.
     counts: function that waits for these counts, and returns them.
-    before: the monitor's `last` before this step.
+    before: `NonFiniteMonitor.last` as it was before this step.
     kept: host memory that the device may still have to read.
     """
 

@@ -387,6 +387,7 @@ class VisibleChunks(Component):
 class _ChunksInView(ChunksInView):
     """The chunks of a step's view, and the steps that some of them have missed.
 
+    of: the component that made this object.
     of_rows: the bounds that the chunks were chosen by. A new object replaces it when rows of the model move, which
         shows that the list is outdated.
     whole: True if the step runs over the whole model; `numbers` then lists all its chunks.
