@@ -147,7 +147,7 @@ def test_frames_are_rendered_again_where_the_cg_changes(folder: Path, tmp_path: 
     write_flat(tmp_path / "cg/z.0002.exr", {"Z": depth})
     capsys.readouterr()
     assert render(folder, tmp_path, flags.format(tmp_path / "cg")) == 0
-    assert "1 of the existing frames were made" in capsys.readouterr().err
+    assert "1 of the existing frames were rendered" in capsys.readouterr().err
     changed = [path.name for path in before if path.stat().st_mtime_ns != before[path]]
     assert changed == ["a.0002.exr"]
     assert render(folder, tmp_path, "--alpha --frames 1 --skip-existing") == 0  # none at all is another picture

@@ -183,7 +183,7 @@ def test_frames_made_otherwise_are_told_and_rendered_again(shot: list[str], tmp_
         assert len(rendered) == count
     hidden_model(30).save(tmp_path / "other.ply")
     assert render([str(tmp_path / "other.ply"), *shot[1:]], tmp_path, "--skip-existing", "--dry-run") == 0
-    assert f"{COUNT} of the frames" in capsys.readouterr().err
+    assert f"{COUNT} of the existing frames" in capsys.readouterr().err
     (tmp_path / "a.0003.exr").write_bytes(b"")
     assert ran(capsys, render, shot, tmp_path, "--skip-existing", "--rasterizer.alpha-min", "0.01").err == ""
 

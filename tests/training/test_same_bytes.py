@@ -139,7 +139,7 @@ def without_points(scene: Scene) -> Scene:
 LITTLE = [
     *((name, 0.45) for name in ("poses", "lenses", "cameras", "long axis")),
     *((name, 0.6) for name in ("thinning", "penalty", "maps")),
-    *(("MCMC", 0.6), ("MCMC", 0.5), ("contributions", 0.6), ("contributions", 0.3), ("absolute", 0.85)),
+    *(("MCMC", 0.6), ("MCMC", 0.5), ("contributions", 0.6), ("contributions", 0.3), ("absolute", 0.7)),
 ]
 """Settings, and the part of the memory that they take."""
 
