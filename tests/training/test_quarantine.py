@@ -346,7 +346,7 @@ def test_without_a_run_it_says_how_to_get_a_bundle(scene: Scene, default_device:
     with (
         heard(),
         spoilt(lambda _: True),
-        pytest.raises(ClsplatError, match=r"with run=\.\.\., a file that reproduces it"),
+        pytest.raises(ClsplatError, match=r"no file that reproduces it is written, as clsplat\.train had no run="),
     ):
         train(scene, config, device=default_device)
 
