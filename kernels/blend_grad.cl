@@ -1,8 +1,6 @@
-// The gradient of alpha blending, back to front: for each pair of a tile and a Gaussian, partial sums over the tile's
-// pixels.
+// The gradient of alpha blending, back to front: sums over a tile's pixels, for each pair of a tile and a Gaussian.
 //
-// Owner: A group owns a tile and writes one slot for each of its pairs. No two groups share a slot, so global memory
-//   needs no atomics.
+// Owner: A group owns a tile and writes one slot for each of its pairs. No two share a slot, so there are no atomics.
 // Launch: As in blend.cl, one group of ITEMS work-items for each tile from first_tile on. An item owns pixels; with
 //   BY_GAUSSIAN it owns one Gaussian after another.
 // Buffers: blend.cl's inputs; blend.cl's outputs transmittance and stops; slot_from_sorted (pairs).
@@ -13,8 +11,7 @@
 //
 // Each pixel visits its Gaussians from the last to the first, and recovers the transmittance by division. `behind` is
 // the light behind the current Gaussian, background included, dotted with the pixel's gradient (shared/behind.h). The
-// sums over pixels are moments of g = alpha * dL/dalpha in the whitened coordinates (u, v), and with CONTRIBUTIONS the
-// sum of the blending weights (55).
+// sums are moments of g = alpha * dL/dalpha in whitened (u, v), and with CONTRIBUTIONS of the blending weights (55).
 #include "shared/widened.h"
 #include "shared/math.h"
 #include "shared/splat.h"
@@ -61,8 +58,7 @@ typedef struct {
 
 #include "shared/behind.h"
 
-// Removes a pair from a cell's pixels, and returns its g and weight there. uncapped: the pair's alpha before the cap, 0
-// in lanes to whose pixel the pair was not added.
+// Removes a pair from a cell's pixels. Returns its g and weight. uncapped: alpha before the cap, 0 where left out.
 static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red, float c_green,
                              float c_blue NEAR_PARAMETER) {
 #if ITEMS == 1
@@ -95,9 +91,8 @@ static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red,
 }
 
 #ifdef RAYS
-// Adds a pixel to a slot's sums along rays. With RAYS, SLOT_GU and SLOT_GV hold the gradient with respect to the mean
-// on its tangent plane. This gradient is not linear in (u, v), because the plane turns with the mean: (21) of
-// docs/cameras.md.
+// Adds a pixel to the sums along rays: SLOT_GU and SLOT_GV get the gradient with respect to the mean on its tangent
+// plane. It is not linear in (u, v), because the plane turns with the mean: equation (21) of docs/cameras.md.
 static inline void add_ray_moments(floatL g, floatL u, floatL v, float l11, float l12, float l22, floatL *sums) {
   const floatL q = fmaL(u, u, v * v);
   const floatL y = v / l22, x = fmaL((floatL)(-l12), y, u) / l11;
@@ -110,8 +105,7 @@ static inline void add_ray_moments(floatL g, floatL u, floatL v, float l11, floa
 }
 #endif
 
-// Adds the gradients of one vector of pixels to a pair's sums (SLOT_STRIDE). place: the vector's index in an array of
-// cells.
+// Adds the gradients of one vector of pixels to a pair's sums (SLOT_STRIDE). place: the vector's index among the cells.
 #define IN_PLACE(cells, place) (((const floatS *)(cells))[place])
 static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floatS g, floatS weight, floatS u, floatS v,
                                  float l11, float l12, float l22) {
@@ -135,8 +129,7 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
 #endif
 }
 
-// The gradient with respect to a pixel's final transmittance. background: the part that comes through the background's
-// colour; by_t: the part from the alpha plane of the image's gradient.
+// The gradient with respect to a pixel's final transmittance. background: its part by colour; by_t: by the alpha plane.
 #ifdef ALPHA_GRADIENT
 #define AT_END(background) ((background) + by_t)
 #define NEAR_PLANE 4
@@ -149,8 +142,7 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
 #include "shared/strips.h"
 #endif
 
-// ALPHA_IN defines for a cell's pixels: u and v; power, the log2 of the alpha; and taken, the lanes to which the tile's
-// i-th pair was added.
+// ALPHA_IN defines for the i-th pair and a cell's pixels: u, v; power, the log2 of alpha; taken, the lanes that add it.
 #ifdef RAYS
 #define WHITENING_HERE                                                                                                 \
   float whitening[3];                                                                                                  \

@@ -125,7 +125,7 @@ class ChunkStore:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the store: those of all rows in main memory, or of all chunks' slots in a scratch file."""
+        """Size in bytes: of all rows for a store in main memory, of the chunks' slots for one in a scratch file."""
         if self.path is None:
             return self.count * self.record.itemsize // CHUNK_ROWS
         return self.chunks * self.file.slot_bytes
@@ -261,7 +261,7 @@ class ChunkStore:
         return rows
 
     def set_records(self, start: int, stop: int, rows: NDArray[Any]) -> None:
-        """Replace the rows [start, stop) by records like those of `get_records`. Raises WriteError and ScratchError."""
+        """Replace the rows [start, stop). rows: as `get_records` returns them. Raises WriteError and ScratchError."""
         numbers, mine, evenly = self._covering(start, stop)
         records = rows
         if not evenly:
@@ -455,7 +455,7 @@ class ChunkStore:
                 self.slots.hold(kept)
 
     def _check(self, number: int, names: Sequence[str], record: Any) -> None:
-        """Raise ScratchError if fields of a record do not have the checksums of what was written."""
+        """Raise ScratchError if the checksum of a field differs from the checksum when it was written."""
         for name in names:
             of_field = number, self._names.index(name)
             if self._constants[of_field] == WRITTEN and zlib.crc32(record[name]) != self._checksums[of_field]:
@@ -474,7 +474,7 @@ def _checksums(records: NDArray[Any]) -> NDArray[np.uint32]:
 
 
 def _carried(values: NDArray[Any], to: Division, shape: tuple[int, int]) -> NDArray[Any]:
-    """Return values (chunks, fields) after a move: those of kept chunks, and zeros for new chunks."""
+    """Return the values (chunks, fields) after a move. Kept chunks keep their values, and new chunks have zeros."""
     carried, stays = np.zeros(shape, values.dtype), to.kept != NEW
     if stays.any():
         carried[stays] = values[to.kept[stays]]

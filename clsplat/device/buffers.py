@@ -216,7 +216,7 @@ def _fill_bytes(device: Device, buffer: cl.Buffer, word: NDArray[np.uint32], nby
 
 
 class _Buffer(cl.Buffer):  # type: ignore[misc]  # no types of its own
-    """An OpenCL buffer that supports weak references, so that the memory account is told when it is freed."""
+    """An OpenCL buffer that can be weakly referenced. Through this the memory account learns when it is freed."""
 
 
 def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity: int = 0) -> DeviceArray:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
+from clsplat.chunks.division import chunks_of
 from clsplat.chunks.residency import CROSSING_SHARE, Residency
 from clsplat.chunks.store import ChunkStore
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
@@ -170,7 +171,7 @@ class ChunkPool:
     def _row_groups(self, start: int, stop: int) -> Iterator[tuple[int, int, NDArray[np.uint32]]]:
         """Split rows into parts that cross the bus one after the other. Yields begin and end of a part, and its
         slots."""
-        slots = np.arange(-(-(stop - start) // CHUNK_ROWS), dtype=np.uint32)
+        slots = np.arange(chunks_of(stop - start), dtype=np.uint32)
         for some in self._groups(len(slots)):
             begin = start + CHUNK_ROWS * some.start
             yield begin, min(begin + CHUNK_ROWS * len(slots[some]), stop), slots[some]

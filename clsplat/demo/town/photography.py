@@ -141,7 +141,7 @@ def _moving_cars(config: TownConfig, photograph: TownPhotograph) -> CityBlock:
 
 
 class _Candidates:
-    """Points in front of a photograph's camera. `see` marks those that no solid hides.
+    """Points in front of a photograph's camera. `see` marks the points that no solid hides from the camera.
 
     blocks: number of the caster's first blocks, which have points. The last block, of moving cars, has none.
     """
