@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import prod
 from typing import Any
 
 import pyopencl as cl
@@ -131,8 +132,14 @@ class Kernel:
         self.tried: set[str] = set()
 
     def most_items(self, device: cl.Device) -> int:
-        """Maximum work-items that the driver allows in a group of this kernel."""
-        return int(self.cl_kernel.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, device))
+        """Maximum work-items in a group of this kernel: what the driver reports, or the kernel's `reqd_work_group_size`.
+
+        The larger of the two counts, as NVIDIA's driver reports 256 also for kernels that it has built for 1024.
+        """
+        info = cl.kernel_work_group_info
+        reported: int = self.cl_kernel.get_work_group_info(info.WORK_GROUP_SIZE, device)
+        built_for: list[int] = self.cl_kernel.get_work_group_info(info.COMPILE_WORK_GROUP_SIZE, device)
+        return max(reported, prod(built_for))
 
 
 class Kernels:

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 
-from clsplat.device import launch
+from clsplat.device import cl, launch
 from clsplat.device.buffers import allocate
 from clsplat.device.context import Device
 from clsplat.device.program import Kernel, Kernels, Variant, build
@@ -63,6 +65,17 @@ def test_a_group_that_the_driver_does_not_allow(
     wanted = rf"shape {label}: words\.cl, words, has 64 items in a group, but the driver allows at most 32"
     with pytest.raises(DriverError, match=wanted):
         launch.launch_groups(default_device, words, 1, 64, 1, 2, 0.5, np.uint64(3), None)
+
+
+@pytest.mark.parametrize(("reported", "built_for", "most"), [(256, [1024, 1, 1], 1024), (256, [0, 0, 0], 256)])
+def test_a_kernel_may_have_the_group_that_it_was_built_for(
+    words: Kernel, monkeypatch: pytest.MonkeyPatch, reported: int, built_for: list[int], most: int
+) -> None:
+    """NVIDIA's driver reports 256 for each kernel, also for one whose reqd_work_group_size is 1024."""
+    info = cl.kernel_work_group_info
+    told = {info.WORK_GROUP_SIZE: reported, info.COMPILE_WORK_GROUP_SIZE: built_for}
+    monkeypatch.setattr(words, "cl_kernel", Mock(get_work_group_info=lambda which, _: told[which]))
+    assert words.most_items(Mock()) == most
 
 
 def test_a_limit_that_is_known_to_be_wrong(

@@ -48,9 +48,10 @@ def measure(subject: Any, device: Any, twins: Path, seconds: float) -> list[dict
     with tempfile.TemporaryDirectory(prefix="clsplat-trial-") as folder:
         dump(subject, device, there, Path(folder))
         ncu = ["ncu", "--csv", "--page", "raw", "--clock-control", "none", "--metrics", ",".join(METRICS)]
-        child = [sys.executable, str(Path(__file__)), str(twins), folder]
+        child = [sys.executable, "-X", "faulthandler", str(Path(__file__)), str(twins), folder]
         done = subprocess.run([*ncu, *child], capture_output=True, text=True, timeout=seconds, check=False)
     if done.returncode:
+        print(done.stdout, done.stderr, sep="\n", file=sys.stderr)
         raise RuntimeError(f"ncu: {done.stderr or done.stdout}")
     return counters_of(done.stdout)
 
