@@ -47,17 +47,19 @@ def fallen(reach: float, part: float, visits: float) -> float:
 
 
 def first_step(config: TrainConfig) -> int:
-    """Last step before cameras are refined. Until then the model is too coarse to align cameras with."""
+    """Return the number of the last step before cameras are refined. Until then the model is too coarse to align
+    cameras with."""
     return min(500, config.iterations // 10)
 
 
 def checked_arrays(
     own: Mapping[str, NDArray[Any]], arrays: Mapping[str, NDArray[Any]], folder: str
 ) -> dict[str, NDArray[Any]]:
-    """Copies of a checkpoint's arrays, keyed by name without the prefix `folder`, checked against the current arrays.
+    """Return copies of a checkpoint's arrays, after a check of shapes, types and finite values against the current
+    arrays.
 
-    own: the current arrays, by name with the prefix.
-    arrays: the checkpoint's arrays, by name without it.
+    own: the current arrays, by name with the prefix `folder`.
+    arrays: the checkpoint's arrays, by name without this prefix, as in the result.
     Raises ValueError if an array is missing, or belongs to other views.
     """
     values = {}
@@ -72,8 +74,8 @@ def checked_arrays(
 def axes_of(matrix: Float64) -> tuple[Float64, Float64]:
     """Eigenvalues (6,) of a symmetric matrix (6, 6), and its eigenvectors as rows.
 
-    Jacobi rotations find them, of three pairs of axes at a time (Golub and Van Loan, section 8.5). LAPACK is not used,
-    because its bits depend on the processor.
+    They are found by Jacobi rotations, of three pairs of axes at a time (Golub and Van Loan, section 8.5). LAPACK is
+    not used, because its bits depend on the processor.
     """
     a, axes = matrix.copy(), np.eye(6)
     for p, q in JACOBI_SWEEPS * JACOBI_PAIRS:
@@ -109,7 +111,7 @@ class Poses:
     """Cameras of the training views, which move if poses are refined.
 
     Adam has moments for each view. Two views do not move, so that the model keeps its place and size: the first view,
-    and the view farthest from it. Outlier cameras are neither of them.
+    and the view farthest from it. Outlier cameras are not among the two.
 
     held: indices of these two views.
     """
@@ -143,7 +145,7 @@ class Poses:
     def move(self, view: int, step: int, gradient: Float64) -> None:
         """Take Adam's step for the pose of training view `view`. A gradient that is not finite causes no step.
 
-        gradient: (6,), with respect to the motion of `Camera.moved`.
+        gradient: (6,), with respect to the camera's rotation and translation, as `Camera.moved` defines them.
         """
         by = gradient * self._scale  # translations relative to the length unit
         if not np.isfinite(by).all():
@@ -175,7 +177,7 @@ class Poses:
         values = checked_arrays(self.arrays(), arrays, "poses/")
         turned = values["rotations"]
         if np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max() > ROTATION_TOLERANCE:
-            raise ValueError("has poses/rotations that are no rotation matrices")
+            raise ValueError("has poses/rotations that are not rotation matrices")
         poses = zip(self._given, values["rotations"], values["translations"], strict=True)
         self.cameras = [given.posed(rotation, translation) for given, rotation, translation in poses]
         self._first, self._second, self._visits = values["first"], values["second"], values["visits"]
