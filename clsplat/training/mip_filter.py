@@ -66,7 +66,8 @@ class MipFilter(Component):
         return {} if self._least is None else {"sampling/least": self._least.get()}
 
     def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002
-        """Load the arrays of a checkpoint of `count` Gaussians. Raises ValueError for another number of Gaussians."""
+        """Load the scales' lower limits from a checkpoint of `count` Gaussians. Raises ValueError for another
+        number."""
         least = named("sampling/").get("least") if self.on else None
         if least is not None and least.shape != (count,):
             raise ValueError(f"sampling/least has shape {least.shape}, expected ({count},)")

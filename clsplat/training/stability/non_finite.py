@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitor of non-finite values: notices elements that `adam` refused, finds the stage at fault and the repair."""
+"""Monitor of non-finite values: records elements that `adam` refused to update, and finds the stage at fault and a
+repair."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ class LastStep:
     """Record of a step, to be inspected if non-finite values are found later.
 
     view, name: index and name of the step's view.
-    sums: function that returns the sums of the view's loss. Call it before the next step has a loss.
+    sums: function that returns the sums of the view's loss. Call it before the next step's loss, which overwrites them.
     others: records of further views of the same step, in a batch.
     """
 
@@ -85,7 +86,11 @@ class NonFiniteMonitor:
         self.last = replace(last, others=(*last.others, view)) if last is not None and same else view
 
     def notice(self, refused: Sequence[int]) -> None:
-        """Record how many elements `adam` refused in the last step, by reason (`REFUSED`). Reads its loss."""
+        """Record that `adam` refused elements in the last step, if any number in `refused` is not 0. Reads the step's
+        loss.
+
+        refused: numbers of elements that `adam` did not update, one for each reason of `REFUSED`.
+        """
         if not any(refused) or self._noticed is not None or self.last is None:
             return
         counts = dict(zip(REFUSED, refused, strict=True))
@@ -94,7 +99,8 @@ class NonFiniteMonitor:
         self._noticed = (culprit or self.last, "loss" if culprit else stage, sum(refused))
 
     def look(self) -> None:
-        """Read from the device how many elements `adam` refused, instead of waiting for the next pass to do so."""
+        """Read from the device how many elements `adam` refused, without waiting for the next forward pass to read
+        it."""
         self.notice([int(value) for value in self.readback.get()[-len(REFUSED) :]])
 
     def loss_failed(self) -> None:

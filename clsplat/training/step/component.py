@@ -21,7 +21,7 @@ from clsplat.training.step.inputs import ViewInputs
 Named = Callable[[str], Mapping[str, Any]]
 """Function of a prefix. It returns the arrays of a checkpoint whose names have the prefix, by name without it.
 
-Arrays of the Gaussians may be files that are read by slices.
+Arrays of the Gaussians may be in a scratch file. Slices of them are then read from the file.
 """
 
 
@@ -75,7 +75,8 @@ class Component:
         """Return to the state after step number `step`. Later steps failed before they changed a Gaussian."""
 
     def complete_exactly(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
-        """Make the postponed changes to parameters and moments that give the same bits whenever they are made."""
+        """Make those postponed changes to parameters and moments that give the same bits at whatever step they are
+        made."""
 
     def complete(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
         """Make all postponed changes to parameters and moments. Called when every row is needed."""
@@ -86,7 +87,8 @@ class Component:
         return parameters
 
     def rows_changed(self, groups: set[str]) -> None:
-        """Forget data that depends on parameter groups whose values density control or a repair has changed."""
+        """Forget data that depends on the parameter groups with the names `groups`, whose values density control or a
+        repair has changed."""
 
     def rows_moved(self, listed: DeviceArray | HostArray) -> None:
         """Move data of individual Gaussians along with their rows, or forget it.
@@ -99,8 +101,11 @@ class Component:
         return {}
 
     def load(self, named: Named, step: int, count: int) -> None:
-        """Load the arrays of a checkpoint of `count` Gaussians after `step` views. Raises ValueError for arrays of
-        other views."""
+        """Load the component's state from a checkpoint of `count` Gaussians after `step` views. Raises ValueError for
+        arrays of other views.
+
+        named: function from a prefix to the checkpoint's arrays whose names have this prefix.
+        """
 
     def write(self, run: Run) -> None:
         """Write the component's files of a finished training into the run's folder."""

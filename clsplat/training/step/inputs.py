@@ -37,7 +37,7 @@ class ChunksInView(Protocol):
     """Chunks of the model that a step runs over."""
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> PlacedChunks | None:
-        """Make the chunks ready for the step. Returns None if the step runs over the whole model instead."""
+        """Make the chunks ready for Adam's step `step`. Returns None if it runs over the whole model instead."""
 
 
 @dataclass(eq=False)
@@ -121,7 +121,8 @@ class ViewPart:
     """True if `compare` changes the photograph."""
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewPart:  # noqa: ARG002
-        """Copy of the part on another device, made from `values`, for `compare` and `gradient` there."""
+        """Return a copy of the part on another device, for `compare` and `gradient` there. values: result of the method
+        `values`."""
         return self
 
     def values(self) -> NDArray[np.float32]:
@@ -151,7 +152,7 @@ class ViewPart:
         return None
 
     def add_rows(self, rows: StepRows) -> None:
-        """Sum the gradients of these rows. Called before the rows change."""
+        """Add the gradients of these rows to the part's sums. Called before the rows change."""
 
     def before_adam(self, rows: StepRows, step: AdamStep) -> None:
         """Change these rows just before Adam does. It is called twice if the sandbox tries the step first."""

@@ -28,7 +28,8 @@ _GROUPS = tuple(PARAMETER_GROUPS)
 
 
 class LateAdam(Component):
-    """Component for late Adam: the last step that each Gaussian took, and the factors of the steps that it missed.
+    """Component for late Adam: keeps the last step that each Gaussian took, and the tables by which missed steps are
+    taken.
 
     step: number of the last step launched.
     """
@@ -39,12 +40,12 @@ class LateAdam(Component):
 
     def _begin(self, last: NDArray[np.uint32], missed: MissedSteps, step: int) -> None:
         self._last, self._missed, self.step = upload(self._device, last), missed, step
-        self._tables: dict[int, Float32] = {step: missed.rounded()}  # by step, also of steps that may be repeated
+        self._tables: dict[int, Float32] = {step: missed.rounded()}  # by step number; steps may be repeated
         self._table = allocate(self._device, self._tables[step].shape, np.float32)
 
     @property
     def row_bytes(self) -> int:
-        """Bytes per Gaussian on the device, for the last step that it took."""
+        """Bytes per Gaussian on the device, for the number of the last step that it took."""
         return 4
 
     def is_due(self, step: int, views: int) -> bool:
@@ -56,7 +57,7 @@ class LateAdam(Component):
         return [replace(each, parts=(*each.parts, _ShownRows(self))) for each in inputs]
 
     def settle_shown(self, rows: StepRows, step: AdamStep) -> None:
-        """Settle the rows that a step's view shows, before Adam's step. Repeating the step gives the same bits."""
+        """Settle the rows that a step's view shows, before Adam's step. A step that is repeated gives the same bits."""
         if step.number > self.step:
             self._missed.add(step.scales)
             self.step = step.number
@@ -130,7 +131,7 @@ class LateAdam(Component):
 
 @dataclass(frozen=True, eq=False)
 class _ShownRows(ViewPart):
-    """Part of a view that settles the rows that the view shows."""
+    """Part of a view that settles the rows that the view shows: it takes the steps of Adam that they missed."""
 
     late: LateAdam
 

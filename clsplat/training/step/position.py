@@ -66,9 +66,10 @@ class Position:
         return {**state, **views, **({"controlled": True} if self.controlled else {})}
 
     def load(self, checkpoint: Checkpoint, views: int) -> RetryBudget:
-        """Continue from a checkpoint, in a scene with `views` training views. Returns the checkpoint's retries.
+        """Continue from a checkpoint, in a scene with `views` training views. Returns the checkpoint's record of
+        retries.
 
-        Raises InputError.
+        Raises InputError for a state that cannot be read.
         """
         try:
             self.rng.bit_generator.state = checkpoint.state["rng"]
@@ -81,8 +82,8 @@ class Position:
                 raise ValueError(f"the last step had {last_views!r:.20} views, expected 1 to {max(checkpoint.step, 1)}")
         except (KeyError, TypeError, ValueError, IndexError) as error:
             why = f"{type(error).__name__}: {error}"
-            raise unusable(checkpoint, f"its state is not as this version writes it ({why})") from None
+            raise unusable(checkpoint, f"its state cannot be read ({why})") from None
         self.step, self.last_views = checkpoint.step, last_views
-        self.queue = queue if max(queue, default=0) < views else []  # the scene has fewer views now
+        self.queue = queue if max(queue, default=0) < views else []  # if the scene has lost views, a new epoch
         self.controlled = bool(checkpoint.state.get("controlled", False))
         return retries
