@@ -95,7 +95,7 @@ class Trainer:
         self.given = initial
         self.monitor = NonFiniteMonitor(self.rasterizer.readback)
         self.pending = SpeculativeSteps(device, self.monitor, self._begin_again)
-        self.pending.on &= self.batch is None and not config.refines  # these wait for the device in each step
+        self.pending.on &= self.batch is None and not config.refines  # both wait for the device in each step
         self._start()
 
     def _start(self) -> None:
@@ -188,7 +188,7 @@ class Trainer:
             counted = (self.rasterizer, (factor, self.rasterizer), self.parameters.count)
             room = 0 if self._looks_at_steps else self.pending.room(*counted)
             result = self.pending.launch(run, room, number=self.step, reads_loss=reads_loss)
-            if self.position.queue:  # the next step's photograph, at this resolution, and its Gaussians
+            if self.position.queue:  # fetch the next step's photograph and Gaussians
                 self.photographs.ahead(self.position.queue[-1], factor)
                 if self.model.in_file:
                     self.model.read_ahead(self.local(self.views[self.position.queue[-1]].camera))
@@ -370,7 +370,7 @@ class Trainer:
     def _next_view(self) -> int:
         if not self.position.queue:
             self.position.queue = self.order.next_pass(self.position.rng)
-            if self.batch is None:  # a batch may not have counted the last epoch's views yet
+            if self.batch is None:  # a batch counts the last epoch's views later
                 self._turn_epoch()
                 self._note(begun=True)
         return self.position.queue.pop()
@@ -393,7 +393,7 @@ class Trainer:
             self.model.widen(coefficients, self._unmark)
 
     def _control_density(self) -> None:
-        """Run the density control that is due after one of the last step's views."""
+        """Run the density control that is due after each of the last step's views."""
         last = range(self.step - self.position.last_views + 1, self.step + 1)
         steps = list(filter(self.strategy.is_due, last))
         for step in steps if self.step > 0 else ():

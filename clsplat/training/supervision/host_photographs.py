@@ -59,7 +59,8 @@ class HostPhotographs:
 
     @cached_property
     def least(self) -> int:
-        """Smallest possible limit in bytes: for the views of a step, one view that is read ahead, and its decoding."""
+        """Smallest possible limit in bytes: room for the views of a step and one view that is read ahead, and to decode
+        that one."""
         return self._needed(1)
 
     @cached_property
@@ -134,7 +135,8 @@ class HostPhotographs:
         self._tell()
 
     def _made(self, key: Key) -> dict[float, NDArray[Any]]:
-        """Read or decode a photograph, and keep it."""
+        """Read a photograph from the disk cache, or decode it, and keep it. Returns its pixels by divisor of the
+        size."""
         index, factor = key
         images = self.decoder.pixels(index, factor, keeps=not self.bounded)
         with self._lock:
