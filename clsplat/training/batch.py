@@ -94,7 +94,7 @@ class _AddedView(GradientStep):
 
     The `model` that it runs on consists of the parameters and the batch's sums of gradients, without moments.
 
-    own: gradients of each view's parts, by the view's position in the batch.
+    own: gradients of each view's parts (`ViewPart`), by the view's position in the batch.
     noise: noise that the batch adds after its last view.
     """
 
@@ -258,7 +258,7 @@ class Batch:
         devices = (rasterizer.device, *further)
         if len({device.queue.int_ptr for device in devices}) < len(devices):
             raise InputError(
-                f"several devices to train on: got {', '.join(device.name for device in devices)}; two of them share a "
+                f"cannot train on {', '.join(device.name for device in devices)} together: two of them share a "
                 "queue and kernels; open each device on its own, because each needs a thread of its own"
             )
         self.rasterizer, self.photographs, self.config = rasterizer, photographs, config
@@ -268,8 +268,8 @@ class Batch:
         self._room: dict[str, NDArray[np.float32]] = {}
 
     def follow(self, plans: Sequence[Plan]) -> None:
-        """Use at most the device memory that `plans` allow: one plan for each further device. Arrays of earlier plans
-        are freed."""
+        """Use at most the device memory that `plans` allow: a plan for each further device. Frees arrays of earlier
+        plans."""
         self._sums = self._sent = None
         self._room.clear()
         for replica, plan in zip(self.replicas, plans, strict=True):
@@ -340,8 +340,7 @@ class Batch:
         return Losses(tuple(losses))
 
     def _sums_for(self, device: Device, parameters: AnyGaussians) -> AnyGaussians:
-        """Return arrays for the sums of gradients. They contain zeros, as `adam` sets them to zero again in each
-        step."""
+        """Return arrays for the sums of gradients. They contain zeros, as `adam` sets them to zero after each use."""
         count, coefficients, sums = parameters.count, parameters.coefficients, self._sums
         if sums is None or (sums.count, sums.coefficients) != (count, coefficients):
             del sums

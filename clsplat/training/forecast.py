@@ -30,10 +30,10 @@ decays because small Gaussians fall below the gradient threshold."""
 RECENT_DENSIFICATIONS = 4
 """Number of latest densifications from which the growth by the next ones is predicted."""
 PRIOR_GROWTH_WEIGHT = 0.5
-"""Weight of the prior: it counts as much as this many measured densifications at the peak."""
+"""Weight of the prior of the peak growth: it counts as much as this many measured densifications at the peak."""
 PRIOR_COSTS = np.array([8000.0, 0.6, 1.2, 80_000.0])
-"""Prior times, relative to each other, as on CPUs: of a step, and in addition for each pixel, each Gaussian, and each
-photograph that is read."""
+"""Prior times, relative to each other, as on CPUs: of a step, and for each pixel, Gaussian, and photograph that is
+read."""
 PRIOR_COST_WEIGHT_SECONDS = 0.03
 """Weight of the prior costs: they count as much as this many measured seconds."""
 OUTLIER_FACTOR = 4.0
@@ -141,7 +141,10 @@ class Forecast:
         return spans
 
     def _grown(self, density: DensityConfig, step: int, number: float, height: float, peak: int) -> float:
-        """Number of Gaussians after a densification, with `number` before it. height, peak: results of `_height`."""
+        """Number of Gaussians after the densification at step `step`, with `number` before it.
+
+        height, peak: results of `_height`.
+        """
         most = max(density.max_gaussians, number)
         if density.growth == "mcmc":
             return min(wanted(density, step, max(round(number), 1)), most)

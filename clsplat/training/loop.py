@@ -106,8 +106,7 @@ def _interruption() -> Iterator[Callable[[], int]]:
 
 
 class TrainingSession:
-    """State of one call of `clsplat.train`: the trainer, its run (None to write no files), and the training time in
-    seconds."""
+    """State of one call of `clsplat.train`: the trainer, its run (None to write no files), and the training time."""
 
     def __init__(
         self,
@@ -218,7 +217,7 @@ class TrainingSession:
             warnings.warn(f"{untold} more steps had values that were not finite")
 
     def give_up(self) -> None:
-        """Write a bundle that reproduces the non-finite values into the run's folder, and raise ClsplatError."""
+        """Write a bundle, by which the non-finite values can be reproduced, and raise ClsplatError."""
         incident = self.trainer.monitor.latest
         assert incident is not None, "retries are used up only by steps with non-finite values"
         trouble = (
@@ -248,8 +247,7 @@ class TrainingSession:
         return StepReport(self.trainer.step, value, psnr, self.trainer.parameters.count, self.seconds)
 
     def draw(self, camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Render the current model with a camera in world coordinates. Returns its image, over the background of
-        evaluations, and alpha."""
+        """Render the current model over the background of evaluations. Returns its image and alpha."""
         result = self.trainer.draw(camera)
         return result.image, result.alpha
 
@@ -309,8 +307,8 @@ class TrainingSession:
         self.run.append_metrics({**record, "elapsed": time.perf_counter() - self.began})
 
     def doubt(self) -> None:
-        """Warn if renders of training views show nothing. If there is too little memory to render, nothing is
-        checked."""
+        """Warn if renders of training views show nothing. Nothing is checked if there is too little memory to
+        render."""
         with suppress(CapacityError):
             if text := sanity_checks.of_pictures(self.draw, self.trainer.views):
                 warnings.warn(f"step {self.trainer.step}: {text}")
@@ -359,7 +357,7 @@ class TrainingSession:
             self.save()
 
     def train(self, between: Between | None) -> Gaussians:
-        """Run the remaining steps, and write the model and its evaluation.
+        """Run the remaining steps, and write the model and its evaluation. between: function called before each step.
 
         Raises InputError, after a checkpoint, for a photograph that cannot be read.
         """
@@ -472,5 +470,5 @@ def _tell_idle_settings(trainer: Trainer) -> None:
     if trainer.step == 0 and config.density.every and count > config.density.max_gaussians:
         warnings.warn(
             f"training begins with {count:,} Gaussians, more than --density.max-gaussians "
-            f"{config.density.max_gaussians:,}. No Gaussian is removed for this; give the scene fewer points"
+            f"{config.density.max_gaussians:,}, which limits only their growth: give the scene fewer points"
         )

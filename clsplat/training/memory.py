@@ -84,8 +84,7 @@ class HostMemory:
         """Make the limit and folders that these arguments of `clsplat.train` ask for. Raises InputError.
 
         max_host_mem: the limit, in bytes or as a text such as "8GiB"; None for no limit.
-        cache: a folder, or "none" for no cache. None stands for RUN/cache if there is a limit, and for no cache
-            otherwise.
+        cache: a folder, or "none" for no cache. None stands for RUN/cache if there is a limit, otherwise for no cache.
         scratch: a folder; None stands for RUN/scratch.
         """
         limit = parse_bytes(max_host_mem, "--max-host-mem")
@@ -124,7 +123,7 @@ class HostMemory:
             if streams_by_chunk(config, device, count):
                 taken = _least_pool(record_bytes(config, contributions=config.density.min_contribution > 0))
             taken *= device.shares_memory
-            photographs = replace(self, cache=None).photographs(scene, config)  # a cache would create its folder
+            photographs = replace(self, cache=None).photographs(scene, config)  # no cache: it would create its folder
             self.share(photographs, count, taken, begins=True)
 
     def pool(self, photographs: HostPhotographs, count: int, record: int, *, begins: bool) -> int | None:
@@ -156,8 +155,7 @@ class HostMemory:
         return self.files.new_file()
 
     def is_exceeded(self, nbytes: int, photographs: HostPhotographs) -> bool:
-        """Return True if main memory has no room for `nbytes` of chunks in addition to the minimum that photographs
-        need."""
+        """Return True if main memory has no room for `nbytes` of chunks beside the minimum that photographs need."""
         return self.limit is not None and self.limit < nbytes + photographs.least
 
     def remove_scratch(self) -> None:
@@ -166,11 +164,9 @@ class HostMemory:
             self.files.remove_unnamed()
 
     def share(self, photographs: HostPhotographs, count: int, taken: int, *, begins: bool) -> bool:
-        """Limit photographs to the memory that the Gaussians leave. Returns False if that is too little for
-        photographs.
+        """Limit photographs to the memory that the Gaussians leave. Returns False if that is too little for them.
 
-        count: number of Gaussians.
-        taken: bytes of the Gaussians on the host.
+        count, taken: number of Gaussians, and their bytes on the host.
         begins: True to raise InputError instead. The message names the smallest limit that is enough.
         """
         if self.limit is None:
@@ -203,8 +199,8 @@ def record_bytes(config: TrainConfig, *, contributions: bool) -> int:
 
 
 def _least_pool(record: int) -> int:
-    """Return the smallest number of bytes, in addition to the minimum for photographs, of which the pool's share holds
-    one chunk.
+    """Return the bytes of main memory that a pool of one chunk needs. A pool gets only a share (POOL_QUARTERS) of the
+    memory beyond the minimum for photographs, so they are more than the chunk's bytes.
 
     record: bytes of a Gaussian in a chunk.
     """
@@ -216,8 +212,7 @@ UNLIMITED = HostMemory()
 
 
 class MemoryPlanner:
-    """Plans the memory of a training before it begins and at each densification, and limits rasterizer and photographs
-    to it.
+    """Plans the memory of a training before it begins and at each densification, and limits the rasterizer to it.
 
     begins: True until the first step. Until then too little main memory is an error, afterwards a warning.
     rows_in_view: largest number of rows in the chunks of one view so far, if the model is streamed by chunk.
@@ -286,9 +281,10 @@ class MemoryPlanner:
         return made
 
     def plan_view(self, made: Plan, chunks: int) -> Plan:
-        """Plan for views of up to `chunks` chunks, if that is more than any view has shown; else return `made`.
+        """Plan for views of up to `chunks` chunks, if neither earlier views nor the plan `made` allow as many.
 
-        made: the present plan, by which the model is streamed by chunk. It stays valid after a CapacityError.
+        made: the present plan, by which the model is streamed by chunk. It is returned if it is enough, and stays valid
+            after a CapacityError.
         """
         device, rows = self._rasterizer.device, CHUNK_ROWS * chunks
         if rows <= max(self.rows_in_view, made.rows):

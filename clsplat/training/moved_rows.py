@@ -76,7 +76,7 @@ class MovedRows:
 
 
 def ordered(plan: RowPlan, parameters: AnyGaussians) -> MovedRows | None:
-    """Return the rows of the model after a plan, in the new model's order; None if no row moves. parameters: before the
+    """Return the model's rows after a plan, in their order; None if no row moves. parameters: the model before the
     plan.
 
     In a model with more than ORDERED_ROWS rows, new rows stand behind the rows that they were copied from. When a model
@@ -111,8 +111,9 @@ def halve(
     halved: Sequence[str],
     at_once: int,
 ) -> None:
-    """Replace the two copies of each split Gaussian with its halves.
+    """Replace the two copies of each split Gaussian in `parameters` with its halves.
 
+    moved: the rows of the model, among them the copies.
     halves: function that computes the first halves, or with True as second argument the second halves (`RowPlan`).
     halved: parameter groups that `halves` reads.
     at_once: number of split Gaussians whose halves are computed at a time; 0 computes all, so that one copy of each

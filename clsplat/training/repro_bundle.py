@@ -307,7 +307,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0 if stage else 1
     print(bundle.record["message"])
     (kept, count), camera = bundle.record["of"], bundle.inputs.camera
-    print(f"{kept:,} of {count:,} Gaussians, {camera.width}x{camera.height} pixels; non-finite values after")
+    print(f"{kept:,} of {count:,} Gaussians, {camera.width}x{camera.height} pixels")
+    print("number of non-finite values after each stage:")
     for name, count in counts.items():
         print(f"  {name:13}{count:>12,}")
     print(f"first in {stage}" if stage else "all is well on this device: every value is finite")

@@ -29,8 +29,8 @@ T = TypeVar("T")
 
 REPORTED_PACKAGES = ("numpy", "pyopencl", "OpenImageIO", "scipy", "scikit-image")
 CONTRIBUTION_SECONDS = 1.0
-"""Limit of the time for measuring contributions of Gaussians to training views, in seconds. It does not count the first
-view."""
+"""Time limit, in seconds, for measuring the Gaussians' contributions to training views; the first view is not
+counted."""
 CONTRIBUTION_BIN_EDGES = tuple(float(edge) for edge in np.round(np.arange(-3.0, 5.01, 0.2), 1))
 """Edges of the bins of the histogram of contributions, as base-10 logarithms of pixels."""
 

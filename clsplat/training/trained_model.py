@@ -183,8 +183,7 @@ class TrainedModel:
         return self._pool.store if self._pool is not None and self._pool.store.path is not None else None
 
     def record(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        """Return the model's arrays and state for a checkpoint. For a model in a scratch file, these are the file's
-        manifest."""
+        """Return the model's arrays and state for a checkpoint; for a model in a scratch file, the file's manifest."""
         if (store := self.store) is None or self._pool is None:
             return self.arrays(), {}
         if store.file.is_lost:
@@ -196,8 +195,7 @@ class TrainedModel:
         return manifest.arrays(), manifest.state()
 
     def saved_now(self) -> None:
-        """Update the scratch files after a checkpoint has been written: chunks that it names are not overwritten any
-        more."""
+        """Update the scratch files after a checkpoint: slots that it names are not overwritten any more."""
         if self._files is not None:
             self._files.saved(self.store)
 
@@ -233,8 +231,8 @@ class TrainedModel:
         self._place([widen(self._device, model, coefficients) for model in self.with_moments])
 
     def rearrange(self, plan: RowPlan, changes: Callable[[], None]) -> DeviceArray | HostArray | None:
-        """Carry out a plan of density control, or of a repair. Returns the source row of each new row; None if no row
-        has moved.
+        """Carry out a plan of density control, or of a repair. Returns the source row of each row; None if no row has
+        moved.
 
         changes: function that is called just before the first change, after the kernels have been tried in the sandbox
             and memory for the moved rows is allocated. It may be called several times.
@@ -334,8 +332,10 @@ class TrainedModel:
         self._use(ChunkPool(self._device, self._work, store, self.plan.rows, cull), move.coefficients)
 
     def _fields(self, coefficients: int) -> dict[str, tuple[int, ...]]:
-        """Shape of a row of each array in a chunk's record, by name (such as "first/means"). coefficients: number for
-        SH."""
+        """Shape of a row of each array in a chunk's record, by name (such as "first/means").
+
+        coefficients: number of SH coefficients.
+        """
         return fields_of(coefficients) | statistics_fields(contributions=self._counts_contributions)
 
     @property
@@ -373,8 +373,7 @@ class TrainedModel:
             vars(self).pop(name, None)
 
     def _go_on_in(self, manifest: Manifest | None, coefficients: int) -> bool:
-        """Continue in the scratch file of a checkpoint. Returns False if there is none, or if this model cannot use
-        it."""
+        """Continue in the scratch file of a checkpoint. Returns False without one, or if this model cannot use it."""
         if (
             manifest is None
             or dict(manifest.fields) != self._fields(coefficients)

@@ -95,7 +95,7 @@ class Trainer:
         self.given = initial
         self.monitor = NonFiniteMonitor(self.rasterizer.readback)
         self.pending = SpeculativeSteps(device, self.monitor, self._begin_again)
-        self.pending.on &= self.batch is None and not config.refines  # both wait for the device in each step
+        self.pending.on &= self.batch is None and not config.refines  # batches and refinement wait for the device
         self._start()
 
     def _start(self) -> None:
@@ -444,7 +444,7 @@ class Trainer:
         return camera.from_origin(self.origin).before(self.near).along_rays(self.by_rays)
 
     def gaussians(self) -> Gaussians:
-        """Current model on the host, with the coefficients of the final SH degree; those not reached yet are zeros."""
+        """Current model on the host, with all SH coefficients; those of degrees that are not in use yet are zeros."""
         return self._of_rows(self.complete_parameters, 0, self.parameters.count)
 
     def rows(self) -> Callable[[int, int], Gaussians]:

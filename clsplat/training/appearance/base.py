@@ -23,8 +23,7 @@ class Appearance(Component):
         return type(self) is not Appearance
 
     def of_views(self, views: Sequence[int], step: int) -> Sequence[ViewPart]:  # noqa: ARG002
-        """Return the part (`ViewPart`) that learns and applies the appearance of each view of a step; () if nothing is
-        learnt.
+        """Return the part (`ViewPart`) that learns the appearance of each view of a step; () if nothing is learnt.
 
         views: indices of the step's views among the training views.
         step: number of the last of these views: how many views training has used, this one included.
@@ -54,11 +53,10 @@ class Appearance(Component):
         self.take(named("appearance/"))
 
     def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load the appearance from a checkpoint's arrays, whose names in `arrays` are without the prefix
-        "appearance/"."""
+        """Load the appearance from a checkpoint's arrays, by name without the prefix "appearance/"."""
 
     def write(self, run: Run) -> None:
-        """Write appearance.json, and `tables` as appearance.npz, into the run's folder. Nothing is written if nothing
-        is learnt."""
+        """Write appearance.json and, if there are `tables`, appearance.npz into the run's folder, if `record` has
+        content."""
         if (record := self.record()) is not None:
             run.write_appearance(record, self.tables())

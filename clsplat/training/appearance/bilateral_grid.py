@@ -102,7 +102,8 @@ class GridsOfAll(Appearance):
 
     @property
     def pixel_bytes(self) -> int:
-        """Bytes on the device per pixel of the largest picture; all grids' bytes are divided among its pixels."""
+        """Bytes on the device per pixel of the largest picture: of a transformed image, and a share of the grids'
+        arrays."""
         return device_bytes(self._count, [(view.camera.width, view.camera.height) for view in self._scene.views])
 
     def of_views(self, views: Sequence[int], step: int) -> list[ViewGrid]:
@@ -136,12 +137,12 @@ class GridsOfAll(Appearance):
         return {"grids": self._grids.grids.get()}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Grids and Adam's moments, as arrays of a checkpoint by name."""
+        """Grids and Adam's moments, as a checkpoint's arrays, by name."""
         held = {"grids": self._grids.grids, "first": self._grids.first, "second": self._grids.second}
         return saved(held)
 
     def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load grids and moments from a checkpoint's arrays, whose names in `arrays` are without the prefix
-        "appearance/". Raises ValueError for arrays of other photographs."""
+        """Load grids and moments from a checkpoint's arrays, by name without "appearance/". Raises ValueError for other
+        photographs."""
         values = loaded(self._device, arrays, ("grids", "first", "second"), self._grids.grids.shape)
         self._grids = Grids(**values)

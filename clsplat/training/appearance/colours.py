@@ -45,8 +45,8 @@ by this number.
 """
 
 START_GAIN_STEP_OCTAVES = 2.0**-10
-"""Step, in octaves, to which initial gains from colours of points are rounded, so that they do not depend on the order
-of summation."""
+"""Step, in octaves, to which initial gains from points are rounded, so that the order of summation does not change
+them."""
 
 VIEW_PULL_WEIGHT, NEIGHBOUR_PULL_WEIGHT = 0.02, 0.7
 """Weights of two terms of the loss's gradient that pull gains towards the gains from points, per octave of distance.
@@ -64,10 +64,10 @@ steps change a photograph's gain by 0.25 %.
 """
 
 GAIN_CHECKPOINT_ARRAYS = ("logs", "start", "first", "second", "gains")
-"""Fields of the photographs' `Gains` that a checkpoint stores. It also stores `told`: 1 for photographs with gains from
-points, else 0."""
+"""Fields of the photographs' `Gains` in a checkpoint. It also has `told`: 1 for photographs with gains from points,
+else 0."""
 LENS_CHECKPOINT_ARRAYS = ("logs", "first", "second")
-"""Fields of the lenses' `Gains` that a checkpoint stores."""
+"""Fields of the lenses' `Gains` in a checkpoint."""
 
 MIX_RATE_FRACTION = 0.3
 """Learning rate of the mixes of colour channels, as a fraction of the gains' rate. At the full rate, mixes absorb
@@ -109,8 +109,7 @@ class ViewColours(ViewPart):
         return replace(self, device=device, colours=colours, lenses=lenses, taken=taken)
 
     def values(self) -> NDArray[np.float32]:
-        """Return the entries of the photograph and its lens (1, entries) on the host, for `on` to upload. Gains are
-        factors."""
+        """Return the entries of the photograph and its lens (1, entries) on the host, for `on`. Gains are factors."""
         row, lens = self.taken.photograph, self.taken.lens
         gains, logs = (array.get_rows(row, row + 1) for array in (self.colours.gains, self.colours.logs))
         of_lens = [] if self.lenses is None else [self.lenses.logs.get_rows(lens, lens + 1)]
@@ -277,12 +276,12 @@ class ColoursOfAll(Appearance):
         return expected
 
     def _of_lens(self, view: View, entries: NDArray[np.float64]) -> dict[str, list[float]]:
-        """Return the entries of a view's lens by name, for appearance.json, and as "centre" the view's principal
-        point."""
+        """Return the entries of a view's lens by name, for appearance.json, and the view's principal point
+        ("centre")."""
         return _named(self._model.of_lens, entries) | {"centre": list(centre(view))}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Entries and Adam's moments of photographs and lenses, as arrays of a checkpoint by name."""
+        """Entries and Adam's moments of photographs and lenses, as a checkpoint's arrays, by name."""
         held = saved({name: getattr(self._gains, name) for name in GAIN_CHECKPOINT_ARRAYS})
         told = np.repeat(self._by_points[:, None], self._model.entries, axis=1)
         lenses = {} if self._lenses is None else vars(self._lenses)
@@ -290,8 +289,8 @@ class ColoursOfAll(Appearance):
         return {**held, "appearance/told": told.astype(np.float32), **saved(of_lenses)}
 
     def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load entries and moments from a checkpoint's arrays, whose names in `arrays` are without the prefix
-        "appearance/". Raises ValueError for arrays of other photographs."""
+        """Load entries and moments from a checkpoint's arrays, by name without "appearance/". Raises ValueError for
+        arrays of other photographs."""
         lenses = self._lenses and self._loaded_lenses(arrays)
         shape = (len(self._scene.train_views), self._model.entries)
         values = loaded(self._device, arrays, (*GAIN_CHECKPOINT_ARRAYS, "told"), shape)

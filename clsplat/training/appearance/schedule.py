@@ -14,7 +14,8 @@ from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.context import Device
 
 APPEARANCE_WARM_UP_STEPS, WARM_UP_START_FRACTION = 500, 0.01
-"""Length of the warm-up in steps (at most a tenth of all steps), and the fraction of the learning rate at its start."""
+"""Steps in which the learning rate rises (at most a tenth of all steps), and the fraction of the rate at their
+start."""
 FULL_LENGTH_STEPS = 10_000
 """Number of steps below which a training counts as short. In a training of this length, at the learning rate of the
 settings, a gain can change by about 2 octaves."""
@@ -42,11 +43,10 @@ def saved(held: Mapping[str, DeviceArray]) -> dict[str, NDArray[Any]]:
 def loaded(
     device: Device, arrays: Mapping[str, NDArray[Any]], names: Iterable[str], shape: tuple[int, ...]
 ) -> dict[str, DeviceArray]:
-    """Upload the arrays `names` of a checkpoint. Raises ValueError if one is missing, or has another shape because it
-    belongs to other photographs.
+    """Upload the arrays `names` (float32, of this shape) of a checkpoint. Raises ValueError for arrays of other
+    photographs.
 
     arrays: the checkpoint's arrays, by name without "appearance/".
-    shape: shape of each of these arrays, which are float32.
     """
     values = {}
     for name in names:

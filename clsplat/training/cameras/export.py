@@ -21,7 +21,7 @@ LENS_WARNING_FOCAL_LENGTHS = 0.1
 
 
 def keep_cameras(run: Run, scene: Scene, poses: Poses, lenses: RefinedLenses, along: Drift | None) -> None:
-    """Write the refined cameras, and warn of any camera with a large change.
+    """Write the refined cameras as a COLMAP model into the run's folder, and warn of any camera with a large change.
 
     along: drift of the refined poses, by which held-out poses and points are moved too; None without refined poses.
     """

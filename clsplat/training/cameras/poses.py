@@ -47,20 +47,18 @@ def fallen(reach: float, part: float, visits: float) -> float:
 
 
 def first_step(config: TrainConfig) -> int:
-    """Return the number of the last step before cameras are refined. Until then the model is too coarse to align
-    cameras with."""
+    """Return the number of the last step before cameras are refined. Until then the model is too coarse for it."""
     return min(500, config.iterations // 10)
 
 
 def checked_arrays(
     own: Mapping[str, NDArray[Any]], arrays: Mapping[str, NDArray[Any]], folder: str
 ) -> dict[str, NDArray[Any]]:
-    """Return copies of a checkpoint's arrays, after a check of shapes, types and finite values against the current
-    arrays.
+    """Return copies of a checkpoint's arrays, if their shapes and types are those of the current arrays.
 
     own: the current arrays, by name with the prefix `folder`.
     arrays: the checkpoint's arrays, by name without this prefix, as in the result.
-    Raises ValueError if an array is missing, or belongs to other views.
+    Raises ValueError if an array is missing, not finite, or belongs to other views.
     """
     values = {}
     for name, like in own.items():
@@ -162,7 +160,7 @@ class Poses:
         return degrees, np.array([np.linalg.norm(a.position - b.position) for a, b in pairs])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Poses and Adam's moments, as arrays of a checkpoint by name."""
+        """Poses and Adam's moments, as a checkpoint's arrays, by name."""
         if not self.on:
             return {}
         rotations = np.array([camera.rotation for camera in self.cameras])

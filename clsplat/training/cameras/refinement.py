@@ -117,8 +117,8 @@ Draw = Callable[[Camera], NDArray[Any]]
 
 
 class ValidationViews:
-    """At most MAX_GATE_VIEWS held-out views, by which the validation gate judges refined cameras. Their pixels are
-    decoded once."""
+    """At most MAX_GATE_VIEWS held-out views, by which the gate judges refined cameras. Their pixels are decoded
+    once."""
 
     def __init__(self, scene: Scene, device: Device, config: TrainConfig) -> None:
         self.views = spread(scene.test_views, MAX_GATE_VIEWS)
@@ -167,7 +167,7 @@ class Cameras(Component):
 
     @property
     def models(self) -> int:
-        """Number of arrays on the device for each parameter of the model (see `Component.models`)."""
+        """Number of arrays on the device for each parameter if cameras are refined, else 0 (see `Component.models`)."""
         return REFINEMENT_ARRAYS_PER_PARAMETER if self._config.refines else 0
 
     @property
@@ -226,7 +226,7 @@ class Cameras(Component):
             warn(warning)
 
     def refined_arrays(self) -> dict[str, NDArray[Any]]:
-        """Refined poses and lenses, as arrays of a checkpoint by name."""
+        """Refined poses and lenses, as a checkpoint's arrays, by name."""
         return self.poses.arrays() | self.lenses.arrays()
 
     def go_back(self, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -235,12 +235,11 @@ class Cameras(Component):
             part.load({key.removeprefix(name): array for key, array in arrays.items() if key.startswith(name)})
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Refined cameras and the gate's measurements, as arrays of a checkpoint by name."""
+        """Refined cameras and the gate's measurements, as a checkpoint's arrays, by name."""
         return self.refined_arrays() | self.gate.arrays()
 
     def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002
-        """Load refined cameras and the gate's measurements from a checkpoint. Raises ValueError for arrays of other
-        views."""
+        """Load refined cameras and the gate's measurements. Raises ValueError for a checkpoint of other views."""
         self.poses.load(named("poses/"))
         self.lenses.load(named("lenses/"))
         self.gate.load(named("gate/"), self.refined_arrays())

@@ -15,9 +15,9 @@ from clsplat.optimisation.density_rules import MarkRules
 
 
 class StatisticsNeeds(NamedTuple):
-    """Statistics that a strategy needs.
+    """Statistics that a strategy needs for each Gaussian.
 
-    gradients: True if it needs sums of screen-space gradients, numbers of views, and radii.
+    gradients: True if it needs sums of screen-space gradients, numbers of views that show the Gaussian, and radii.
     absolute: True if it needs gradients as sums of absolute values per pixel (AbsGS).
     contributions: True if it needs contributions to the pictures of an epoch.
     """
@@ -116,20 +116,19 @@ class Strategy:
     optional."""
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
-        """Return the statistics that step number `step` gathers. For step 0, return all that any step of the training
-        gathers."""
+        """Return the statistics that step number `step` gathers; for step 0, those that any step gathers."""
         raise NotImplementedError
 
     def is_due(self, step: int) -> bool:
-        """True if `before_step` may return a plan after `step` steps. Non-finite values are repaired before it is
-        called."""
+        """True if `before_step` may return a plan after `step` steps. Before the call, non-finite values are
+        repaired."""
         raise NotImplementedError
 
     def before_step(self, model: ModelState) -> RowPlan | None:
         """Return a plan after `model.step` steps, which is carried out when the next step begins."""
         raise NotImplementedError
 
-    def after_gradient(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002  # for subclasses
+    def after_gradient(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002
         """Return a plan at the end of step number `model.step`, after Adam's step."""
         return None
 

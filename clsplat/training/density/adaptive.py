@@ -28,7 +28,7 @@ SCORED_ROWS = 1 << 16
 
 
 class Adaptive(Strategy):
-    """Density control of Kerbl et al.: clone, split, prune, and reset opacities; with the extensions of
+    """Density control of Kerbl et al. (clone, split, prune, reset opacities), with the extensions of
     `DensityConfig`."""
 
     def __init__(self, config: TrainConfig) -> None:
@@ -251,7 +251,7 @@ def draw_offsets(quaternions: Float32 | Float64, log_scales: Float32 | Float64, 
 def rotated(quaternions: Float32 | Float64, offsets: Float64) -> Float64:
     """Rotate offsets (m, 3) by quaternions (m, 4) from the Gaussians' own axes to the world's."""
     q = quaternions.astype(np.float64)
-    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-300)  # for zero quaternions, which are never rendered
+    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-300)  # zero quaternions are never rendered
     w, axis = q[:, :1], q[:, 1:]
     twice = 2 * np.cross(axis, offsets)
     turned: Float64 = offsets + w * twice + np.cross(axis, twice)

@@ -95,8 +95,7 @@ class Mcmc(Strategy):
     def _moved(
         self, groups: dict[str, Float32], rows: NDArray[np.int64], left: NDArray[np.int64], rng: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Relocate the dead Gaussians in rows `left` to live ones, drawn in proportion to opacity, as Kheradmand et al.
-        do.
+        """Relocate the dead Gaussians in rows `left`, as published, to live ones, drawn in proportion to opacity.
 
         groups, rows: values by parameter group, and source rows, of the new model; both are updated in place.
         Returns the rows whose values change.
@@ -144,8 +143,8 @@ def wanted(config: DensityConfig, step: int, count: int) -> int:
 
 
 def strongest(scores: Float32, count: int) -> NDArray[np.int64]:
-    """Return the indices of the `count` largest scores, or of all positive scores if these are fewer, in rising
-    order."""
+    """Return the indices, in rising order, of the `count` largest scores, or of all positive scores if they are
+    fewer."""
     order = np.argsort(-scores, kind="stable")[:count]
     return np.sort(order[scores[order] > 0])
 

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitor of non-finite values: records elements that `adam` refused to update, and finds the stage at fault and a
-repair."""
+"""Monitor of non-finite values: records elements that `adam` refused, and finds the stage at fault and a repair."""
 
 from __future__ import annotations
 
@@ -55,7 +54,7 @@ class NonFiniteMonitor:
     """Monitor of non-finite values in a training.
 
     readback: device array of `Rasterizer.readback`, whose last values are the numbers of elements that `adam` refused.
-    last: the current step, once it has its loss.
+    last: record of the latest step whose loss has been launched.
     incidents: incidents that the training has not reported yet.
     latest: the latest incident.
     retries: counts of steps with non-finite values, and of returns to a checkpoint.
@@ -86,8 +85,7 @@ class NonFiniteMonitor:
         self.last = replace(last, others=(*last.others, view)) if last is not None and same else view
 
     def notice(self, refused: Sequence[int]) -> None:
-        """Record that `adam` refused elements in the last step, if any number in `refused` is not 0. Reads the step's
-        loss.
+        """Record a step in which `adam` refused elements. If there are any, the step's loss is read.
 
         refused: numbers of elements that `adam` did not update, one for each reason of `REFUSED`.
         """
@@ -99,8 +97,7 @@ class NonFiniteMonitor:
         self._noticed = (culprit or self.last, "loss" if culprit else stage, sum(refused))
 
     def look(self) -> None:
-        """Read from the device how many elements `adam` refused, without waiting for the next forward pass to read
-        it."""
+        """Read from the device how many elements `adam` refused, without waiting for the next forward pass."""
         self.notice([int(value) for value in self.readback.get()[-len(REFUSED) :]])
 
     def loss_failed(self) -> None:

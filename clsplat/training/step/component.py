@@ -75,8 +75,7 @@ class Component:
         """Return to the state after step number `step`. Later steps failed before they changed a Gaussian."""
 
     def complete_exactly(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
-        """Make those postponed changes to parameters and moments that give the same bits at whatever step they are
-        made."""
+        """Make those postponed changes to parameters and moments that give the same bits at any time."""
 
     def complete(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
         """Make all postponed changes to parameters and moments. Called when every row is needed."""
@@ -87,8 +86,8 @@ class Component:
         return parameters
 
     def rows_changed(self, groups: set[str]) -> None:
-        """Forget data that depends on the parameter groups with the names `groups`, whose values density control or a
-        repair has changed."""
+        """Forget data that depends on these parameter groups, because density control or a repair has changed
+        values."""
 
     def rows_moved(self, listed: DeviceArray | HostArray) -> None:
         """Move data of individual Gaussians along with their rows, or forget it.
@@ -97,12 +96,11 @@ class Component:
         """
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """State of the component, as arrays of a checkpoint by name."""
+        """State of the component, as a checkpoint's arrays, by name."""
         return {}
 
     def load(self, named: Named, step: int, count: int) -> None:
-        """Load the component's state from a checkpoint of `count` Gaussians after `step` views. Raises ValueError for
-        arrays of other views.
+        """Load the state from a checkpoint of `count` Gaussians after `step` views. Raises ValueError for other views.
 
         named: function from a prefix to the checkpoint's arrays whose names have this prefix.
         """

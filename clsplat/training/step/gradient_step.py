@@ -211,8 +211,7 @@ class GradientStep:
         frame: ForwardPass,
         terms: Sequence[LossTerm],
     ) -> Loss:
-        """Return the loss between a frame and the photograph `source`. of: parameters of the model, whose arrays the
-        frame uses."""
+        """Return the loss between a frame and the photograph `source`. of: parameters of the model in the frame."""
         work, size = self.rasterizer.work, (inputs.camera.width, inputs.camera.height)
         alpha = any(term.wants_alpha for term in terms)
         changed = any(part.changes_target for part in inputs.parts)
@@ -276,8 +275,8 @@ class GradientStep:
     def _parts(
         self, model: tuple[AnyGaussians, ...], projected: Projected, chunks: ChunkList | ChunkNumbers | None
     ) -> Iterator[tuple[int, tuple[DeviceGaussians, ...], Projected]]:
-        """Yield the parts of the model that are on the device at a time. Each is its first row, its rows of all arrays,
-        and their projection."""
+        """Yield the parts of the model that are on the device at a time: for each the number of its first row, its rows
+        of all arrays, and their projection."""
         work = self.rasterizer.work
         if isinstance(chunks, ChunkNumbers):
             for start, stop, part, slots in chunk_parts(work, chunks, *model, changes=True):
@@ -364,7 +363,7 @@ class GradientStep:
             part.update(gradient, self.rasterizer.readback)
 
     def update(self, rows: StepRows) -> None:
-        """Take Adam's step for some rows, and before it compute the gradient of projection if that is not done yet."""
+        """Take Adam's step for some rows. Before it, compute the gradient of projection, unless `rows` has it."""
         step, readback = self.adam_step, self.rasterizer.readback
         if rows.gradients is not None:
             parameters, first, second = rows.model
@@ -394,8 +393,7 @@ def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = Fa
 
 
 def slot_fields(needs: StatisticsNeeds, *, nearness: bool = False) -> SlotFields:
-    """Values that a step computes for each pair in addition to the plain gradients, because the density statistics need
-    them.
+    """Values that a step computes for each pair in addition to the plain gradients, for the density statistics `needs`.
 
     nearness: True if there is a depth loss, which needs the gradient with respect to nearness.
     """

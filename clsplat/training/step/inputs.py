@@ -91,8 +91,8 @@ class StepRows(ViewRows):
     """Rows of the model, with all that a step needs to change them.
 
     model: parameters of the rows, then the arrays that the step changes too: moments, or sums of gradients.
-    device: the device with the switches of the view's projection.
-    camera_array, slots: the step's camera, and the gradients of the rows' pairs.
+    device: the device, with the kernels for the view's projection.
+    camera_array, slots: the step's camera on the device, and the gradients of the rows' pairs.
     gradients: gradients with respect to the rows' parameters, if requested.
     by_lens: (rows, 4), gradients with respect to the view's lens.
     """
@@ -121,8 +121,8 @@ class ViewPart:
     """True if `compare` changes the photograph."""
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewPart:  # noqa: ARG002
-        """Return a copy of the part on another device, for `compare` and `gradient` there. values: result of the method
-        `values`."""
+        """Return a copy of the part on another device, for `compare` and `gradient` there. values: as from
+        `values()`."""
         return self
 
     def values(self) -> NDArray[np.float32]:
@@ -158,7 +158,8 @@ class ViewPart:
         """Change these rows just before Adam does. It is called twice if the sandbox tries the step first."""
 
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
-        """Take Adam's step for the part's own parameters. It changes nothing if the step's pass has stopped.
+        """Take Adam's step for the part's own parameters.
 
         own: gradient of these parameters.
+        readback: counts of the step's pass on the device. If they say that the pass has stopped, nothing changes.
         """

@@ -28,8 +28,7 @@ _GROUPS = tuple(PARAMETER_GROUPS)
 
 
 class LateAdam(Component):
-    """Component for late Adam: keeps the last step that each Gaussian took, and the tables by which missed steps are
-    taken.
+    """Component for late Adam: keeps the last step that each Gaussian took, and factors by which it takes missed steps.
 
     step: number of the last step launched.
     """
@@ -107,7 +106,7 @@ class LateAdam(Component):
         self._last = upload(self._device, self._last.get()[listed.get() & ~np.uint32(FRESH)])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Last steps of the Gaussians, and factors of missed steps, as arrays of a checkpoint by name."""
+        """Last steps of the Gaussians, and factors of missed steps, as a checkpoint's arrays, by name."""
         return {"late/last": self._last.get(), "late/missed": self._missed.factors.copy()}
 
     def load(self, named: Named, step: int, count: int) -> None:

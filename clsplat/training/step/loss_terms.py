@@ -11,8 +11,7 @@ from clsplat.training.step.inputs import ViewInputs
 
 
 def alpha_term(config: TrainConfig, inputs: ViewInputs) -> LossTerm | None:
-    """Return the alpha loss, if the settings ask for it and the view's photograph has alpha or a mask; otherwise
-    None."""
+    """Return the alpha loss; None if the settings ask for none, or if the photograph has neither alpha nor a mask."""
     wanted = config.alpha_loss > 0 and inputs.photograph.shape[2] > 3
     return AlphaTerm(config.alpha_loss) if wanted else None
 

@@ -41,7 +41,7 @@ class StepMonitor(StepProbe):
     changes: Callable[[], None]
 
     def forward(self, frame: ForwardPass) -> None:
-        """Record how many elements `adam` refused to update in the previous step. This pass has read that number."""
+        """Record how many elements `adam` refused in the previous step. This forward pass has read the number back."""
         self.monitor.notice(frame.refused)
         self.pending.seen(frame)
 

@@ -57,7 +57,7 @@ class _Step:
 
 
 def by_capacity(device: Device) -> bool:
-    """True if steps on this device are launched by capacity where possible. Raises InputError."""
+    """True if steps on this device are launched by capacity. Raises InputError for an invalid CLSPLAT_BY_CAPACITY."""
     return switched_on(BY_CAPACITY_VARIABLE) if os.environ.get(BY_CAPACITY_VARIABLE) else device.kind != "cpu"
 
 
@@ -134,7 +134,7 @@ class SpeculativeSteps:
             return run(0, None)
         if not room:
             self.settle()
-        # steps with exact counts alternate too, because their loss is read a step later
+        # steps with exact counts use the arrays of loss sums in turn too, because their loss is read a step later
         turn = self._turn = (self._turn + 1) % self.turns
         before, result = self._monitor.last, run(turn, PairCapacity(room, turn, self._appends) if room else None)
         if not room:

@@ -40,14 +40,14 @@ STEPS_PER_MEASUREMENT = 16
 """Steps after which the bounds of the chunks that took part in them are measured again. More steps widen the bounds,
 whose growth by each step is an upper limit; fewer wait more often for the device."""
 MAX_SHARE_IN_VIEW = 0.6
-"""Share of the chunks in view above which a step runs over the whole model. On a CPU, with 0.4 of a town in view, steps
-take 0.89 of the time of steps over the whole; with 0.78 of bonsai, 1.01."""
+"""Share of the chunks in view above which a step runs over the whole model. Steps over the chunks in view take 0.89 of
+the time of steps over the whole model with 0.4 of a town in view, and 1.01 with 0.78 of bonsai, on a CPU."""
 _BOUNDED_GROUPS = ("means", "log_scales")
 """Parameter groups that the bounds of a chunk are measured from."""
 _ROWS_AT_ONCE = 1 << 16
 """Number of rows of a checkpoint that are read at a time."""
 MOST_MISSED_STEPS = 1024
-"""Steps after which a chunk is caught up even if no view shows it."""
+"""Number of missed steps after which a chunk is caught up even if no view shows it."""
 
 
 def settings_of_whole_steps(config: TrainConfig) -> list[str]:
@@ -75,8 +75,7 @@ def streams_by_chunk(config: TrainConfig, device: Device, count: int) -> bool:
 
 
 def most_in_view(gaussians: Gaussians, cameras: Iterable[Camera], config: TrainConfig) -> int:
-    """Return the largest number of chunks that one of the cameras may show. gaussians: a model in the order of its
-    chunks."""
+    """Return the largest number of chunks that one camera may show. gaussians: a model in the order of its chunks."""
     bounds, still = ChunkBounds.measured(gaussians.means, gaussians.log_scales), np.zeros((2, 1))
     table, updates = BoundsTable(len(bounds)), MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT
     measured = np.hstack([bounds.lowest, bounds.highest, bounds.largest[:, None]])
@@ -155,8 +154,8 @@ class VisibleChunks(Component):
 
     @property
     def on(self) -> bool:
-        """True if steps may run over some chunks: they change the other Gaussians only by Adam, and read none of their
-        gradients."""
+        """True if steps may run over some chunks: they change all other Gaussians only by Adam, and need no gradient of
+        theirs."""
         return runs_by_chunk(self._config, self._rasterizer.device) and isfinite(self._step_limit)
 
     def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002
@@ -165,8 +164,7 @@ class VisibleChunks(Component):
 
     @property
     def reads_all_rows(self) -> bool:
-        """True if a chunk has missed so many steps that all chunks must be caught up before the next measurement of
-        bounds."""
+        """True if a chunk has missed so many steps that all are caught up before the next measurement of bounds."""
         return self.step - int(self._last.min(initial=self.step)) >= MOST_MISSED_STEPS
 
     def before_step(self, gaussians: AnyGaussians) -> None:
@@ -210,7 +208,7 @@ class VisibleChunks(Component):
         if count <= ORDERED_ROWS or self._since is None:
             return inputs
         (of_view,) = inputs
-        if self.step < step - 1:  # steps since then ran over all rows, because the model was small or streamed
+        if self.step < step - 1:  # the steps in between ran over all rows, as the model was small or streamed
             self._begin_table(step - 1, len(self._last))
         hidden, most_hidden = self._hidden_movement(step)
         numbers = self._shown(of_view, step, hidden, most_hidden)
@@ -230,19 +228,17 @@ class VisibleChunks(Component):
         return self._shown_by(camera, 1.0, *self._hidden_movement(self.step + 1))
 
     def _shown(self, of_view: ViewInputs, step: int, hidden: Movement, most: Float64) -> NDArray[np.uint32]:
-        """Numbers of the chunks that the view may show, in rising order. hidden, most: results of
-        `_hidden_movement`."""
+        """Chunks that the view may show, in rising order. hidden, most: results of `_hidden_movement`."""
         thinning = thinning_of(self._config, step)
         return self._shown_by(of_view.camera, 1.0 if thinning is None else thinning.factor, hidden, most)
 
     def _shown_by(self, camera: Camera, factor: float, hidden: Movement, most: Float64) -> NDArray[np.uint32]:
-        """Numbers of the chunks that a camera may show if opacities are multiplied by `factor`. Other arguments as for
-        `_shown`."""
+        """Chunks that a camera may show if opacities are multiplied by `factor`. Other arguments as for `_shown`."""
         picture = PictureBorders.of(camera, self._config.rasterizer, factor)
         return self._found.seen(partial(visible, picture), hidden, most, MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
 
     def _hidden_movement(self, step: int) -> tuple[Movement, Float64]:
-        """Limit the movement of means and log scales in the steps before number `step` that chunks have missed.
+        """Compute limits of the movement of means and log scales in missed steps, before step number `step`.
 
         Returns a function from chunk numbers (n,) to these limits (2, n), and the largest limits of all chunks (2, 1).
         """
@@ -261,8 +257,7 @@ class VisibleChunks(Component):
         return np.array([[rates["means"]], [rates["log_scales"]]])
 
     def _note_movement(self, chunks: NDArray[np.uint32], hidden: Float64) -> None:
-        """Widen the bounds of the chunks by `hidden` (2, n), the limit of their movement in the steps that they have
-        missed."""
+        """Widen the bounds of the chunks by `hidden` (2, n), the limit of their movement in missed steps."""
         self._found.move(chunks, hidden)
         self._unmeasured[chunks] = True
 
@@ -278,8 +273,7 @@ class VisibleChunks(Component):
         return Missed(numbers, last, step, table, first)
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep, chunks: _ChunksInView) -> PlacedChunks | None:
-        """Catch up the chunks that a step's view shows, and send their list to the device. A step that is repeated
-        gives the same bits."""
+        """Catch up the chunks that a step's view shows, and send their list. A repeated step gives the same bits."""
         if chunks.of_rows is not self._found:  # rows have moved since, and all have taken every step
             self._divide(_pool_of(model))
             everything = np.arange(len(self._last), dtype=np.uint32)
@@ -356,7 +350,7 @@ class VisibleChunks(Component):
         self._last, self.step = self._before[step + 1], step
 
     def complete_exactly(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
-        """Catch up all chunks."""
+        """Catch up all chunks: take the steps of Adam that they have missed."""
         missed = self._missed(np.arange(len(self._last), dtype=np.uint32), self.step)
         if missed is None:
             return
@@ -375,8 +369,8 @@ class VisibleChunks(Component):
         self._begin(listed.shape[0], self.step)
 
     def load(self, named: Named, step: int, count: int) -> None:
-        """Begin without bounds at a checkpoint. Its moments, which other decay rates may have made, limit the movement
-        in a step."""
+        """Begin without bounds at a checkpoint. Its moments, perhaps from other decay rates, limit the movement per
+        step."""
         first, second = named("first/"), named("second/")
         ratio = 0.0
         for begin in range(0, count, _ROWS_AT_ONCE):
@@ -390,7 +384,8 @@ class VisibleChunks(Component):
 
     @property
     def row_bytes(self) -> int:
-        """Bytes per Gaussian: those of a chunk in lists, bounds and missed steps, rounded up."""
+        """Bytes per Gaussian on the device: those of its chunk's bounds and missed steps, divided by the rows and
+        rounded up."""
         return 1 if self.on else 0
 
 

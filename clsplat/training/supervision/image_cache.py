@@ -59,8 +59,7 @@ class ImageCache:
         return self._kept[key]
 
     def bring(self, index: int, factor: float) -> NDArray[Any] | DeviceArray:
-        """Return the photograph of view `index` (see `load`): a device array if the device has memory for it, else the
-        host's.
+        """Return the photograph of view `index`: a device array if the device has memory for it, else the host's array.
 
         A photograph is uploaded once and stays, unless `ahead` has already sent it to the upload ring. A device that
         shares main memory reads the host's array.
