@@ -410,7 +410,10 @@ class TrainingSession:
         return model
 
     def make_steps(self, between: Between | None) -> None:
-        """Run the remaining steps, and the work that is due after them. After Ctrl-C, save and raise Interrupted."""
+        """Run the remaining steps and the work due after them. After Ctrl-C, save and raise Interrupted.
+
+        between: function called before each step.
+        """
         trainer, last = self.trainer, self.trainer.config.iterations
         with _interruption() as interrupted:
             while True:

@@ -37,7 +37,7 @@ from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.supervision.resolution import by_doubling
 
 NO_CACHE = "none"
-"""Value of --cache for no cache of decoded photographs."""
+"""Value of --cache that switches off the cache of decoded photographs."""
 POOL_QUARTERS = 3
 """Share of the model's chunks, in quarters, in the main memory beyond the minimum for photographs. The other quarter
 goes to more photographs."""
@@ -281,10 +281,10 @@ class MemoryPlanner:
         return made
 
     def plan_view(self, made: Plan, chunks: int) -> Plan:
-        """Plan for views of up to `chunks` chunks, if neither earlier views nor the plan `made` allow as many.
+        """Plan for views of up to `chunks` chunks. Returns `made` if it has room for as many, or an earlier view had as
+        many.
 
-        made: the present plan, by which the model is streamed by chunk. It is returned if it is enough, and stays valid
-            after a CapacityError.
+        made: the present plan, by which the model is streamed by chunk. It stays valid after a CapacityError.
         """
         device, rows = self._rasterizer.device, CHUNK_ROWS * chunks
         if rows <= max(self.rows_in_view, made.rows):
@@ -300,7 +300,7 @@ class MemoryPlanner:
         return wider
 
     def scratch_file(self, nbytes: int) -> Path | None:
-        """Return the path of a new scratch file; None if main memory has room (`HostMemory.scratch_file`)."""
+        """Return the path of a new scratch file for `nbytes` of chunks; None if main memory has room for them."""
         return self._memory.scratch_file(nbytes, self._photographs.host)
 
     @property

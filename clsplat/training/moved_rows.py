@@ -76,11 +76,12 @@ class MovedRows:
 
 
 def ordered(plan: RowPlan, parameters: AnyGaussians) -> MovedRows | None:
-    """Return the model's rows after a plan, in their order; None if no row moves. parameters: the model before the
-    plan.
+    """Return the rows that a plan leads to, in the order of the new model; None if no row moves.
 
     In a model with more than ORDERED_ROWS rows, new rows stand behind the rows that they were copied from. When a model
     exceeds this number for the first time, its rows are sorted along a curve through space (`space_order`).
+
+    parameters: the model before the plan.
     """
     listed, was_large = plan.listed, parameters.count > ORDERED_ROWS
     if plan.rows is not None:

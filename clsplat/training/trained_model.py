@@ -195,7 +195,7 @@ class TrainedModel:
         return manifest.arrays(), manifest.state()
 
     def saved_now(self) -> None:
-        """Update the scratch files after a checkpoint: slots that it names are not overwritten any more."""
+        """Update the scratch files after a checkpoint has been written: slots that it names are kept."""
         if self._files is not None:
             self._files.saved(self.store)
 
@@ -373,7 +373,8 @@ class TrainedModel:
             vars(self).pop(name, None)
 
     def _go_on_in(self, manifest: Manifest | None, coefficients: int) -> bool:
-        """Continue in the scratch file of a checkpoint. Returns False without one, or if this model cannot use it."""
+        """Continue in the scratch file of a checkpoint. Returns False if there is no such file, or this model cannot
+        use it."""
         if (
             manifest is None
             or dict(manifest.fields) != self._fields(coefficients)

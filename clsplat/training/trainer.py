@@ -309,7 +309,7 @@ class Trainer:
         self.mark = None
 
     def _watched_in_batch(self, needs: StatisticsNeeds, inputs: ViewInputs, step: GradientStep) -> StepProbe:
-        """Return the probe of a batch's view. Call it in the order of views: the first of an epoch begins the epoch."""
+        """Return the probe of a batch's view. Call it in the order of views: an epoch's first view resets totals."""
         if inputs.begins:
             self._turn_epoch()
         return self._watched(needs, inputs, step, self.step)
@@ -383,8 +383,8 @@ class Trainer:
         self.model.statistics = self.statistics.next_epoch()
 
     def _raise_sh_degree(self) -> None:
-        """Raise the SH degree in use. Higher bands have no arrays yet: their gradients, and so their steps, would be
-        zero."""
+        """Raise the SH degree in use, by adding coefficients of zero to the model. Before, higher bands have no arrays,
+        because their gradients would be zero."""
         every = self.config.sh_degree_every
         degree = min(self.step // every, self.config.sh_degree) if every > 0 else self.config.sh_degree
         coefficients = (degree + 1) ** 2
@@ -464,7 +464,7 @@ class Trainer:
         unless `monitor.retries.lost`."""
         self.repair(look=True)
         arrays, state = self._arrays()
-        if not self.model.changes_are_finite():  # also in Gaussians that no step has updated
+        if not self.model.changes_are_finite():  # examine also Gaussians that no step has updated
             repair = self.monitor.examine_all(self.model.by_kind(arrays))
             if repair is not None:
                 self._apply(repair)

@@ -19,7 +19,7 @@ class Appearance(Component):
 
     @property
     def on(self) -> bool:
-        """True if appearance is learnt: for every subclass."""
+        """True if appearance is learnt, as in every subclass."""
         return type(self) is not Appearance
 
     def of_views(self, views: Sequence[int], step: int) -> Sequence[ViewPart]:  # noqa: ARG002
@@ -56,7 +56,7 @@ class Appearance(Component):
         """Load the appearance from a checkpoint's arrays, by name without the prefix "appearance/"."""
 
     def write(self, run: Run) -> None:
-        """Write appearance.json and, if there are `tables`, appearance.npz into the run's folder, if `record` has
-        content."""
+        """Write `record` as appearance.json and `tables` as appearance.npz into the run's folder; nothing if `record`
+        is None."""
         if (record := self.record()) is not None:
             run.write_appearance(record, self.tables())

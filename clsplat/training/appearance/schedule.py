@@ -14,8 +14,8 @@ from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.context import Device
 
 APPEARANCE_WARM_UP_STEPS, WARM_UP_START_FRACTION = 500, 0.01
-"""Steps in which the learning rate rises (at most a tenth of all steps), and the fraction of the rate at their
-start."""
+"""Number of steps in which the learning rate rises at first (at most a tenth of all steps), and the fraction of the
+full rate with which it begins."""
 FULL_LENGTH_STEPS = 10_000
 """Number of steps below which a training counts as short. In a training of this length, at the learning rate of the
 settings, a gain can change by about 2 octaves."""

@@ -30,9 +30,9 @@ NEIGHBOUR_WEIGHT_STEP = 2.0**-20
 
 
 def places(cameras: Sequence[Camera]) -> Float64:
-    """Return a point (n, 6) for each camera, to measure distances between cameras: its centre, relative to the median
-    distance of the centres from their middle, and its viewing direction. Centres that all differ only by rounding
-    become equal."""
+    """Return a point (n, 6) for each camera, to measure distances between cameras: its position relative to the middle
+    of all positions, in units of the median distance from there, and its viewing direction. If all positions differ
+    only by rounding, they count as equal."""
     centres = np.array([camera.position for camera in cameras])
     apart = centres - np.median(centres, axis=0)
     extent = float(np.median(np.linalg.norm(apart, axis=1)))

@@ -47,7 +47,7 @@ def fallen(reach: float, part: float, visits: float) -> float:
 
 
 def first_step(config: TrainConfig) -> int:
-    """Return the number of the last step before cameras are refined. Until then the model is too coarse for it."""
+    """Return the last step number before cameras are refined: until then the model is too coarse to align them."""
     return min(500, config.iterations // 10)
 
 

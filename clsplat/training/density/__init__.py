@@ -89,9 +89,9 @@ class RowPlan:
     fresh: (m,) bool, True for rows whose moments start at zero and whose contributions are unknown.
     listed: list of rows from the model's marker, in place of `rows` and `fresh`.
     values: by parameter group, the indices (k,) of new rows whose values change, and their new values (k, ...).
-    halves: function of the split Gaussians' groups `halved` and a bool. It returns new values of one half of each: of
-        the first half if the bool is False, of the second if True. It is called for some Gaussians at a time, first
-        with False for all.
+    halves: function that computes values of one half of each split Gaussian. Its arguments are the groups `halved` of
+        some split Gaussians, and False for first or True for second halves. It is called for all first halves before
+        the second.
     halved: parameter groups that `halves` reads.
     changes: by parameter group, a function from values of some rows to the new values of these rows.
     restarted: groups whose moments start at zero in every row.

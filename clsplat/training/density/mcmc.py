@@ -95,7 +95,8 @@ class Mcmc(Strategy):
     def _moved(
         self, groups: dict[str, Float32], rows: NDArray[np.int64], left: NDArray[np.int64], rng: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Relocate the dead Gaussians in rows `left`, as published, to live ones, drawn in proportion to opacity.
+        """Relocate the dead Gaussians in rows `left` to live ones, drawn in proportion to opacity (Kheradmand et al.
+        2024).
 
         groups, rows: values by parameter group, and source rows, of the new model; both are updated in place.
         Returns the rows whose values change.

@@ -85,7 +85,7 @@ class NonFiniteMonitor:
         self.last = replace(last, others=(*last.others, view)) if last is not None and same else view
 
     def notice(self, refused: Sequence[int]) -> None:
-        """Record a step in which `adam` refused elements. If there are any, the step's loss is read.
+        """Record the last step if `adam` refused elements in it. The loss of this step is then read.
 
         refused: numbers of elements that `adam` did not update, one for each reason of `REFUSED`.
         """

@@ -121,8 +121,7 @@ class ViewPart:
     """True if `compare` changes the photograph."""
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewPart:  # noqa: ARG002
-        """Return a copy of the part on another device, for `compare` and `gradient` there. values: as from
-        `values()`."""
+        """Return a copy of the part on another device, for `compare` and `gradient` there. values: from `values()`."""
         return self
 
     def values(self) -> NDArray[np.float32]:

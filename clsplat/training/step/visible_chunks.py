@@ -52,7 +52,8 @@ MOST_MISSED_STEPS = 1024
 
 def settings_of_whole_steps(config: TrainConfig) -> list[str]:
     """Return the options in use, such as "--batch", that make each step run over the whole model. With them, a step
-    changes Gaussians that the view does not show by more than Adam's step, or reads their gradients."""
+    reads the gradients of Gaussians that the view does not show, or changes these Gaussians in other ways than by
+    Adam."""
     wanted = {
         "--density.growth mcmc": config.density.growth == "mcmc",
         "--antialiased": config.antialiased,
@@ -154,8 +155,8 @@ class VisibleChunks(Component):
 
     @property
     def on(self) -> bool:
-        """True if steps may run over some chunks: they change all other Gaussians only by Adam, and need no gradient of
-        theirs."""
+        """True if steps may run over some chunks: they change other Gaussians only by Adam, and read none of their
+        gradients."""
         return runs_by_chunk(self._config, self._rasterizer.device) and isfinite(self._step_limit)
 
     def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002

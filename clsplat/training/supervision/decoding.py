@@ -63,7 +63,7 @@ class Decoder:
         return max(int(camera.width / factor), 1), max(int(camera.height / factor), 1)
 
     def pixels(self, index: int, factor: float, *, keeps: bool) -> dict[float, NDArray[Any]]:
-        """Return pixels (H, W, C) of view `index` at 1/`factor` of its size, by divisor of the size.
+        """Decode view `index` at 1/`factor` of its size. Returns pixels (H, W, C), keyed by the divisor of the size.
 
         keeps: True to return larger sizes too, which the training needs later, if the file has to be decoded.
         Raises PhotographError.

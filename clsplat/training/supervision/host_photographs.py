@@ -135,7 +135,7 @@ class HostPhotographs:
         self._tell()
 
     def _made(self, key: Key) -> dict[float, NDArray[Any]]:
-        """Read a photograph from the disk cache, or decode it, and keep it. Returns its pixels by divisor."""
+        """Read a photograph from the disk cache, or decode it, and keep it. Returns the result of `Decoder.pixels`."""
         index, factor = key
         images = self.decoder.pixels(index, factor, keeps=not self.bounded)
         with self._lock:
