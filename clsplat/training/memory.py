@@ -236,7 +236,7 @@ class MemoryPlanner:
 
         Only an even sample of the views is counted. The number is 0 if device memory has no limit, or if a model of
         this size is never streamed by chunk.
-        local: function that converts a camera from world coordinates to those of the model.
+        local: function that converts a camera from world to model coordinates.
         initial: the model at the start, in the order of its chunks.
         """
         device, views = self._rasterizer.device, self._scene.views

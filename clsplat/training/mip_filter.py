@@ -62,7 +62,7 @@ class MipFilter(Component):
         self._least = None
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The scales' lower limits, as an array of a checkpoint, by name."""
+        """The scales' lower limits, keyed by their name in a checkpoint."""
         return {} if self._least is None else {"sampling/least": self._least.get()}
 
     def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002

@@ -373,8 +373,7 @@ class TrainedModel:
             vars(self).pop(name, None)
 
     def _go_on_in(self, manifest: Manifest | None, coefficients: int) -> bool:
-        """Continue in the scratch file of a checkpoint. Returns False if there is no such file, or this model cannot
-        use it."""
+        """Continue in the scratch file of a checkpoint. Returns False if there is none that this model can use."""
         if (
             manifest is None
             or dict(manifest.fields) != self._fields(coefficients)
@@ -392,7 +391,7 @@ class TrainedModel:
         return True
 
     def _use(self, pool: ChunkPool, coefficients: int) -> None:
-        """Set parameters, moments and statistics to those of a pool's store."""
+        """Take parameters, moments and statistics from the store of `pool` from now on."""
         if self._files is not None and pool.store.path is not None:
             self._files.follow(pool.store)
         self._pool, pool.before_view = pool, self._before_view

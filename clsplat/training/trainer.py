@@ -283,7 +283,7 @@ class Trainer:
         return self.photographs.load(view, self.sizes.factor(self.step))
 
     def _view_inputs(self, place: int) -> ViewInputs:
-        """Inputs of the next view. place: index of the view among those of the step."""
+        """Inputs of the next view. place: index of the view within the step."""
         begins, view = not self.position.queue, self._next_view()
         inputs = self.loader.inputs(view, self.position, place, begins=begins)
         self.background = inputs.background
@@ -433,7 +433,7 @@ class Trainer:
         self._rearrange(self.strategy.at_end(self._state()))
 
     def close(self) -> None:
-        """End the threads of a batch and those that read photographs, and close the model's scratch file."""
+        """End the threads of a batch and of reading photographs, and close the model's scratch file."""
         self.photographs.host.close()
         self.model.close()
         if self.batch is not None:

@@ -67,9 +67,9 @@ class ViewGrid(ViewPart):
     def gradient(
         self, work: Workspace, image: DeviceArray, gradient: DeviceArray, size: tuple[int, int]
     ) -> DeviceArray:
-        """Compute the loss's gradient with respect to the grid, and return it. In place, change `gradient` from the
-        gradient with respect to the result of `compare` to the one with respect to its input `image`.
+        """Compute the loss's gradient with respect to the grid, and return it.
 
+        gradient: with respect to the result of `compare` at first; then, in place, with respect to `image`.
         At the grid's first step, the sandbox also tries the kernels of `update` here, before anything changes.
         """
         of_view = (self.grids, self.view, image, gradient)
@@ -137,7 +137,7 @@ class GridsOfAll(Appearance):
         return {"grids": self._grids.grids.get()}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Grids and Adam's moments, as a checkpoint's arrays, by name."""
+        """Grids and Adam's moments, keyed by their names in a checkpoint."""
         held = {"grids": self._grids.grids, "first": self._grids.first, "second": self._grids.second}
         return saved(held)
 

@@ -191,8 +191,8 @@ class ColoursOfAll(Appearance):
 
     @cached_property
     def _gains(self) -> Gains:
-        """Entries of all training photographs, with gains that begin at those from points or EXIF. They are computed on
-        first use, because sampling the photographs takes time, and not at all if a checkpoint is loaded before."""
+        """Entries of all training photographs. Their gains begin at gains from points or from EXIF. They are computed
+        on first use, because sampling the photographs takes time, and not at all if a checkpoint is loaded before."""
         scene = self._scene
         curve = CODED_OCTAVES_PER_LIGHT_OCTAVE if photos_space(view.path for view in scene.views) == SRGB else 1.0
         by_exif = curve * np.nan_to_num(_from_mean(self._told, self._told))
@@ -243,8 +243,8 @@ class ColoursOfAll(Appearance):
         """Return the content of appearance.json: the learnt entries by the names of the photographs.
 
         Nothing is learnt about held-out photographs. If EXIF gives the exposure of such a photograph, its gains follow
-        from a linear fit of gains to exposures over the training photographs. The entries of its lens are the learnt
-        ones, or the mean of all lenses if no training photograph has this lens.
+        from a linear fit of gains to exposures over the training photographs. Its lens has the learnt entries, or the
+        mean of all lenses if no training photograph has this lens.
         """
         entries, scene, model = self._gains.logs.get().astype(np.float64), self._scene, self._model
         photographs = {
@@ -263,7 +263,7 @@ class ColoursOfAll(Appearance):
         return {"kind": self._config.appearance, "photographs": photographs, "held_out": held_out}
 
     def _expected(self, logs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Predict the log2 gains (held-out photographs, 3) of held-out photographs from their EXIF exposures.
+        """Predict the log2 gains (n, 3) of the n held-out photographs from their EXIF exposures.
 
         logs: (training photographs, 3), learnt log2 gains.
         """
@@ -281,7 +281,7 @@ class ColoursOfAll(Appearance):
         return _named(self._model.of_lens, entries) | {"centre": list(centre(view))}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Entries and Adam's moments of photographs and lenses, as a checkpoint's arrays, by name."""
+        """Entries and Adam's moments of photographs and lenses, keyed by their names in a checkpoint."""
         held = saved({name: getattr(self._gains, name) for name in GAIN_CHECKPOINT_ARRAYS})
         told = np.repeat(self._by_points[:, None], self._model.entries, axis=1)
         lenses = {} if self._lenses is None else vars(self._lenses)

@@ -80,7 +80,7 @@ class RefinedLenses:
         return float(np.abs(self.changes).max()) if self.on else 0.0
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Changes of the lenses and Adam's moments, as a checkpoint's arrays, by name."""
+        """Changes of the lenses and Adam's moments, keyed by their names in a checkpoint."""
         if not self.on:
             return {}
         moments = {"lenses/first": self._first, "lenses/second": self._second, "lenses/visits": self._visits}

@@ -160,7 +160,7 @@ class Poses:
         return degrees, np.array([np.linalg.norm(a.position - b.position) for a, b in pairs])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Poses and Adam's moments, as a checkpoint's arrays, by name."""
+        """Poses and Adam's moments, keyed by their names in a checkpoint."""
         if not self.on:
             return {}
         rotations = np.array([camera.rotation for camera in self.cameras])

@@ -211,7 +211,7 @@ class Cameras(Component):
 
         Held-out views are measured twice, with their given poses, and with these poses moved by the drift of the
         refined poses. The better result counts. The given poses are right if only some training poses were wrong, and
-        the moved ones if the whole world has drifted.
+        the moved poses are right if the whole world has drifted.
 
         draw, look: as for `ValidationViews.psnr`.
         """
@@ -226,7 +226,7 @@ class Cameras(Component):
             warn(warning)
 
     def refined_arrays(self) -> dict[str, NDArray[Any]]:
-        """Refined poses and lenses, as a checkpoint's arrays, by name."""
+        """Refined poses and lenses, keyed by their names in a checkpoint."""
         return self.poses.arrays() | self.lenses.arrays()
 
     def go_back(self, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -235,7 +235,7 @@ class Cameras(Component):
             part.load({key.removeprefix(name): array for key, array in arrays.items() if key.startswith(name)})
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Refined cameras and the gate's measurements, as a checkpoint's arrays, by name."""
+        """Refined cameras and the gate's measurements, keyed by their names in a checkpoint."""
         return self.refined_arrays() | self.gate.arrays()
 
     def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002

@@ -159,7 +159,7 @@ class CameraGate:
         return {"measured": measured, "best": self.best[0], "ended": self.ended}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Measurements and the best cameras, as a checkpoint's arrays, by name."""
+        """Measurements and the best cameras, keyed by their names in a checkpoint."""
         if not self.measured:
             return {}
         ended = np.array([-1 if self.ended is None else self.ended], np.int64)

@@ -96,7 +96,7 @@ class Component:
         """
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """State of the component, as a checkpoint's arrays, by name."""
+        """Arrays of the component's state, keyed by their names in a checkpoint."""
         return {}
 
     def load(self, named: Named, step: int, count: int) -> None:

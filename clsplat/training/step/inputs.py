@@ -42,14 +42,15 @@ class ChunksInView(Protocol):
 
 @dataclass(eq=False)
 class ViewInputs:
-    """Inputs of a view in a step. Not frozen, because frozen ones take longer to make, and each step makes one.
+    """Inputs of a view in a step. The dataclass is not frozen, because each step makes one, and frozen ones take
+    longer.
 
     view: the view's index among the training views.
     photograph: (H, W, 3 to 5): colours, then alpha and mask.
     camera: the view's camera, of the photograph's size.
     begins: True if an epoch begins with this view.
     kept: number of pixels that the view's mask keeps; None without a mask.
-    depth: depth loss with the view's known depths; None without.
+    depth: depth loss with the view's known depths; None if they are not known.
     area: number of pixels at full resolution per pixel of `photograph`.
     place: the view's position in the step.
     parts: the parts that components have in the view.
@@ -73,8 +74,8 @@ class ViewInputs:
 
 @dataclass(frozen=True, eq=False)
 class ViewRows:
-    """Rows [start, stop) of a step that are on the device at once. The rows of a step are those of the whole model or,
-    if a step runs over some chunks, those of the chunks one after the other.
+    """Rows [start, stop) of a step that are on the device at once. The step's rows are all rows of the model, or all
+    rows of some chunks, one chunk after the other.
 
     projected: projection of the rows [start, stop) into the step's view.
     screen: screen-space gradients of these rows. They may be undefined until the kernel has run that changes the rows.

@@ -106,12 +106,12 @@ class LateAdam(Component):
         self._last = upload(self._device, self._last.get()[listed.get() & ~np.uint32(FRESH)])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Last steps of the Gaussians, and factors of missed steps, as a checkpoint's arrays, by name."""
+        """Arrays of the Gaussians' last steps and of missed steps' factors, keyed by their names in a checkpoint."""
         return {"late/last": self._last.get(), "late/missed": self._missed.factors.copy()}
 
     def load(self, named: Named, step: int, count: int) -> None:
-        """Continue from a checkpoint's arrays. If the checkpoint has none of these arrays, continue as if all rows had
-        taken every step.
+        """Continue from a checkpoint's arrays. If it has no arrays of late Adam, continue as if all rows had taken
+        every step.
 
         Raises ValueError for arrays of another model or step.
         """
@@ -137,5 +137,5 @@ class _ShownRows(ViewPart):
     changes_rows = True
 
     def before_adam(self, rows: StepRows, step: AdamStep) -> None:
-        """Settle those of the rows that the view shows."""
+        """Settle the rows that the view shows, among these rows."""
         self.late.settle_shown(rows, step)

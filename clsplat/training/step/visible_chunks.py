@@ -134,7 +134,7 @@ class VisibleChunks(Component):
         self._unmeasured = np.ones(chunks, np.bool_)
         self._since: int | None = None
         """Steps since the last measurement; None if there is none."""
-        most = 2 * (MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)  # twice the need: rows are seldom moved to the front
+        most = 2 * (MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)  # twice the need, so that rows are seldom moved
         self._table = np.zeros((most, 2 + len(PARAMETER_GROUPS)), np.float32)
         """The steps from `_first_step` on, of which chunks may have missed some (`stages.catch_up.step_table`)."""
         self._begin_table(step, chunks)
@@ -385,7 +385,7 @@ class VisibleChunks(Component):
 
     @property
     def row_bytes(self) -> int:
-        """Bytes per Gaussian on the device: those of its chunk's bounds and missed steps, divided by the rows and
+        """Bytes per Gaussian on the device: the bytes of a chunk's bounds and missed steps, divided by its rows,
         rounded up."""
         return 1 if self.on else 0
 

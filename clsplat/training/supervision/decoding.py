@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decoding of photographs to the sizes that the warm-up needs, or reading of decoded ones from the cache on the disk.
+"""Decoding of photographs to the sizes that the warm-up needs, or reading of their decoded pixels from the disk cache.
 Policy only: no device."""
 
 from __future__ import annotations

@@ -59,8 +59,7 @@ class HostPhotographs:
 
     @cached_property
     def least(self) -> int:
-        """Smallest possible limit in bytes: for the views of a step, one view that is read ahead, and the decoding of
-        one."""
+        """Smallest possible limit in bytes: for the views of a step, one view that is read ahead, and decoding."""
         return self._needed(1)
 
     @cached_property

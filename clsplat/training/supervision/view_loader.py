@@ -23,7 +23,7 @@ class ViewLoader:
     """Loader of the inputs of a step's views.
 
     refined: function that returns the current camera of a training view, by index.
-    local: function that converts a camera from world coordinates to those of the model.
+    local: function that converts a camera from world to model coordinates.
     """
 
     def __init__(
