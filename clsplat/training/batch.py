@@ -53,7 +53,7 @@ a view's gradient.
 
 
 def scaled(config: OptimiserConfig, batch: int) -> OptimiserConfig:
-    """Adam's constants for steps of `batch` views: moments decay as much per view as with one view per step.
+    """Return Adam's settings for steps of `batch` views: moments decay as much per view as in steps of one view.
 
     Zhao et al. 2024, "On Scaling Up 3D Gaussian Splatting Training", section 4.
     """
@@ -62,10 +62,10 @@ def scaled(config: OptimiserConfig, batch: int) -> OptimiserConfig:
 
 
 def scaled_rates(rates: Mapping[str, float], batch: int) -> dict[str, float]:
-    """Learning rates for steps of `batch` views.
+    """Return the learning rates for steps of `batch` views, from `rates` for steps of one view.
 
     Gradients of different views are nearly independent, so their sum grows with the root of their number. Adam divides
-    by that growth, and the rates restore it (Zhao et al. 2024, section 4).
+    by the sum's size, which cancels this growth, so the rates are multiplied by the root (Zhao et al. 2024, section 4).
     """
     return {group: rate * sqrt(batch) for group, rate in rates.items()}
 
@@ -92,9 +92,9 @@ class Losses:
 class _AddedView(GradientStep):
     """Step of one view that adds the view's gradients to the batch's sums, in place of Adam.
 
-    Its `model` consists of the parameters and the batch's sums of gradients, without moments.
+    The `model` that it runs on consists of the parameters and the batch's sums of gradients, without moments.
 
-    own: gradients of each view's parts, by the view's position in the batch.
+    own: gradients of each view's parts (`ViewPart`), by the view's position in the batch.
     noise: noise that the batch adds after its last view.
     """
 
@@ -145,7 +145,7 @@ class _RemoteView(GradientStep):
         self.own.extend(None if gradient is None else gradient.get() for gradient in own)
 
     def update(self, rows: StepRows) -> None:
-        """Copy the rows' results to the host."""
+        """Copy the results for these rows to the host: their gradients, and the values that density control needs."""
         assert rows.gradients is not None, "the batch asks for them"
         on_device = {
             "tile_counts": rows.projected.tile_counts,
@@ -182,7 +182,11 @@ class Replica:
         self.photographs.follow(plan.photographs)
 
     def take(self, values: Mapping[str, NDArray[np.float32]], coefficients: int) -> None:
-        """Upload parameters from the host: `values` by group, of a model with `coefficients` SH coefficients."""
+        """Upload the model's parameters from the host.
+
+        values: parameters by group. A group that is left out keeps its values.
+        coefficients: number of SH coefficients of the model.
+        """
         assert self.plan is not None, "planned before the first step"
         count = self.plan.need.gaussians
         if self.parameters is None or self.parameters.coefficients != coefficients:
@@ -232,7 +236,8 @@ class Replica:
         return ViewOutcome(arrays, gradients, view.run((parameters,), here, StepProbe(), room, reads_loss=True), own)
 
     def _host(self, place: int, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> NDArray[Any]:
-        """Host array that is reused from step to step, because fresh pages would take as much time as the copy."""
+        """Return the host array for result `name` of this device's view number `place` of the batch. It is reused from
+        step to step, because allocating fresh memory would take as much time as the copy."""
         held = self._room.get((place, name))
         if held is None or held.shape != shape:
             held = self._room[place, name] = np.empty(shape, dtype)
@@ -253,7 +258,7 @@ class Batch:
         devices = (rasterizer.device, *further)
         if len({device.queue.int_ptr for device in devices}) < len(devices):
             raise InputError(
-                f"several devices to train on: got {', '.join(device.name for device in devices)}; two of them share a "
+                f"cannot train on {', '.join(device.name for device in devices)} together: two of them share a "
                 "queue and kernels; open each device on its own, because each needs a thread of its own"
             )
         self.rasterizer, self.photographs, self.config = rasterizer, photographs, config
@@ -263,7 +268,8 @@ class Batch:
         self._room: dict[str, NDArray[np.float32]] = {}
 
     def follow(self, plans: Sequence[Plan]) -> None:
-        """Use at most the memory that `plans` allow, one for each further device. Arrays of earlier plans are freed."""
+        """Use at most the device memory that `plans` allow: a plan for each further device. Frees arrays of earlier
+        plans."""
         self._sums = self._sent = None
         self._room.clear()
         for replica, plan in zip(self.replicas, plans, strict=True):
@@ -334,7 +340,7 @@ class Batch:
         return Losses(tuple(losses))
 
     def _sums_for(self, device: Device, parameters: AnyGaussians) -> AnyGaussians:
-        """Arrays for the sums of gradients. They contain zeros, which `adam` leaves in them after each step."""
+        """Return arrays for the sums of gradients. They contain zeros, as `adam` sets them to zero after each use."""
         count, coefficients, sums = parameters.count, parameters.coefficients, self._sums
         if sums is None or (sums.count, sums.coefficients) != (count, coefficients):
             del sums
@@ -347,7 +353,8 @@ class Batch:
         return sums
 
     def _send(self, parameters: AnyGaussians) -> list[Future[None]]:
-        """Begin to send the parameters to the further devices, without the higher SH bands if these are unchanged."""
+        """Begin to send the parameters to the further devices, without the higher SH bands if these are unchanged.
+        Returns the transfers, to be waited for."""
         if not self.replicas:
             return []
         groups = [group for group in PARAMETER_GROUPS if group != "sh_rest" or self._sent is not parameters]
@@ -372,9 +379,10 @@ class Batch:
         step: _AddedView,
         probes: Callable[[ViewInputs, GradientStep], StepProbe],
     ) -> Loss:
-        """Run the step of a view on the first device.
+        """Run the step of a view on the first device, and return its loss.
 
         model: parameters, and sums of gradients.
+        probes: as in `run`.
         """
         gradients = view_gradients(self.rasterizer.work, model[0])
         inputs = replace(inputs, photograph=self.photographs.bring(inputs.view, factor))
@@ -383,11 +391,11 @@ class Batch:
     def _take(
         self, parameters: AnyGaussians, sums: AnyGaussians, outcome: ViewOutcome, step: _AddedView, probe: StepProbe
     ) -> Loss:
-        """Add a further device's results of a view to the sums. They are first copied to scratch arrays on the first
-        device.
+        """Add the gradients of a view that a further device computed to the sums, and its other results to the density
+        statistics, by way of scratch arrays on the first device. Returns the view's loss.
 
-        parameters: the model's parameters. If they are in a pool, the density statistics of the same rows are on the
-            device too.
+        parameters: the model's parameters. If they are streamed from a pool, each of its parts brings the density
+            statistics of its rows to the device.
         """
         device, work = step.device, self.rasterizer.work
         probe.loss(outcome.loss)
@@ -405,7 +413,8 @@ class Batch:
 
 
 def _brought(work: Workspace, device: Device, name: str, values: NDArray[Any]) -> DeviceArray:
-    """Copy an array from the host to this device. The host's array must stay unchanged until the next step."""
+    """Copy `values` from the host to a scratch array `name` on the device. A device that shares main memory uses the
+    values in place, so they must not change until the next step."""
     if device.shares_memory and values.size:
         return shared(device, values)
     array = work.array(name, values.shape, values.dtype.type)

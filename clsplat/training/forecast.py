@@ -30,15 +30,16 @@ decays because small Gaussians fall below the gradient threshold."""
 RECENT_DENSIFICATIONS = 4
 """Number of latest densifications from which the growth by the next ones is predicted."""
 PRIOR_GROWTH_WEIGHT = 0.5
-"""Weight of the prior: it counts as much as this many measured densifications at the peak."""
+"""Weight of the prior of the peak growth: it counts as much as this many measured densifications at the peak."""
 PRIOR_COSTS = np.array([8000.0, 0.6, 1.2, 80_000.0])
-"""Prior times of a step, a pixel, a Gaussian, and reading a photograph, relative to each other, as on CPUs."""
+"""Prior times, relative to each other, as on CPUs: of a step, and for each pixel, Gaussian, and photograph that is
+read."""
 PRIOR_COST_WEIGHT_SECONDS = 0.03
 """Weight of the prior costs: they count as much as this many measured seconds."""
 OUTLIER_FACTOR = 4.0
 """Steps that took over this many times the usual time are left out, because a kernel was probably built then."""
 PACE_WINDOW_SECONDS = 60.0
-"""Time in seconds before the last report from which the machine's current speed is taken."""
+"""Length in seconds of the period before the last report over which the machine's current speed is measured."""
 
 
 class TimedStep(Protocol):
@@ -53,8 +54,8 @@ class Span(NamedTuple):
     """Consecutive steps with one picture size and one number of Gaussians.
 
     factor: divisor of the photographs' width and height (`Sizes`).
-    reads: number of photographs that are read.
-    seconds: duration, if the steps are done.
+    reads: number of photographs that these steps read from files, on average if the steps are still to come.
+    seconds: measured duration of the steps; 0 if they are still to come.
     """
 
     factor: float
@@ -67,7 +68,7 @@ class Span(NamedTuple):
 class Forecast:
     """Forecast of the seconds until the end of a training. Call `see` with each report, in order.
 
-    photographs: number of photographs to train on. Each is read when it is first seen, for all sizes.
+    photographs: number of photographs to train on. Each is read once, at its first use, for all sizes.
     pixels: number of pixels of a photograph at full size.
     """
 
@@ -140,7 +141,10 @@ class Forecast:
         return spans
 
     def _grown(self, density: DensityConfig, step: int, number: float, height: float, peak: int) -> float:
-        """Number of Gaussians after a densification, with `number` before it. height, peak: results of `_height`."""
+        """Number of Gaussians after the densification at step `step`, with `number` before it.
+
+        height, peak: results of `_height`.
+        """
         most = max(density.max_gaussians, number)
         if density.growth == "mcmc":
             return min(wanted(density, step, max(round(number), 1)), most)
@@ -164,7 +168,7 @@ class Forecast:
     def _cost(self) -> tuple[Float64, float]:
         """Fit the time of a step. Returns the seconds that a unit of each of the `_amounts` takes (4,), and the factor
         by which recent steps took longer than these seconds predict."""
-        spans = self.spans[1:] or self.spans  # the first span includes building kernels
+        spans = self.spans[1:] or self.spans  # in the first span, kernels were built too
         parts = np.array(self.amounts[-len(spans) :])
         steps, seconds = np.array([(span.steps, span.seconds) for span in spans]).T
         rates = seconds / np.maximum(steps * (parts @ PRIOR_COSTS), 1e-12)
@@ -187,7 +191,7 @@ class Forecast:
 def _course(density: DensityConfig, step: int, peak: int = 0) -> float:
     """Growth of the model by the densification at step `step`, as a fraction of the peak growth (the paper's rule).
 
-    peak: step up to which the growth does not decay, even if it would by the density settings alone.
+    peak: step of the largest growth so far. Before it, growth does not decay, whatever the density settings say.
     """
     index = step // density.every - density.start // density.every - 1
     if index < len(GROWTH_RAMP):

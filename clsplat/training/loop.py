@@ -51,7 +51,7 @@ REPORT_EVERY = 10
 rest of the step."""
 GROWTH_LIMIT_FRACTION = 0.97
 """Fraction of --density.max-gaussians from which growth counts as limited. It is below 1 because some Gaussians are
-pruned after the limit was reached."""
+pruned after the limit is reached."""
 OVERFITTING_DB = 0.2
 """Fall of the held-out views' mean PSNR, in dB, from which a warning reports overfitting.
 
@@ -106,7 +106,7 @@ def _interruption() -> Iterator[Callable[[], int]]:
 
 
 class TrainingSession:
-    """One call of `clsplat.train`: the trainer, its run (None without), and the training time in seconds."""
+    """State of one call of `clsplat.train`: the trainer, its run (None to write no files), and the training time."""
 
     def __init__(
         self,
@@ -131,12 +131,12 @@ class TrainingSession:
             self.trainer.restore(checkpoint)
             seconds = checkpoint.state.get("seconds")
             if not isinstance(seconds, float | int):
-                raise unusable(checkpoint, f"its state is not as this version writes it (seconds: {seconds!r})")
+                raise unusable(checkpoint, f"its training time is {seconds!r}, expected a number of seconds")
             self.seconds = float(seconds)
             self.saved = checkpoint.step
 
     def save(self) -> None:
-        """Write a checkpoint, unless this step has one, or too many Gaussians have non-finite values."""
+        """Write a checkpoint, unless the current step already has one, or too many Gaussians have non-finite values."""
         if self.run is not None and self.trainer.step > self.saved:
             arrays, state = self.trainer.checkpoint()
             if not self.trainer.monitor.retries.lost:
@@ -146,11 +146,10 @@ class TrainingSession:
                 self.saved = self.trainer.step
 
     def rescue(self) -> str:
-        """Write a checkpoint of the state at the start of the step, if that is intact.
+        """Write a checkpoint of the state at the start of the step, unless the step has already changed the model.
 
-        Called when a trial of kernels or a command of the driver fails, device memory is used up, or a photograph
-        cannot be read. A lost GPU is such a failure. Returns the end of an error message, which names the checkpoint,
-        or "".
+        Called after a failure of a kernel's trial or of the driver (such as a lost GPU), if device memory is used up,
+        and if a photograph cannot be read. Returns the end of an error message, which names the checkpoint, or "".
         """
         if self.run is None:
             return ""
@@ -160,7 +159,7 @@ class TrainingSession:
         try:
             self.save()
         except (ClsplatError, OSError) as error:
-            return f"; its checkpoint could not be written ({error}){earlier}"
+            return f"; no checkpoint could be written ({error}){earlier}"
         if not 0 < self.trainer.step <= self.saved:
             return ""
         return f"; a checkpoint of step {self.trainer.step} is written: {self.run.resume_command} continues from it"
@@ -211,23 +210,23 @@ class TrainingSession:
         self.trainer.monitor.incidents.clear()
 
     def tell_the_rest(self) -> None:
-        """Warn of the number of steps with non-finite values that were only counted."""
+        """Warn of the number of further steps with non-finite values, which `tell_trouble` only counted."""
         self.trainer.repair()
         self.tell_trouble()
         if untold := self.troubles.total() - len(self.troubles):
             warnings.warn(f"{untold} more steps had values that were not finite")
 
     def give_up(self) -> None:
-        """Write a bundle that reproduces the non-finite values into the run's folder, and raise ClsplatError."""
+        """Write a bundle, by which the non-finite values can be reproduced, and raise ClsplatError."""
         incident = self.trainer.monitor.latest
         assert incident is not None, "retries are used up only by steps with non-finite values"
         trouble = (
             f"{incident}, and {MAX_CHECKPOINT_RETURNS} returns to a checkpoint with smaller learning rates did not help"
         )
         if self.run is None:
-            raise ClsplatError(f"{trouble}: no file that reproduces it is written, as clsplat.train had no run=...")
+            raise ClsplatError(f"{trouble}: to get a file that reproduces the step, give clsplat.train a run=...")
         path = write_bundle(self.run.path, self.trainer, incident)
-        raise ClsplatError(f"{trouble}: {path} reproduces it (python -m clsplat.training.repro_bundle)")
+        raise ClsplatError(f"{trouble}: {path} reproduces the step (python -m clsplat.training.repro_bundle)")
 
     def tell_plan(self) -> None:
         """Report the memory plan at the start, and whenever work has to be split into pieces or no longer has to be."""
@@ -248,19 +247,19 @@ class TrainingSession:
         return StepReport(self.trainer.step, value, psnr, self.trainer.parameters.count, self.seconds)
 
     def draw(self, camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Image of the current model over the background of evaluations, and alpha."""
+        """Render the current model over the background of evaluations. Returns its image and alpha."""
         result = self.trainer.draw(camera)
         return result.image, result.alpha
 
     def render(self, model: Gaussians, camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Image of a model on the host, over black, and alpha."""
+        """Render a model on the host. Returns its image, over black, and alpha."""
         result = Renderer(self.trainer.device, config=self.trainer.config.rasterizer).render(model, camera)
         return result.image, result.alpha
 
     def evaluate(self, *, keep: bool) -> Evaluation:
         """Evaluate the held-out views.
 
-        keep: save their renders in the run's folder test/.
+        keep: True to save their renders in RUN/test/, and to measure them at aligned poses too if poses are refined.
         """
         trainer = self.trainer
         trainer.settle()
@@ -308,7 +307,8 @@ class TrainingSession:
         self.run.append_metrics({**record, "elapsed": time.perf_counter() - self.began})
 
     def doubt(self) -> None:
-        """Warn if renders of training views show nothing. Without the memory to render, nothing is checked."""
+        """Warn if renders of training views show nothing. Nothing is checked if there is too little memory to
+        render."""
         with suppress(CapacityError):
             if text := sanity_checks.of_pictures(self.draw, self.trainer.views):
                 warnings.warn(f"step {self.trainer.step}: {text}")
@@ -357,7 +357,7 @@ class TrainingSession:
             self.save()
 
     def train(self, between: Between | None) -> Gaussians:
-        """Run the remaining steps, and write the model and its evaluation.
+        """Run the remaining steps, and write the model and its evaluation. between: function called before each step.
 
         Raises InputError, after a checkpoint, for a photograph that cannot be read.
         """
@@ -410,7 +410,10 @@ class TrainingSession:
         return model
 
     def make_steps(self, between: Between | None) -> None:
-        """Run the remaining steps, and the work that is due after them. After Ctrl-C, save and raise Interrupted."""
+        """Run the remaining steps and the work due after them. After Ctrl-C, save and raise Interrupted.
+
+        between: function called before each step.
+        """
         trainer, last = self.trainer, self.trainer.config.iterations
         with _interruption() as interrupted:
             while True:
@@ -470,5 +473,5 @@ def _tell_idle_settings(trainer: Trainer) -> None:
     if trainer.step == 0 and config.density.every and count > config.density.max_gaussians:
         warnings.warn(
             f"training begins with {count:,} Gaussians, more than --density.max-gaussians "
-            f"{config.density.max_gaussians:,}, which only prevents new Gaussians: give the scene fewer points"
+            f"{config.density.max_gaussians:,}, which limits only their growth: give the scene fewer points"
         )

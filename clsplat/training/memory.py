@@ -37,32 +37,33 @@ from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.supervision.resolution import by_doubling
 
 NO_CACHE = "none"
-"""Value of --cache for no cache of decoded photographs."""
+"""Value of --cache that switches off the cache of decoded photographs."""
 POOL_QUARTERS = 3
-"""Quarters of the main memory beyond the least that photographs need, which go to the model's chunks. The photographs
-get the rest."""
+"""Share of the model's chunks, in quarters, in the main memory beyond the minimum for photographs. The other quarter
+goes to more photographs."""
 
 MOST_VIEWS_LOOKED_AT = 200
 """Maximum number of views whose chunks in view are counted before the first step. With 20 million Gaussians a view
-takes about 7 ms. If a later view shows more chunks than all of these, memory is planned again before its step."""
+takes about 7 ms. If a later view shows more chunks than any of these, memory is planned again before its step."""
 
 
 def model_bytes(config: TrainConfig) -> int:
-    """Return the bytes per Gaussian: parameters, moments, statistics, and with --batch gradients and their sums."""
+    """Return the bytes per Gaussian of parameters, moments and statistics; with --batch, also of a view's gradients and
+    of the sums of gradients."""
     arrays = MODELS if config.batch == 1 else OWNER_ARRAYS_PER_PARAMETER
     return arrays * 4 * floats_of((config.sh_degree + 1) ** 2) + gaussian_bytes(contributions=False)
 
 
 @dataclass(frozen=True)
 class HostMemory:
-    """Main memory of a training, with the folders for what it has no room for.
+    """Limit of a training's main memory, and the folders for data beyond it.
 
     limit: maximum number of bytes for photographs and Gaussians; None for no limit.
     cache: folder of the cache of decoded photographs; None for no cache.
     keeps_cache: True if the user named the cache's folder, so that it stays after the training.
     scratch: folder for scratch files of Gaussians; None if there is no folder.
     owner: beginning of the names of this training's scratch files.
-    run: run whose checkpoints name scratch files.
+    run: run whose checkpoints name scratch files; None if there is no run.
     """
 
     limit: int | None = None
@@ -80,10 +81,10 @@ class HostMemory:
         run: Run | None,
         scratch: str | Path | None = None,
     ) -> HostMemory:
-        """Make the memory that these arguments of `clsplat.train` ask for. Raises InputError.
+        """Make the limit and folders that these arguments of `clsplat.train` ask for. Raises InputError.
 
-        cache: a folder, or "none" for no cache. If it is None, the cache is RUN/cache with a limit, and there is no
-            cache without one.
+        max_host_mem: the limit, in bytes or as a text such as "8GiB"; None for no limit.
+        cache: a folder, or "none" for no cache. None stands for RUN/cache if there is a limit, otherwise for no cache.
         scratch: a folder; None stands for RUN/scratch.
         """
         limit = parse_bytes(max_host_mem, "--max-host-mem")
@@ -122,13 +123,14 @@ class HostMemory:
             if streams_by_chunk(config, device, count):
                 taken = _least_pool(record_bytes(config, contributions=config.density.min_contribution > 0))
             taken *= device.shares_memory
-            photographs = replace(self, cache=None).photographs(scene, config)  # a cache would create its folder
+            photographs = replace(self, cache=None).photographs(scene, config)  # no cache: it would create its folder
             self.share(photographs, count, taken, begins=True)
 
     def pool(self, photographs: HostPhotographs, count: int, record: int, *, begins: bool) -> int | None:
-        """Return the bytes for chunks on a device that shares main memory; None if all chunks fit within the limit.
+        """Return the bytes of main memory for the pool of a streamed model, if the device shares main memory; None if
+        all chunks fit within the limit.
 
-        record: bytes of a Gaussian in a chunk.
+        count, record: number of Gaussians, and bytes of a Gaussian in a chunk.
         begins: True to raise InputError if the limit is too small for one chunk.
         """
         if self.limit is None or self.limit >= count * record + photographs.least:
@@ -147,13 +149,13 @@ class HostMemory:
             return None
         if self.files is None:
             raise InputError(
-                f"--max-host-mem {amount(self.limit or 0)} leaves {amount(nbytes)} of Gaussians to files: name a "
-                "folder for them (--scratch DIR), or a run's folder (-o)"
+                f"--max-host-mem {amount(self.limit or 0)} has no room for {amount(nbytes)} of Gaussians: name a "
+                "folder for a file of them (--scratch DIR), or a run's folder (-o)"
             )
         return self.files.new_file()
 
     def is_exceeded(self, nbytes: int, photographs: HostPhotographs) -> bool:
-        """Return True if main memory has no room for `nbytes` of chunks beside the least that photographs need."""
+        """Return True if main memory has no room for `nbytes` of chunks beside the minimum that photographs need."""
         return self.limit is not None and self.limit < nbytes + photographs.least
 
     def remove_scratch(self) -> None:
@@ -162,11 +164,10 @@ class HostMemory:
             self.files.remove_unnamed()
 
     def share(self, photographs: HostPhotographs, count: int, taken: int, *, begins: bool) -> bool:
-        """Limit photographs to the memory that the Gaussians leave. Returns False if this is too little for them.
+        """Limit photographs to the memory that the Gaussians leave. Returns False if that is too little for them.
 
-        count: number of Gaussians.
-        taken: bytes of the Gaussians on the host.
-        begins: True to raise InputError if it is too little. The message names the smallest limit that is enough.
+        count, taken: number of Gaussians, and their bytes on the host.
+        begins: True to raise InputError instead. The message names the smallest limit that is enough.
         """
         if self.limit is None:
             return True
@@ -198,7 +199,8 @@ def record_bytes(config: TrainConfig, *, contributions: bool) -> int:
 
 
 def _least_pool(record: int) -> int:
-    """Return the smallest main memory, beside the photographs, whose share for the pool holds one chunk.
+    """Return the bytes of main memory that a pool of one chunk needs. A pool gets only a share (POOL_QUARTERS) of the
+    memory beyond the minimum for photographs, so they are more than the chunk's bytes.
 
     record: bytes of a Gaussian in a chunk.
     """
@@ -206,11 +208,11 @@ def _least_pool(record: int) -> int:
 
 
 UNLIMITED = HostMemory()
-"""Main memory without a limit, a cache and scratch files."""
+"""Main memory with no limit, no cache and no scratch files."""
 
 
 class MemoryPlanner:
-    """Plans the memory of a training before it begins and at each densification, and sets the limits of its parts.
+    """Plans the memory of a training before it begins and at each densification, and limits the rasterizer to it.
 
     begins: True until the first step. Until then too little main memory is an error, afterwards a warning.
     rows_in_view: largest number of rows in the chunks of one view so far, if the model is streamed by chunk.
@@ -234,7 +236,7 @@ class MemoryPlanner:
 
         Only an even sample of the views is counted. The number is 0 if device memory has no limit, or if a model of
         this size is never streamed by chunk.
-        local: function from a camera in world coordinates to the camera in those of the model.
+        local: function that converts a camera from world to model coordinates.
         initial: the model at the start, in the order of its chunks.
         """
         device, views = self._rasterizer.device, self._scene.views
@@ -247,6 +249,7 @@ class MemoryPlanner:
         """Plan the memory for `count` Gaussians with their final number of SH coefficients.
 
         needs: statistics of density control.
+        components: components of the training, which need memory too.
         turns: number of arrays of loss sums that steps use in turn (`stages.loss.loss`).
         Raises CapacityError, or InputError for too little main memory.
         """
@@ -278,14 +281,15 @@ class MemoryPlanner:
         return made
 
     def plan_view(self, made: Plan, chunks: int) -> Plan:
-        """Plan for views of up to `chunks` chunks, if that is more than any view has shown; else return `made`.
+        """Plan for views of up to `chunks` chunks. Returns `made` if it has room for as many, or an earlier view had as
+        many.
 
         made: the present plan, by which the model is streamed by chunk. It stays valid after a CapacityError.
         """
         device, rows = self._rasterizer.device, CHUNK_ROWS * chunks
         if rows <= max(self.rows_in_view, made.rows):
             return made
-        try:  # with room for a few chunks more, so that not each longer view plans again
+        try:  # with room for a few more chunks, so that slightly larger views need no new plan
             padded = CHUNK_ROWS * listed_chunks(chunks)
             wider, rows = plan_view(device, made, padded), padded
         except CapacityError:
@@ -296,7 +300,7 @@ class MemoryPlanner:
         return wider
 
     def scratch_file(self, nbytes: int) -> Path | None:
-        """Return the path of a new scratch file; None if main memory has room (`HostMemory.scratch_file`)."""
+        """Return the path of a new scratch file for `nbytes` of chunks; None if main memory has room for them."""
         return self._memory.scratch_file(nbytes, self._photographs.host)
 
     @property

@@ -62,11 +62,12 @@ class MipFilter(Component):
         self._least = None
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The scales' lower limits, as an array of a checkpoint by name."""
+        """The scales' lower limits, keyed by their name in a checkpoint."""
         return {} if self._least is None else {"sampling/least": self._least.get()}
 
     def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002
-        """Load the arrays of a checkpoint of `count` Gaussians. Raises ValueError for another number of Gaussians."""
+        """Load the scales' lower limits from a checkpoint. Raises ValueError if they are not those of `count`
+        Gaussians."""
         least = named("sampling/").get("least") if self.on else None
         if least is not None and least.shape != (count,):
             raise ValueError(f"sampling/least has shape {least.shape}, expected ({count},)")

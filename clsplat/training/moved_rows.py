@@ -31,7 +31,7 @@ class Move:
         rows.
     coefficients: number of SH coefficients; 0 for as many as there are.
     changes: function that is called before the first change of the model.
-    values: values of new rows, and of fields that the old records do not have.
+    values: initial values of new Gaussians, and of arrays that the old chunks do not have.
     """
 
     rows: NDArray[np.uint32] | None = None
@@ -46,7 +46,7 @@ class Move:
 
 @dataclass(frozen=True, eq=False)
 class MovedRows:
-    """The rows of a model after a plan is carried out.
+    """The rows of a model after a plan is carried out. Each entry of the plan's list of rows becomes one of them.
 
     rows: (m,) uint32, the source row of each row, with the bit FRESH set if the row is new.
     halves: number of halves of split Gaussians, two of each.
@@ -61,7 +61,7 @@ class MovedRows:
     listed: SourceList | None = None
 
     def at(self, rows: NDArray[Any]) -> NDArray[Any]:
-        """Return the rows of the model that entries of the plan's list have become."""
+        """Return the rows of the new model that the entries `rows` of the plan's list have become."""
         places = self.places if self.listed is None else self.listed.by_kind()
         return rows if places is None else places[rows]
 
@@ -80,6 +80,8 @@ def ordered(plan: RowPlan, parameters: AnyGaussians) -> MovedRows | None:
 
     In a model with more than ORDERED_ROWS rows, new rows stand behind the rows that they were copied from. When a model
     exceeds this number for the first time, its rows are sorted along a curve through space (`space_order`).
+
+    parameters: the model before the plan.
     """
     listed, was_large = plan.listed, parameters.count > ORDERED_ROWS
     if plan.rows is not None:
@@ -110,8 +112,9 @@ def halve(
     halved: Sequence[str],
     at_once: int,
 ) -> None:
-    """Replace the two copies of each split Gaussian with its halves.
+    """Replace the two copies of each split Gaussian in `parameters` with its halves.
 
+    moved: the rows of the model, among them the copies.
     halves: function that computes the first halves, or with True as second argument the second halves (`RowPlan`).
     halved: parameter groups that `halves` reads.
     at_once: number of split Gaussians whose halves are computed at a time; 0 computes all, so that one copy of each
@@ -133,14 +136,14 @@ def halve(
 
 
 def both(first: Places, second: Places) -> Places:
-    """Concatenate the rows of first and second halves."""
+    """Concatenate the row numbers of first and second halves."""
     if isinstance(first, slice) or isinstance(second, slice):
         return slice(first.start, second.stop)  # type: ignore[union-attr]  # both are
     return np.concatenate([first, second])
 
 
 def some_of(places: Places, begin: int, count: int) -> Places:
-    """Return `count` of the places from index `begin` on, or as many as there are."""
+    """Return `count` of the row numbers `places` from index `begin` on, or as many as there are."""
     if isinstance(places, slice):
         return slice(places.start + begin, min(places.start + begin + count, places.stop))
     return places[begin : begin + count]

@@ -36,7 +36,7 @@ def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None) -> S
     check_refinable(config, scene.train_views)
     start = config.start_points
     is_prepared = bool(start) and scene.start == start
-    if not len(scene.points) and not start.sky:  # the length unit follows from the points of --points too
+    if not len(scene.points) and not start.sky:  # the length unit is computed from these points
         scene = with_points(scene, start)
     unit = _length_unit(scene, resumed, is_prepared=is_prepared)
     if unit != scene.unit:
@@ -46,9 +46,9 @@ def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None) -> S
 
 
 def _length_unit(scene: Scene, resumed: Run | None, *, is_prepared: bool) -> float | None:
-    """Length unit in world units; None for the extent, which in some scenes depends on the start points.
+    """Length unit in world units; None if it is the extent, which in some scenes depends on the start points.
 
-    A run that has begun keeps its unit, which is the extent if its record is missing.
+    resumed: the run that continues, or None. It keeps its unit, which is the extent if scene.json is missing.
     is_prepared: True if the scene already has its unit, and points from which none can be computed, such as a sky's.
     """
     record = None if resumed is None else scene_record.read(resumed)
@@ -63,8 +63,8 @@ def _length_unit(scene: Scene, resumed: Run | None, *, is_prepared: bool) -> flo
     if resumed is None or not began:
         return unit
     warnings.warn(
-        f"{resumed.path / scene_record.SCENE_RECORD_FILE_NAME}: is missing, so lengths are relative to the extent, "
-        f"{scene.extent:.4g}; if the training began relative to {unit:.4g}, begin it anew"
+        f"{resumed.path / scene_record.SCENE_RECORD_FILE_NAME}: is missing, so lengths are relative to the extent "
+        f"{scene.extent:.4g}; if they were relative to {unit:.4g} when the training began, start a new training"
     )
     return None
 
@@ -154,10 +154,11 @@ def late_settings(config: TrainConfig) -> Iterator[str]:
 
 @contextmanager
 def saved_model(checkpoint: Checkpoint, sh_degree: int) -> Iterator[tuple[list[HostGaussians], Checkpoint]]:
-    """Context with parameters, first and second moments of a checkpoint, and the checkpoint with all its arrays.
+    """Context that yields parameters, first and second moments of a checkpoint, and the checkpoint with all its arrays.
 
     sh_degree: final SH degree of the training.
-    A scratch file that has some of them is open in the context. Raises InputError for arrays of another model.
+    If some arrays are in a scratch file, the file is open within the context. Raises InputError for arrays of another
+    model.
     """
     saved: Mapping[str, Any] = {}
     with ExitStack() as reading:

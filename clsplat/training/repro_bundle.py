@@ -178,7 +178,8 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
 
 
 def _unmarked(models: dict[str, HostGaussians]) -> dict[str, HostGaussians]:
-    """The models with zeros in place of moments that are not finite, which may mark steps that `adam` refused."""
+    """Return the models with zeros in place of moments that are not finite. `adam` writes such moments to mark a step
+    that it refused."""
     for kind in ("first", "second"):
         arrays = {g: HostArray(finite_or_zero(array.get())) for g, array in models[kind].arrays.items()}
         models[kind] = replace(models[kind], arrays=arrays)
@@ -197,9 +198,9 @@ def read_bundle(path: Path) -> Bundle:
 
 
 def _bundle_of(saved: Checkpoint, path: Path) -> Bundle:
-    """Make a bundle from the content of its file. May raise any exception if arrays and state do not make a step.
+    """Make a bundle from the content of its file. May raise any exception if the content does not describe a step.
 
-    All array sizes have to follow from the photograph's.
+    All sizes in the file must match the photograph's.
     """
     record, arrays = cast("StepRecord", {**saved.state, "step": saved.step}), saved.arrays
     record["rates"] = {group: float(record["rates"][group]) for group in PARAMETER_GROUPS}
@@ -306,7 +307,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0 if stage else 1
     print(bundle.record["message"])
     (kept, count), camera = bundle.record["of"], bundle.inputs.camera
-    print(f"{kept:,} of {count:,} Gaussians, {camera.width}x{camera.height} pixels; values that are not finite after")
+    print(f"{kept:,} of {count:,} Gaussians, {camera.width}x{camera.height} pixels")
+    print("number of non-finite values after each stage:")
     for name, count in counts.items():
         print(f"  {name:13}{count:>12,}")
     print(f"first in {stage}" if stage else "all is well on this device: every value is finite")

@@ -29,7 +29,8 @@ T = TypeVar("T")
 
 REPORTED_PACKAGES = ("numpy", "pyopencl", "OpenImageIO", "scipy", "scikit-image")
 CONTRIBUTION_SECONDS = 1.0
-"""Time limit, in seconds after the first view, for measuring the Gaussians' contributions to training views."""
+"""Time limit, in seconds, for measuring the Gaussians' contributions to training views; the first view is not
+counted."""
 CONTRIBUTION_BIN_EDGES = tuple(float(edge) for edge in np.round(np.arange(-3.0, 5.01, 0.2), 1))
 """Edges of the bins of the histogram of contributions, as base-10 logarithms of pixels."""
 
@@ -70,12 +71,12 @@ def timed(device: Device, work: Callable[[], T]) -> tuple[T, dict[str, float]]:
 
 
 def contributions(trainer: Trainer, seconds: float = CONTRIBUTION_SECONDS) -> dict[str, Any] | None:
-    """Histogram of the Gaussians' largest contributions to a training view (`largest_contributions`), for the report.
+    """Return a histogram of the Gaussians' largest contributions to a training view (`largest_contributions`), for the
+    report. Returns None if device memory is limited, because the memory plan reserves none for this measurement.
 
-    `views` of the `of` training views are sampled. `none` is the number of Gaussians that none of them shows. `counts`
-    are the numbers of the other Gaussians in the bins between `edges`, base-10 logarithms of pixels. The outer bins
-    include all values beyond their outer edge. Returns None if device memory is limited, because the memory plan
-    reserves none for this measurement.
+    Keys of the result: `views`, number of training views that were sampled, and `of`, the number of all; `none`, number
+    of Gaussians that no sampled view shows; `edges` of the bins, base-10 logarithms of pixels; `counts`, the number of
+    Gaussians in each bin. The outer bins include all values beyond their outer edge.
     """
     if trainer.device.memory.limit is not None or isinstance(trainer.parameters, HostGaussians):
         return None

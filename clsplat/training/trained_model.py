@@ -171,8 +171,8 @@ class TrainedModel:
         return by_field(self.with_moments) | self.statistics.by_field()
 
     def by_kind(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Mapping[str, AnyArray]]:
-        """Return the arrays of a checkpoint by parameter group, for each of "parameters", "first" and "second" moments.
-        They are among `arrays`, or in the scratch file if the checkpoint has only a manifest."""
+        """Return parameters and moments by kind ("parameters", "first", "second") and parameter group. They are among
+        `arrays` of a checkpoint, or in the scratch file if the checkpoint has only a manifest."""
         if self.in_file:
             return {kind: model.arrays for kind, model in self.kinds().items()}
         return {kind: _host_arrays({g: arrays[f"{kind}/{g}"] for g in PARAMETER_GROUPS}) for kind in KINDS}
@@ -183,7 +183,7 @@ class TrainedModel:
         return self._pool.store if self._pool is not None and self._pool.store.path is not None else None
 
     def record(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        """Return the model's arrays and state for a checkpoint: with a scratch file, its manifest."""
+        """Return the model's arrays and state for a checkpoint; for a model in a scratch file, the file's manifest."""
         if (store := self.store) is None or self._pool is None:
             return self.arrays(), {}
         if store.file.is_lost:
@@ -195,7 +195,7 @@ class TrainedModel:
         return manifest.arrays(), manifest.state()
 
     def saved_now(self) -> None:
-        """Update the scratch files after a checkpoint has been written."""
+        """Update the scratch files after a checkpoint has been written: slots that it names are kept."""
         if self._files is not None:
             self._files.saved(self.store)
 
@@ -231,7 +231,8 @@ class TrainedModel:
         self._place([widen(self._device, model, coefficients) for model in self.with_moments])
 
     def rearrange(self, plan: RowPlan, changes: Callable[[], None]) -> DeviceArray | HostArray | None:
-        """Carry out a plan of density control, or of a repair. Returns the list of rows if rows have moved.
+        """Carry out a plan of density control, or of a repair. Returns the source row of each row; None if no row has
+        moved.
 
         changes: function that is called just before the first change, after the kernels have been tried in the sandbox
             and memory for the moved rows is allocated. It may be called several times.
@@ -269,6 +270,7 @@ class TrainedModel:
         models: new parameters and moments, not in a store. None keeps the Gaussians of this model, which are in a store
             now or will be.
         statistics: statistics of new models by name; others get their initial values. None keeps this model's.
+        move: the new rows and number of coefficients, if the Gaussians are in a store now or will be.
         """
         parameters = self.parameters if models is None else models[0]
         assert parameters is not None
@@ -330,12 +332,15 @@ class TrainedModel:
         self._use(ChunkPool(self._device, self._work, store, self.plan.rows, cull), move.coefficients)
 
     def _fields(self, coefficients: int) -> dict[str, tuple[int, ...]]:
-        """Return the fields of a store of this model."""
+        """Shape of a row of each array in a chunk's record, by name (such as "first/means").
+
+        coefficients: number of SH coefficients.
+        """
         return fields_of(coefficients) | statistics_fields(contributions=self._counts_contributions)
 
     @property
     def _widest(self) -> dict[str, tuple[int, ...]]:
-        """Fields with the final SH degree."""
+        """Shapes of `_fields` with the final SH degree."""
         return self._fields((self._sh_degree + 1) ** 2)
 
     def _record_bytes(self, coefficients: int) -> int:
@@ -368,7 +373,7 @@ class TrainedModel:
             vars(self).pop(name, None)
 
     def _go_on_in(self, manifest: Manifest | None, coefficients: int) -> bool:
-        """Continue in the scratch file of a checkpoint. Returns False if this model cannot use the file."""
+        """Continue in the scratch file of a checkpoint. Returns False if there is none that this model can use."""
         if (
             manifest is None
             or dict(manifest.fields) != self._fields(coefficients)
@@ -386,7 +391,7 @@ class TrainedModel:
         return True
 
     def _use(self, pool: ChunkPool, coefficients: int) -> None:
-        """Set parameters, moments and statistics to those of a pool's store."""
+        """Take parameters, moments and statistics from the store of `pool` from now on."""
         if self._files is not None and pool.store.path is not None:
             self._files.follow(pool.store)
         self._pool, pool.before_view = pool, self._before_view
@@ -440,7 +445,7 @@ class TrainedModel:
     def _move(
         self, rows: DeviceArray | NDArray[np.uint32], changes: Callable[[], None], *, new_statistics: bool
     ) -> None:
-        """Rearrange all arrays: row j becomes the old row rows[j], with zero moments if its bit FRESH is set."""
+        """Rearrange all arrays: new row j becomes the old row rows[j], with zero moments if FRESH is set in rows[j]."""
         count, before, gathers = rows.shape[0], self.parameters.count, self.plan.gathers
         with only_tried(self._device):
             try_gather(self._device, count, self.parameters)
@@ -461,7 +466,8 @@ class TrainedModel:
     def _gather(
         self, rows: DeviceArray | NDArray[np.uint32], *, on_device: bool, changes: Callable[[], None]
     ) -> DeviceArray | NDArray[np.uint32]:
-        """Move the rows of a model without a store. Returns the list of rows, on the device if the rows moved there."""
+        """Copy the rows `rows` of a model that is not in a store to new arrays, on the device if `on_device`, else on
+        the host. Returns `rows`, on the device if `on_device`."""
         if on_device:
             rows = rows if isinstance(rows, DeviceArray) else upload(self._device, rows)
         else:

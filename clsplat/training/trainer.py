@@ -95,7 +95,7 @@ class Trainer:
         self.given = initial
         self.monitor = NonFiniteMonitor(self.rasterizer.readback)
         self.pending = SpeculativeSteps(device, self.monitor, self._begin_again)
-        self.pending.on &= self.batch is None and not config.refines  # these wait for the device in each step
+        self.pending.on &= self.batch is None and not config.refines  # batches and refinement wait for the device
         self._start()
 
     def _start(self) -> None:
@@ -188,7 +188,7 @@ class Trainer:
             counted = (self.rasterizer, (factor, self.rasterizer), self.parameters.count)
             room = 0 if self._looks_at_steps else self.pending.room(*counted)
             result = self.pending.launch(run, room, number=self.step, reads_loss=reads_loss)
-            if self.position.queue:  # the next step's photograph, at this resolution, and its Gaussians
+            if self.position.queue:  # fetch the next step's photograph and Gaussians
                 self.photographs.ahead(self.position.queue[-1], factor)
                 if self.model.in_file:
                     self.model.read_ahead(self.local(self.views[self.position.queue[-1]].camera))
@@ -283,7 +283,7 @@ class Trainer:
         return self.photographs.load(view, self.sizes.factor(self.step))
 
     def _view_inputs(self, place: int) -> ViewInputs:
-        """Inputs of the next view. place: index of the view among those of the step."""
+        """Inputs of the next view. place: index of the view within the step."""
         begins, view = not self.position.queue, self._next_view()
         inputs = self.loader.inputs(view, self.position, place, begins=begins)
         self.background = inputs.background
@@ -309,7 +309,7 @@ class Trainer:
         self.mark = None
 
     def _watched_in_batch(self, needs: StatisticsNeeds, inputs: ViewInputs, step: GradientStep) -> StepProbe:
-        """Return the probe of a batch's view. Call it in the order of views: the first of an epoch begins the epoch."""
+        """Return the probe of a batch's view. Call it in the order of views: an epoch's first view resets totals."""
         if inputs.begins:
             self._turn_epoch()
         return self._watched(needs, inputs, step, self.step)
@@ -370,7 +370,7 @@ class Trainer:
     def _next_view(self) -> int:
         if not self.position.queue:
             self.position.queue = self.order.next_pass(self.position.rng)
-            if self.batch is None:  # a batch may not have counted the last epoch's views yet
+            if self.batch is None:  # a batch counts the last epoch's views later
                 self._turn_epoch()
                 self._note(begun=True)
         return self.position.queue.pop()
@@ -383,8 +383,8 @@ class Trainer:
         self.model.statistics = self.statistics.next_epoch()
 
     def _raise_sh_degree(self) -> None:
-        """Raise the SH degree in use. Higher bands have no arrays yet: their gradients, and so their steps, would be
-        zero."""
+        """Raise the SH degree in use, by adding coefficients of zero to the model. Before, higher bands have no arrays,
+        because their gradients would be zero."""
         every = self.config.sh_degree_every
         degree = min(self.step // every, self.config.sh_degree) if every > 0 else self.config.sh_degree
         coefficients = (degree + 1) ** 2
@@ -393,7 +393,7 @@ class Trainer:
             self.model.widen(coefficients, self._unmark)
 
     def _control_density(self) -> None:
-        """Run the density control that is due after one of the last step's views."""
+        """Run the density control that is due after each of the last step's views."""
         last = range(self.step - self.position.last_views + 1, self.step + 1)
         steps = list(filter(self.strategy.is_due, last))
         for step in steps if self.step > 0 else ():
@@ -433,7 +433,7 @@ class Trainer:
         self._rearrange(self.strategy.at_end(self._state()))
 
     def close(self) -> None:
-        """End the threads of a batch and those that read photographs, and close the model's scratch file."""
+        """End the threads of a batch and of reading photographs, and close the model's scratch file."""
         self.photographs.host.close()
         self.model.close()
         if self.batch is not None:
@@ -444,7 +444,7 @@ class Trainer:
         return camera.from_origin(self.origin).before(self.near).along_rays(self.by_rays)
 
     def gaussians(self) -> Gaussians:
-        """Current model on the host, with the coefficients of the final SH degree; those not reached yet are zeros."""
+        """Current model on the host, with all SH coefficients; those of degrees that are not in use yet are zeros."""
         return self._of_rows(self.complete_parameters, 0, self.parameters.count)
 
     def rows(self) -> Callable[[int, int], Gaussians]:
@@ -464,7 +464,7 @@ class Trainer:
         unless `monitor.retries.lost`."""
         self.repair(look=True)
         arrays, state = self._arrays()
-        if not self.model.changes_are_finite():  # also in Gaussians that no step has updated
+        if not self.model.changes_are_finite():  # examine also Gaussians that no step has updated
             repair = self.monitor.examine_all(self.model.by_kind(arrays))
             if repair is not None:
                 self._apply(repair)

@@ -146,7 +146,7 @@ def _second(scene: Scene) -> str:
 @pytest.mark.parametrize(
     ("name", "spoilt", "text"),
     [
-        ("rotations", lambda array: 2 * array, "has poses/rotations that are no rotation matrices"),
+        ("rotations", lambda array: 2 * array, "has poses/rotations that are not rotation matrices"),
         ("visits", lambda array: array[1:], "has no poses/visits of shape"),
         ("first", lambda array: array * np.nan, "has no poses/first of shape"),
     ],

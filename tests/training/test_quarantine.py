@@ -262,8 +262,8 @@ def test_what_cannot_be_helped_stops_with_a_bundle(scene: Scene, default_device:
         train(scene, config, device=default_device, run=run)
     assert caught.value.exit_status == 1
     message = re.fullmatch(
-        r"step (\d+), view (\S+), stage adam: .*, and 3 returns to a checkpoint .* did not help: (\S+) reproduces it "
-        r"\(python -m clsplat\.training\.repro_bundle\)",
+        r"step (\d+), view (\S+), stage adam: .*, and 3 returns to a checkpoint .* did not help: (\S+) reproduces the "
+        r"step \(python -m clsplat\.training\.repro_bundle\)",
         str(caught.value),
     )
     assert message is not None
@@ -346,7 +346,7 @@ def test_without_a_run_it_says_how_to_get_a_bundle(scene: Scene, default_device:
     with (
         heard(),
         spoilt(lambda _: True),
-        pytest.raises(ClsplatError, match=r"no file that reproduces it is written, as clsplat\.train had no run="),
+        pytest.raises(ClsplatError, match=r"to get a file that reproduces the step, give clsplat\.train a run="),
     ):
         train(scene, config, device=default_device)
 

@@ -147,8 +147,9 @@ def test_the_rule(values: list[float], ended: int | None) -> None:
 def test_the_warning_has_the_figures_and_a_way_on() -> None:
     gate, said = judged([25.126, 24, 23.5, 28])
     text = (
-        "--refine-poses: held-out views had 25.13 dB at step 100, 24.00 and 23.50 dB at steps 200 and 300: the cameras "
-        "of step 100 are restored, and refinement ends; try a smaller --pose-reach, or train without --refine-poses"
+        "--refine-poses: held-out views had 25.13 dB at step 100, but 24.00 and 23.50 dB at steps 200 and 300: the "
+        "cameras of step 100 are restored, and refinement ends; try a smaller --pose-reach, or train without "
+        "--refine-poses"
     )
     assert said == [text]
     assert gate.record()["best"] == 100
@@ -156,7 +157,7 @@ def test_the_warning_has_the_figures_and_a_way_on() -> None:
     lenses = replace(CONFIG, refine_poses=False, refine_lenses=True)
     assert judged([25, 24, 23], lenses)[1][0].endswith("try a smaller --lens-reach, or train without --refine-lenses")
     late = judged([*[25] * 8, 24, 24])[1]
-    assert "no step is left in which to go back" in late[0]
+    assert "as no step is left to train with earlier ones" in late[0]
 
 
 def test_the_bound_is_a_setting() -> None:
@@ -192,8 +193,8 @@ def test_a_checkpoint_has_all_of_it(values: list[float]) -> None:
 @pytest.mark.parametrize(
     ("name", "value", "text"),
     [
-        ("measured", np.zeros((0, 2)), "has no gate/measured of steps and dB"),
-        ("measured", np.full((1, 2), np.nan), "has no gate/measured of steps and dB"),
+        ("measured", np.zeros((0, 2)), "expected finite steps and dB"),
+        ("measured", np.full((1, 2), np.nan), "expected finite steps and dB"),
         ("ended", np.zeros(2, np.int64), "has no gate/ended of shape"),
         ("poses/rotations", np.zeros((3, 3, 3)), "has no gate/poses/rotations of shape"),
     ],

@@ -19,39 +19,44 @@ class Appearance(Component):
 
     @property
     def on(self) -> bool:
-        """True if appearance is learnt: for every subclass."""
+        """True if appearance is learnt, as in every subclass."""
         return type(self) is not Appearance
 
     def of_views(self, views: Sequence[int], step: int) -> Sequence[ViewPart]:  # noqa: ARG002
-        """Appearance of each view of a step. The list is empty if the views have the model's own colours.
+        """Return the part (`ViewPart`) that learns the appearance of each view of a step; () if nothing is learnt.
 
-        step: number of the last view.
+        views: indices of the step's views among the training views.
+        step: number of the last of these views: how many views training has used, this one included.
         """
         return ()
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
-        """Return the views, each with its appearance among its parts."""
+        """Return `inputs`, with the appearance of each view added to its parts."""
         shares = self.of_views([each.view for each in inputs], step)
         if not shares:
             return inputs
         return [replace(each, parts=(*each.parts, share)) for each, share in zip(inputs, shares, strict=True)]
 
     def record(self) -> dict[str, Any] | None:
-        """Content of appearance.json; None if there is nothing to write."""
+        """Return the content of appearance.json; None if no appearance is learnt."""
         return None
 
     def tables(self) -> dict[str, NDArray[Any]]:
-        """Arrays of appearance.npz, by name; empty if there is no such file."""
+        """Return the arrays of appearance.npz, by name; {} if no such file is written."""
         return {}
 
     def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002
-        """Load the arrays of a checkpoint. Raises ValueError for arrays of other photographs."""
+        """Load the appearance from a checkpoint. Raises ValueError for arrays of other photographs.
+
+        named: function from a prefix to the checkpoint's arrays whose names have this prefix.
+        """
         self.take(named("appearance/"))
 
     def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load the arrays of a checkpoint, by name without "appearance/"."""
+        """Load the appearance from a checkpoint's arrays, by name without the prefix "appearance/"."""
 
     def write(self, run: Run) -> None:
-        """Write appearance.json and appearance.npz into the run's folder, as far as there is content for them."""
+        """Write `record` as appearance.json and `tables` as appearance.npz into the run's folder; nothing if `record`
+        is None."""
         if (record := self.record()) is not None:
             run.write_appearance(record, self.tables())

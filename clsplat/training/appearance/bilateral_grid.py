@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bilateral grids of each photograph, learnt with the model: use in a step, and storage in a checkpoint."""
+"""Bilateral grids, one for each training photograph, learnt with the model: gradient, Adam's step, and checkpoints."""
 
 from __future__ import annotations
 
@@ -31,9 +31,11 @@ GRID_RATE_END_FRACTION = 0.01
 
 @dataclass(frozen=True, eq=False)
 class ViewGrid(ViewPart):
-    """Grid of one view in one step.
+    """Bilateral grid of one view's photograph, as a part of one training step.
 
+    grids, view: the grids of all photographs with their moments, and the row of this view's grid.
     visit: number of steps that have shown this view, this one included.
+    rate: learning rate of the grid in this step.
     ends: True if a pass through all training views ends with this view.
     place: the view's position in the batch.
     """
@@ -47,24 +49,28 @@ class ViewGrid(ViewPart):
     place: int = 0
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewGrid:
-        """Copy of the grid on another device, uploaded from `values`, to apply it and to compute its gradient."""
+        """Return this part with its grid on another device, to apply the grid there and to compute its gradient.
+
+        values: the grid on the host, as the method `values` returns it.
+        """
         grids = upload(device, values)
         return replace(self, device=device, grids=Grids(grids, grids, grids), view=0)
 
     def values(self) -> NDArray[np.float32]:
-        """The photograph's grid on the host, from which `on` makes a copy on another device."""
+        """Return the photograph's grid on the host, for `on` to upload to another device."""
         return self.grids.grids.get_rows(self.view, self.view + 1)
 
     def compare(self, work: Workspace, image: DeviceArray, target: DeviceArray, size: tuple[int, int]) -> DeviceArray:  # noqa: ARG002
-        """Return the image with the photograph's grid applied."""
+        """Return the render `image`, with the colour changes of the photograph's grid."""
         return apply_grid(self.device, work, self.grids, self.view, image, *size)
 
     def gradient(
         self, work: Workspace, image: DeviceArray, gradient: DeviceArray, size: tuple[int, int]
     ) -> DeviceArray:
-        """Convert `gradient`, in place, to the gradient with respect to the image. Return the gradient of the grid.
+        """Compute the loss's gradient with respect to the grid, and return it.
 
-        The kernels of `update`, which uses the result, are tried here in the sandbox, before anything changes.
+        gradient: with respect to the result of `compare` at first; then, in place, with respect to `image`.
+        At the grid's first step, the sandbox also tries the kernels of `update` here, before anything changes.
         """
         of_view = (self.grids, self.view, image, gradient)
         by_grid = grid_gradient(self.device, work, *of_view, *size, VARIATION_WEIGHT, self.place)
@@ -74,9 +80,10 @@ class ViewGrid(ViewPart):
         return by_grid
 
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
-        """Take Adam's step for the grid. After a pass through all views, also centre all grids.
+        """Take Adam's step for the grid. After a pass through all views, also shift all grids so that their mean is the
+        identity: a colour change that all photographs share belongs to the model.
 
-        Centred grids have the identity as their mean. Their common colour change belongs to the model instead.
+        own: gradient of the grid, from `gradient`.
         """
         assert own is not None, "made by `gradient`"
         step_grid(self.device, self.grids, self.view, own, self.visit, self.rate, readback)
@@ -95,13 +102,14 @@ class GridsOfAll(Appearance):
 
     @property
     def pixel_bytes(self) -> int:
-        """Bytes on the device per pixel of the largest picture; all grids' bytes are divided among its pixels."""
+        """Bytes on the device per pixel of the largest picture: of a transformed image, and a share of the grids'
+        arrays."""
         return device_bytes(self._count, [(view.camera.width, view.camera.height) for view in self._scene.views])
 
     def of_views(self, views: Sequence[int], step: int) -> list[ViewGrid]:
-        """Grids of the views of a step. Each pass visits every view once.
+        """Return the part of each view of a step that learns and applies its grid. Each pass shows every view once.
 
-        step: number of the last view.
+        step: number of the last view: how many views training has used, this one included.
         """
         count = self._count
         numbers = range(step - len(views) + 1, step + 1)
@@ -119,8 +127,8 @@ class GridsOfAll(Appearance):
         ]
 
     def record(self) -> dict[str, Any]:
-        """Content of appearance.json: indices of the photographs' grids in appearance.npz. Held-out photographs have
-        none."""
+        """Return the content of appearance.json: for each training photograph, the index of its grid in appearance.npz.
+        Held-out photographs have no grid."""
         places = {view.name: {"grid": place} for place, view in enumerate(self._scene.train_views)}
         return {"kind": self._config.appearance, "photographs": places, "held_out": {}}
 
@@ -129,11 +137,12 @@ class GridsOfAll(Appearance):
         return {"grids": self._grids.grids.get()}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Grids and Adam's moments, as arrays of a checkpoint by name."""
+        """Grids and Adam's moments, keyed by their names in a checkpoint."""
         held = {"grids": self._grids.grids, "first": self._grids.first, "second": self._grids.second}
         return saved(held)
 
     def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load a checkpoint's arrays, by name without "appearance/". Raises ValueError for other photographs."""
+        """Load grids and moments from a checkpoint's arrays, by name without "appearance/". Raises ValueError for other
+        photographs."""
         values = loaded(self._device, arrays, ("grids", "first", "second"), self._grids.grids.shape)
         self._grids = Grids(**values)

@@ -21,11 +21,11 @@ APPEARANCE_MODELS: dict[str, Callable[[TrainConfig, Device, Scene], Appearance]]
     **dict.fromkeys(COLOUR_MODELS, ColoursOfAll),
     "grid": GridsOfAll,
 }
-"""Appearance models by value of the setting `appearance`."""
+"""Class of the appearance model for each value of the setting `appearance`, except "none"."""
 
 
 def appearance_of(config: TrainConfig, device: Device, scene: Scene) -> Appearance:
-    """The appearance model that the settings ask for."""
+    """Make the appearance model that the setting `appearance` names."""
     if config.appearance == "none":
         return Appearance()
     return APPEARANCE_MODELS[config.appearance](config, device, scene)

@@ -45,8 +45,8 @@ by this number.
 """
 
 START_GAIN_STEP_OCTAVES = 2.0**-10
-"""Step, in octaves, to which initial gains from colours of points are rounded. The order of summation then does not
-change them."""
+"""Step, in octaves, to which initial gains from points are rounded, so that the order of summation does not change
+them."""
 
 VIEW_PULL_WEIGHT, NEIGHBOUR_PULL_WEIGHT = 0.02, 0.7
 """Weights of two terms of the loss's gradient that pull gains towards the gains from points, per octave of distance.
@@ -64,22 +64,25 @@ steps change a photograph's gain by 0.25 %.
 """
 
 GAIN_CHECKPOINT_ARRAYS = ("logs", "start", "first", "second", "gains")
-"""Arrays of `Gains` in a checkpoint. A further array, `told`, is 1 for photographs with gains from points, else 0."""
+"""Fields of the photographs' `Gains` in a checkpoint. It also has `told`: 1 for photographs with gains from points,
+else 0."""
 LENS_CHECKPOINT_ARRAYS = ("logs", "first", "second")
-"""Arrays of the lenses' `Gains` in a checkpoint."""
+"""Fields of the lenses' `Gains` in a checkpoint."""
 
 MIX_RATE_FRACTION = 0.3
-"""Learning rate of mixes, as a fraction of the gains' rate. At the full rate they absorb colours of the scene."""
+"""Learning rate of the mixes of colour channels, as a fraction of the gains' rate. At the full rate, mixes absorb
+colours that belong to the scene."""
 _COLOUR_UPDATE = GainEntries(mix_rate=MIX_RATE_FRACTION)
 
 
 @dataclass(frozen=True, eq=False)
 class ViewColours(ViewPart):
-    """Entries of one photograph and its lens in one step.
+    """Parameters (entries) of the colour model for one photograph and its lens, as a part of one training step.
 
     colours, lenses: entries of all photographs, and of all lenses; `lenses` is None if lenses have no entries in the
         colour model.
     taken: the photograph's row in `colours`, and its lens's row in `lenses`.
+    rate, lens_rate: learning rates of the photograph's entries, and of the lens's entries.
     place: the view's position in the batch.
     """
 
@@ -95,7 +98,10 @@ class ViewColours(ViewPart):
     changes_target = True
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewColours:
-        """Copy of the entries on another device, uploaded from `values`, to apply them and compute their gradient."""
+        """Return this part with its entries on another device, to apply them there and to compute their gradient.
+
+        values: the entries on the host, as the method `values` returns them.
+        """
         parts = (np.ascontiguousarray(part) for part in np.split(values, [self.model.entries], axis=1))
         colours, lenses = (Gains(*[upload(device, part)] * len(fields(Gains))) if part.size else None for part in parts)
         assert colours is not None, "each model has gains"
@@ -103,21 +109,25 @@ class ViewColours(ViewPart):
         return replace(self, device=device, colours=colours, lenses=lenses, taken=taken)
 
     def values(self) -> NDArray[np.float32]:
-        """Entries of the photograph and its lens on the host, from which `on` makes a copy; gains as factors."""
+        """Return the entries of the photograph and its lens (1, entries) on the host, for `on`. Gains are factors."""
         row, lens = self.taken.photograph, self.taken.lens
         gains, logs = (array.get_rows(row, row + 1) for array in (self.colours.gains, self.colours.logs))
         of_lens = [] if self.lenses is None else [self.lenses.logs.get_rows(lens, lens + 1)]
         return np.concatenate([gains[:, :GAIN_ENTRIES], logs[:, GAIN_ENTRIES:], *of_lens], axis=1)
 
     def compare(self, work: Workspace, image: DeviceArray, target: DeviceArray, size: tuple[int, int]) -> DeviceArray:  # noqa: ARG002
-        """Remove the colours of the photograph and its lens from `target`, in place. Returns the unchanged image."""
+        """Remove the photograph's own colours, as its entries and its lens's describe them, from the photograph
+        `target`, in place. Returns the render `image`, which is unchanged."""
         develop(self.device, self.model, self.colours, self.lenses, self.taken, target, size)
         return image
 
     def gradient(
         self, work: Workspace, image: DeviceArray, gradient: DeviceArray, size: tuple[int, int]
     ) -> DeviceArray:
-        """Return the sums that `update` needs. The kernels of `update` are tried here, before anything changes."""
+        """Return the loss's gradient with respect to the entries, as column sums (`entry_gradient`), for `update`.
+
+        At the first step, the sandbox also tries the kernels of `update` here, before anything changes.
+        """
         columns = entry_gradient(self.device, work, self.model, self.taken, image, gradient, size, self.place)
         if self.step == 1:
             with only_tried(self.device):
@@ -125,7 +135,7 @@ class ViewColours(ViewPart):
         return columns
 
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
-        """Take Adam's step for the entries of the photograph and of its lens."""
+        """Take Adam's step for the entries of the photograph and of its lens. own: result of `gradient`."""
         assert own is not None, "made by `gradient`"
         row, lens, step = self.taken.photograph, self.taken.lens, self.step
         step_gains(self.device, self.colours, row, own, step, self.rate, readback, _COLOUR_UPDATE)
@@ -146,7 +156,10 @@ def panorama(view: View) -> bool:
 
 
 def _from_mean(told: Sequence[float | None], of: Sequence[float | None]) -> NDArray[np.float64]:
-    """Exposures from EXIF (`told`), relative to the mean of the known exposures in `of`; NaN where unknown."""
+    """Subtract the mean of the known exposures in `of` from the exposures in `told`. Unknown exposures become NaN.
+
+    told, of: exposures from EXIF in octaves (`exposure_of`); None if unknown.
+    """
     known = [value for value in of if value is not None]
     return np.array([np.nan if value is None or not known else value - np.mean(known) for value in told], np.float64)
 
@@ -178,8 +191,8 @@ class ColoursOfAll(Appearance):
 
     @cached_property
     def _gains(self) -> Gains:
-        """Initial gains, unless a checkpoint has been loaded. Computed on first use, because sampling the photographs
-        takes time."""
+        """Entries of all training photographs. Their gains begin at gains from points or from EXIF. They are computed
+        on first use, because sampling the photographs takes time, and not at all if a checkpoint is loaded before."""
         scene = self._scene
         curve = CODED_OCTAVES_PER_LIGHT_OCTAVE if photos_space(view.path for view in scene.views) == SRGB else 1.0
         by_exif = curve * np.nan_to_num(_from_mean(self._told, self._told))
@@ -206,9 +219,9 @@ class ColoursOfAll(Appearance):
         return self._model.pixel_bytes
 
     def of_views(self, views: Sequence[int], step: int) -> list[ViewColours]:
-        """Entries of each view of a step.
+        """Return the part of each view of a step that learns and applies its entries.
 
-        step: number of the last view.
+        step: number of the last view: how many views training has used, this one included.
         """
         numbers = range(step - len(views) + 1, step + 1)
         return [
@@ -227,11 +240,11 @@ class ColoursOfAll(Appearance):
         ]
 
     def record(self) -> dict[str, Any]:
-        """Content of appearance.json: the learnt entries by the names of the photographs.
+        """Return the content of appearance.json: the learnt entries by the names of the photographs.
 
-        Nothing is learnt about held-out photographs. If EXIF has their exposure, their gains follow from a linear fit
-        of the training photographs' gains to their exposures. They have the entries of their lens, or the mean of all
-        lenses if no training photograph has their lens.
+        Nothing is learnt about held-out photographs. If EXIF gives the exposure of such a photograph, its gains follow
+        from a linear fit of gains to exposures over the training photographs. Its lens has the learnt entries, or the
+        mean of all lenses if no training photograph has this lens.
         """
         entries, scene, model = self._gains.logs.get().astype(np.float64), self._scene, self._model
         photographs = {
@@ -250,7 +263,10 @@ class ColoursOfAll(Appearance):
         return {"kind": self._config.appearance, "photographs": photographs, "held_out": held_out}
 
     def _expected(self, logs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Expected log2 gains (held-out, 3) of held-out photographs, from those of the training photographs (n, 3)."""
+        """Predict the log2 gains (n, 3) of the n held-out photographs from their EXIF exposures.
+
+        logs: (training photographs, 3), learnt log2 gains.
+        """
         told = _from_mean(self._told, self._told)
         known = ~np.isnan(told)
         spread = np.square(told[known]).sum()
@@ -260,11 +276,12 @@ class ColoursOfAll(Appearance):
         return expected
 
     def _of_lens(self, view: View, entries: NDArray[np.float64]) -> dict[str, list[float]]:
-        """Entries of a view's lens by name, and its centre as fractions of the picture's size, for appearance.json."""
+        """Return the entries of a view's lens by name, for appearance.json, and the view's principal point
+        ("centre")."""
         return _named(self._model.of_lens, entries) | {"centre": list(centre(view))}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Entries and Adam's moments of photographs and lenses, as arrays of a checkpoint by name."""
+        """Entries and Adam's moments of photographs and lenses, keyed by their names in a checkpoint."""
         held = saved({name: getattr(self._gains, name) for name in GAIN_CHECKPOINT_ARRAYS})
         told = np.repeat(self._by_points[:, None], self._model.entries, axis=1)
         lenses = {} if self._lenses is None else vars(self._lenses)
@@ -272,7 +289,8 @@ class ColoursOfAll(Appearance):
         return {**held, "appearance/told": told.astype(np.float32), **saved(of_lenses)}
 
     def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load a checkpoint's arrays, by name without "appearance/". Raises ValueError for other photographs."""
+        """Load entries and moments from a checkpoint's arrays, by name without "appearance/". Raises ValueError for
+        arrays of other photographs."""
         lenses = self._lenses and self._loaded_lenses(arrays)
         shape = (len(self._scene.train_views), self._model.entries)
         values = loaded(self._device, arrays, (*GAIN_CHECKPOINT_ARRAYS, "told"), shape)

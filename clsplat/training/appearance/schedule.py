@@ -14,17 +14,18 @@ from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.context import Device
 
 APPEARANCE_WARM_UP_STEPS, WARM_UP_START_FRACTION = 500, 0.01
-"""Length of the warm-up in steps (at most a tenth of all steps), and the fraction of the learning rate at its start."""
+"""Number of steps in which the learning rate rises at first (at most a tenth of all steps), and the fraction of the
+full rate with which it begins."""
 FULL_LENGTH_STEPS = 10_000
-"""Number of steps below which a training counts as short. In this many steps, and at the rate of the settings, a gain
-can change by about 2 octaves."""
+"""Number of steps below which a training counts as short. In a training of this length, at the learning rate of the
+settings, a gain can change by about 2 octaves."""
 
 
 def rate_at(config: TrainConfig, step: int, views: int, *, ends: float, hastens: bool = True) -> float:
     """Learning rate of appearance in step number `step`.
 
-    views: number of photographs. A photograph has a gradient in only one of this many steps, which shrinks its Adam
-    steps by the root of this number. The rate is multiplied by the root to make up for it.
+    views: number of photographs, or of lenses. Each has a gradient in only one of this many steps, so Adam's steps for
+        it are smaller by the root of this number. The rate is multiplied by the root to make up for it.
     ends: fraction of the rate that is left at the last step.
     hastens: True to raise the rate in a short training, so that gains can change by as much as in a long one.
     """
@@ -35,14 +36,18 @@ def rate_at(config: TrainConfig, step: int, views: int, *, ends: float, hastens:
 
 
 def saved(held: Mapping[str, DeviceArray]) -> dict[str, NDArray[Any]]:
-    """Download appearance arrays for a checkpoint, with "appearance/" before their names."""
+    """Download the arrays `held` for a checkpoint, with "appearance/" before their names."""
     return {f"appearance/{name}": array.get() for name, array in held.items()}
 
 
 def loaded(
     device: Device, arrays: Mapping[str, NDArray[Any]], names: Iterable[str], shape: tuple[int, ...]
 ) -> dict[str, DeviceArray]:
-    """Upload the arrays of a checkpoint. Raises ValueError if one is missing, or belongs to other photographs."""
+    """Upload the arrays `names` (float32, of this shape) of a checkpoint. Raises ValueError for arrays of other
+    photographs.
+
+    arrays: the checkpoint's arrays, by name without "appearance/".
+    """
     values = {}
     for name in names:
         value = arrays.get(name)

@@ -19,9 +19,9 @@ from clsplat.camera import Camera
 NEIGHBOUR_DISTANCE_LIMIT = 2.5
 """Distance at which cameras stop being neighbours.
 
-It combines two distances: between centres, relative to their median distance from the middle, and between unit viewing
-directions. A neighbour at a quarter of the limit has about half of the weight. A colour of SH degree 3 can vary with
-the direction over about that distance.
+The distance combines two: between centres, relative to their median distance from the middle, and between unit viewing
+directions. A neighbour at a quarter of the limit has about half of the weight. Over about this quarter, a colour of SH
+degree 3 can vary with the direction.
 """
 MAX_MEAN_NEIGHBOURS = 256
 """Maximum mean number of neighbours of a camera, itself included. With more, the distance limit is reduced."""
@@ -30,8 +30,9 @@ NEIGHBOUR_WEIGHT_STEP = 2.0**-20
 
 
 def places(cameras: Sequence[Camera]) -> Float64:
-    """Centres and viewing directions of cameras as points (n, 6), to measure distances between. Centres that differ
-    only by rounding coincide."""
+    """Return a point (n, 6) for each camera, to measure distances between cameras: its position relative to the middle
+    of all positions, in units of the median distance from there, and its viewing direction. If all positions differ
+    only by rounding, they count as equal."""
     centres = np.array([camera.position for camera in cameras])
     apart = centres - np.median(centres, axis=0)
     extent = float(np.median(np.linalg.norm(apart, axis=1)))

@@ -21,7 +21,7 @@ LENS_WARNING_FOCAL_LENGTHS = 0.1
 
 
 def keep_cameras(run: Run, scene: Scene, poses: Poses, lenses: RefinedLenses, along: Drift | None) -> None:
-    """Write the refined cameras, and warn of any camera with a large change.
+    """Write the refined cameras as a COLMAP model into the run's folder, and warn of any camera with a large change.
 
     along: drift of the refined poses, by which held-out poses and points are moved too; None without refined poses.
     """
@@ -48,15 +48,15 @@ def keep_cameras(run: Run, scene: Scene, poses: Poses, lenses: RefinedLenses, al
 
 
 def doubt_poses(mean: Mapping[str, float], most: float) -> None:
-    """Warn if held-out views score over `most` dB better at aligned poses than at their given poses.
+    """Warn if held-out views score over `most` dB better at aligned poses than at their given poses, because the model
+    has then moved away from the given cameras.
 
-    Then the model has moved away from the given cameras.
-    mean: mean scores of eval.json.
+    mean: mean scores of the held-out views by name, as in eval.json.
     """
     lost = mean.get("psnr_aligned", 0.0) - mean["psnr"]
     if 0 < most < lost:
         warnings.warn(
             f"--refine-poses: held-out views have {mean['psnr']:.2f} dB at their given poses and "
             f"{mean['psnr_aligned']:.2f} dB at the poses that fit best: the model has moved with the refined cameras. "
-            "Use the cameras of refined/ with it; if the given cameras are good, train without --refine-poses"
+            "Use this model with the cameras in refined/; if the given cameras are good, train without --refine-poses"
         )

@@ -34,7 +34,7 @@ class RefinedLenses:
         self._start, count = first_step(config), len(self._rows)
         self._shares = np.bincount(self._of_view) / len(views)
         self.changes = np.zeros((count, LENS_PARAMETERS))
-        # `descend` takes six parameters; the last three of a lens stay 0
+        # `descend` works on six parameters. A lens has three of them; the others stay 0.
         self._first, self._second = np.zeros((count, 6)), np.zeros((count, 6, 6))
         self._visits = np.zeros(count, np.int64)
 
@@ -80,7 +80,7 @@ class RefinedLenses:
         return float(np.abs(self.changes).max()) if self.on else 0.0
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Changes of the lenses and Adam's moments, as arrays of a checkpoint by name."""
+        """Changes of the lenses and Adam's moments, keyed by their names in a checkpoint."""
         if not self.on:
             return {}
         moments = {"lenses/first": self._first, "lenses/second": self._second, "lenses/visits": self._visits}

@@ -47,18 +47,18 @@ def fallen(reach: float, part: float, visits: float) -> float:
 
 
 def first_step(config: TrainConfig) -> int:
-    """Last step before cameras are refined. Until then the model is too coarse to align cameras with."""
+    """Return the last step number before cameras are refined: until then the model is too coarse to align them."""
     return min(500, config.iterations // 10)
 
 
 def checked_arrays(
     own: Mapping[str, NDArray[Any]], arrays: Mapping[str, NDArray[Any]], folder: str
 ) -> dict[str, NDArray[Any]]:
-    """Copies of a checkpoint's arrays, keyed by name without the prefix `folder`, checked against the current arrays.
+    """Return copies of a checkpoint's arrays, if their shapes and types are those of the current arrays.
 
-    own: the current arrays, by name with the prefix.
-    arrays: the checkpoint's arrays, by name without it.
-    Raises ValueError if an array is missing, or belongs to other views.
+    own: the current arrays, by name with the prefix `folder`.
+    arrays: the checkpoint's arrays, by name without this prefix, as in the result.
+    Raises ValueError if an array is missing, not finite, or belongs to other views.
     """
     values = {}
     for name, like in own.items():
@@ -72,8 +72,8 @@ def checked_arrays(
 def axes_of(matrix: Float64) -> tuple[Float64, Float64]:
     """Eigenvalues (6,) of a symmetric matrix (6, 6), and its eigenvectors as rows.
 
-    Jacobi rotations find them, of three pairs of axes at a time (Golub and Van Loan, section 8.5). LAPACK is not used,
-    because its bits depend on the processor.
+    They are found by Jacobi rotations, of three pairs of axes at a time (Golub and Van Loan, section 8.5). LAPACK is
+    not used, because its bits depend on the processor.
     """
     a, axes = matrix.copy(), np.eye(6)
     for p, q in JACOBI_SWEEPS * JACOBI_PAIRS:
@@ -109,7 +109,7 @@ class Poses:
     """Cameras of the training views, which move if poses are refined.
 
     Adam has moments for each view. Two views do not move, so that the model keeps its place and size: the first view,
-    and the view farthest from it. Outlier cameras are neither of them.
+    and the view farthest from it. Outlier cameras are not among the two.
 
     held: indices of these two views.
     """
@@ -143,7 +143,7 @@ class Poses:
     def move(self, view: int, step: int, gradient: Float64) -> None:
         """Take Adam's step for the pose of training view `view`. A gradient that is not finite causes no step.
 
-        gradient: (6,), with respect to the motion of `Camera.moved`.
+        gradient: (6,), with respect to the camera's rotation and translation, as `Camera.moved` defines them.
         """
         by = gradient * self._scale  # translations relative to the length unit
         if not np.isfinite(by).all():
@@ -160,7 +160,7 @@ class Poses:
         return degrees, np.array([np.linalg.norm(a.position - b.position) for a, b in pairs])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Poses and Adam's moments, as arrays of a checkpoint by name."""
+        """Poses and Adam's moments, keyed by their names in a checkpoint."""
         if not self.on:
             return {}
         rotations = np.array([camera.rotation for camera in self.cameras])
@@ -175,7 +175,7 @@ class Poses:
         values = checked_arrays(self.arrays(), arrays, "poses/")
         turned = values["rotations"]
         if np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max() > ROTATION_TOLERANCE:
-            raise ValueError("has poses/rotations that are no rotation matrices")
+            raise ValueError("has poses/rotations that are not rotation matrices")
         poses = zip(self._given, values["rotations"], values["translations"], strict=True)
         self.cameras = [given.posed(rotation, translation) for given, rotation, translation in poses]
         self._first, self._second, self._visits = values["first"], values["second"], values["visits"]

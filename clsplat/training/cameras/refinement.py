@@ -56,7 +56,7 @@ class CameraSums(ViewPart):
 
     The step calls `add_rows` for all rows of the model, in order.
     pose, lens: True to sum the gradient with respect to the pose, and to the lens.
-    move: function that is called with the sums after Adam's step, to move the camera.
+    move: function that moves the camera after Adam's step. Its argument is this object.
     """
 
     wants_gradients = True
@@ -74,7 +74,8 @@ class CameraSums(ViewPart):
         return self.work.array("by_lens", (rows, LENS_NUMBERS)) if self.lens else None
 
     def add_rows(self, rows: StepRows) -> None:
-        """Add the rows' gradients to the sums. Kernels that read the sums are tried here, before the model changes."""
+        """Add the gradients of these rows to the sums. At the first rows of a view, the sandbox tries the kernels that
+        read the sums, before the model changes."""
         assert rows.gradients is not None, "asked for where cameras are refined"
         counts = rows.projected.tile_counts
         if self._device is None:
@@ -103,7 +104,7 @@ class CameraSums(ViewPart):
         return found
 
     def by_pose(self) -> Float64:
-        """Gradient (6,) with respect to the motion of `Camera.moved`; waits for the device."""
+        """Gradient (6,) with respect to the rotation and translation of `Camera.moved`; waits for the device."""
         return self._gradient(POSE_NUMBERS)
 
     def by_lens(self) -> Float64:
@@ -116,7 +117,8 @@ Draw = Callable[[Camera], NDArray[Any]]
 
 
 class ValidationViews:
-    """Held-out views by which the gate validates cameras, at most MAX_GATE_VIEWS. Their pixels are decoded once."""
+    """At most MAX_GATE_VIEWS held-out views, by which the gate judges refined cameras. Their pixels are decoded
+    once."""
 
     def __init__(self, scene: Scene, device: Device, config: TrainConfig) -> None:
         self.views = spread(scene.test_views, MAX_GATE_VIEWS)
@@ -125,12 +127,13 @@ class ValidationViews:
         self._measure = metrics.psnr if config.appearance == "none" else metrics.psnr_corrected
 
     def psnr(self, draw: Draw, look: Look, cameras: Sequence[Camera]) -> float:
-        """Mean PSNR in dB of the views, rendered with `cameras`, one for each; 0 if no photograph counts.
+        """Mean PSNR in dB of the views; 0 if no photograph counts. A photograph counts if its mask keeps a pixel.
 
-        A photograph counts if its mask keeps a pixel. If appearance is learnt, colours are fitted before the
-        comparison.
+        If appearance is learnt, the render's colours are fitted to the photograph before the comparison.
 
-        look: function that gives a render the appearance of a view, for views whose appearance is known.
+        draw: function that renders with a camera (`Draw`).
+        look: function of a view's name and a render. It gives the render the view's appearance, if that is known.
+        cameras: a camera for each view, to render with.
         """
         found = []
         for index, camera in enumerate(cameras):
@@ -164,7 +167,7 @@ class Cameras(Component):
 
     @property
     def models(self) -> int:
-        """Number of arrays on the device for each parameter of the model (see `Component.models`)."""
+        """Number of arrays on the device for each parameter if cameras are refined, else 0 (see `Component.models`)."""
         return REFINEMENT_ARRAYS_PER_PARAMETER if self._config.refines else 0
 
     @property
@@ -203,12 +206,14 @@ class Cameras(Component):
         return drift(given, self.poses.cameras, self._scene.length_unit) if self.poses.on else None
 
     def validate(self, views: ValidationViews, step: int, draw: Draw, look: Look) -> None:
-        """Measure the held-out views with the refined cameras. If the gate rejects the cameras, warn and go back to
-        earlier cameras.
+        """Measure the PSNR of held-out views with the refined cameras. If the gate rejects the cameras, warn and go
+        back to earlier cameras.
 
         Held-out views are measured twice, with their given poses, and with these poses moved by the drift of the
         refined poses. The better result counts. The given poses are right if only some training poses were wrong, and
-        the moved ones if the whole world has drifted.
+        the moved poses are right if the whole world has drifted.
+
+        draw, look: as for `ValidationViews.psnr`.
         """
         seen = [self.lenses.seen(view.lens, view.camera) for view in views.views]
         psnr = views.psnr(draw, look, seen)
@@ -221,7 +226,7 @@ class Cameras(Component):
             warn(warning)
 
     def refined_arrays(self) -> dict[str, NDArray[Any]]:
-        """Refined poses and lenses, as arrays of a checkpoint by name."""
+        """Refined poses and lenses, keyed by their names in a checkpoint."""
         return self.poses.arrays() | self.lenses.arrays()
 
     def go_back(self, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -230,11 +235,11 @@ class Cameras(Component):
             part.load({key.removeprefix(name): array for key, array in arrays.items() if key.startswith(name)})
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Refined cameras and the gate's measurements, as arrays of a checkpoint by name."""
+        """Refined cameras and the gate's measurements, keyed by their names in a checkpoint."""
         return self.refined_arrays() | self.gate.arrays()
 
     def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002
-        """Load the arrays of a checkpoint. Raises ValueError for arrays of other views."""
+        """Load refined cameras and the gate's measurements. Raises ValueError for a checkpoint of other views."""
         self.poses.load(named("poses/"))
         self.lenses.load(named("lenses/"))
         self.gate.load(named("gate/"), self.refined_arrays())

@@ -90,7 +90,7 @@ def drift(given: Sequence[Camera], refined: Sequence[Camera], length_unit: float
         rotation = left @ right
         turned, squares = a @ rotation.T, float((parts * (a * a).T).sum())
         scale = float((parts * (b * turned).T).sum()) / squares if squares > MIN_DRIFT_RESIDUAL else 1.0
-        angles = np.square(new @ rotation - old).sum(axis=(1, 2)) / 2  # 4 sin^2 of half the angle
+        angles = np.square(new @ rotation - old).sum(axis=(1, 2)) / 2  # 4 sin^2(angle / 2), nearly the squared angle
         residuals = np.sqrt(angles + np.square(b - scale * turned).sum(axis=1))
         bound = max(float(np.median(residuals)), MIN_DRIFT_RESIDUAL)
         weights = bound / np.maximum(residuals, bound)
@@ -146,20 +146,20 @@ class CameraGate:
         figures, steps = (
             " and ".join(each) for each in zip(*((f"{value:.2f}", str(on)) for on, value in low), strict=True)
         )
-        found = f"{flag}: held-out views had {best:.2f} dB at step {at}, {figures} dB at steps {steps}"
+        found = f"{flag}: held-out views had {best:.2f} dB at step {at}, but {figures} dB at steps {steps}"
         advice = f"try a smaller {reach}, or train without {flag}"
         if step >= self._config.iterations:
-            return None, f"{found}: no step is left in which to go back; {advice}"
+            return None, f"{found}: the last cameras are kept, as no step is left to train with earlier ones; {advice}"
         self.ended = step
         return self._best, f"{found}: the cameras of step {at} are restored, and refinement ends; {advice}"
 
     def record(self) -> dict[str, Any]:
-        """Measurements so far, as `gate` of metrics.jsonl. At least one must have been made."""
+        """Return the measurements so far, at least one, for the key `gate` in a line of metrics.jsonl."""
         measured = [{"step": step, "psnr": psnr} for step, psnr in self.measured]
         return {"measured": measured, "best": self.best[0], "ended": self.ended}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Measurements and the best cameras, as arrays of a checkpoint by name."""
+        """Measurements and the best cameras, keyed by their names in a checkpoint."""
         if not self.measured:
             return {}
         ended = np.array([-1 if self.ended is None else self.ended], np.int64)
@@ -167,8 +167,9 @@ class CameraGate:
         return {f"gate/{name}": array for name, array in own.items()}
 
     def load(self, arrays: Mapping[str, NDArray[Any]], cameras: Mapping[str, NDArray[Any]]) -> None:
-        """Load a checkpoint's arrays, by name without "gate/". There are none before the first measurement.
+        """Load the measurements and the best cameras from a checkpoint's arrays.
 
+        arrays: by name without the prefix "gate/"; {} before the first measurement.
         cameras: arrays of the current cameras; the loaded arrays must have the same shapes.
         Raises ValueError for arrays of other views.
         """
@@ -177,7 +178,7 @@ class CameraGate:
             return
         measured = arrays.get("measured", np.zeros(0))
         if measured.ndim != 2 or measured.shape[1] != 2 or not len(measured) or not np.isfinite(measured).all():
-            raise ValueError(f"has no gate/measured of steps and dB (shape {measured.shape}, expected finite (n, 2))")
+            raise ValueError(f"gate/measured has shape {measured.shape}, expected finite steps and dB (n, 2)")
         like = {"gate/ended": np.zeros(1, np.int64), **{f"gate/{name}": array for name, array in cameras.items()}}
         self._best = checked_arrays(like, arrays, "gate/")
         ended = int(self._best.pop("ended")[0])

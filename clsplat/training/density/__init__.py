@@ -15,9 +15,9 @@ from clsplat.optimisation.density_rules import MarkRules
 
 
 class StatisticsNeeds(NamedTuple):
-    """Statistics that a strategy needs.
+    """Statistics that a strategy needs for each Gaussian.
 
-    gradients: True if it needs sums of screen-space gradients, numbers of views, and radii.
+    gradients: True if it needs sums of screen-space gradients, numbers of views that show the Gaussian, and radii.
     absolute: True if it needs gradients as sums of absolute values per pixel (AbsGS).
     contributions: True if it needs contributions to the pictures of an epoch.
     """
@@ -40,7 +40,7 @@ class RowList(Protocol):
 
 
 class Marker(Protocol):
-    """Marks the Gaussians of a model by rules, on the device or host of its arrays."""
+    """Applies density rules to the Gaussians of a model, on the device or the host, where the model's arrays are."""
 
     def scores(self, rules: MarkRules) -> Float32:
         """Return the mean gradient norms (n,) of the Gaussians that may be densified; negative for the others."""
@@ -50,7 +50,7 @@ class Marker(Protocol):
 
 
 class HostCopy(Protocol):
-    """An array on the device or the host."""
+    """An array, on the device or the host, that can be copied to the host."""
 
     def get(self) -> NDArray[Any]:
         """Return a copy on the host."""
@@ -89,10 +89,11 @@ class RowPlan:
     fresh: (m,) bool, True for rows whose moments start at zero and whose contributions are unknown.
     listed: list of rows from the model's marker, in place of `rows` and `fresh`.
     values: by parameter group, the indices (k,) of new rows whose values change, and their new values (k, ...).
-    halves: function that computes the values of one half of each split Gaussian, from the groups `halved`. It is called
-        part by part with False, for the first halves of all split Gaussians, then with True for the second halves.
+    halves: function that computes values of one half of each split Gaussian. Its arguments are the groups `halved` of
+        some split Gaussians, and False for first or True for second halves. It is called for all first halves before
+        the second.
     halved: parameter groups that `halves` reads.
-    changes: by parameter group, function from values of rows to new values of the same rows.
+    changes: by parameter group, a function from values of some rows to the new values of these rows.
     restarted: groups whose moments start at zero in every row.
     new_statistics: True if all statistics except contributions start from zero.
     forget_contributions: True if contributions become unknown in every row.
@@ -115,18 +116,19 @@ class Strategy:
     optional."""
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
-        """Return the statistics that step number `step` has to gather; for 0, those that any step needs."""
+        """Return the statistics that step number `step` gathers; for step 0, those that any step gathers."""
         raise NotImplementedError
 
     def is_due(self, step: int) -> bool:
-        """True if `before_step` may return a plan after `step` steps. Before it, non-finite values are repaired."""
+        """True if `before_step` may return a plan after `step` steps. Before the call, non-finite values are
+        repaired."""
         raise NotImplementedError
 
     def before_step(self, model: ModelState) -> RowPlan | None:
         """Return a plan after `model.step` steps, which is carried out when the next step begins."""
         raise NotImplementedError
 
-    def after_gradient(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002  # most have none
+    def after_gradient(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002
         """Return a plan at the end of step number `model.step`, after Adam's step."""
         return None
 
@@ -135,7 +137,11 @@ class Strategy:
         return None
 
     def rearranged(self, rows: NDArray[np.uint32], fresh: NDArray[np.bool_]) -> None:
-        """Update state by row after a plan or a repair has moved rows: row j of the model is the old row rows[j]."""
+        """Update the strategy's own values of each Gaussian after a plan or a repair has moved rows: row j is the old
+        row rows[j].
+
+        fresh: (m,), True for rows of new Gaussians.
+        """
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the state of the strategy by name, for a checkpoint."""

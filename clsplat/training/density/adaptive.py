@@ -28,7 +28,8 @@ SCORED_ROWS = 1 << 16
 
 
 class Adaptive(Strategy):
-    """The strategy of Kerbl et al., with the extensions of `DensityConfig`."""
+    """Density control of Kerbl et al. (clone, split, prune, reset opacities), with the extensions of
+    `DensityConfig`."""
 
     def __init__(self, config: TrainConfig) -> None:
         self.config, self.white, self.sky = config.density, config.background == "white", config.sky > 0
@@ -54,7 +55,7 @@ class Adaptive(Strategy):
         return rows_change or is_reset_due(self.config, step, white=self.white)
 
     def before_step(self, model: ModelState) -> RowPlan:
-        """Densify or prune, then reset opacities, each only if it is due."""
+        """Plan to densify or prune, and then to reset opacities, each only if it is due."""
         config, step, made = self.config, model.step, RowPlan()
         if (densifies := is_due(config, step)) or is_pruning_due(config, step):
             made = plan(config, model, sky=self.sky) if densifies else plan_pruning(config, model)
@@ -80,8 +81,8 @@ def is_pruning_due(config: DensityConfig, step: int) -> bool:
 
 
 def is_reset_due(config: DensityConfig, step: int, *, white: bool) -> bool:
-    """True if opacities are reset after this step. A white background has one more early reset, as in the authors'
-    code."""
+    """True if opacities are reset after this step. With a white background they are reset once more, at the start of
+    densification, as in the authors' code."""
     if config.every <= 0 or step >= config.stop:
         return False
     return (config.opacity_reset_every > 0 and step % config.opacity_reset_every == 0) or (
@@ -90,14 +91,14 @@ def is_reset_due(config: DensityConfig, step: int, *, white: bool) -> bool:
 
 
 def plan(config: DensityConfig, model: ModelState, *, sky: bool = False) -> RowPlan:
-    """Clone small and split large Gaussians with a large mean gradient. Prune Gaussians that are transparent, oversized
-    or contribute little.
+    """Plan to clone small and to split large Gaussians with a large mean gradient, and to prune Gaussians that are
+    transparent, oversized or contribute little.
 
     sky: True if the model has sky Gaussians. The size limit of all Gaussians is then relative to SKY_RADIUS_RATIO
         (`config.points`) times the extent.
     In the plan the remaining Gaussians come first, in their order. Clones and halves are marked as fresh.
     """
-    # Each rule compares as NumPy compares a float32 array with a Python number: in float32.
+    # Each rule compares in float32, as NumPy does with a float32 array and a Python number.
     size = SKY_RADIUS_RATIO * model.extent if sky else model.length_unit
     too_large = config.max_world_fraction * size
     dense = config.dense_fraction * model.length_unit
@@ -177,9 +178,9 @@ def weakest(scores: Float32, count: int) -> tuple[float, int]:
 def budget(config: DensityConfig, step: int, count: int) -> int:
     """Number of Gaussians after this step's densification, from `count` before it.
 
-    Taming 3DGS (Mallick et al. 2024): A(x) = (B - S - k N)/N^2 x^2 + k x + S with k = 2 (B - S)/N, from S to B in N
-    densifications. This equals B - (B - S)(1 - x/N)^2. So each densification reduces the gap to B by a known ratio,
-    even if Gaussians were pruned since the last densification. The last densification reaches B.
+    In Taming 3DGS (Mallick et al. 2024), A(x) = (B - S - k N)/N^2 x^2 + k x + S with k = 2 (B - S)/N is the number of
+    Gaussians after x of N densifications, from S at first to B at last. This equals B - (B - S)(1 - x/N)^2. So each
+    densification reduces the gap to B, here max_gaussians, by a known ratio, even if Gaussians were pruned in between.
     """
     last = (config.stop - 1) // config.every * config.every
     before = max(step - config.every, config.start)
@@ -190,13 +191,14 @@ def budget(config: DensityConfig, step: int, count: int) -> int:
 def draw_halves(
     config: DensityConfig,
     split: Mapping[str, Float32],
-    second: bool,  # noqa: ARG001  # both are drawn alike
+    second: bool,  # noqa: ARG001
     *,
     rng: np.random.Generator,
 ) -> dict[str, Float32]:
     """Draw the means and log scales of one half of each split Gaussian, for `RowPlan.halves`.
 
     split: the groups SPLIT_GROUPS of the split Gaussians.
+    second: not used, because both halves are drawn from the same distribution.
     """
     means, log_scales = split_halves(config, split, rng)
     return {"means": means, "log_scales": log_scales}
@@ -205,9 +207,10 @@ def draw_halves(
 def long_halves(split: Mapping[str, Float32], second: bool) -> dict[str, Float32]:
     """Compute one half of each split Gaussian, moved along its longest axis: equation (102) of docs/gradients.md.
 
-    Returns means, log scales and opacity logits. With `second` the halves are moved in the opposite direction.
+    Returns means, log scales and opacity logits.
 
     split: the groups SPLIT_GROUPS and opacity_logits of the split Gaussians.
+    second: True for the second halves, which are moved in the opposite direction.
     """
     log_scales = split["log_scales"].astype(np.float64)
     longest = log_scales.argmax(axis=1)
@@ -248,7 +251,7 @@ def draw_offsets(quaternions: Float32 | Float64, log_scales: Float32 | Float64, 
 def rotated(quaternions: Float32 | Float64, offsets: Float64) -> Float64:
     """Rotate offsets (m, 3) by quaternions (m, 4) from the Gaussians' own axes to the world's."""
     q = quaternions.astype(np.float64)
-    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-300)  # a zero quaternion is not drawn
+    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-300)  # zero quaternions are never rendered
     w, axis = q[:, :1], q[:, 1:]
     twice = 2 * np.cross(axis, offsets)
     turned: Float64 = offsets + w * twice + np.cross(axis, twice)

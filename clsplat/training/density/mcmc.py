@@ -33,7 +33,8 @@ SCORE_ALL_RULES = MarkRules(gradient=-inf, large=-inf)
 
 
 class Mcmc(Strategy):
-    """Relocation and growth every `every` steps, and removal of invisible Gaussians at the end.
+    """MCMC density control: every `DensityConfig.every` steps it relocates dead Gaussians and adds new ones, and at the
+    end it removes invisible Gaussians.
 
     `exploration_of` gives the noise and the penalties of each step.
     """
@@ -94,9 +95,10 @@ class Mcmc(Strategy):
     def _moved(
         self, groups: dict[str, Float32], rows: NDArray[np.int64], left: NDArray[np.int64], rng: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Relocate the dead Gaussians `left` as published: to live ones, drawn in proportion to opacity.
+        """Relocate the dead Gaussians in rows `left` to live ones, drawn in proportion to opacity (Kheradmand et al.
+        2024).
 
-        groups, rows: values and source rows of the new model, updated in place.
+        groups, rows: values by parameter group, and source rows, of the new model; both are updated in place.
         Returns the rows whose values change.
         """
         if len(left) == 0:
@@ -142,7 +144,8 @@ def wanted(config: DensityConfig, step: int, count: int) -> int:
 
 
 def strongest(scores: Float32, count: int) -> NDArray[np.int64]:
-    """Return rising indices of the `count` largest scores, or of all positive scores if these are fewer."""
+    """Return the indices, in rising order, of the `count` largest scores, or of all positive scores if they are
+    fewer."""
     order = np.argsort(-scores, kind="stable")[:count]
     return np.sort(order[scores[order] > 0])
 
@@ -151,7 +154,8 @@ def draw(weights: Float64, count: int, rng: np.random.Generator) -> NDArray[np.i
     """Draw indices (count,) with replacement, with probabilities proportional to the weights."""
     sums = np.cumsum(weights)
     found: NDArray[np.int64] = np.searchsorted(sums, rng.random(count) * sums[-1], side="right")
-    last = int(np.flatnonzero(weights)[-1])  # a random number rounded up to the total would select the index after it
+    # a random number that is rounded up to the total would select an index after the last weight
+    last = int(np.flatnonzero(weights)[-1])
     found[found > last] = last
     return found
 

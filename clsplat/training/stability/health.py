@@ -19,7 +19,7 @@ MAX_TROUBLED_STEPS = 5
 """Number of steps with non-finite values, among the last TROUBLE_WINDOW_STEPS, at which training goes back to a
 checkpoint."""
 TROUBLE_WINDOW_STEPS = 100
-"""Number of latest steps in which steps with non-finite values are counted."""
+"""Number of latest steps among which steps with non-finite values are counted."""
 MAX_CHECKPOINT_RETURNS = 3
 """Maximum number of returns to a checkpoint. If one more would be needed, training ends with an error."""
 RETURN_RATE_FACTOR = 0.5
@@ -48,7 +48,7 @@ Model = Mapping[str, Rows]
 
 
 def examine(parameters: Model, first: Model, second: Model) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Gaussians with a broken parameter (n,), and Gaussians with a non-finite moment (n,).
+    """Return two masks (n,): Gaussians with a broken parameter, and Gaussians with a non-finite moment.
 
     A parameter is broken if it is not finite or over its limit. `adam` also writes a non-finite moment to mark a step
     that it has refused.
@@ -65,17 +65,22 @@ def examine(parameters: Model, first: Model, second: Model) -> tuple[NDArray[np.
 
 
 def _over(values: NDArray[np.float32], limit: float) -> NDArray[np.bool_]:
-    """Rows (n,) with a value that is not finite, or at or over a limit."""
+    """Return a mask (n,) of the rows with a value that is not finite, or with an absolute value of at least `limit`."""
     return _any_in_row(~(np.abs(values, out=values) < limit))
 
 
 def _any_in_row(marks: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Rows (n,) in which any of the marks (n, ...) is True."""
+    """Return a mask (n,) of the rows in which any of the marks (n, ...) is True."""
     return np.asarray(marks.any(axis=tuple(range(1, marks.ndim))))
 
 
 def lost(stage: str, broken: NDArray[np.bool_], refused: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Gaussians to remove. If the loss is not finite, Gaussians whose step was refused are not at fault and stay."""
+    """Return a mask (n,) of the Gaussians to remove. If the loss is not finite, Gaussians whose step was refused are
+    not at fault and stay.
+
+    stage: first stage with non-finite values.
+    broken, refused: results of `examine`.
+    """
     return broken if stage == "loss" else broken | refused
 
 
@@ -91,10 +96,10 @@ class Incident:
     step, view: number of the step, and index of the view, in which the values arose.
     name: name of the view.
     stage: first stage with non-finite values: "loss", "project_grad", "parameters" or "adam".
-    count: number of Gaussians concerned, or of array elements if no Gaussian is.
+    count: number of Gaussians with such values or refused steps; if there are none, number of refused array elements.
     done: the response in words, for messages.
     background: background of the view.
-    gaussians: up to MAX_INCIDENT_GAUSSIANS of the Gaussians concerned, by "parameters/means" and so on.
+    gaussians: up to MAX_INCIDENT_GAUSSIANS of these Gaussians: arrays by name, such as "parameters/means".
     """
 
     step: int
@@ -123,7 +128,8 @@ class RetryBudget:
     """Recent steps with non-finite values, and the returns to a checkpoint so far. Checkpoints contain it.
 
     troubled: numbers of the steps with non-finite values, among the last TROUBLE_WINDOW_STEPS.
-    rate_factor: factor on the learning rates because of these returns.
+    rate_factor: factor on the learning rates, smaller after each return to a checkpoint.
+    returns: number of returns to a checkpoint.
     lost: True if too much of the model is broken to continue with it.
     """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitor of non-finite values: notices elements that `adam` refused, finds the stage at fault and the repair."""
+"""Monitor of non-finite values: records elements that `adam` refused, and finds the stage at fault and a repair."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class LastStep:
     """Record of a step, to be inspected if non-finite values are found later.
 
     view, name: index and name of the step's view.
-    sums: function that returns the sums of the view's loss. Call it before the next step has a loss.
+    sums: function that returns the sums of the view's loss. Call it before the next step's loss, which overwrites them.
     others: records of further views of the same step, in a batch.
     """
 
@@ -54,7 +54,7 @@ class NonFiniteMonitor:
     """Monitor of non-finite values in a training.
 
     readback: device array of `Rasterizer.readback`, whose last values are the numbers of elements that `adam` refused.
-    last: the current step, once it has its loss.
+    last: record of the latest step whose loss has been launched.
     incidents: incidents that the training has not reported yet.
     latest: the latest incident.
     retries: counts of steps with non-finite values, and of returns to a checkpoint.
@@ -85,7 +85,10 @@ class NonFiniteMonitor:
         self.last = replace(last, others=(*last.others, view)) if last is not None and same else view
 
     def notice(self, refused: Sequence[int]) -> None:
-        """Record how many elements `adam` refused in the last step, by reason (`REFUSED`). Reads its loss."""
+        """Record the last step if `adam` refused elements in it. The loss of this step is then read.
+
+        refused: numbers of elements that `adam` did not update, one for each reason of `REFUSED`.
+        """
         if not any(refused) or self._noticed is not None or self.last is None:
             return
         counts = dict(zip(REFUSED, refused, strict=True))
@@ -94,7 +97,7 @@ class NonFiniteMonitor:
         self._noticed = (culprit or self.last, "loss" if culprit else stage, sum(refused))
 
     def look(self) -> None:
-        """Read from the device how many elements `adam` refused, instead of waiting for the next pass to do so."""
+        """Read from the device how many elements `adam` refused, without waiting for the next forward pass."""
         self.notice([int(value) for value in self.readback.get()[-len(REFUSED) :]])
 
     def loss_failed(self) -> None:

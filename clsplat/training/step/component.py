@@ -21,7 +21,7 @@ from clsplat.training.step.inputs import ViewInputs
 Named = Callable[[str], Mapping[str, Any]]
 """Function of a prefix. It returns the arrays of a checkpoint whose names have the prefix, by name without it.
 
-Arrays of the Gaussians may be files that are read by slices.
+Arrays of the Gaussians may be in a scratch file. Slices of them are then read from the file.
 """
 
 
@@ -75,7 +75,7 @@ class Component:
         """Return to the state after step number `step`. Later steps failed before they changed a Gaussian."""
 
     def complete_exactly(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
-        """Make the postponed changes to parameters and moments that give the same bits whenever they are made."""
+        """Make those postponed changes to parameters and moments that give the same bits at any time."""
 
     def complete(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
         """Make all postponed changes to parameters and moments. Called when every row is needed."""
@@ -86,7 +86,8 @@ class Component:
         return parameters
 
     def rows_changed(self, groups: set[str]) -> None:
-        """Forget data that depends on parameter groups whose values density control or a repair has changed."""
+        """Forget data that depends on these parameter groups, because density control or a repair has changed
+        values."""
 
     def rows_moved(self, listed: DeviceArray | HostArray) -> None:
         """Move data of individual Gaussians along with their rows, or forget it.
@@ -95,12 +96,14 @@ class Component:
         """
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """State of the component, as arrays of a checkpoint by name."""
+        """Arrays of the component's state, keyed by their names in a checkpoint."""
         return {}
 
     def load(self, named: Named, step: int, count: int) -> None:
-        """Load the arrays of a checkpoint of `count` Gaussians after `step` views. Raises ValueError for arrays of
-        other views."""
+        """Load the state from a checkpoint of `count` Gaussians after `step` views. Raises ValueError for other views.
+
+        named: function from a prefix to the checkpoint's arrays whose names have this prefix.
+        """
 
     def write(self, run: Run) -> None:
         """Write the component's files of a finished training into the run's folder."""

@@ -59,10 +59,10 @@ class StepProbe:
         """Observe the pairs' gradients, after the gradient of blending has been launched."""
 
     def before_replay(self) -> None:
-        """Prepare for a replay of launches in which Adam changes the model."""
+        """Called before a command buffer with the launches of Adam is replayed, which changes the model."""
 
     def before_rows(self, rows: StepRows) -> None:
-        """Observe the rows of the model that Adam is about to update, before Adam is launched."""
+        """Observe rows of the model, on which Adam is about to be launched."""
 
     def after_rows(self, rows: ViewRows) -> None:
         """Observe rows of the model, after Adam on them has been launched. In a batch of views, after the gradients of
@@ -78,7 +78,7 @@ class GradientStep:
     """Step of one view on one device: forward, loss, backward and Adam.
 
     step: number of the step, for learning rates and Adam.
-    fields: fields of a pair's gradient that the step computes.
+    fields: values that the step computes for each pair in addition to the plain gradients.
     turn: which array receives the loss's sums (`stages.loss.loss`), so that an earlier step's sums can still be read.
     room: number of pairs that there is memory for, if the step is launched by capacity; None counts the pairs first.
     explore: noise and penalties of the step.
@@ -116,8 +116,9 @@ class GradientStep:
     ) -> Loss:
         """Update the model (parameters, first and second moments) with a view. Returns the loss.
 
-        gradients: arrays for the gradients of rows, as `view_gradients` makes them, if a probe or a part of the view
-        reads gradients. They contain zeros before and after. With or without them the model has the same bits.
+        gradients: arrays for the gradients of rows, as `view_gradients` makes them; None if neither the probe nor a
+            part of the view reads gradients. They contain zeros before and after. The model gets the same bits with and
+            without them.
         reads_loss: True if the loss will be read. Reading then does not wait for the rest of the step.
         """
         camera = inputs.camera
@@ -134,7 +135,7 @@ class GradientStep:
         else:
             numbers, given = thinning_numbers(self.thinning), (source, sent[0])
             frame, result, slots, own = self.replayed(model[0], key, gradient, numbers, given)
-            self.device.under_way.append(source.buffer)  # alive until it is read, as in `target`
+            self.device.under_way.append(source.buffer)  # keeps the array until the device has read it, as in `target`
             frame = frame.by(camera, sent[0])
             probe.forward(frame)
             probe.loss(result)
@@ -190,8 +191,8 @@ class GradientStep:
     ) -> tuple[object, ...] | None:
         """Key of the command buffer with all launches of the view's gradient; None if they cannot be in one buffer.
 
-        They cannot with exact counts, with parts, or with depths. Nor can they with a mask, because each photograph
-        then has its own divisor of the loss.
+        They cannot if pairs are counted exactly, if components have parts in the view, or with a depth loss. Nor can
+        they with a mask, because each photograph then has its own divisor of the loss.
         """
         keys, camera, room, fields = tuple(term.key for term in terms), inputs.camera, self.room, self.fields
         if room is None or inputs.parts or inputs.kept is not None or None in keys:
@@ -210,7 +211,7 @@ class GradientStep:
         frame: ForwardPass,
         terms: Sequence[LossTerm],
     ) -> Loss:
-        """Loss between a frame and the photograph `source`. of: parameters of the model (`Workspace.replayed`)."""
+        """Return the loss between a frame and the photograph `source`. of: parameters of the model in the frame."""
         work, size = self.rasterizer.work, (inputs.camera.width, inputs.camera.height)
         alpha = any(term.wants_alpha for term in terms)
         changed = any(part.changes_target for part in inputs.parts)
@@ -237,7 +238,7 @@ class GradientStep:
         if None in keys:
             return compared()
         key = (frame.listed, image.buffer, inputs.kept, keys, self.turn)
-        if is_photograph(planes):  # each photograph has a buffer of its own
+        if is_photograph(planes):  # each photograph has its own array, so it is passed to the replay
             return self.replayed(of, (*key, planes.shape, planes.dtype), compared, given=(planes,))
         return self.replayed(of, key, compared)
 
@@ -274,8 +275,8 @@ class GradientStep:
     def _parts(
         self, model: tuple[AnyGaussians, ...], projected: Projected, chunks: ChunkList | ChunkNumbers | None
     ) -> Iterator[tuple[int, tuple[DeviceGaussians, ...], Projected]]:
-        """Yield the parts of the model that are on the device at a time. Each is its first row, its rows of all arrays,
-        and their projection."""
+        """Yield the parts of the model that are on the device at a time: for each the number of its first row, its rows
+        of all arrays, and their projection."""
         work = self.rasterizer.work
         if isinstance(chunks, ChunkNumbers):
             for start, stop, part, slots in chunk_parts(work, chunks, *model, changes=True):
@@ -312,7 +313,7 @@ class GradientStep:
         )
 
     def _change_rows(self, rows: StepRows, inputs: ViewInputs, probe: StepProbe) -> None:
-        """Take Adam's step for some rows, between the two calls of the probe."""
+        """Take Adam's step for some rows. Calls the probe before and after it."""
         if rows.gradients is not None:
             project_grad(
                 rows.device,
@@ -362,7 +363,7 @@ class GradientStep:
             part.update(gradient, self.rasterizer.readback)
 
     def update(self, rows: StepRows) -> None:
-        """Take Adam's step for some rows, and before it compute the gradient of projection if that is not done yet."""
+        """Take Adam's step for some rows. Before it, compute the gradient of projection, unless `rows` has it."""
         step, readback = self.adam_step, self.rasterizer.readback
         if rows.gradients is not None:
             parameters, first, second = rows.model
@@ -392,8 +393,8 @@ def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = Fa
 
 
 def slot_fields(needs: StatisticsNeeds, *, nearness: bool = False) -> SlotFields:
-    """Fields of a pair's gradient that a step computes for these density statistics.
+    """Values that a step computes for each pair in addition to the plain gradients, for the density statistics `needs`.
 
-    nearness: True if there is a depth loss.
+    nearness: True if there is a depth loss, which needs the gradient with respect to nearness.
     """
     return SlotFields(needs.absolute, needs.contributions, nearness)

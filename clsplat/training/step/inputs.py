@@ -37,19 +37,20 @@ class ChunksInView(Protocol):
     """Chunks of the model that a step runs over."""
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> PlacedChunks | None:
-        """Make the chunks ready for the step. Returns None if the step runs over the whole model instead."""
+        """Make the chunks ready for Adam's step `step`. Returns None if it runs over the whole model instead."""
 
 
 @dataclass(eq=False)
 class ViewInputs:
-    """Inputs of a view in a step. Not frozen, because frozen ones take longer to make, and each step makes one.
+    """Inputs of a view in a step. The dataclass is not frozen, because each step makes one, and frozen ones take
+    longer.
 
     view: the view's index among the training views.
     photograph: (H, W, 3 to 5): colours, then alpha and mask.
     camera: the view's camera, of the photograph's size.
     begins: True if an epoch begins with this view.
     kept: number of pixels that the view's mask keeps; None without a mask.
-    depth: depth loss with the view's known depths; None without.
+    depth: depth loss with the view's known depths; None if they are not known.
     area: number of pixels at full resolution per pixel of `photograph`.
     place: the view's position in the step.
     parts: the parts that components have in the view.
@@ -73,8 +74,8 @@ class ViewInputs:
 
 @dataclass(frozen=True, eq=False)
 class ViewRows:
-    """Rows [start, stop) of a step that are on the device at once. The rows of a step are those of the whole model or,
-    if a step runs over some chunks, those of the chunks one after the other.
+    """Rows [start, stop) of a step that are on the device at once. The step's rows are all rows of the model, or all
+    rows of some chunks, one chunk after the other.
 
     projected: projection of the rows [start, stop) into the step's view.
     screen: screen-space gradients of these rows. They may be undefined until the kernel has run that changes the rows.
@@ -91,8 +92,8 @@ class StepRows(ViewRows):
     """Rows of the model, with all that a step needs to change them.
 
     model: parameters of the rows, then the arrays that the step changes too: moments, or sums of gradients.
-    device: the device with the switches of the view's projection.
-    camera_array, slots: the step's camera, and the gradients of the rows' pairs.
+    device: the device, with the kernels for the view's projection.
+    camera_array, slots: the step's camera on the device, and the gradients of the rows' pairs.
     gradients: gradients with respect to the rows' parameters, if requested.
     by_lens: (rows, 4), gradients with respect to the view's lens.
     """
@@ -121,7 +122,7 @@ class ViewPart:
     """True if `compare` changes the photograph."""
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewPart:  # noqa: ARG002
-        """Copy of the part on another device, made from `values`, for `compare` and `gradient` there."""
+        """Return a copy of the part on another device, for `compare` and `gradient` there. values: from `values()`."""
         return self
 
     def values(self) -> NDArray[np.float32]:
@@ -151,13 +152,14 @@ class ViewPart:
         return None
 
     def add_rows(self, rows: StepRows) -> None:
-        """Sum the gradients of these rows. Called before the rows change."""
+        """Add the gradients of these rows to the part's sums. Called before the rows change."""
 
     def before_adam(self, rows: StepRows, step: AdamStep) -> None:
         """Change these rows just before Adam does. It is called twice if the sandbox tries the step first."""
 
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
-        """Take Adam's step for the part's own parameters. It changes nothing if the step's pass has stopped.
+        """Take Adam's step for the part's own parameters.
 
         own: gradient of these parameters.
+        readback: counts of the step's pass on the device. If they say that the pass has stopped, nothing changes.
         """

@@ -28,7 +28,7 @@ _GROUPS = tuple(PARAMETER_GROUPS)
 
 
 class LateAdam(Component):
-    """Component for late Adam: the last step that each Gaussian took, and the factors of the steps that it missed.
+    """Component for late Adam: keeps the last step that each Gaussian took, and factors by which it takes missed steps.
 
     step: number of the last step launched.
     """
@@ -39,12 +39,12 @@ class LateAdam(Component):
 
     def _begin(self, last: NDArray[np.uint32], missed: MissedSteps, step: int) -> None:
         self._last, self._missed, self.step = upload(self._device, last), missed, step
-        self._tables: dict[int, Float32] = {step: missed.rounded()}  # by step, also of steps that may be repeated
+        self._tables: dict[int, Float32] = {step: missed.rounded()}  # by step number; steps may be repeated
         self._table = allocate(self._device, self._tables[step].shape, np.float32)
 
     @property
     def row_bytes(self) -> int:
-        """Bytes per Gaussian on the device, for the last step that it took."""
+        """Bytes per Gaussian on the device, for the number of the last step that it took."""
         return 4
 
     def is_due(self, step: int, views: int) -> bool:
@@ -56,7 +56,7 @@ class LateAdam(Component):
         return [replace(each, parts=(*each.parts, _ShownRows(self))) for each in inputs]
 
     def settle_shown(self, rows: StepRows, step: AdamStep) -> None:
-        """Settle the rows that a step's view shows, before Adam's step. Repeating the step gives the same bits."""
+        """Settle the rows that a step's view shows, before Adam's step. A step that is repeated gives the same bits."""
         if step.number > self.step:
             self._missed.add(step.scales)
             self.step = step.number
@@ -106,12 +106,12 @@ class LateAdam(Component):
         self._last = upload(self._device, self._last.get()[listed.get() & ~np.uint32(FRESH)])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Last steps of the Gaussians, and factors of missed steps, as arrays of a checkpoint by name."""
+        """Arrays of the Gaussians' last steps and of missed steps' factors, keyed by their names in a checkpoint."""
         return {"late/last": self._last.get(), "late/missed": self._missed.factors.copy()}
 
     def load(self, named: Named, step: int, count: int) -> None:
-        """Continue from a checkpoint's arrays. If the checkpoint has none of these arrays, continue as if all rows had
-        taken every step.
+        """Continue from a checkpoint's arrays. If it has no arrays of late Adam, continue as if all rows had taken
+        every step.
 
         Raises ValueError for arrays of another model or step.
         """
@@ -130,12 +130,12 @@ class LateAdam(Component):
 
 @dataclass(frozen=True, eq=False)
 class _ShownRows(ViewPart):
-    """Part of a view that settles the rows that the view shows."""
+    """Part of a view that settles the rows that the view shows: it takes the steps of Adam that they missed."""
 
     late: LateAdam
 
     changes_rows = True
 
     def before_adam(self, rows: StepRows, step: AdamStep) -> None:
-        """Settle those of the rows that the view shows."""
+        """Settle the rows that the view shows, among these rows."""
         self.late.settle_shown(rows, step)

@@ -11,13 +11,13 @@ from clsplat.training.step.inputs import ViewInputs
 
 
 def alpha_term(config: TrainConfig, inputs: ViewInputs) -> LossTerm | None:
-    """The alpha loss, for photographs with alpha, or with masks if masks mean transparency."""
+    """Return the alpha loss; None if the settings ask for none, or if the photograph has neither alpha nor a mask."""
     wanted = config.alpha_loss > 0 and inputs.photograph.shape[2] > 3
     return AlphaTerm(config.alpha_loss) if wanted else None
 
 
 def depth_term(config: TrainConfig, inputs: ViewInputs) -> LossTerm | None:  # noqa: ARG001
-    """The depth loss, for views with known depths."""
+    """Return the depth loss, if the view has known depths; otherwise None."""
     return inputs.depth
 
 

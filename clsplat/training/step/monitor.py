@@ -19,12 +19,12 @@ from clsplat.training.step.speculative_steps import SpeculativeSteps
 
 @dataclass(eq=False)
 class StepMonitor(StepProbe):
-    """Probe of a step, which finds non-finite values and adds the statistics of density control.
+    """Probe of a step, which finds non-finite values and adds the view's statistics for density control.
 
     It also launches each kernel that changes the model in the sandbox before its first use.
 
     number: number of views that training has used so far, this one included.
-    needs: the statistics that density control needs of this step.
+    needs: the statistics that this step gathers for density control.
     tried: combinations of array sizes and build settings whose kernels have passed the sandbox; `before_rows` adds this
         step's.
     changes: function that is called before the model changes.
@@ -41,7 +41,7 @@ class StepMonitor(StepProbe):
     changes: Callable[[], None]
 
     def forward(self, frame: ForwardPass) -> None:
-        """Record how many elements `adam` refused to update in the previous step. This pass has read that number."""
+        """Record how many elements `adam` refused in the previous step. This forward pass has read the number back."""
         self.monitor.notice(frame.refused)
         self.pending.seen(frame)
 

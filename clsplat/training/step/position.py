@@ -66,23 +66,23 @@ class Position:
         return {**state, **views, **({"controlled": True} if self.controlled else {})}
 
     def load(self, checkpoint: Checkpoint, views: int) -> RetryBudget:
-        """Continue from a checkpoint, in a scene with `views` training views. Returns the checkpoint's retries.
+        """Continue from a checkpoint, in a scene with `views` training views. Returns the checkpoint's `RetryBudget`.
 
-        Raises InputError.
+        Raises InputError for a state that cannot be read.
         """
         try:
             self.rng.bit_generator.state = checkpoint.state["rng"]
             queue = list(checkpoint.state["queue"])
             if not all(type(index) is int and index >= 0 for index in queue):
-                raise ValueError(f"the queue of views begins with {queue[:3]}, expected indices")
+                raise ValueError(f"the queue of views begins with {queue[:3]}, expected indices from 0 on")
             retries = RetryBudget(**checkpoint.state.get("patience", {}))
             last_views = checkpoint.state.get("views", 1)
             if type(last_views) is not int or not 1 <= last_views <= max(checkpoint.step, 1):
                 raise ValueError(f"the last step had {last_views!r:.20} views, expected 1 to {max(checkpoint.step, 1)}")
         except (KeyError, TypeError, ValueError, IndexError) as error:
             why = f"{type(error).__name__}: {error}"
-            raise unusable(checkpoint, f"its state is not as this version writes it ({why})") from None
+            raise unusable(checkpoint, f"its state cannot be read ({why})") from None
         self.step, self.last_views = checkpoint.step, last_views
-        self.queue = queue if max(queue, default=0) < views else []  # the scene has fewer views now
+        self.queue = queue if max(queue, default=0) < views else []  # the scene has fewer views: a new epoch
         self.controlled = bool(checkpoint.state.get("controlled", False))
         return retries

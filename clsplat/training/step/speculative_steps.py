@@ -42,7 +42,7 @@ class _Step:
     number: number of the step's last view.
     readback: the step's counts on the device.
     counts: function that waits for these counts, and returns them.
-    before: `NonFiniteMonitor.last` as it was before this step.
+    before: value of `NonFiniteMonitor.last` before this step.
     kept: host memory that the device may still have to read.
     """
 
@@ -57,7 +57,7 @@ class _Step:
 
 
 def by_capacity(device: Device) -> bool:
-    """True if steps on this device are launched by capacity where possible. Raises InputError."""
+    """True if steps on this device are launched by capacity. Raises InputError for an invalid CLSPLAT_BY_CAPACITY."""
     return switched_on(BY_CAPACITY_VARIABLE) if os.environ.get(BY_CAPACITY_VARIABLE) else device.kind != "cpu"
 
 
@@ -84,7 +84,7 @@ class SpeculativeSteps:
 
     @property
     def turns(self) -> int:
-        """Number of arrays for losses' sums, which steps use in turn."""
+        """Number of arrays for the sums of the loss. Consecutive steps use different ones."""
         return MAX_COUNTED_PASSES if self.on else 1
 
     def forget(self) -> None:
@@ -95,7 +95,8 @@ class SpeculativeSteps:
     def seen(self, frame: ForwardPass) -> None:
         """Record the forward pass of a step that has just been launched."""
         counted = frame.listed.counted
-        self._counted = counted if counted.arriving is not None else None  # else the memory is free for the next step
+        # exact counts are not kept, because the next step uses their memory
+        self._counted = counted if counted.arriving is not None else None
         if self._counted is None:
             self._count(counted.pairs if len(frame.bands) == 1 else None)
 
@@ -105,9 +106,9 @@ class SpeculativeSteps:
     def room(self, rasterizer: Rasterizer, size: object, gaussians: int) -> int:
         """Capacity in pairs of the next step; 0 to count its pairs first.
 
-        It is a quarter more than the most pairs of a step with photographs of this `size`, scaled by the growth in
-        Gaussians. It is 0 if steps are not launched by capacity, if no number is known yet, or if the rasterizer's
-        capacity is less.
+        The capacity is a quarter more than the largest number of pairs of earlier steps with photographs of this
+        `size`, multiplied by the growth to `gaussians` Gaussians. It is 0 if steps are not launched by capacity, if no
+        earlier number is known, or if it would exceed the rasterizer's capacity.
         """
         if not self.on or not rasterizer.takes_room:
             return 0
@@ -133,7 +134,7 @@ class SpeculativeSteps:
             return run(0, None)
         if not room:
             self.settle()
-        # also for steps with exact counts, because their loss is read a step later
+        # steps with exact counts use the arrays of loss sums in turn too, because their loss is read a step later
         turn = self._turn = (self._turn + 1) % self.turns
         before, result = self._monitor.last, run(turn, PairCapacity(room, turn, self._appends) if room else None)
         if not room:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Order of the views in an epoch, a pass through the training photographs (--view-order). Policy only: no device.
 
-A pass shows each view once. Its order is random, or it goes through four clusters of near views at a time.
+A pass shows each view once. Its order is random, or alternates between four clusters of views that look at near points.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from clsplat.camera import Camera
 CLUSTER_VIEWS = 16
 """Maximum number of views in a cluster."""
 CLUSTERS_AT_ONCE = 4
-"""Number of clusters whose views alternate. One cluster after the other would show nearer views, but costs 0.3 dB on
-bonsai: the model fits the last cluster at the expense of the others (docs/decisions/0050)."""
+"""Number of clusters whose views alternate. With one cluster after the other, successive views would have more in
+common, but bonsai loses 0.3 dB: the model fits the last cluster at the expense of the others (docs/decisions/0050)."""
 GAZE_UNITS = 1.5
 """Distance, in length units, from a camera to the point on its viewing axis that stands for the view.
 
@@ -25,8 +25,8 @@ A length unit is 1.4 times the median depth of what photographs look at, or less
 a cluster have the most Gaussians in common (docs/decisions/0050).
 """
 POINT_STEP = 2.0**-16
-"""Points are rounded to multiples of this, in length units. So cameras in a row or in one place stay level with each
-other, however their coordinates were rounded."""
+"""Points are rounded to multiples of this, in length units. So the points of cameras in a row or in one place have
+equal coordinates, in spite of rounding errors."""
 
 
 class ViewOrder:
@@ -34,7 +34,7 @@ class ViewOrder:
 
     cameras: cameras of the training views, as given. The order does not follow refined poses.
     unit: length unit of the scene, in world units.
-    near: True to go through clusters of near views; False for a random order.
+    near: True to group views that look at near points into clusters; False for a random order.
     """
 
     def __init__(self, cameras: Sequence[Camera], unit: float, *, near: bool) -> None:
@@ -55,9 +55,9 @@ class ViewOrder:
 
 
 def gaze_points(cameras: Sequence[Camera], unit: float) -> Int64:
-    """Points (n, 3) that stand for the views, relative to their middle, in multiples of `POINT_STEP`.
+    """Points (n, 3) that the views look at, relative to the middle of the cameras, in multiples of `POINT_STEP`.
 
-    A panorama shows every direction, so its camera's position stands for it.
+    The point of a panorama, which looks in every direction, is its camera's position.
     """
     positions = np.array([camera.position for camera in cameras])
     axes = np.array([camera.rotation[2] * (not camera.model.wraps) for camera in cameras])
@@ -66,9 +66,10 @@ def gaze_points(cameras: Sequence[Camera], unit: float) -> Int64:
 
 
 def clusters_of(points: Int64) -> list[Int64]:
-    """Clusters of views with near points (n, d), each of at most `CLUSTER_VIEWS` views and nearly the same size.
+    """Divide views into clusters by their points (n, d): each of at most `CLUSTER_VIEWS` views with near points, and
+    all of nearly the same size. Returns the indices of each cluster's views.
 
-    They are the leaves of a k-d tree, which divides along the coordinate of the widest range. Views with equal
+    The clusters are the leaves of a k-d tree, which divides along the coordinate of the widest range. Views with equal
     coordinates are divided by their index.
     """
     leaves, nodes = [], [np.arange(len(points))]

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A step of a large model runs over the chunks that its view may show (docs/decisions/0051-chunks.md)."""
+"""Steps of a large model over the chunks that the view may show: bounds of chunks, and steps that hidden chunks missed
+(docs/decisions/0051-chunks.md)."""
 
 from __future__ import annotations
 
@@ -39,19 +40,20 @@ STEPS_PER_MEASUREMENT = 16
 """Steps after which the bounds of the chunks that took part in them are measured again. More steps widen the bounds,
 whose growth by each step is an upper limit; fewer wait more often for the device."""
 MAX_SHARE_IN_VIEW = 0.6
-"""Share of the chunks in view above which a step runs over the whole model. On a CPU, with 0.4 of a town in view, steps
-take 0.89 of the time of steps over the whole; with 0.78 of bonsai, 1.01."""
+"""Share of the chunks in view above which a step runs over the whole model. Steps over the chunks in view take 0.89 of
+the time of steps over the whole model with 0.4 of a town in view, and 1.01 with 0.78 of bonsai, on a CPU."""
 _BOUNDED_GROUPS = ("means", "log_scales")
 """Parameter groups that the bounds of a chunk are measured from."""
 _ROWS_AT_ONCE = 1 << 16
 """Number of rows of a checkpoint that are read at a time."""
 MOST_MISSED_STEPS = 1024
-"""Steps after which a chunk is caught up even if no view shows it."""
+"""Number of missed steps after which a chunk is caught up even if no view shows it."""
 
 
 def settings_of_whole_steps(config: TrainConfig) -> list[str]:
-    """Names of the given settings that make each step run over the whole model. With them a step changes hidden
-    Gaussians by other means than Adam, or reads their gradients."""
+    """Return the options in use, such as "--batch", that make each step run over the whole model. With them, a step
+    reads the gradients of Gaussians that the view does not show, or changes these Gaussians in other ways than by
+    Adam."""
     wanted = {
         "--density.growth mcmc": config.density.growth == "mcmc",
         "--antialiased": config.antialiased,
@@ -74,7 +76,7 @@ def streams_by_chunk(config: TrainConfig, device: Device, count: int) -> bool:
 
 
 def most_in_view(gaussians: Gaussians, cameras: Iterable[Camera], config: TrainConfig) -> int:
-    """Number of chunks of an ordered model that one of the cameras may show, at most."""
+    """Return the largest number of chunks that one camera may show. gaussians: a model in the order of its chunks."""
     bounds, still = ChunkBounds.measured(gaussians.means, gaussians.log_scales), np.zeros((2, 1))
     table, updates = BoundsTable(len(bounds)), MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT
     measured = np.hstack([bounds.lowest, bounds.highest, bounds.largest[:, None]])
@@ -122,9 +124,9 @@ class VisibleChunks(Component):
         self._hidden_limit = 0.0 if self._config.optimiser.sparse else hidden_path(self._config.optimiser, step)
 
     def _begin(self, count: int, step: int, chunks: int = 0) -> None:
-        """Forget all bounds, of a model of `count` Gaussians that have all taken step number `step`.
+        """Forget all bounds. The model has `count` Gaussians, and all have taken step number `step`.
 
-        chunks: number of its chunks; 0 if they are full.
+        chunks: number of the model's chunks; 0 if all but the last are full, so that `count` gives their number.
         """
         chunks = chunks or chunks_of(count)
         self._count = count
@@ -132,7 +134,7 @@ class VisibleChunks(Component):
         self._unmeasured = np.ones(chunks, np.bool_)
         self._since: int | None = None
         """Steps since the last measurement; None if there is none."""
-        most = 2 * (MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)  # twice, so that the table is seldom moved
+        most = 2 * (MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)  # twice the need, so that rows are seldom moved
         self._table = np.zeros((most, 2 + len(PARAMETER_GROUPS)), np.float32)
         """The steps from `_first_step` on, of which chunks may have missed some (`stages.catch_up.step_table`)."""
         self._begin_table(step, chunks)
@@ -153,7 +155,8 @@ class VisibleChunks(Component):
 
     @property
     def on(self) -> bool:
-        """True if a step changes hidden Gaussians at most by Adam, and reads gradients of none of them."""
+        """True if steps may run over some chunks: they change other Gaussians only by Adam, and read none of their
+        gradients."""
         return runs_by_chunk(self._config, self._rasterizer.device) and isfinite(self._step_limit)
 
     def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002
@@ -162,7 +165,7 @@ class VisibleChunks(Component):
 
     @property
     def reads_all_rows(self) -> bool:
-        """True if a chunk has missed so many steps that all are caught up at the next measurement."""
+        """True if a chunk has missed so many steps that all are caught up before the next measurement of bounds."""
         return self.step - int(self._last.min(initial=self.step)) >= MOST_MISSED_STEPS
 
     def before_step(self, gaussians: AnyGaussians) -> None:
@@ -182,7 +185,7 @@ class VisibleChunks(Component):
         self._unmeasured[numbers] = False
 
     def _measured(self, gaussians: AnyGaussians, numbers: NDArray[np.uint32]) -> Float32:
-        """Bounds (chunks, BOUNDS_FLOATS) of these chunks."""
+        """Measure the bounds (chunks, BOUNDS_FLOATS) of the chunks `numbers`."""
         if isinstance(gaussians, DeviceGaussians):
             return self._measured_on_device(gaussians, numbers)
         assert gaussians.pool is not None
@@ -202,11 +205,11 @@ class VisibleChunks(Component):
         return bounds(self._rasterizer.device, work, gaussians, chunks)[: len(numbers)]
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:
-        """The view, with the chunks that it may show."""
+        """Return the step's only view, with the chunks that it may show."""
         if count <= ORDERED_ROWS or self._since is None:
             return inputs
         (of_view,) = inputs
-        if self.step < step - 1:  # steps since then ran over all rows, because the model was small or streamed
+        if self.step < step - 1:  # the steps in between ran over all rows, as the model was small or streamed
             self._begin_table(step - 1, len(self._last))
         hidden, most_hidden = self._hidden_movement(step)
         numbers = self._shown(of_view, step, hidden, most_hidden)
@@ -222,23 +225,23 @@ class VisibleChunks(Component):
         return [replace(of_view, chunks=_ChunksInView(self, numbers, missed, self._found, whole=whole))]
 
     def in_view(self, camera: Camera) -> NDArray[np.uint32]:
-        """The chunks that a camera may show, as they are after the last step."""
+        """Numbers of the chunks that a camera may show after the last step."""
         return self._shown_by(camera, 1.0, *self._hidden_movement(self.step + 1))
 
     def _shown(self, of_view: ViewInputs, step: int, hidden: Movement, most: Float64) -> NDArray[np.uint32]:
-        """The chunks that the view may show, in rising order. hidden, most: results of `_hidden_movement`."""
+        """Chunks that the view may show, in rising order. hidden, most: results of `_hidden_movement`."""
         thinning = thinning_of(self._config, step)
         return self._shown_by(of_view.camera, 1.0 if thinning is None else thinning.factor, hidden, most)
 
     def _shown_by(self, camera: Camera, factor: float, hidden: Movement, most: Float64) -> NDArray[np.uint32]:
-        """The chunks that a camera may show, with opacities times a factor."""
+        """Chunks that a camera may show if opacities are multiplied by `factor`. Other arguments as for `_shown`."""
         picture = PictureBorders.of(camera, self._config.rasterizer, factor)
         return self._found.seen(partial(visible, picture), hidden, most, MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
 
     def _hidden_movement(self, step: int) -> tuple[Movement, Float64]:
-        """Limits of the movement of means and log scales in missed steps, those before number `step`.
+        """Compute limits of the movement of means and log scales in missed steps, before step number `step`.
 
-        Returns a function of chunks that gives their limits (2, n), and the largest limits of all chunks (2, 1).
+        Returns a function from chunk numbers (n,) to these limits (2, n), and the largest limits of all chunks (2, 1).
         """
         longest = np.argmin(self._last, axis=0, keepdims=True)
         rates = self._mean_and_scale_rates(range(min(int(self._last[longest[0]]), step - 1) + 1, step + 1))
@@ -255,7 +258,7 @@ class VisibleChunks(Component):
         return np.array([[rates["means"]], [rates["log_scales"]]])
 
     def _note_movement(self, chunks: NDArray[np.uint32], hidden: Float64) -> None:
-        """Note that these chunks move by `hidden` (2, n) in the steps that they have missed."""
+        """Widen the bounds of the chunks by `hidden` (2, n), the limit of their movement in missed steps."""
         self._found.move(chunks, hidden)
         self._unmeasured[chunks] = True
 
@@ -271,7 +274,7 @@ class VisibleChunks(Component):
         return Missed(numbers, last, step, table, first)
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep, chunks: _ChunksInView) -> PlacedChunks | None:
-        """Catch up the chunks that a step's view shows, and send their list. Repeating a step gives the same bits."""
+        """Catch up the chunks that a step's view shows, and send their list. A repeated step gives the same bits."""
         if chunks.of_rows is not self._found:  # rows have moved since, and all have taken every step
             self._divide(_pool_of(model))
             everything = np.arange(len(self._last), dtype=np.uint32)
@@ -330,7 +333,8 @@ class VisibleChunks(Component):
         step: int,
         table: StepTable,
     ) -> None:
-        """Catch up chunks or slots of a model on the device to a step. Arguments as those of `catch_up`."""
+        """Catch up chunks of a model on the device to a step. numbers: of chunks, or of slots in the pool. Other
+        arguments as for `catch_up`."""
         device, work, readback = self._rasterizer.device, self._rasterizer.work, self._rasterizer.readback
         chunks = send_chunks(work, "chunks_behind", numbers, model[0].count)
         on_device = work.array("last_steps", chunks.numbers.shape, np.uint32)
@@ -340,13 +344,14 @@ class VisibleChunks(Component):
         catch_up(device, self._config.optimiser, model, chunks, on_device, caught, step, table, readback)
 
     def step_back(self, step: int) -> None:
-        """Return to the state after step number `step`. Chunks that were caught up after it are marked as such."""
+        """Return to the state after step number `step`. Chunks that have been caught up since then are not caught up
+        twice: the device knows the step of each."""
         if step >= self.step:
             return
         self._last, self.step = self._before[step + 1], step
 
     def complete_exactly(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
-        """Catch up all chunks."""
+        """Catch up all chunks: take the steps of Adam that they have missed."""
         missed = self._missed(np.arange(len(self._last), dtype=np.uint32), self.step)
         if missed is None:
             return
@@ -356,16 +361,17 @@ class VisibleChunks(Component):
         self._last[missed.numbers] = missed.step
 
     def rows_changed(self, groups: set[str]) -> None:
-        """Measure all bounds again if means or scales have changed."""
+        """Forget all bounds if means or scales have changed. The next step measures them."""
         if not groups.isdisjoint(_BOUNDED_GROUPS):
             self._begin(self._count, self.step)
 
     def rows_moved(self, listed: DeviceArray | HostArray) -> None:
-        """Measure all bounds again."""
+        """Forget all bounds, because rows have moved. The next step measures them."""
         self._begin(listed.shape[0], self.step)
 
     def load(self, named: Named, step: int, count: int) -> None:
-        """Measure all bounds of the checkpoint's Gaussians, whose moments other decays may have made."""
+        """Begin without bounds at a checkpoint. Its moments, perhaps from other decay rates, limit the movement per
+        step."""
         first, second = named("first/"), named("second/")
         ratio = 0.0
         for begin in range(0, count, _ROWS_AT_ONCE):
@@ -379,7 +385,8 @@ class VisibleChunks(Component):
 
     @property
     def row_bytes(self) -> int:
-        """Bytes per Gaussian: those of a chunk in lists, bounds and missed steps, rounded up."""
+        """Bytes per Gaussian on the device: the bytes of a chunk's bounds and missed steps, divided by its rows,
+        rounded up."""
         return 1 if self.on else 0
 
 
@@ -388,8 +395,8 @@ class _ChunksInView(ChunksInView):
     """The chunks of a step's view, and the steps that some of them have missed.
 
     of: the component that made this object.
-    of_rows: the bounds that the chunks were chosen by. A new object replaces it when rows of the model move, which
-        shows that the list is outdated.
+    of_rows: the bounds from which the chunks were chosen. When rows move, the component makes new bounds, which shows
+        that the list of chunks is outdated.
     whole: True if the step runs over the whole model; `numbers` then lists all its chunks.
     """
 
@@ -400,7 +407,7 @@ class _ChunksInView(ChunksInView):
     whole: bool
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> PlacedChunks | None:
-        """Catch up these chunks, and send their list."""
+        """Catch up these chunks, and send their list to the device."""
         return self.of.prepare(model, step, self)
 
 

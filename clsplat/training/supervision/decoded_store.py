@@ -129,8 +129,8 @@ class DecodedStore:
             if not self._told_damage:
                 self._told_damage = True
                 self._notes.append(
-                    f"{path}: is no intact file of decoded pixels ({reason}); the photograph is decoded again (further "
-                    "damaged files are not reported)"
+                    f"{path}: is not an intact file of decoded pixels ({reason}); the photograph is decoded again "
+                    "(further damaged files are not reported)"
                 )
 
     def _count(self, nbytes: int, seconds: float) -> None:
@@ -159,7 +159,7 @@ def _is_abandoned(path: Path) -> bool:
 
 
 def _read(path: Path, key: bytes) -> NDArray[Any]:
-    """Pixels (H, W, C) of a file. Raises OSError, and ValueError for a damaged file or another key."""
+    """Pixels (H, W, C) of a file. Raises OSError, and ValueError for a damaged file or a file with another key."""
     with open(path, "rb", buffering=0) as file:
         size = os.fstat(file.fileno()).st_size
         head = file.read(_HEADER_BYTES)

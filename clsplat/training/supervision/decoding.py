@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decoding of photographs to the sizes that the warm-up needs, or reading of decoded ones from the cache on the disk.
+"""Decoding of photographs to the sizes that the warm-up needs, or reading of their decoded pixels from the disk cache.
 Policy only: no device."""
 
 from __future__ import annotations
@@ -31,13 +31,14 @@ class PhotographError(InputError):
 
 
 def stored(image: Float32, *, rounds: bool) -> NDArray[Any]:
-    """Pixels (H, W, C) as uint8 if that is exact, else as float32.
+    """Convert an image (H, W, 3 to 5) to uint8 if that is exact, else to float32.
 
-    rounds: True to round them to uint8 even if that is not exact. An image with a value outside 0 to 1 stays float32.
+    rounds: True to round the values to uint8 even if that is not exact. An image with a value outside 0 to 1 stays
+        float32.
     """
     levels = np.rint(image * 255)
     fits = 0 <= levels.min() <= levels.max() <= 255
-    if fits and (rounds or np.array_equal(levels * np.float32(1 / 255), image)):  # as in target.cl, to float
+    if fits and (rounds or np.array_equal(levels * np.float32(1 / 255), image)):  # target.cl converts in the same way
         return levels.astype(np.uint8)
     return np.ascontiguousarray(image, np.float32)
 
@@ -62,9 +63,9 @@ class Decoder:
         return max(int(camera.width / factor), 1), max(int(camera.height / factor), 1)
 
     def pixels(self, index: int, factor: float, *, keeps: bool) -> dict[float, NDArray[Any]]:
-        """Pixels (H, W, C) of view `index` at 1/factor of its size, by factor.
+        """Decode view `index` at 1/`factor` of its size. Returns pixels (H, W, C), keyed by the divisor of the size.
 
-        keeps: True to return the larger sizes as well, which the training needs later, if the file has to be decoded.
+        keeps: True to return larger sizes too, which the training needs later, if the file has to be decoded.
         Raises PhotographError.
         """
         store = self.store

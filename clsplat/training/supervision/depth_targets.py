@@ -37,6 +37,7 @@ def weight_at(config: TrainConfig, step: int) -> float:
 class DepthTargets(Component):
     """Known depths of all training views at one resolution; inactive unless the settings ask for depths.
 
+    near: near plane of the model, in world units.
     pixels: function that returns a view's photograph (H, W, 3 to 5) at the step's size, on the host.
     """
 

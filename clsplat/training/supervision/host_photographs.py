@@ -59,7 +59,7 @@ class HostPhotographs:
 
     @cached_property
     def least(self) -> int:
-        """Smallest possible limit in bytes: for the views of a step, one view that is read ahead, and its decoding."""
+        """Smallest possible limit in bytes: for the views of a step, one view that is read ahead, and decoding."""
         return self._needed(1)
 
     @cached_property
@@ -134,7 +134,7 @@ class HostPhotographs:
         self._tell()
 
     def _made(self, key: Key) -> dict[float, NDArray[Any]]:
-        """Read or decode a photograph, and keep it."""
+        """Read a photograph from the disk cache, or decode it, and keep it. Returns the result of `Decoder.pixels`."""
         index, factor = key
         images = self.decoder.pixels(index, factor, keeps=not self.bounded)
         with self._lock:
@@ -160,7 +160,7 @@ class HostPhotographs:
             self._bytes -= self._held.pop(key).nbytes
 
     def _enter(self, factor: float) -> None:
-        """When the size changes, evict photographs of the sizes used before, and with a limit of all other sizes."""
+        """When the size changes, evict photographs of earlier sizes. With a limit, evict all other sizes."""
         if factor == self._factor:
             return
         self._factor = factor

@@ -52,17 +52,17 @@ class ImageCache:
         return self.host.get(index, factor)
 
     def kept(self, index: int, factor: float) -> int | None:
-        """Number of pixels that the mask of the image of `load` keeps; None without a mask."""
+        """Number of pixels that the mask of view `index` keeps at 1/factor of its size; None without a mask."""
         key = index, factor
         if key not in self._kept:
             self._kept[key] = kept_pixels(self.load(index, factor))
         return self._kept[key]
 
     def bring(self, index: int, factor: float) -> NDArray[Any] | DeviceArray:
-        """The image of `load`: a device array if the device has memory for it, else the host's array.
+        """Return the photograph of view `index`: a device array if the device has memory for it, else the host's array.
 
-        An image is uploaded once and stays, unless `ahead` has already sent it to the upload ring. A device that shares
-        the host's memory reads the host's array.
+        A photograph is uploaded once and stays, unless `ahead` has already sent it to the upload ring. A device that
+        shares main memory reads the host's array.
         """
         self._enter(factor)
         if index in self._on_device:
@@ -70,7 +70,7 @@ class ImageCache:
         image = self.load(index, factor)
         if self._device.shares_memory:
             array = shared(self._device, image)
-            if not self.host.bounded:  # a bounded host may evict the image
+            if not self.host.bounded:  # with a limit, `host` may evict the image
                 self._on_device[index] = array
             return array
         if self._uploads is not None and (sent := self._uploads.take((index, factor))) is not None:
@@ -88,7 +88,7 @@ class ImageCache:
         return array
 
     def ahead(self, index: int, factor: float) -> None:
-        """Begin to upload an image for the next `bring`, if the device has no memory to keep it (`UploadRing`).
+        """Begin to upload the photograph for the next `bring`, if the device has no memory to keep it (`UploadRing`).
 
         Call it after launching a step: the upload then runs while the device computes.
         """

@@ -22,8 +22,8 @@ from clsplat.training.supervision.resolution import Sizes
 class ViewLoader:
     """Loader of the inputs of a step's views.
 
-    refined: function that returns the current camera of a view.
-    local: function that moves a camera to the coordinates of the model.
+    refined: function that returns the current camera of a training view, by index.
+    local: function that converts a camera from world to model coordinates.
     """
 
     def __init__(
@@ -54,6 +54,7 @@ class ViewLoader:
     def inputs(self, view: int, position: Position, place: int, *, begins: bool) -> ViewInputs:
         """Inputs of a view, at the size of the current step.
 
+        position: the training's position, with the step and the random generator.
         place: the view's position in the step.
         begins: True if an epoch begins with the view.
         In a batch the photograph stays on the host, because any device may take the view.
