@@ -40,7 +40,7 @@ def strays(places: Float64, most: float, least: float = 0.0, middle: Float64 | N
         `least` is 0 and all positions but a few coincide, no position is an outlier.
     """
     found = np.zeros(len(places), np.bool_)
-    first = len(places) - int(most * len(places))  # number of nearest positions, which cannot be outliers
+    first = len(places) - int(most * len(places))  # this many nearest positions cannot be outliers
     if not 0 < first < len(places):
         return found
     distances = np.linalg.norm(places - (np.median(places, axis=0) if middle is None else middle), axis=1)

@@ -101,7 +101,7 @@ def by_name(folder: Path, present: Collection[Path], used: Sequence[Path]) -> di
     """Return the pictures by their paths relative to `folder`, without masks, depth maps and downscaled copies.
 
     present: the pictures in `folder`.
-    used: pictures that the data set uses, whose masks and depth maps are recognised by name.
+    used: pictures that the data set uses. Their masks and depth maps are recognised by name.
     """
     aside = companions(present, used, folder)
     copies = {path for path in {path.parent for path in present} if is_smaller_copy(path)}

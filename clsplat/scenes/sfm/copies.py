@@ -34,7 +34,8 @@ Programs with such folders are the 3DGS authors' convert.py, Polycam, OpenSfM (u
 (dense/0/images) and others.
 """
 PLAIN_FOLDER_STAGE, UNDISTORTED_FOLDER_STAGE = 1, 2
-"""Stages, as indices in UNDISTORTION_FOLDERS: of photographs in folders with other names, and of undistorted ones."""
+"""Indices in UNDISTORTION_FOLDERS: of the stage of photographs in folders that it does not list, and of the stage of
+undistorted photographs."""
 LOSSLESS_EXTENSIONS = (".png", ".tif", ".tiff", ".bmp")
 """Extensions of lossless photographs, which are preferred to their lossy copies."""
 COPY_THUMBNAIL_SIZE_PX = (96, 72)
@@ -193,7 +194,7 @@ def thumb_of(pixels: NDArray[Any], alpha: int) -> Thumb:
 
 
 def resolved(copies: dict[str, Copy]) -> dict[str, Copy]:
-    """Return copies with the photographs that are used in the end. In the input, `Copy.kept` may itself be a copy."""
+    """Return the copies, with `Copy.kept` followed until it names a photograph that is not itself a copy."""
 
     def last(name: str) -> str:
         while name in copies:
@@ -204,7 +205,7 @@ def resolved(copies: dict[str, Copy]) -> dict[str, Copy]:
 
 
 def listed(copies: dict[str, Copy]) -> str:
-    """Return copies as text for a message: the first of them in the order of names."""
+    """Return text for a message with examples of the copies, such as "b.jpg is a.jpg, smaller"."""
     return examples(f"{name} is {copy.kept}, {copy.why}" for name, copy in sorted(copies.items()))
 
 
@@ -240,9 +241,9 @@ class _Staged:
 
 
 class _Pictures:
-    """Sizes and thumbnails of the pictures in a folder, read on demand.
+    """Sizes and thumbnails of the pictures in a folder, read on demand, to compare its sub-folders.
 
-    groups: groups of photographs with the same name in related folders.
+    groups: groups of photographs with the same name in related folders. Their `head` names the folders to compare.
     """
 
     def __init__(self, folder: Path, groups: Sequence[Sequence[_Staged]]) -> None:
@@ -363,11 +364,12 @@ def _alike(names: Iterable[str]) -> list[list[_Place]]:
 def _found(
     groups: Iterable[list[P]], rank: Callable[[P], tuple[Hashable, ...]], why: Callable[[P, P], str]
 ) -> dict[str, Copy]:
-    """Find the copies in each group: photographs that match an earlier one in the order of `rank`.
+    """Find the copies in each group: photographs that show the same as a better photograph of the group.
 
-    The earlier photograph may itself be a copy.
+    The better photograph may itself be a copy.
 
-    why: function of the earlier and the later photograph that returns the text for `Copy.why`; "" if they differ.
+    rank: sort key of a photograph; better photographs have smaller keys.
+    why: function of the better and the other photograph that returns the text for `Copy.why`; "" if they differ.
     """
     copies: dict[str, Copy] = {}
     for group in groups:
@@ -381,9 +383,10 @@ def _found(
 
 
 def _of_same_bytes(folder: Path, names: Sequence[str]) -> dict[str, Copy]:
-    """Find files with the same bytes as another file.
+    """Find files with the same bytes. Returns the copies by name.
 
-    The file in the earliest of UNDISTORTION_FOLDERS is used; if there are several, the one with the shortest name.
+    Of equal files, the one whose folder has the earliest stage in UNDISTORTION_FOLDERS is used. If there are several,
+    the one with the shortest name is used.
     """
     alike: dict[tuple[object, ...], list[str]] = {}
     keys: tuple[Callable[[Path], object], ...] = (lambda path: path.stat().st_size, _middle, short_digest)
@@ -425,7 +428,7 @@ def _numbered(folder: str) -> tuple[str, int]:
 def _is_downscaled(factor: int, by: int, whole: tuple[int, int], size: tuple[int, int]) -> bool:
     """Return True if two pictures' sizes agree with the factors in the names of their folders.
 
-    factor, by: factors of the larger and of the smaller picture.
+    factor, by: the factors of downscaling of the larger and of the smaller picture.
     whole, size: width and height of the larger and of the smaller picture.
     """
     return factor < by and all(abs(side * by / factor - long) <= by for side, long in zip(size, whole, strict=True))

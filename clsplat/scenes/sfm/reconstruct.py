@@ -170,7 +170,7 @@ def _staged_photos(
 ) -> list[sfm_photos.Photo]:
     """Put the photographs under `target`. Returns the photographs that are not copies, and warns of copies.
 
-    copies: by name, the copies that were found by their names.
+    copies: copies that were found before the photographs were decoded, by name.
     Raises InputError if too few photographs remain.
     """
     photos = sfm_photos.stage_photos(
@@ -226,7 +226,7 @@ def sfm_task(
 
 
 def _write_record(folder: Path, fingerprint: str, photos: list[sfm_photos.Photo], result: dict[str, Any]) -> None:
-    """Write sfm.json into the folder of the result."""
+    """Write sfm.json, the record of a reconstruction, into the folder of the result."""
     missing = sorted({photo.name for photo in photos} - set(result["registered"]))
     record = {"fingerprint": fingerprint, "photos": len(photos), "unregistered": missing, **result}
     record["files"] = _sizes(folder)
@@ -242,7 +242,7 @@ def _warn_of_losses(
     result: folder of the undistorted photographs.
     """
     if missing := sorted({photo.name for photo in photos} - set(registered)):
-        warn(f"{images}: {_listed(missing)} could not be placed and will not be used")
+        warn(f"{images}: no camera pose was found for {_listed(missing)}, which will not be used")
     lost = _without_their_alpha(photos, registered, result)
     if lost and (masks is None or masks.alpha == "blend"):
         loss = "lost their alpha when they were undistorted: their images in the scene are opaque"
@@ -305,7 +305,7 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
         return False
     complete = (output / "sparse/0/images.bin").is_file() and (output / "images").is_dir()
     files = record.get("files")
-    was = files if isinstance(files, dict) else {}  # a record may have no such list
+    was = files if isinstance(files, dict) else {}  # sfm.json may lack the list of files
     now = _sizes(output)
     changed = sorted(name for name, size in was.items() if now.get(name) != size)
     if complete and not changed and record.get("fingerprint") == fingerprint:
@@ -360,7 +360,7 @@ def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str,
         finally:
             process.kill()
             process.wait()
-            with contextlib.suppress(OSError):  # closing flushes input, which the worker may not have read
+            with contextlib.suppress(OSError):  # fails if input is left that the ended worker did not read
                 process.stdin.close()
             process.stdout.close()
     if not answer:
