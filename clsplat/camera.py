@@ -77,8 +77,8 @@ JACOBIAN_CLAMP_HALF_FRAMES = 0.3
 DEFAULT_NEAR_PLANE = 0.01
 """Default near plane in world units, for cameras and models without their own."""
 MIN_SIZE_IN_NEAR_PLANES = 100.0
-"""Minimum ratio of a scene's length unit, or of a small model's size, to its near plane. The near plane is less than
-DEFAULT_NEAR_PLANE where this requires it."""
+"""The near plane of a scene is at most its length unit divided by this, and that of a tiny model its size divided by
+this."""
 ROTATION_TOLERANCE = 1e-2
 """Largest allowed entry of |R^T R - I|. It is this large because poses may be typed with few digits or be float32."""
 MAX_FOCAL_PX = 1e12
@@ -92,7 +92,8 @@ class Window:
     x, y: frame coordinates of the picture's first pixel; negative if it lies left of or above the frame.
     width, height: size of the frame.
     clamp: distance beyond the frame's edges, in halves of the frame's size, up to which the projection's Jacobian
-    follows a Gaussian's mean. It is larger than the default only for a picture that extends further beyond its frame.
+    follows a Gaussian's mean; for means farther out, it is the Jacobian at this distance. It is larger than the default
+    only for a picture that extends further beyond its frame.
     """
 
     x: int
@@ -295,7 +296,8 @@ class Camera:
     def refocused(self, log: float, x: float, y: float) -> Camera:
         """The same pose with fx and fy multiplied by exp(log), cx moved by x * fx, and cy moved by y * fy.
 
-        The shifts use fx and fy from before the multiplication."""
+        The shifts use fx and fy from before the multiplication.
+        """
         factor, moved = math.exp(log), (self.cx + x * self.fx, self.cy + y * self.fy)
         return replace(self, fx=self.fx * factor, fy=self.fy * factor, cx=moved[0], cy=moved[1])
 

@@ -66,7 +66,7 @@ class PlaneProjection(NamedTuple):
 
     ratios: (N, 2), x/z and y/z as in the Jacobian, clamped.
     unclamped: (N, 2), True if the ratio is not clamped, and so has a gradient.
-    jacobian: (N, 2, 3).
+    jacobian: (N, 2, 3), derivative of the pixel coordinates with respect to the point.
     """
 
     ratios: Float64
@@ -181,7 +181,7 @@ class CameraModel:
         raise NotImplementedError(self.projection)
 
     def rays_of(self, view: Intrinsics, a: Float64, b: Float64) -> tuple[Float64, Float64]:
-        """Return origins and unit directions (N, 3), in the camera's axes, of pixels' rays; NaN for pixels without one.
+        """Return origins and unit directions (N, 3) of pixels' rays in the camera's axes; NaN for pixels without a ray.
 
         a, b: (N,), horizontal and vertical offsets of the pixels from the principal point, in focal lengths.
         """
@@ -242,7 +242,7 @@ class CameraModel:
         raise NotImplementedError(self.projection)
 
     def low_pass_grad(self, view: Intrinsics, directions: Float64, gradients: Float64, low_pass: float) -> Float64:
-        """Return the gradient of means' directions that is due to the low-pass filter: B of eqs. (26) to (28).
+        """Return the gradient with respect to means' directions through the low-pass filter: B of eqs. (26) to (28).
 
         The result is (N, 2), with components along the axes of the tangent planes.
 

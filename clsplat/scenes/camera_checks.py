@@ -219,7 +219,7 @@ def _inverted_opengl(camera: Camera) -> Camera:
 
 
 def _of_places(camera: Camera) -> Camera:
-    """Return the camera with its pose corrected, assuming that the translation it has is its position."""
+    """Return the camera with its pose corrected, assuming that its translation is in fact its position."""
     return replace(camera, translation=-camera.rotation @ camera.translation)
 
 

@@ -294,7 +294,7 @@ def _warn_of_uneven(images: Sequence[PosedImage], views: Sequence[View]) -> None
         _, across, down = uneven[0]
         warn(
             f"{examples(name for name, *_ in uneven)}: has {across:.4g} times the width and {down:.4g} times the "
-            "height of its camera, which is scaled likewise; do the cameras belong to these pictures?"
+            "height of its camera, which is scaled by these factors; do the cameras belong to these pictures?"
         )
 
 

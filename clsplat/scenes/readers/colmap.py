@@ -369,7 +369,7 @@ def _binary_images(path: Path) -> Iterator[tuple[int, str, int, tuple[float, ...
 
 
 def _image_lines(path: Path) -> Iterator[tuple[int, str, str]]:
-    """Yield line number, text and expected fields of the first line of each image.
+    """Yield number and text of the first line of each image, and the fields expected in it, for error messages.
 
     An image's second line, with its observations, may be empty, and some tools omit it.
     """

@@ -56,9 +56,9 @@ MIN_FOLDER_CORRELATION, CORRELATION_SIDE_PX = 0.9, 24
 """Minimum correlation of the pictures in two related folders, and longer side to which the pictures are reduced for it.
 
 The median of FOLDER_PAIR_SAMPLES pairs is compared with the minimum. In the scene fox (k1 0.058, k2 -0.081),
-photographs correlate with their undistorted copies at 0.9995. In six other scenes, with k1 from 0.1 to -0.35,
-they do at 0.93 or more. Successive photographs of these scenes correlate at 0.16 to 0.87, and photographs farther apart
-at 0.45 or less.
+the correlation of photographs with their undistorted copies is 0.9995. In six other scenes, with k1 from 0.1 to -0.35,
+it is at least 0.93. The correlation of successive photographs of these scenes is 0.16 to 0.87, and that of photographs
+farther apart is at most 0.45.
 
 Frames of an almost still video correlate more than pictures and their copies after strong undistortion. So two folders
 of such frames are mistaken for copies.

@@ -67,7 +67,7 @@ class SfmSettings:
     shared_camera: which photographs share a camera, as in `photos.camera_groups`.
     max_image_size: longest side in pixels for finding features. The undistorted photographs keep their size.
     max_features: maximum number of features in a photograph.
-    seed: the same seed gives the same cameras; up to 80 photographs, bit by bit.
+    seed: seed of random numbers. For up to 80 photographs, the same seed gives cameras with the same bits.
     """
 
     matching: Matching = "auto"
@@ -108,7 +108,7 @@ def reconstruct(
     The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points) and `sfm.json`. The
     folder is created when all files are complete. An existing result for the same photographs and settings is reused.
 
-    threads: all cores if None.
+    threads: number of CPU threads; None for one per core.
     overwrite: replace a result of other photographs.
     masks: use of masks and alpha. No features are found in masked pixels. The masks are written to the output too, as
         `masks/IMAGE.jpg.png`, with white for kept pixels.
@@ -116,7 +116,7 @@ def reconstruct(
 
     Of several copies of a photograph, one is used (`clsplat.scenes.sfm.copies`).
 
-    Warns of copies, and of photographs that cannot be placed, have an unreadable format, or lost their alpha. Raises
+    Warns of copies, and of photographs that get no pose, have an unreadable format, or lost their alpha. Raises
     InputError for a folder without photographs, a photograph that does not decode, and an existing output that must not
     be replaced. Also raises InputError if the cameras cannot be recovered. Raises ClsplatError if pycolmap fails. After
     KeyboardInterrupt no files remain.
@@ -360,7 +360,7 @@ def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str,
         finally:
             process.kill()
             process.wait()
-            with contextlib.suppress(OSError):  # fails if input is left that the ended worker did not read
+            with contextlib.suppress(OSError):  # closing sends buffered input, which an ended worker cannot read
                 process.stdin.close()
             process.stdout.close()
     if not answer:
@@ -406,7 +406,7 @@ def _follow(lines: IO[str], database: Path, report: Progress) -> dict[str, Any]:
 
 
 def _rows(database: Path, table: str) -> int:
-    """Return the number of rows in a table that the worker fills; 0 while the table cannot be read."""
+    """Return the number of rows in a table of the worker's database; 0 while the table cannot be read."""
     try:
         name = f"{database.resolve().as_uri()}?mode=ro"
         with contextlib.closing(sqlite3.connect(name, uri=True, timeout=0.1)) as connection:

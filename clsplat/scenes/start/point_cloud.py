@@ -45,7 +45,8 @@ SKY_IMAGE_SIDE_PX = 400
 """Longer side in pixels to which larger photographs are reduced to find the sky. A sky point covers several pixels of
 the full size."""
 SKY_RADIUS_QUANTILE = 0.95
-"""Quantile of the distances of the scene's points that counts as the farthest distance, and scales the sky sphere."""
+"""Quantile of the points' distances from the middle of the cameras. The radius of the sky sphere is proportional to it,
+or to the scene's extent if that is larger."""
 SKY_OVERSAMPLING = 4
 """Number of candidate directions on the half sphere, per requested point."""
 SKYLINE_COLUMNS = 24
@@ -240,8 +241,8 @@ def _means(values: NDArray[Any], cells: NDArray[np.int64]) -> Float64:
 def sky_points(scene: Scene, count: int) -> tuple[Float64, Float32]:
     """Return at most `count` points (N, 3) on a sphere around the scene, in directions of the sky, and colours (N, 3).
 
-    A direction above the horizon is sky if, in most photographs that show it, no scene point lies above it in its
-    column strip. Colours are means over the photographs.
+    A direction above the horizon is sky if, in most photographs that show it, no scene point lies above it in the
+    same strip of columns. Colours are means over the photographs that show sky there.
 
     Raises InputError if there is no such direction, no common up direction, or no points in the scene.
     """

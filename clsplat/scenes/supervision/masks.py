@@ -34,7 +34,7 @@ twice as many may be read."""
 VOID_LABEL = 255
 """Label of undefined pixels, as at the object borders in VOC and Cityscapes."""
 MAX_LABEL = 40
-"""Largest label except VOID_LABEL. Soft masks have larger values."""
+"""Largest label except VOID_LABEL. A mask with larger values below a half is a soft mask, not a mask of labels."""
 MAX_LABEL_NOISE_RATIO = 0.01
 """A mask counts as black and white with noise, not as labels, if the pixels with labels from 1 are fewer than this
 fraction of the white pixels."""
