@@ -199,7 +199,7 @@ class Camera:
 
     @property
     def is_pinhole(self) -> bool:
-        """True if the camera projects like an undistorted photograph, on the image plane or along rays."""
+        """True for perspective cameras, whether they draw Gaussians on the image plane or along rays."""
         return self.model.is_pinhole
 
     @property
@@ -365,7 +365,7 @@ class Camera:
         return replace(self, width=width, height=height, fx=fx, fy=fy, cx=middle, cy=cy)
 
     def cropped(self, x: int, y: int, width: int, height: int) -> Camera:
-        """The part of the picture that begins at its pixel (x, y). It may extend beyond the picture.
+        """The camera of a part of the picture, which begins at pixel (x, y) and may extend beyond the picture.
 
         The part is a window of the frame, and its pixels are bit-identical to the frame's there (docs/pictures.md).
         """

@@ -93,7 +93,10 @@ class BentFisheye(Fisheye):
         return _fold(tuple(radial))
 
     def angles(self, view: Intrinsics, radius: Float64) -> Float64:
-        """Return the angles of pixels at image radii `radius`: the inverse of `radii`, by bisection."""
+        """Return angles (N,) from the axis, in radians, of pixels at image radii `radius` (N,), in focal lengths.
+
+        This is the inverse of `radii`, computed by bisection.
+        """
         low, high = np.zeros_like(radius), np.full_like(radius, view.fold[0])
         for _ in range(50):
             middle = 0.5 * (low + high)

@@ -108,7 +108,7 @@ class CameraModel:
     wraps: ClassVar[bool] = False
     """True for panoramas: the right edge continues at the left one, and nothing lies beyond the edges."""
     self_tested: ClassVar[bool] = True
-    """True if the self-test renders a picture with this model. Read only for models with RAYS."""
+    """True if the self-test renders a picture with this model. Used only for models with RAYS."""
     without_motion: ClassVar[str] = ""
     """For models without the channel `motion`: the end of the error message, which names this model and models that
     have the channel. Empty for models with the channel."""
@@ -144,7 +144,8 @@ class CameraModel:
         return 0.25 * width
 
     def fold(self, radial: tuple[float, float, float, float]) -> tuple[float, float]:  # noqa: ARG002
-        """Return the largest angle from the axis that the model shows, in radians, and its radius in focal lengths."""
+        """Return the largest angle from the axis that the model shows, in radians, and the image radius there, in focal
+        lengths."""
         return math.pi, math.pi
 
     def turn(self, view: Intrinsics) -> float:

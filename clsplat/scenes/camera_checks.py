@@ -24,7 +24,7 @@ from clsplat.scenes.dataset import (
 Named = tuple[str, Camera, Lens]
 """Name, camera and lens of a photograph."""
 MIN_CHECKED_POSES = 4
-"""Minimum number of cameras whose poses are checked."""
+"""Minimum number of cameras for a check of their poses."""
 MAX_CHECKED_POSES = 40
 """Maximum number of cameras whose poses are checked, evenly spaced."""
 MAX_POSE_CHECK_POINTS = 1000
@@ -50,7 +50,7 @@ given, and at least the second fraction does after inverting them."""
 PARALLEL_MEAN_AXIS_LENGTH = 0.7
 """Length of the mean optical axis above which the cameras look in the same direction, as along a facade.
 
-Such cameras are not checked without points, as they may converge by chance if their poses are inverted.
+Without points, the poses of such cameras are not checked, as their inverses may converge by chance.
 """
 CENTRE_RATIO_TOLERANCE = 0.02
 """Relative tolerance between cx / width and cy / height. If these ratios agree but are not 1/2, (cx, cy) is the centre
@@ -255,7 +255,7 @@ POSE_MISREADINGS: tuple[tuple[str, Callable[[Camera], Camera]], ...] = (
     (TRANSPOSED_ROTATIONS, _transposed_in_place),
     (TRANSPOSED_ROTATIONS, _transposed_opengl),
 )
-"""Common mistakes in poses: a description of the mistake, for messages, and a function that corrects a camera."""
+"""Common mistakes in poses: the description of each, for messages, and a function that corrects a camera's pose."""
 
 
 def _shares(cameras: Sequence[Camera], points: Float64) -> Float64:

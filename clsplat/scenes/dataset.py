@@ -45,7 +45,7 @@ POINTS_PER_OCCLUSION_CELL = 16
 With fewer points, occluded points show through the gaps. With more, cells are so wide that they cover adjacent objects.
 """
 MAX_OCCLUSION_CELL_FRACTION = 1 / 25
-"""Maximum side of an occlusion cell, relative to the picture's longer side. It limits cells where points are few."""
+"""Maximum side of an occlusion cell, relative to the picture's longer side. It applies where there are few points."""
 
 
 @cache
@@ -142,7 +142,10 @@ class Lens:
         )
 
     def camera(self, rotation: Float64, translation: Float64, lenses: Lenses) -> Camera:
-        """Return the camera for training: panoramas and, with lenses "native", fisheyes as they are; else `pinhole`."""
+        """Return the camera for training, with the given pose.
+
+        Panoramas keep their projection, and so do fisheyes if `lenses` is "native". Other lenses give `pinhole`.
+        """
         native = self.native
         if native is None or (lenses == "undistort" and not native.wraps):
             return self.pinhole(rotation, translation)
@@ -318,7 +321,7 @@ def in_pixels(lens: Lens) -> tuple[Lens, bool]:
 
 
 def given_in_parts(names: Iterable[object]) -> str:
-    """Return the warning that `in_pixels` has converted the lenses of these cameras."""
+    """Return the warning that `in_pixels` has converted the lenses of the cameras `names`."""
     return (
         f"the principal point (cx cy) of {examples(names)} is given as fractions of the picture's width and height, "
         "not in pixels; it is read as fractions, and so are focal lengths below a twentieth of the longer side"
@@ -331,7 +334,7 @@ def pixels_of(
     """Locate points in a view's picture.
 
     points: (N, 3), world coordinates.
-    lens: needed if the camera is not a pinhole camera.
+    lens: the photograph's lens; needed only if the camera is not a pinhole camera.
     Returns the rows and columns of the points that lie in front of the camera and in its picture, and `inside` (N,),
     which is True for these points.
     """

@@ -188,7 +188,7 @@ def _beside(views: Sequence[View], told: Mapping[str, Path], *, strict: bool) ->
     A map is named like its photograph, with or without the photograph's extension, or with _depth or .depth after the
     stem.
 
-    told: by view name, maps that the data set names; they are skipped.
+    told: the maps that the data set names, by view name. These files are skipped.
     strict: raise InputError for a map that fits no photograph.
     Raises InputError for two maps of one photograph.
     """

@@ -20,7 +20,7 @@ OUTLIER_DISTANCE_RATIO = 5.0
 """Minimum distance of an outlier from the middle, relative to the farthest position that is not an outlier.
 
 If the scene size includes an outlier at 5, 8, 12 or 30 times that distance, a training on 24 photographs loses
-1.2, 2.7, 4 or 7 dB.
+1.2, 2.7, 4 or 7 dB of PSNR.
 """
 MAX_OUTLIER_CAMERA_FRACTION = 0.25
 """Maximum fraction of the cameras that can be outliers. If more cameras are far away, they belong to the capture."""

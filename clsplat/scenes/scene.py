@@ -48,7 +48,8 @@ a standard deviation of 0.29. The picture of an outlier shows no points, or has 
 MIN_FAR_GROUP_NEIGHBOURS = 2
 """In a scene without points, a distant camera is not an outlier if at least this many other cameras are near it."""
 MAX_SAMPLED_PHOTOGRAPHS = 200
-"""Maximum number of photographs that findings (`scenes.analysis`) are based on, if training decodes them later."""
+"""Maximum number of photographs that findings (`scenes.analysis`) are based on, if they are not all decoded before
+training."""
 SAME_PLACE_TOLERANCE = 1e-12
 """Cameras are in one place if none is farther from their middle than this fraction of their largest coordinate."""
 
@@ -234,7 +235,7 @@ class Scene:
 
     @cached_property
     def sampled_views(self) -> list[View]:
-        """Views that findings (`scenes.analysis`) are based on: all views, but an even sample if there are many."""
+        """Views that findings (`scenes.analysis`) are based on: all views, or an even sample of many views."""
         if self.decoded_first:
             return self.views
         count = min(MAX_SAMPLED_PHOTOGRAPHS, len(self.train_views))

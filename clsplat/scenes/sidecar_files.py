@@ -150,7 +150,7 @@ _NAME_KEYS: tuple[Callable[[str], str], ...] = (
     lambda name: _INNER_EXTENSION.sub("", _loose(name)),
     lambda name: _INNER_EXTENSION.sub("", _loose(name)).rpartition("/")[2],
 )
-"""Functions that reduce a name to a key, for successive steps of matching. Each ignores more of the name."""
+"""Functions that reduce a name to a key, for successive steps of matching. Each step ignores more of the name."""
 
 
 def _unambiguous(known: Mapping[str, str], step: Callable[[str], str]) -> dict[str, str]:

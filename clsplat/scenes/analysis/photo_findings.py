@@ -61,7 +61,8 @@ WIDE_FISHEYE_DEGREES = 100.0
 FEW_TRAINING_VIEWS = 16
 """Number of training photographs below which they hardly constrain the depth of a scene.
 
-According to publications, training on 12 photographs gives a PSNR 8 dB below training on 100, and on 24 about 3 dB.
+According to publications, training on 12 photographs gives a PSNR 8 dB below training on 100, and training on
+24 one about 3 dB below.
 """
 SPARSE_TRAINING_VIEWS = 30
 """Number of training photographs below which unlimited growth overfits (docs/quality.md)."""
@@ -355,7 +356,7 @@ def _blur(scene: Scene) -> Finding | None:
 
 
 def _duplicates(scene: Scene) -> Finding | None:
-    """Find photographs with nearly identical thumbnails."""
+    """Return a finding about photographs with nearly identical thumbnails; None if there are none."""
     by_size: dict[tuple[int, ...], list[str]] = {}
     for view in scene.sampled_views:
         by_size.setdefault(scene.thumbnails[view.name].pixels.shape, []).append(view.name)

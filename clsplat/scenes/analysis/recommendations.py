@@ -14,7 +14,7 @@ from clsplat.errors import InputError
 from clsplat.scenes.analysis.photo_findings import Finding, Kind
 
 SCHEDULE_SETTING = "schedule"
-"""Key, among recommended settings, of the name of a schedule: a bundle of learning rates and steps."""
+"""Key in a dictionary of recommended settings. Its value names a schedule: a bundle of learning rates and steps."""
 SETTINGS_BY_FINDING: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
     "exposure": ({"appearance": "exposure"},),
     "scales": ({"antialiased": True},),
@@ -38,8 +38,8 @@ SETTINGS_BY_FINDING: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
 """Alternative settings for each kind of finding, best first. The first one compatible with the other settings is used.
 """
 PASSES_SETTING = "passes"
-"""Key, among recommended settings, of the number of passes through the photographs, which scales the schedule
-(`config.presets.by_passes`)."""
+"""Key in a dictionary of recommended settings. Its value is a number of passes through the photographs, to which
+`config.presets.by_passes` scales the schedule."""
 SCHEDULED_SETTINGS = ("sh_degree_every", "optimiser", "density.stop", "density.noise_rate")
 """Settings that a schedule changes, apart from the number of steps."""
 ADVICE_BY_FINDING: Mapping[Kind, str] = {
@@ -48,7 +48,7 @@ ADVICE_BY_FINDING: Mapping[Kind, str] = {
     "blur": "leave them out if other photographs show the same",
     "duplicates": "remove the copies",
 }
-"""Advice, by kind of finding, where SETTINGS_BY_FINDING has no settings."""
+"""Advice for the kinds of findings that are not in SETTINGS_BY_FINDING."""
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from clsplat.scenes.scene import Scene, View
 MAX_SAMPLED_SCENE_POINTS = 4000
 """Maximum number of scene points that are sampled. A larger sample changes a median brightness by less than 0.01."""
 THUMBNAIL_OCCLUSION_DEPTH_RATIO = 1.15
-"""Ratio of a point's depth to that of the nearest point in its cell, above which the point counts as occluded."""
+"""A point counts as occluded if its depth is over this many times that of the nearest point in its occlusion cell."""
 THUMBNAIL_OCCLUSION_CELL_PX = 8
-"""Side of an occlusion cell in thumbnail pixels."""
+"""Side in thumbnail pixels of an occlusion cell, a square in which the nearest point hides farther ones."""
 MIN_POINTS_PER_VIEW = 40
 """Minimum number of visible points in a photograph whose brightness or scale is measured."""
 MIN_EXPOSURE_COLOUR, MAX_EXPOSURE_COLOUR = 0.06, 0.94
@@ -149,8 +149,8 @@ def relative_exposures(points: NDArray[np.int64], views: NDArray[np.int64], logs
 
 
 def _sums(places: NDArray[np.int64], weights: Float64, values: Float64) -> Float64:
-    """Return, for each of the K indices in `places` (M,), the weighted sum of the `values` (M, 3) there: (K, 3).
+    """Return sums (K, 3) of `values` (M, 3) times `weights` (M,). Values with the same of K indices are added.
 
-    weights: (M,), factors of the values.
+    places: (M,), index of each value's sum.
     """
     return np.stack([np.bincount(places, weights * column) for column in values.T], axis=1)

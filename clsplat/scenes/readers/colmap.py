@@ -132,7 +132,7 @@ class Tracks:
     by_image: dict[str, NDArray[np.int64]]
 
     def shown_in(self, names: Sequence[str]) -> dict[str, NDArray[np.int64]]:
-        """Return the indices (k,) of the points observed in each photograph, by its name. Others are left out.
+        """Return the indices (k,) of the points observed in each photograph, by its name, if there are any.
 
         names: names of the photographs. `photo_names.match` finds the image of each.
         """
@@ -141,7 +141,7 @@ class Tracks:
 
 
 def read_tracks(folder: Path) -> Tracks:
-    """Read the tracks of the model in `folder`, without observations in images that it lacks.
+    """Read the tracks of the model in `folder`, without observations in images that the model lacks.
 
     Raises InputError like `read_model`.
     """

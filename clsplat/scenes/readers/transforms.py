@@ -277,7 +277,9 @@ def read_blender(folder: Path, *, images: Path | None = None, missing: Missing =
     names = {image.name for image in train.images}
     for image in test.images:
         if image.name in names:
-            raise InputError(f"{held_out}: lists {image.name}, which is a training picture too; remove one of them")
+            raise InputError(
+                f"{held_out}: lists {image.name}, which is a training picture too; keep it in one file only"
+            )
     both = [replace(image, split="train") for image in train.images]
     both += [replace(image, split="test") for image in test.images]
     return replace(train, images=both, missing=train.missing + test.missing)
@@ -290,7 +292,7 @@ def _plain(listed: str) -> str:
 
 
 def _find_file(keys: Keys) -> Path:
-    """Return the path of a frame's picture, with the extension that the file may omit; the listed path if missing."""
+    """Return the path of a frame's picture, with the extension that the file may omit; else the listed path."""
     path = Path(os.path.normpath(keys.path.parent / keys.text("file_path").replace("\\", "/")))
     if is_file(path) or not path.name:
         return path

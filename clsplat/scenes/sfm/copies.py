@@ -66,7 +66,8 @@ of such frames are mistaken for copies.
 FOLDER_PAIR_SAMPLES = 5
 """Number of pairs of pictures that are decoded to compare two folders."""
 MAX_COPY_ASPECT_RATIO_CHANGE = 1.3
-"""Ratio of two aspect ratios from which the pictures are different. Cropping by undistortion changes them by less."""
+"""Two pictures differ if their aspect ratios differ by at least this factor. Cropping after undistortion changes them
+by less."""
 FEATURELESS_STD_LEVELS = 8.0
 """Standard deviation in 255ths below which a picture is featureless, and never counts as a copy."""
 ASPECT_RATIO_TOLERANCE = 0.02
@@ -225,8 +226,8 @@ class _Staged:
     """A photograph, classified by the names of its folders: UNDISTORTION_FOLDERS, or names such as images_2.
 
     head: path up to the last folder with such a name, "" for none.
-    stage: largest index in UNDISTORTION_FOLDERS of the folders.
-    factor: factor by which the photograph is downscaled, by the folder's name.
+    stage: index in UNDISTORTION_FOLDERS of the latest stage that a folder in the path is named after.
+    factor: factor by which the photograph is downscaled, according to the folder's name.
     """
 
     name: str
@@ -314,8 +315,8 @@ class _Pictures:
 def _staged(names: Iterable[str]) -> list[list[_Staged]]:
     """Group photographs with the same stem in the same folders, ignoring folders that `_Staged` classifies.
 
-    Each group has at least two kinds (`_Staged.kind`). Folders above a folder of undistorted pictures are also ignored,
-    as another program may have made them.
+    Each group has photographs of at least two kinds (`_Staged.kind`). Folders above a folder of undistorted pictures
+    are also ignored, as another program may have made them.
     """
     groups: dict[tuple[Hashable, ...], list[_Staged]] = defaultdict(list)
     for name in names:
@@ -347,8 +348,8 @@ def _plain_stem(name: str) -> str:
 def _alike(names: Iterable[str]) -> list[list[_Place]]:
     """Group photographs that may be copies according to their names.
 
-    The photographs of a group have the same stem. They are in one folder, in sibling folders, or in a folder and its
-    sub-folder, or in sub-folders of these with the same names.
+    The photographs of a group have the same stem. They are in one folder, in sibling folders, in a folder and its
+    sub-folder, or in equally named sub-folders of such folders.
     """
     groups: dict[tuple[Hashable, ...], list[_Place]] = defaultdict(list)
     for name in names:

@@ -112,7 +112,7 @@ def reconstruct(
     overwrite: replace a result of other photographs.
     masks: use of masks and alpha. No features are found in masked pixels. The masks are written to the output too, as
         `masks/IMAGE.jpg.png`, with white for kept pixels.
-    progress: function that is called in every stage, with a text and a fraction or None.
+    progress: function that is called with the name of a stage, and the fraction of it that is done or None.
 
     Of several copies of a photograph, one is used (`clsplat.scenes.sfm.copies`).
 
@@ -209,7 +209,10 @@ def _staged_masks(
 def sfm_task(
     settings: SfmSettings, photos: list[sfm_photos.Photo], masked: list[str], work: Path, threads: int
 ) -> dict[str, Any]:
-    """Return the task for the worker process (`clsplat.scenes.sfm.worker.Worker`), as values for JSON."""
+    """Return the task for the worker process (`clsplat.scenes.sfm.worker.Worker`), as values for JSON.
+
+    masked: names of the photographs with a mask. work: folder for the photographs, masks and intermediate files.
+    """
     many = len(photos) > MAX_EXHAUSTIVE_PHOTOS
     return {
         "masks": masked,

@@ -62,7 +62,7 @@ In photographs farther away, the colour of a point is mixed with its surrounding
 something else in front of the point would have too much weight.
 """
 OCCLUSION_DEPTH_RATIO = 1.05
-"""Ratio of a point's depth to that of the nearest point in its cell, above which the point counts as occluded."""
+"""A point counts as occluded if its depth is over this many times that of the nearest point in its occlusion cell."""
 HIDDEN_POINT_RANK = 1e30
 """Factor that makes the ranks of occluded points larger than the ranks of all visible points.
 
