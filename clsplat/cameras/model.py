@@ -144,8 +144,10 @@ class CameraModel:
         return 0.25 * width
 
     def fold(self, radial: tuple[float, float, float, float]) -> tuple[float, float]:  # noqa: ARG002
-        """Return the largest angle from the axis that the model shows, in radians, and the image radius there, in focal
-        lengths."""
+        """Return the largest angle from the axis that the model shows, in radians, and the image radius at this angle.
+
+        radial: coefficients k1 to k4 of a fisheye. The radius is in focal lengths.
+        """
         return math.pi, math.pi
 
     def turn(self, view: Intrinsics) -> float:

@@ -62,7 +62,7 @@ FEW_TRAINING_VIEWS = 16
 """Number of training photographs below which they hardly constrain the depth of a scene.
 
 According to publications, training on 12 photographs gives a PSNR 8 dB below training on 100, and training on
-24 one about 3 dB below.
+24 gives one about 3 dB below.
 """
 SPARSE_TRAINING_VIEWS = 30
 """Number of training photographs below which unlimited growth overfits (docs/quality.md)."""

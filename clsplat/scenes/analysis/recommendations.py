@@ -38,8 +38,8 @@ SETTINGS_BY_FINDING: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
 """Alternative settings for each kind of finding, best first. The first one compatible with the other settings is used.
 """
 PASSES_SETTING = "passes"
-"""Key in a dictionary of recommended settings. Its value is a number of passes through the photographs, to which
-`config.presets.by_passes` scales the schedule."""
+"""Key in a dictionary of recommended settings. Its value is the number of passes through the photographs that the
+schedule makes after scaling by `config.presets.by_passes`."""
 SCHEDULED_SETTINGS = ("sh_degree_every", "optimiser", "density.stop", "density.noise_rate")
 """Settings that a schedule changes, apart from the number of steps."""
 ADVICE_BY_FINDING: Mapping[Kind, str] = {

@@ -149,8 +149,8 @@ def relative_exposures(points: NDArray[np.int64], views: NDArray[np.int64], logs
 
 
 def _sums(places: NDArray[np.int64], weights: Float64, values: Float64) -> Float64:
-    """Return sums (K, 3) of `values` (M, 3) times `weights` (M,). Values with the same of K indices are added.
+    """Return, for each index from 0 to K - 1, the sum of the weighted values that have this index: (K, 3).
 
-    places: (M,), index of each value's sum.
+    places: (M,), the index of each value. weights: (M,). values: (M, 3).
     """
     return np.stack([np.bincount(places, weights * column) for column in values.T], axis=1)

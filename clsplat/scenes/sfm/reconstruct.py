@@ -112,7 +112,7 @@ def reconstruct(
     overwrite: replace a result of other photographs.
     masks: use of masks and alpha. No features are found in masked pixels. The masks are written to the output too, as
         `masks/IMAGE.jpg.png`, with white for kept pixels.
-    progress: function that is called with the name of a stage, and the fraction of it that is done or None.
+    progress: function that is called with the name of a stage, and the fraction that is done, or None if unknown.
 
     Of several copies of a photograph, one is used (`clsplat.scenes.sfm.copies`).
 
