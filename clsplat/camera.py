@@ -67,7 +67,7 @@ CAMERA_MODELS: tuple[CameraModel, ...] = (
     BentFisheye("fisheye", "radial", defines={"RAYS": True, "FISHEYE_RAYS": True, "BENT_FISHEYE": True}),
     PerspectiveByRays("perspective", "by_rays", defines={"RAYS": True, "PERSPECTIVE_RAYS": True}),
 )
-"""Every camera model. docs/cameras.md (Adding a camera model) explains the fields of a row."""
+"""Every camera model. docs/cameras.md (Adding a camera model) explains each attribute."""
 
 PROJECTIONS: dict[str, CameraModel] = {model.projection: model for model in CAMERA_MODELS if not model.option}
 """The model of each projection without options (`radial`, `by_rays`). Messages and the self-test use this order."""
@@ -77,8 +77,8 @@ JACOBIAN_CLAMP_HALF_FRAMES = 0.3
 DEFAULT_NEAR_PLANE = 0.01
 """Default near plane in world units, for cameras and models without their own."""
 MIN_SIZE_IN_NEAR_PLANES = 100.0
-"""A scene's length unit, or a small model's size, divided by this is the near plane, if the default near plane is
-larger."""
+"""The near plane of a scene is at most its length unit divided by this, and that of a tiny model its size divided by
+this."""
 ROTATION_TOLERANCE = 1e-2
 """Largest allowed entry of |R^T R - I|. It is this large because poses may be typed with few digits or be float32."""
 MAX_FOCAL_PX = 1e12
@@ -92,7 +92,8 @@ class Window:
     x, y: frame coordinates of the picture's first pixel; negative if it lies left of or above the frame.
     width, height: size of the frame.
     clamp: distance beyond the frame's edges, in halves of the frame's size, up to which the projection's Jacobian
-    follows a Gaussian's mean. It is larger than the default only for a picture that extends further beyond its frame.
+    follows a Gaussian's mean; for means farther out, it is the Jacobian at this distance. It is larger than the default
+    only for a picture that extends further beyond its frame.
     """
 
     x: int
@@ -103,7 +104,10 @@ class Window:
 
 
 def _is_set(option: object) -> bool:
-    """True if a camera's option is True, or has a number that is not zero. Fast, since every step calls it often."""
+    """Return True for `by_rays` = True, and for a `radial` that is not all zeros.
+
+    Plain Python is used for tuples because it is faster than NumPy, and every step calls this often.
+    """
     if isinstance(option, bool):
         return option
     return any(option) if isinstance(option, tuple) else bool(np.any(option))  # type: ignore[call-overload]
@@ -182,7 +186,7 @@ class Camera:
     by_rays: bool = False
 
     def __getstate__(self) -> dict[str, object]:
-        """Pickle the fields, without the cached `model`: another process uses the model of its own CAMERA_MODELS."""
+        """Return the state to pickle: the fields, without the cached `model`. Another process looks it up itself."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @cached_property
@@ -195,7 +199,7 @@ class Camera:
 
     @property
     def is_pinhole(self) -> bool:
-        """True if the camera projects like an undistorted photograph, on the image plane or along rays."""
+        """True for perspective cameras, whether they draw Gaussians on the image plane or along rays."""
         return self.model.is_pinhole
 
     @property
@@ -221,7 +225,7 @@ class Camera:
         return centre
 
     def check(self) -> None:
-        """Raise InputError, which names the value, if the camera is not valid."""
+        """Raise InputError if an attribute is invalid. The message names the attribute and its value."""
         for name in ("width", "height"):
             side = getattr(self, name)
             if isinstance(side, bool) or not isinstance(side, int | np.integer) or side < 1:
@@ -266,7 +270,7 @@ class Camera:
         return replace(self, projection=cast("Projection", model.projection), radial=(k1, k2, k3, k4), by_rays=False)
 
     def from_origin(self, origin: Float64) -> Camera:
-        """The camera that shows the same view of a world whose coordinates are relative to origin (3,)."""
+        """The same camera for world coordinates that are relative to the point `origin` (3,) of this camera's world."""
         if not origin.any():
             return self
         return replace(self, translation=self.translation + self.rotation @ origin)
@@ -290,31 +294,35 @@ class Camera:
         return replace(self, rotation=rotation, translation=translation)
 
     def refocused(self, log: float, x: float, y: float) -> Camera:
-        """The same pose with focal lengths multiplied by e^log, and the principal point moved by x and y old focal
-        lengths."""
+        """The same pose with fx and fy multiplied by exp(log), cx moved by x * fx, and cy moved by y * fy.
+
+        The shifts use fx and fy from before the multiplication.
+        """
         factor, moved = math.exp(log), (self.cx + x * self.fx, self.cy + y * self.fy)
         return replace(self, fx=self.fx * factor, fy=self.fy * factor, cx=moved[0], cy=moved[1])
 
     def before(self, near: float) -> Camera:
-        """The same view with a model's near plane, unless the camera has its own."""
+        """The same view with the near plane `near` of a model, in world units. A camera whose near plane is not the
+        default keeps it."""
         return replace(self, near=near) if self.near == DEFAULT_NEAR_PLANE != near else self
 
     def along_rays(self, by_rays: bool) -> Camera:
-        """The same view with `by_rays` set for a perspective camera. Other cameras are returned unchanged."""
+        """The same view with this value of `by_rays` for a perspective camera. Other cameras are returned unchanged."""
         changes = self.is_pinhole and by_rays != self.by_rays
         return replace(self, by_rays=by_rays) if changes else self
 
     def depths_of_distances(self) -> Float32 | None:
-        """Factors (height, width) that convert distances along the rays of a `by_rays` camera to depths z: `cosines`.
+        """Factors (height, width) that turn distances along the rays of a `by_rays` camera into depths z: `cosines`.
 
-        None for all other cameras, for which the kernels compute the depths that files store.
+        None for all other cameras, whose depths need no conversion before they are written to files.
         """
         return self.cosines() if self.by_rays else None
 
     def cosines(self) -> Float32 | None:
         """Cosines (height, width) of the angles between a perspective camera's axis and the rays of its pixels.
 
-        None for other projections: orthographic rays are parallel to the axis, and the others have distances as depths.
+        None for other projections, which need no conversion: orthographic rays are parallel to the axis, and the depths
+        of fisheyes and panoramas are distances.
         """
         if not self.is_pinhole:
             return None
@@ -332,8 +340,10 @@ class Camera:
         return np.asarray(local[:, 2] if self.model.flat else np.linalg.norm(local, axis=1))
 
     def drawn_depths(self, offsets: Float64) -> Float64:
-        """Depths (N,) by which Gaussians are sorted. offsets: (N, 3), vectors along the world's axes from the camera's
-        centre to the means."""
+        """Depths (N,) by which Gaussians are sorted: z, or distances if the model draws along rays.
+
+        offsets: (N, 3), vectors from the camera's centre to the means, in world axes.
+        """
         return np.asarray(
             np.linalg.norm(offsets, axis=1) if self.model.along_rays else offsets @ self.rotation[2], np.float64
         )
@@ -355,7 +365,7 @@ class Camera:
         return replace(self, width=width, height=height, fx=fx, fy=fy, cx=middle, cy=cy)
 
     def cropped(self, x: int, y: int, width: int, height: int) -> Camera:
-        """The part of the picture that begins at its pixel (x, y). It may extend beyond the picture.
+        """The camera of a part of the picture, which begins at pixel (x, y) and may extend beyond the picture.
 
         The part is a window of the frame, and its pixels are bit-identical to the frame's there (docs/pictures.md).
         """
@@ -375,7 +385,7 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The same view on another pixel grid. Since pixel centres are at +0.5, this is a pure scaling.
 
-        Raises ValueError if a window's edges would not be on the grid.
+        Raises ValueError if edges of `window` would not be at whole pixels.
         """
         sx, sy = width / self.width, height / self.height
         window = self.window
@@ -383,7 +393,7 @@ class Camera:
             edges = [window.x * sx, window.y * sy, window.width * sx, window.height * sy]
             if any(edge != round(edge) for edge in edges):
                 size = f"resized from {self.width}x{self.height} to {width}x{height}"
-                raise ValueError(f"{window} {size} does not have edges on whole pixels")
+                raise ValueError(f"{window} {size} would not have its edges at whole pixels")
             x, y, across, down = (round(edge) for edge in edges)
             window = Window(x, y, across, down, window.clamp)
         return replace(
@@ -415,12 +425,15 @@ def focal_length(fov: float, size: float, projection: Projection = "perspective"
 
 
 def model_with(column: str, value: object) -> CameraModel | None:
-    """The model in CAMERA_MODELS whose column, such as "usd", contains the name `value`; None if there is none."""
+    """The camera model that another program calls `value`; None if no model has this name.
+
+    column: attribute of CameraModel with the program's names, such as "usd" or "nerfstudio".
+    """
     return next((model for model in CAMERA_MODELS if value in getattr(model, column)), None)
 
 
 def names_of(column: str) -> tuple[str, ...]:
-    """All names in a column of CAMERA_MODELS, such as "usd"; the names of panoramas come last."""
+    """All names that another program has for camera models, those of panoramas last. column: as for `model_with`."""
     return tuple(
         name for model in sorted(CAMERA_MODELS, key=lambda each: each.wraps) for name in getattr(model, column)
     )

@@ -13,7 +13,7 @@ from clsplat.cameras.model import CameraModel, Intrinsics
 
 
 class AroundAxis(CameraModel):
-    """A camera model whose image radius depends only on the angle from the axis. Subclasses give `angles_of_pixel`."""
+    """A camera model whose image radius depends only on the angle from the axis. Subclasses add `angles_of_pixel`."""
 
     def angles_of_pixel(self, view: Intrinsics, theta: Float64) -> tuple[Float64, Float64, Float64, Float64]:
         """Return p, q and their derivatives with respect to theta, each (N,): eqs. (10) and (27).

@@ -73,7 +73,7 @@ class Fisheye(AroundAxis):
         return np.where(seen, depths / focal * np.minimum(along, around), np.inf)
 
     def angles_of_pixel(self, view: Intrinsics, theta: Float64) -> tuple[Float64, Float64, Float64, Float64]:
-        """Return the angles of fx pixels away from the axis and around it, and their derivatives: eqs. (10), (19)."""
+        """Return p, q and their derivatives, as described for `AroundAxis`: eqs. (10), (19)."""
         radius, slope, bend = radii(view, theta)
         with np.errstate(all="ignore"):
             ratio = np.where(theta > 1e-6, np.sin(theta) / radius, 1.0)
@@ -86,14 +86,17 @@ class Fisheye(AroundAxis):
 class BentFisheye(Fisheye):
     """A fisheye with coefficients (Kannala and Brandt), eqs. (18), (19). Kernels: fisheye.h with bent_fisheye.h."""
 
-    self_tested = False  # The self-test tests Fisheye, which has the same kernels and footprints.
+    self_tested = False  # the self-test renders with Fisheye, which has the same kernels and footprints
     without_motion = "a fisheye with coefficients, expected a fisheye without them or a pinhole camera"
 
     def fold(self, radial: tuple[float, float, float, float]) -> tuple[float, float]:
         return _fold(tuple(radial))
 
     def angles(self, view: Intrinsics, radius: Float64) -> Float64:
-        """Return the angles of pixels at image radii `radius`: the inverse of `radii`, by bisection."""
+        """Return angles (N,) from the axis, in radians, of pixels at image radii `radius` (N,), in focal lengths.
+
+        This is the inverse of `radii`, computed by bisection.
+        """
         low, high = np.zeros_like(radius), np.full_like(radius, view.fold[0])
         for _ in range(50):
             middle = 0.5 * (low + high)

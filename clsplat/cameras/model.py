@@ -66,7 +66,7 @@ class PlaneProjection(NamedTuple):
 
     ratios: (N, 2), x/z and y/z as in the Jacobian, clamped.
     unclamped: (N, 2), True if the ratio is not clamped, and so has a gradient.
-    jacobian: (N, 2, 3).
+    jacobian: (N, 2, 3), derivative of the pixel coordinates with respect to the point.
     """
 
     ratios: Float64
@@ -108,10 +108,10 @@ class CameraModel:
     wraps: ClassVar[bool] = False
     """True for panoramas: the right edge continues at the left one, and nothing lies beyond the edges."""
     self_tested: ClassVar[bool] = True
-    """True if the self-test renders a picture with this model. Read only for models with RAYS."""
+    """True if the self-test renders a picture with this model. Used only for models with RAYS."""
     without_motion: ClassVar[str] = ""
-    """End of the error message for the channel `motion`, if the model lacks this channel. It names the model, and the
-    models that have the channel. Empty for these."""
+    """For models without the channel `motion`: the end of the error message, which names this model and models that
+    have the channel. Empty for models with the channel."""
     focal_keys: ClassVar[tuple[str, ...]] = ("fov_x", "fov_y")
     """Properties of a clsplat camera file that give a focal length, other than fx and fy."""
     whole_angles: ClassVar[tuple[float, float]] = (360.0, 180.0)
@@ -144,7 +144,10 @@ class CameraModel:
         return 0.25 * width
 
     def fold(self, radial: tuple[float, float, float, float]) -> tuple[float, float]:  # noqa: ARG002
-        """Return the largest angle from the axis that the model shows, in radians, and its radius in focal lengths."""
+        """Return the largest angle from the axis that the model shows, in radians, and the image radius at this angle.
+
+        radial: coefficients k1 to k4 of a fisheye. The radius is in focal lengths.
+        """
         return math.pi, math.pi
 
     def turn(self, view: Intrinsics) -> float:
@@ -181,14 +184,14 @@ class CameraModel:
         raise NotImplementedError(self.projection)
 
     def rays_of(self, view: Intrinsics, a: Float64, b: Float64) -> tuple[Float64, Float64]:
-        """Return origins and unit directions (N, 3), in the camera's axes, of the rays of pixels; NaN without a ray.
+        """Return origins and unit directions (N, 3) of pixels' rays in the camera's axes; NaN for pixels without a ray.
 
         a, b: (N,), horizontal and vertical offsets of the pixels from the principal point, in focal lengths.
         """
         raise NotImplementedError(self.projection)
 
     def places_of(self, view: Intrinsics, points: Float64) -> tuple[Float64, Float64, Float64]:
-        """Project points (N, 3) in the camera's axes. Points without a pixel get NaN.
+        """Project points (N, 3) in the camera's axes. Points that the projection cannot show get NaN.
 
         Returns a and b (N,), horizontal and vertical offsets from the principal point in focal lengths, and depths
         (N,).
@@ -217,7 +220,7 @@ class CameraModel:
         raise NotImplementedError(self.projection)
 
     def projected(self, view: Intrinsics, points: Float64) -> PlaneProjection:
-        """Return the linearised projection of points (N, 3) in the camera's axes."""
+        """Return the projection of points (N, 3), given in the camera's axes, with its derivatives."""
         raise NotImplementedError(self.projection)
 
     def mean_grad(
@@ -225,7 +228,7 @@ class CameraModel:
     ) -> Float64:
         """Return the gradient (N, 3) with respect to the points.
 
-        plane: the points' result of `projected`.
+        plane: result of `projected` for these points.
         d_jacobian: (N, 2, 3), gradient with respect to the Jacobians.
         d_means2d: (N, 2), gradient with respect to the positions in the image, in pixels.
         """
@@ -234,19 +237,20 @@ class CameraModel:
     # Methods for models with RAYS, which draw Gaussians on planes tangent to the sphere of directions.
 
     def footprints(self, view: Intrinsics, directions: Float64) -> tuple[Float64, Float64, Float64]:
-        """Return tangent planes at unit directions (N, 3), and the footprint of a pixel on each: eqs. (9), (10).
+        """Return the unit sphere's tangent planes at `directions` (N, 3), and a pixel's footprint on each: (9), (10).
 
-        The results are the planes' axes right and down, each (N, 3), and the footprints (N, 2, 2), whose columns are
-        the pixel's sides along u and v in radians.
+        The first two results are the planes' axes to the right and down, each (N, 3). The third is the footprints
+        (N, 2, 2): columns are the pixel's sides along u and v, in radians.
         """
         raise NotImplementedError(self.projection)
 
     def low_pass_grad(self, view: Intrinsics, directions: Float64, gradients: Float64, low_pass: float) -> Float64:
-        """Return the gradient (N, 2) with respect to the mean's direction, through the low-pass: B of (26) to (28).
+        """Return the gradient with respect to means' directions through the low-pass filter: B of eqs. (26) to (28).
 
-        The gradient's components are along the tangent plane's axes.
+        The result is (N, 2), with components along the axes of the tangent planes.
 
-        gradients: (N, 2, 2), with respect to the projected covariance.
+        directions: (N, 3), unit vectors from the camera to the means.
+        gradients: (N, 2, 2), gradient with respect to the projected covariances.
         low_pass: variance in square pixels that is added to the projected covariance.
         """
         raise NotImplementedError(self.projection)

@@ -24,7 +24,7 @@ from clsplat.scenes.dataset import (
 Named = tuple[str, Camera, Lens]
 """Name, camera and lens of a photograph."""
 MIN_CHECKED_POSES = 4
-"""Minimum number of cameras whose poses are checked."""
+"""Minimum number of cameras for a check of their poses."""
 MAX_CHECKED_POSES = 40
 """Maximum number of cameras whose poses are checked, evenly spaced."""
 MAX_POSE_CHECK_POINTS = 1000
@@ -34,9 +34,9 @@ MIN_POSE_CHECK_POINTS = 30
 MIN_VISIBLE_POINT_FRACTION, MIN_VISIBLE_POINT_GAIN = 0.25, 4.0
 """Thresholds for suggesting another convention of the poses (POSE_MISREADINGS).
 
-With the other convention, views must show at least the first fraction of the points on average. This fraction must also
-be at least the second number times the fraction with the poses as given. The first threshold excludes aerial surveys,
-where a picture shows about 1 % of the points with either convention.
+Another convention is suggested if with it, views show on average at least the first fraction of the points, and at
+least the second number times the fraction that they show with the poses as given. The first threshold excludes aerial
+surveys, where a picture shows about 1 % of the points with either convention.
 """
 BLIND_VIEW_POINT_FRACTION, MIN_BLIND_VIEW_FRACTION = 0.01, 0.2
 """Fraction of visible points below which a view is blind, and fraction of blind views that makes the poses doubtful.
@@ -50,7 +50,7 @@ given, and at least the second fraction does after inverting them."""
 PARALLEL_MEAN_AXIS_LENGTH = 0.7
 """Length of the mean optical axis above which the cameras look in the same direction, as along a facade.
 
-Such cameras are not checked without points, as they may converge by chance if their poses are inverted.
+Without points, the poses of such cameras are not checked, as their inverses may converge by chance.
 """
 CENTRE_RATIO_TOLERANCE = 0.02
 """Relative tolerance between cx / width and cy / height. If these ratios agree but are not 1/2, (cx, cy) is the centre
@@ -81,7 +81,7 @@ def cameras_of(images: Sequence[PosedImage], lenses: Lenses = "undistort") -> di
 def camera_checks(views: Sequence[Named], points: Float64 | None = None) -> list[str]:
     """Return warnings about implausible cameras.
 
-    views: photographs at any size.
+    views: the photographs, with cameras and lenses for any size of the pictures.
     points: (N, 3), the scene's points in world coordinates, if it has any.
     """
     flat = [(name, camera) for name, camera, _ in views if camera.is_pinhole]
@@ -141,10 +141,11 @@ def _another_size(views: Sequence[Named]) -> str:
 
 
 def _poses(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
-    """Return a warning if the poses seem to follow another convention than COLMAP's, else "".
+    """Return a warning if the poses seem to follow another convention than COLMAP's (POSE_MISREADINGS), else "".
 
-    With points, conventions are compared by the fraction of points in view. If none fits better than COLMAP's, blind
-    views are reported. Without points, conventions are compared by the fraction of cameras that face a common point.
+    With points, conventions are compared by the fraction of the points that the cameras see. If no other convention
+    fits better, the result is a warning about views that see almost no points. Without points, conventions are compared
+    by the fraction of cameras that face a common point.
     """
     flat = [camera for _, camera in views[:: -(-len(views) // MAX_CHECKED_POSES) or 1]]
     if len(flat) < MIN_CHECKED_POSES:
@@ -174,7 +175,7 @@ def _poses(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
         evidence = (
             f"the cameras face no common point, but {100 * meeting:.0f} % of them face one if the poses have {words}"
         )
-    return f"{evidence}: were they exported like that? Export them again, or correct the file"
+    return f"{evidence}: was the file written like that? Export it again, or correct it"
 
 
 def _blind(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
@@ -208,7 +209,7 @@ def _flipped(camera: Camera) -> Camera:
 
 
 def _inverted_opengl(camera: Camera) -> Camera:
-    """Camera with the correct pose if its matrix in OpenGL's axes was inverted by mistake."""
+    """Return the camera with its pose corrected, assuming that its matrix in OpenGL's axes was inverted by mistake."""
     turned = _inverted(camera)
     return replace(
         turned,
@@ -218,12 +219,12 @@ def _inverted_opengl(camera: Camera) -> Camera:
 
 
 def _of_places(camera: Camera) -> Camera:
-    """Camera with the correct pose if its position was given in place of its translation."""
+    """Return the camera with its pose corrected, assuming that its translation is in fact its position."""
     return replace(camera, translation=-camera.rotation @ camera.translation)
 
 
 def _of_last_w(camera: Camera) -> Camera:
-    """Camera with the correct pose if its quaternion was given as x y z w and read as w x y z."""
+    """Return the camera with its pose corrected, assuming that its quaternion x y z w was read as w x y z."""
     return replace(camera, rotation=rotation_from_quaternion(np.roll(quaternion_of(camera.rotation), 1)))
 
 
@@ -237,7 +238,7 @@ def _transposed_in_place(camera: Camera) -> Camera:
 
 
 def _transposed_opengl(camera: Camera) -> Camera:
-    """Camera with the correct pose if the rotation in its matrix, in OpenGL's axes, was transposed by mistake."""
+    """Return the camera with its pose corrected, assuming that its rotation in OpenGL's axes was transposed."""
     turn = OPENGL_AXIS_SIGNS[:, None] * camera.rotation.T * OPENGL_AXIS_SIGNS
     return replace(camera, rotation=turn, translation=-turn @ camera.position)
 
@@ -254,18 +255,19 @@ POSE_MISREADINGS: tuple[tuple[str, Callable[[Camera], Camera]], ...] = (
     (TRANSPOSED_ROTATIONS, _transposed_in_place),
     (TRANSPOSED_ROTATIONS, _transposed_opengl),
 )
-"""Common mistakes in poses: a description of the mistake, for messages, and a function that corrects a camera."""
+"""Common mistakes in poses: the description of each, for messages, and a function that corrects a camera's pose."""
 
 
 def _shares(cameras: Sequence[Camera], points: Float64) -> Float64:
-    """Return the fraction of the points that each camera sees, (cameras,)."""
+    """Return the fraction of the points (N, 3) that each camera sees, as an array with one value per camera."""
     return np.array([pixels_of(points, camera)[2].mean() for camera in cameras])
 
 
 def _facing(cameras: Sequence[Camera]) -> float:
     """Return the fraction of the cameras that face a common point, the point nearest to all optical axes.
 
-    A camera much nearer to that point than half the cameras' spread does not count as facing it.
+    A camera that is much nearer to the common point than half the median distance of the cameras from their middle does
+    not count as facing it.
     """
     centres = np.stack([camera.position for camera in cameras])
     axes = np.stack([camera.rotation[2] for camera in cameras])

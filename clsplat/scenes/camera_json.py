@@ -51,7 +51,7 @@ class Keys:
     def require(self, key: str, default: float | None = None) -> float:
         """Return the number under `key`, else `default`.
 
-        Raises InputError for an invalid value, or if the file and the caller give none."""
+        Raises InputError for an invalid value, and if there is neither a value nor a default."""
         value = self.number(key)
         if (value := default if value is None else value) is None:
             raise self.wrong(key, "a number")
@@ -72,14 +72,14 @@ class Keys:
         return vector
 
     def focal(self, key: str, size: int, projection: Projection = Camera.projection) -> float:
-        """Return the focal length in pixels; the value under `key` is the angle of view of `size` pixels in degrees."""
+        """Return the focal length in pixels with which `size` pixels show the angle of view under `key`, in degrees."""
         try:
             return focal_length(math.radians(self.require(key)), size, projection)
         except ValueError as error:
             raise InputError(f"{self.where}: '{key}': {error}") from None
 
     def wrong(self, key: str, expected: str) -> InputError:
-        """Return the error for a missing or invalid value. expected: a noun phrase for valid values."""
+        """Return the error for a missing or invalid value. expected: valid values in words, such as "a number"."""
         value = self.get(key)
         shown = f"{value:g}" if isinstance(value, float) else short(value)
         problem = f"has no '{key}'" if value is None else f"'{key}' is {shown}"
@@ -90,16 +90,16 @@ def short(value: object) -> str:
     """Return a value as text, shortened for an error message."""
     try:
         return repr(value)[:60]
-    except ValueError:  # an integer of thousands of digits
+    except ValueError:  # Python refuses to print an integer of thousands of digits
         return "a number of thousands of digits"
 
 
 def load_document(path: Path, expected: str = "a transforms.json", key: str = "'frames'") -> dict[str, Any]:
     """Load the JSON object in a file.
 
-    expected: kind of file, for the error message.
-    key: key that the object should have, for the error message.
-    Raises InputError.
+    expected: the kind of file in words, for the error message.
+    key: a key that the object must have, for the error message; the caller checks it.
+    Raises InputError if the file cannot be read or has no JSON object.
     """
     try:
         document = parse_json(read_document(path, expected), once=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contents of a data set in any layout: images with lenses and poses, and points. Undistortion of pictures.
+"""Contents of a data set in any layout: images with lenses and poses, and points. Also undistortion of pictures.
 
 The camera models and their formulas are COLMAP's, evaluated by pycolmap (`Camera.img_from_cam`, `undistort_camera`).
 """
@@ -25,7 +25,8 @@ from clsplat.images.alpha import associate, unassociate
 from clsplat.images.reading import downscale
 from clsplat.process import undisturbed
 
-# On Ctrl-C during its import, pycolmap says "not installed". It also sets a SIGTERM handler that prints a stack trace.
+# If Ctrl-C interrupts its import, pycolmap says that it is not installed. It also sets a SIGTERM handler that prints a
+# stack trace. `undisturbed` prevents both.
 with undisturbed():
     import pycolmap
 
@@ -44,7 +45,7 @@ POINTS_PER_OCCLUSION_CELL = 16
 With fewer points, occluded points show through the gaps. With more, cells are so wide that they cover adjacent objects.
 """
 MAX_OCCLUSION_CELL_FRACTION = 1 / 25
-"""Maximum side of an occlusion cell, relative to the picture's longer side. It limits cells where points are few."""
+"""Maximum side of an occlusion cell, relative to the picture's longer side. It applies where there are few points."""
 
 
 @cache
@@ -81,7 +82,7 @@ class Lens:
 
     @property
     def native(self) -> CameraModel | None:
-        """Camera model that renders through this lens without undistortion; None for a pinhole or if there is none."""
+        """The camera model that renders fisheyes and panoramas like this lens; None for all other lenses."""
         camera_model = lens_models().get(self.model, (None, None))[1]
         return camera_model if camera_model is not None and not camera_model.is_pinhole else None
 
@@ -102,7 +103,7 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """True if pictures need no undistortion, as with a distortion model whose coefficients are all 0."""
+        """True if pictures need no undistortion: for pinhole models, and distortion models with all coefficients 0."""
         if self.model in ("PINHOLE", "SIMPLE_PINHOLE"):
             return True
         camera = self._camera()
@@ -141,7 +142,10 @@ class Lens:
         )
 
     def camera(self, rotation: Float64, translation: Float64, lenses: Lenses) -> Camera:
-        """Return the camera for training: panoramas and, with lenses "native", fisheyes as they are; else `pinhole`."""
+        """Return the camera for training, with the given pose.
+
+        Panoramas keep their projection, and so do fisheyes if `lenses` is "native". Other lenses give `pinhole`.
+        """
         native = self.native
         if native is None or (lenses == "undistort" and not native.wraps):
             return self.pinhole(rotation, translation)
@@ -178,7 +182,10 @@ class Lens:
         return replace(self, width=width, height=height, params=tuple(params))
 
     def refocused(self, log: float, x: float, y: float) -> Lens:
-        """Return the lens with focal lengths times exp(log), and principal point shifted by x and y focal lengths."""
+        """Return the lens with fx and fy multiplied by exp(log), cx moved by x * fx, and cy moved by y * fy.
+
+        The shifts use fx and fy from before the multiplication.
+        """
         camera, params = self._camera(), list(self.params)
         shift = (x * camera.focal_length_x, y * camera.focal_length_y)
         for index, by in zip(camera.principal_point_idxs(), shift, strict=True):
@@ -188,7 +195,7 @@ class Lens:
         return replace(self, params=tuple(params))
 
     def img_from_cam(self, points: Float64) -> Float64:
-        """Project points (N, 3) in camera space to pixels (N, 2); NaN for points without an image in this model."""
+        """Project points (N, 3) in camera space to pixels (N, 2); NaN for points that the lens does not show."""
         if self.native is not None and not self.is_colmap:
             shown = self.camera(np.eye(3), np.zeros(3), "native")
             a, b, _ = self.native.places_of(shown, points)
@@ -210,7 +217,7 @@ class Lens:
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """An image of a data set: its name, its lens at the listed size, and its pose `cam_from_world`.
+    """An image of a data set: its name, the lens at the size in the data set, and the pose `cam_from_world`.
 
     rotation, translation: (3, 3) and (3,), float64.
     path: the file, if the data set names it.
@@ -255,7 +262,10 @@ class DataSet:
 
 
 def check_lens(lens: Lens, where: str) -> Lens:
-    """Return `lens`. Raises InputError, beginning with `where`, if it cannot be used."""
+    """Return `lens` unchanged. Raises InputError if its model, size or parameters are invalid.
+
+    where: beginning of the error message.
+    """
     counts = dict(colmap_camera_models().values())
     counts |= {name: 2 if model.wraps else 4 for name, (row, model) in lens_models().items() if not row.is_colmap}
     if lens.model not in counts:
@@ -311,7 +321,7 @@ def in_pixels(lens: Lens) -> tuple[Lens, bool]:
 
 
 def given_in_parts(names: Iterable[object]) -> str:
-    """Return the warning that `in_pixels` has converted the lenses of these cameras."""
+    """Return the warning that `in_pixels` has converted the lenses of the cameras `names`."""
     return (
         f"the principal point (cx cy) of {examples(names)} is given as fractions of the picture's width and height, "
         "not in pixels; it is read as fractions, and so are focal lengths below a twentieth of the longer side"
@@ -324,7 +334,7 @@ def pixels_of(
     """Locate points in a view's picture.
 
     points: (N, 3), world coordinates.
-    lens: needed if the camera is not a pinhole camera.
+    lens: the photograph's lens; needed only if the camera is not a pinhole camera.
     Returns the rows and columns of the points that lie in front of the camera and in its picture, and `inside` (N,),
     which is True for these points.
     """
@@ -347,16 +357,17 @@ def pixels_of(
 MIN_TRACKED_POINTS_IN_VIEW = 0.1
 """Minimum fraction of tracked points that the scene's cameras project into the photographs of their tracks.
 
-The fraction is 0.4 for an undistorted fisheye of 200 degrees. It was 0.001 for cameras in another coordinate frame.
+The fraction is 0.4 for an undistorted fisheye of 200 degrees, and 0.001 for cameras in another coordinate frame.
 """
 
 
 def tracked_in_view(tracked: Iterable[tuple[Camera, Lens | None, Float64]]) -> tuple[int, int, bool]:
-    """Return how many tracked points their photographs show, how many there are, and True if enough are shown.
+    """Count the points that the cameras project into the photographs in which COLMAP observed them.
 
-    If hardly any point is shown, the cameras have another world frame than the points.
+    Returns this count, the number of observations, and True if their ratio is at least MIN_TRACKED_POINTS_IN_VIEW.
+    Otherwise the cameras and the points have different world frames.
 
-    tracked: camera, lens and points (k, 3) of each photograph.
+    tracked: for each photograph its camera, its lens and the points (k, 3) that COLMAP observed in it.
     """
     seen = whole = 0
     for camera, lens, points in tracked:
@@ -366,13 +377,16 @@ def tracked_in_view(tracked: Iterable[tuple[Camera, Lens | None, Float64]]) -> t
 
 
 def occlusion_cell(camera: Camera, points: int) -> float:
-    """Return the side in pixels of an occlusion cell for this number of points in the camera's picture."""
+    """Return the side in pixels of an occlusion cell, if the camera's picture shows this number of points."""
     cell = np.sqrt(POINTS_PER_OCCLUSION_CELL * camera.width * camera.height / max(points, 1))
     return float(max(min(cell, MAX_OCCLUSION_CELL_FRACTION * max(camera.width, camera.height)), 1.0))
 
 
 def nearest_around(rows: NDArray[np.int64], columns: NDArray[np.int64], depths: Float64, cell: float) -> Float64:
-    """Return, for each point, the least depth (N,) among the points in its cell of `cell` x `cell` pixels."""
+    """Return, for each point, the least depth (N,) of the points in the same square of `cell` x `cell` pixels.
+
+    rows, columns, depths: (N,), pixel and depth of each point.
+    """
     across, down = (columns // cell).astype(np.int64), (rows // cell).astype(np.int64)
     cells = down * (across.max(initial=0) + 1) + across
     nearest = np.full(cells.max(initial=0) + 1, np.inf)
@@ -381,7 +395,7 @@ def nearest_around(rows: NDArray[np.int64], columns: NDArray[np.int64], depths: 
 
 
 def undistort(image: Float32, lens: Lens, camera: Camera) -> Float32:
-    """Resample a picture (H, W, C) taken through `lens` to a camera at the same position.
+    """Resample a picture (H, W, C) that was taken through `lens` to the pixels of `camera`, which has the same pose.
 
     Interpolation is by cubic spline, clipped to the picture's range of values. If `camera` is less than 3/4 as wide as
     `lens.pinhole`, the picture is interpolated bilinearly to the size of `lens.pinhole` and then averaged over areas.
@@ -395,7 +409,7 @@ def undistort(image: Float32, lens: Lens, camera: Camera) -> Float32:
         (np.arange(grid.width) + 0.5 - grid.cx) / grid.fx, (np.arange(grid.height) + 0.5 - grid.cy) / grid.fy
     )
     rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
-    pixels = lens.img_from_cam(rays) - 0.5  # the centre of the first pixel is sample 0
+    pixels = lens.img_from_cam(rays) - 0.5  # from pixel centres at +0.5 to whole indices
     far = 2.0 * max(lens.width, lens.height)
     pixels = np.clip(np.nan_to_num(pixels, nan=far), -far, far)
     coordinates = pixels[:, ::-1].T.reshape(2, grid.height, grid.width)

@@ -32,10 +32,10 @@ MIN_DEPTH_FIT_POINTS = 10
 MAX_DEPTH_SCALE_RATIO = 5.0
 """Largest factor by which the scale fitted to a relative depth map may differ from the median scale of all maps."""
 DEPTH_TO_UNIT = 1.4
-"""Largest length unit, as a multiple of the median depth.
+"""Largest length unit, as a multiple of the median depth (`length_unit_of`).
 
-In scenes that are photographed from all around, the extent is at most 1.29 times the median depth, so that it remains
-the length unit.
+In scenes that are photographed from all around, the extent is at most 1.29 times the median depth. So their length unit
+is the extent.
 """
 NEAR_PER_EXTENT = 1e-6
 """Least depth of the points that the length unit is computed from, as a fraction of the extent."""
@@ -70,9 +70,11 @@ def with_depths(scene: Scene, use: DepthUse) -> Scene:
 
 
 def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
-    """Return the points that COLMAP observed in each photograph, with weights 1/(1 + e^2) for errors of e pixels.
+    """Return the points that COLMAP observed in each photograph, by view name.
 
-    asked: the option that needs tracks, for messages.
+    The weight of a point with a reprojection error of e pixels is 1/(1 + e^2).
+
+    asked: the option that needs the points, for messages.
     """
     if (read := _tracks_of(scene)) is None:
         raise InputError(f"{scene.name}: {asked} needs to know which photographs show a point, expected a COLMAP model")
@@ -86,15 +88,18 @@ def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
     if not known:
         raise InputError(
             f"{model}: has photographs such as {examples(tracked)} but none of the scene's "
-            f"({examples([view.name for view in scene.train_views])}), expected the same; {asked} uses their points"
+            f"({examples([view.name for view in scene.train_views])}); expected the same names, as {asked} uses the "
+            "points of the model's photographs"
         )
     _check_frame(scene, known, model)
     return known
 
 
 def _check_frame(scene: Scene, known: Mapping[str, KnownDepth], model: Path) -> None:
-    """Raise InputError if hardly any tracked point is projected into its photographs: the cameras then have another
-    world frame."""
+    """Raise InputError if the cameras project hardly any tracked point into its photographs.
+
+    The cameras and the points of `model` then have different world frames. known: points of each view, by its name.
+    """
     views = [view for view in scene.train_views if view.name in known]
     seen, whole, enough = tracked_in_view(
         (view.camera.before(scene.near), view.lens, known[view.name].points) for view in views
@@ -107,7 +112,7 @@ def _check_frame(scene: Scene, known: Mapping[str, KnownDepth], model: Path) -> 
 
 
 def _mapped(scene: Scene, use: DepthUse) -> dict[str, KnownDepth]:
-    """Return the depth maps of the photographs. Relative maps get the scale and offset that fit COLMAP's points."""
+    """Return the depth maps of the photographs, by view name. Relative maps get a scale and offset by `_fitted`."""
     told = {view.name: view.depth_file for view in scene.views if view.depth_file}
     files = {**_beside(scene.views, told, strict=not scene.missing), **told}
     if not files:
@@ -135,10 +140,13 @@ def _check_shape(path: Path, width: int, height: int, lens: Lens) -> None:
 
 
 def _fitted(scene: Scene, known: dict[str, KnownDepth]) -> dict[str, KnownDepth]:
-    """Fit relative maps, which have larger values for nearer points, to the points of their photographs.
+    """Return the relative maps with scales and offsets that convert their values to inverse depths.
 
-    The offset comes from medians, the scale from mean absolute deviations. Maps with few points, or with a scale far
-    from the others, are left out, and `with_depths` warns of them.
+    They are fitted to the inverse depths of COLMAP's points in each photograph. The offset comes from medians, the
+    scale from mean absolute deviations. Maps with few points, or with a scale far from the others, are left out, and
+    `with_depths` warns of them.
+
+    known: the maps by view name.
     """
     points, fits = _tracked(scene, "--depth-maps relative"), {}
     for view in scene.train_views:
@@ -180,7 +188,7 @@ def _beside(views: Sequence[View], told: Mapping[str, Path], *, strict: bool) ->
     A map is named like its photograph, with or without the photograph's extension, or with _depth or .depth after the
     stem.
 
-    told: by view name, maps that the data set names; they are skipped.
+    told: the maps that the data set names, by view name. These files are skipped.
     strict: raise InputError for a map that fits no photograph.
     Raises InputError for two maps of one photograph.
     """
@@ -208,7 +216,7 @@ def _maps_in(folder: Path) -> Iterator[Path]:
 
 
 def _tracks_of(scene: Scene) -> tuple[Path, colmap.Tracks] | None:
-    """The COLMAP model that the scene was read from, and its tracks; None without such a model."""
+    """Return the folder of the COLMAP model that the scene was read from, and its tracks; None for other scenes."""
     model = None if scene.source is None else colmap.find_model(scene.source)
     return None if model is None else (model, colmap.read_tracks(model))
 
@@ -216,8 +224,8 @@ def _tracks_of(scene: Scene) -> tuple[Path, colmap.Tracks] | None:
 def length_unit_of(scene: Scene) -> float:
     """Return the scene's length unit, in world units: the extent, but at most `DEPTH_TO_UNIT` times the median depth.
 
-    Each training photograph has a median depth of the points that it shows; the median of these is used. A COLMAP
-    model's tracks tell which points a photograph shows. Without tracks, it shows the nearest point in each cell of
+    The median depth is the median over the training photographs of the median depth of the points that each shows.
+    COLMAP's tracks tell which points a photograph shows. Without tracks, these are the nearest points in cells of
     pixels.
     """
     medians = [float(np.median(depths)) for depths in _depths(scene) if len(depths)]
@@ -255,9 +263,9 @@ def _tracked_points(scene: Scene, views: Sequence[View]) -> dict[str, Float64]:
 
 
 def _nearest(points: Float64, view: View, near: float) -> Float64:
-    """Return the depth of the nearest point in each cell of the view's picture that has any of the points (N, 3).
+    """Return the depths (k,) of the points that a view shows: in each cell of pixels, the nearest of `points` (N, 3).
 
-    near: least depth of a point that is used, if the camera has no near plane of its own.
+    near: points at less than this depth are ignored; a camera's own near plane takes precedence.
     """
     camera = view.camera.before(near)
     rows, columns, inside = pixels_of(points, camera, view.lens)

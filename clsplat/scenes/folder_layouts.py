@@ -38,7 +38,7 @@ MAX_HELD_OUT_LIST_BYTES = 64 << 20
 
 
 def detect(path: Path) -> Kind:
-    """Return the layout of a scene's folder or transforms.json. Raises InputError, with all layouts, if none fits."""
+    """Return the layout of a scene's folder or transforms.json. Raises InputError if no layout fits."""
     path = Path(path)
     if path.is_file():
         if path.suffix.lower() != ".json":
@@ -63,10 +63,11 @@ def detect(path: Path) -> Kind:
 
 
 def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tuple[DataSet, list[Path]]:
-    """Read a COLMAP model and find its pictures. Returns the data set, and folders with downscaled copies of them.
+    """Read a COLMAP model and find its pictures. Returns the data set, and folders with downscaled copies of pictures.
 
     chosen: folder with the pictures, relative to `path`; None searches for it.
-    Raises InputError.
+    missing: how many pictures may be missing, as for `find_pictures`.
+    Raises InputError if the model or its pictures cannot be read.
     """
     model_path = colmap.find_model(path)
     assert model_path is not None  # detect has found it
@@ -74,7 +75,7 @@ def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tupl
     folder = _picture_folder(path, chosen, model_path, model.images)
     present = find_images(folder)
     if not present:
-        raise InputError(f"{folder}: no images found, expected the {len(model.images)} of {model_path}")
+        raise InputError(f"{folder}: no images found, expected the {len(model.images)} images of {model_path}")
     listed = [image.name for image in model.images]
     files = find_pictures(listed, [folder / name for name in listed], folder, model_path, missing, present)
     names = [called(name, folder / name, file, folder) for name, file in zip(listed, files, strict=True)]
@@ -99,8 +100,9 @@ def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tupl
 def read_transforms(path: Path, kind: Kind, chosen: str | Path | None, missing: Missing, *, masks: bool) -> DataSet:
     """Read the data set of one transforms.json, or of Blender's two files for training and test.
 
-    chosen: as for `read_colmap`.
-    Raises InputError.
+    chosen, missing: as for `read_colmap`.
+    masks: True if masks are used.
+    Raises InputError if a file or its pictures cannot be read.
     """
     folder = path.parent if path.is_file() else path
     images = None if chosen is None else folder / chosen
@@ -121,10 +123,11 @@ def read_transforms(path: Path, kind: Kind, chosen: str | Path | None, missing: 
 
 
 def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, images: Sequence[PosedImage]) -> Path:
-    """Find the folder of a COLMAP model's pictures: images/, else images_2 and the like, a known name, or the scene's.
+    """Find the folder with the pictures of a COLMAP model.
 
-    If images/ has no pictures, a folder with a picture that the model lists is preferred. Warns if the folder is not
-    images/. Raises InputError if there is no such folder.
+    The first of these folders that has pictures is used: images/, a downscaled copy such as images_2, a folder named in
+    OTHER_IMAGE_FOLDERS, and the scene's own. After images/, folders with a picture that the model lists come first.
+    Warns if the folder is not images/. Raises InputError if there is no such folder.
     """
     if chosen is not None:
         if not (folder := path / chosen).is_dir():
@@ -138,7 +141,7 @@ def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, ima
     copies = [copy for folder in usual if (copy := or_smaller(folder)) != folder]
     named = [inside(parent, (name,)) for parent in above for name in OTHER_IMAGE_FOLDERS]
     others = [folder for folder in named if folder is not None and has_pictures(folder)]
-    bare = [parent for parent in above if find_images(parent, deep=False)]  # RealityScan writes all in one folder
+    bare = [parent for parent in above if find_images(parent, deep=False)]  # as written by RealityScan
     found = [*copies, *others, *bare]
     listed = [folder for folder in found if any(is_file(folder / image.name) for image in images)]
     if listed or found:
@@ -163,9 +166,9 @@ def _warn_of_unlisted(present: Iterable[Path], data: DataSet, listed_in: Path, f
 
 
 def _held_out(data: DataSet, path: Path) -> list[PosedImage]:
-    """Return the images with the split from the file of held-out names `path`; unchanged if there is no such file.
+    """Return the images, split by the list of held-out names in the file `path`; unchanged if there is no such file.
 
-    Names are matched like a model's (`photo_names.match`). Warns of names that match no picture. Raises InputError if
+    Names are matched to pictures by `photo_names.match`. Warns of names that match no picture. Raises InputError if
     no training picture is left.
     """
     path = next((each for each in path.parent.iterdir() if each.name.lower() == path.name), path)
@@ -192,7 +195,7 @@ def _held_out(data: DataSet, path: Path) -> list[PosedImage]:
 
 
 def _text(path: Path) -> str:
-    """Decode a text file in UTF-8 or UTF-16. Bytes of another encoding become surrogates (`photo_names.match`)."""
+    """Decode a text file in UTF-8 or UTF-16. Bytes of another encoding become surrogates, for `photo_names.match`."""
     with open_input(path, "a list of pictures") as file:
         raw = file.read(MAX_HELD_OUT_LIST_BYTES + 1)
     if len(raw) > MAX_HELD_OUT_LIST_BYTES:

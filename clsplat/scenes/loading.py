@@ -42,7 +42,7 @@ A file whose ratio differs more, or that is rotated, counts as another picture.
 SIDE_ROUNDING_PX = 2.5
 """Largest difference between a camera's side and its picture's, in pixels of the camera, that rounding may cause."""
 BLENDER_CUBE_HALF_SIDE = 1.3
-"""Half the side of the cube for random points in the synthetic scenes. This is the 3DGS authors' value."""
+"""Half the side, in world units, of the cube for random points in Blender's scenes. This is the 3DGS authors' value."""
 
 
 def load_scene(
@@ -63,13 +63,14 @@ def load_scene(
     path: a folder in a layout that `detect` knows, or a transforms.json.
     resolution: longest side of the views in pixels, never larger than the pictures. 0 keeps their size up to 1600.
     test_every: every n-th view, by name, is held out; 0 for none. A split in the data set takes precedence.
-    test_most: maximum number of views that `test_every` holds out, spread evenly over them, 0 for no maximum.
+    test_most: maximum number of views that `test_every` holds out. If it is exceeded, an evenly spaced selection of
+        them is held out. 0 for no maximum.
     images: another folder with the pictures, relative to `path`, such as "images_4". By default, images_2, images_4 or
         images_8 of a COLMAP scene is used instead of larger pictures if its pictures have exactly the requested size.
         Such a folder of any size is used if there are no other pictures.
     lenses: "undistort" turns fisheyes into pinhole cameras, "native" keeps them.
     work_dir: output of structure from motion, by default NAME_colmap next to `path`.
-    progress: function that is called with a text and a fraction or None.
+    progress: function that is called with the name of a stage, and the fraction that is done, or None if unknown.
     masks: the meaning of masks and alpha channels (`clsplat.scenes.supervision.masks`). With masks, downscaled pictures
         are not used, and structure from motion finds no features in masked pixels.
     missing: how many listed pictures may be missing, "few" (a tenth), "skip" (any number but not all) or "error"
@@ -100,7 +101,7 @@ def load_scene(
         files = _read(path, kind, images, missing, masks, work_dir, progress)
         views = _views(files, path, resolution, (test_every, test_most), lenses)
         scene = _scene(files, path, kind, views)
-        near_views = [view for view in views if view.name not in scene.stray_cameras]  # outliers are reported already
+        near_views = [view for view in views if view.name not in scene.stray_cameras]  # `_scene` has warned of outliers
         for doubt in camera_checks([(view.name, view.camera, view.lens) for view in near_views], scene.points):
             warn(doubt)
     scene.warnings = [plain(str(warning.message)) for warning in caught]
@@ -113,7 +114,7 @@ class _SceneFiles:
 
     source: the folder from which the data set was read. For photographs it is the result of structure from motion.
     smaller: folders of downscaled pictures that may be used instead of the data set's pictures.
-    masks: the meaning of the masks in `source`.
+    masks: the meaning of masks and alpha channels in `source`.
     """
 
     data: DataSet
@@ -131,7 +132,10 @@ def _read(
     work_dir: Path | None,
     progress: Progress | None,
 ) -> _SceneFiles:
-    """Read a data set of this layout. For photographs, run structure from motion first."""
+    """Read a data set of the layout `kind`. For photographs, run structure from motion first.
+
+    The other arguments are those of `load_scene`.
+    """
     if kind in ("blender", "transforms"):
         return _SceneFiles(read_transforms(path, kind, images, missing, masks=masks.masks != "none"), path, (), masks)
     folder = path
@@ -145,9 +149,12 @@ def _read(
 
 
 def _views(files: _SceneFiles, path: Path, resolution: int, test_views: tuple[int, int], lenses: Lenses) -> list[View]:
-    """Return the data set's views, sorted by name, with split and masks. Warns of copies and of uneven scaling.
+    """Return the data set's views, sorted by name, with split and masks.
 
-    test_views: test_every and test_most.
+    Warns of held-out pictures that are copies of training pictures, and of pictures that do not have their camera's
+    aspect ratio.
+
+    test_views: test_every and test_most, as for `load_scene`.
     """
     data = files.data
     posed = sorted(data.images, key=lambda image: image.name)
@@ -165,9 +172,9 @@ def _views(files: _SceneFiles, path: Path, resolution: int, test_views: tuple[in
 
 
 def _held_out(names: Sequence[str], every: int, most: int) -> Sequence[str]:
-    """Return the names to hold out: every `every`-th of the sorted names, none if `every` is 0.
+    """Return the names to hold out: every `every`-th of the sorted names; none if `every` is 0.
 
-    most: maximum number of names, which are then spread evenly; 0 for no maximum.
+    most: maximum number of names. If there are more, an evenly spaced selection is returned. 0 for no maximum.
     """
     chosen = names[::every] if every > 0 else []
     if not 0 < most < len(chosen):
@@ -209,7 +216,9 @@ def camera_bounds(cameras: list[Camera], box: tuple[Float64, Float64] | None = N
 
     The cube's centre is the point nearest to all optical axes. If the axes are parallel, a weak pull towards a point
     ahead of the cameras determines the centre. The cube holds all cameras. It is three times as large if the cameras
-    face away from its centre (outward from one place). It is clipped to `box` if they overlap.
+    face away from its centre (outward from one place).
+
+    box: corners (low, high) of a box to which the cube is clipped, if they overlap.
     """
     centres = np.stack([camera.position for camera in cameras])
     axes = np.stack([camera.rotation[2] for camera in cameras])
@@ -250,7 +259,10 @@ def _warn_of_copies(views: list[View]) -> None:
 
 
 def _view(image: PosedImage, split: Split, resolution: int, smaller: Sequence[Path], lenses: Lenses) -> View:
-    """Return the view of an image at the working size. Reads and checks the picture's header."""
+    """Return the view of an image at the working size. Reads and checks the picture's header.
+
+    smaller: folders with downscaled copies of the pictures; one with exactly the working size is used.
+    """
     lens, upright = _fit(image.path, image.lens)
     camera = lens.camera(image.rotation, image.translation, lenses)
     longest = max(camera.width, camera.height)
@@ -283,12 +295,15 @@ def _warn_of_uneven(images: Sequence[PosedImage], views: Sequence[View]) -> None
         _, across, down = uneven[0]
         warn(
             f"{examples(name for name, *_ in uneven)}: has {across:.4g} times the width and {down:.4g} times the "
-            "height of its camera, which is scaled likewise; do the cameras belong to these pictures?"
+            "height of its camera, which is scaled by these factors; do the cameras belong to these pictures?"
         )
 
 
 def _stands_in(path: Path, width: int, height: int, lens: Lens) -> bool:
-    """Return True if a downscaled picture has the requested size, up to rounding of the shorter side by 1 pixel."""
+    """Return True if a picture is downscaled and has the requested size, up to 1 pixel of the shorter side.
+
+    lens: the lens at the size of the original picture.
+    """
     size = image_size(path, orient=False)
     near = abs(size[0] - width) <= 1 and abs(size[1] - height) <= 1
     return near and max(size) == max(width, height) and max(size) < max(lens.width, lens.height)
@@ -299,7 +314,7 @@ def _fit(path: Path, lens: Lens) -> tuple[Lens, bool]:
 
     COLMAP, instant-ngp and nerfstudio use the pixels as stored. If only the rotated picture has the camera's aspect
     ratio, the cameras are from a tool that rotates pictures, so that the picture is rotated here too. Raises InputError
-    if neither has a similar aspect ratio.
+    if the aspect ratio differs by more than MAX_ASPECT_RATIO_CHANGE.
     """
     stored = image_size(path, orient=False)
     if stored == (lens.width, lens.height):

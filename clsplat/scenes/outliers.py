@@ -20,7 +20,7 @@ OUTLIER_DISTANCE_RATIO = 5.0
 """Minimum distance of an outlier from the middle, relative to the farthest position that is not an outlier.
 
 If the scene size includes an outlier at 5, 8, 12 or 30 times that distance, a training on 24 photographs loses
-1.2, 2.7, 4 or 7 dB.
+1.2, 2.7, 4 or 7 dB of PSNR.
 """
 MAX_OUTLIER_CAMERA_FRACTION = 0.25
 """Maximum fraction of the cameras that can be outliers. If more cameras are far away, they belong to the capture."""
@@ -40,7 +40,7 @@ def strays(places: Float64, most: float, least: float = 0.0, middle: Float64 | N
         `least` is 0 and all positions but a few coincide, no position is an outlier.
     """
     found = np.zeros(len(places), np.bool_)
-    first = len(places) - int(most * len(places))  # number of nearest positions, which cannot be outliers
+    first = len(places) - int(most * len(places))  # this many nearest positions cannot be outliers
     if not 0 < first < len(places):
         return found
     distances = np.linalg.norm(places - (np.median(places, axis=0) if middle is None else middle), axis=1)

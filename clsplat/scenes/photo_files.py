@@ -41,8 +41,8 @@ def find_pictures(
     missing: how many pictures may be left out: "error" none, "skip" any number but not all, "few" up to
         MAX_MISSING_FRACTION.
     present: the pictures in `folder`, if known.
-    Warns of other names and of pictures that are left out. Raises InputError that names the missing pictures and
-    similar names.
+    Warns of pictures found under other names and of pictures that are left out. Raises InputError that names the
+    missing pictures and similar names.
     """
     files = [path if path is not None and is_file(path) else None for path in exact]
     lost = [index for index, path in enumerate(files) if path is None]
@@ -101,7 +101,7 @@ def by_name(folder: Path, present: Collection[Path], used: Sequence[Path]) -> di
     """Return the pictures by their paths relative to `folder`, without masks, depth maps and downscaled copies.
 
     present: the pictures in `folder`.
-    used: pictures that the data set uses, whose masks and depth maps are recognised by name.
+    used: pictures that the data set uses. Their masks and depth maps are recognised by name.
     """
     aside = companions(present, used, folder)
     copies = {path for path in {path.parent for path in present} if is_smaller_copy(path)}

@@ -184,5 +184,5 @@ def _without_extension(name: str) -> str:
 
 
 def _ending(count: int, key: Key, name: str) -> str:
-    """Return the last `count` parts of a path's key, or all of them if it has fewer."""
+    """Return the last `count` parts of a path's key, or all parts if there are fewer."""
     return "/".join(key(name).split("/")[-count:])

@@ -26,7 +26,7 @@ PLY_COLOUR_PROPERTIES = (
     ("scalar_red", "scalar_green", "scalar_blue"),
     ("color_red", "color_green", "color_blue"),
 )
-"""Possible names of a PLY's colour properties, in any case. The first set that is present is used."""
+"""Possible names of a PLY's colour properties, in upper or lower case. The first set that is present is used."""
 UNCOLOURED_GREY = 0.5
 """Grey value of points from a file without colours."""
 LAS_EXTENSIONS = (".las", ".laz")
@@ -79,12 +79,12 @@ def read_cloud(path: Path) -> Cloud:
 
 
 def of_one_colour(colors: Float32) -> bool:
-    """Return True if all of several colours (N, 3) are equal, as those of points from a file without colours."""
+    """Return True if there are several colours (N, 3) and all are equal, as for points from a file without colours."""
     return len(colors) > 1 and bool((colors == colors[0]).all())
 
 
 def point_colours(levels: NDArray[Any]) -> Float32:
-    """Convert stored colours (N, 3) to [0, 1]. Their range of values tells the white level (`full_scale`)."""
+    """Convert stored colours (N, 3) to [0, 1]. `full_scale` infers the white level, such as 255, from their range."""
     colors: Float32 = np.clip(np.asarray(levels, np.float32) / np.float32(full_scale(levels)), 0, 1)
     return colors
 
@@ -161,7 +161,10 @@ def _read_las(path: Path) -> Cloud:
 
 
 def _warn_of_left_out(path: Path, good: NDArray[np.bool_]) -> None:
-    """Warn of points that are not finite. Raises InputError if all of them are."""
+    """Warn of points that are not finite and are left out. Raises InputError if none remains.
+
+    good: (N,), True for the points that are kept.
+    """
     if good.all():
         return
     bad = int(np.count_nonzero(~good))

@@ -39,16 +39,17 @@ FAR_ORIGIN_RATIO = 64.0
 At this distance float32 resolves 64 * 2^-24 of the scene's size, or 1 % of a pixel if the scene is 2600 pixels wide.
 """
 MIN_POINTS_IN_FAR_VIEW, MIN_POINT_SPREAD_IN_FAR_VIEW = 10, 0.08
-"""A distant camera is no outlier if its picture shows at least this many points, and the standard deviation of their
-pixels is at least this fraction of the width or height.
+"""A distant camera is not an outlier if its picture shows at least this many points, and the standard deviation of
+their pixels is at least this fraction of the width or height.
 
 Such a picture shows the scene from further away, or another reconstructed part of it. Points all over the picture have
 a standard deviation of 0.29. The picture of an outlier shows no points, or has every point in one pixel.
 """
 MIN_FAR_GROUP_NEIGHBOURS = 2
-"""In a scene without points, a distant camera is no outlier if at least this many other cameras are near it."""
+"""In a scene without points, a distant camera is not an outlier if at least this many other cameras are near it."""
 MAX_SAMPLED_PHOTOGRAPHS = 200
-"""Maximum number of photographs that findings (`scenes.analysis`) are based on, if training decodes them later."""
+"""Maximum number of photographs that findings (`scenes.analysis`) are based on, if they are not all decoded before
+training."""
 SAME_PLACE_TOLERANCE = 1e-12
 """Cameras are in one place if none is farther from their middle than this fraction of their largest coordinate."""
 
@@ -62,7 +63,8 @@ class View:
     path: the photograph's file.
     split: "train" or "test".
     lens: the lens that took the file, at the file's size.
-    upright: True if the camera belongs to the picture rotated by its EXIF orientation, False if to the stored picture.
+    upright: True if the camera fits the picture after rotation by its EXIF orientation, False if it fits the stored
+        picture.
     mask: mask of the pixels that training uses, None if it uses all.
     depth_file: the depth map that the data set names, if any.
     depth: known depths for training.
@@ -122,8 +124,8 @@ class View:
     def load_sizes(self, sizes: Sequence[tuple[int, int]], *, reduce: bool = False) -> list[Float32]:
         """Read like `load_masked` at several sizes, (width, height), decoding the file only once.
 
-        reduce: resample each size from the picture at the camera's size, which is quicker than from the file's and
-        differs by rounding. Pictures with masked pixels are always resampled from the file's size.
+        reduce: resample the picture to the camera's size first, and from this to each size. This is faster, and differs
+        by rounding. Pictures with masked pixels are always resampled from the file's size.
         """
         image, counts = self._read(), None
         if self.mask is not None:
@@ -136,9 +138,12 @@ class View:
         return [self._fitted(image, width, height) for width, height in sizes]
 
     def _masked(self, image: Float32, counts: Float32, width: int, height: int) -> Float32:
-        """Resample a picture (H, W, 3 or 4) and its mask (H, W, 1) to a picture as from `load_masked`."""
+        """Resample a picture (H, W, 3 or 4) to `width` x `height` pixels, with five channels as from `load_masked`.
+
+        counts: (H, W, 1), the mask: 1 for kept pixels, else 0.
+        """
         parts = [np.where(counts > 0, image[:, :, :3], np.float32(0)), counts]
-        if image.shape[2] == 4:  # alpha is averaged over the kept part, like a colour
+        if image.shape[2] == 4:  # alpha is averaged over kept pixels only, like a colour
             there = np.where(counts > 0, image[:, :, 3:], np.float32(0))
             alpha = self._fitted(np.concatenate([there, there, there, counts], axis=2), width, height)
             parts[0] = parts[0] * there
@@ -182,7 +187,7 @@ class Scene:
     point_colors: (N, 3) float32 in [0, 1].
     bounds: corners (low, high) of the box for random initial points, each (3,) float64, in world units.
     warnings: messages for the user, one line each.
-    start: settings by which the initial points were chosen (`scenes.start.point_cloud`).
+    start: settings by which `points` were chosen for the start of training (`scenes.start.point_cloud`).
     colourless: (N,), True for points that get their colours from photographs; None if no point does.
     source: the folder from which the scene was read.
     depth_use: settings by which known depths were added (`scenes.depth_sources`).
@@ -224,13 +229,13 @@ class Scene:
 
     @property
     def decoded_first(self) -> bool:
-        """True if every picture is decoded before training. With MANY_PHOTOGRAPHS training views or more, a picture is
-        decoded when a step first needs it."""
+        """True if every picture is decoded before training. In scenes of MANY_PHOTOGRAPHS training views or more, each
+        picture is decoded when a step first needs it instead."""
         return len(self.train_views) < MANY_PHOTOGRAPHS
 
     @cached_property
     def sampled_views(self) -> list[View]:
-        """Views that findings (`scenes.analysis`) are based on: all views, but an even sample if there are many."""
+        """Views that findings (`scenes.analysis`) are based on: all views, or an even sample of many views."""
         if self.decoded_first:
             return self.views
         count = min(MAX_SAMPLED_PHOTOGRAPHS, len(self.train_views))
@@ -287,8 +292,8 @@ class Scene:
     def stray_cameras(self) -> frozenset[str]:
         """Names of the views whose cameras are outliers, far from the other cameras and from the points.
 
-        A camera is no outlier if its picture shows points in a fair part of its area. In scenes without points, it is
-        no outlier if other cameras are near it.
+        A camera is not an outlier if its picture shows points in a fair part of its area. In scenes without points, it
+        is not an outlier if other cameras are near it.
         """
         centres = np.stack([view.camera.position for view in self.views])
         middle = np.median(centres, axis=0)
@@ -347,7 +352,7 @@ def spread(items: Sequence[T], most: int) -> list[T]:
 
 
 def _shows_much(view: View, points: Float64, views: Sequence[View]) -> bool:
-    """Return True if a distant camera is part of the capture, for example in another room, and no outlier.
+    """Return True if a distant camera is not an outlier but part of the capture, for example in another room.
 
     The picture must show points over a fair part of its area. Without points, at least MIN_FAR_GROUP_NEIGHBOURS other
     cameras must be nearer to the camera than the median distance of all cameras from their middle.

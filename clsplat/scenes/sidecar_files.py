@@ -45,12 +45,18 @@ def bases_of(images: Sequence[Named]) -> list[Path]:
 
 
 def beside(base: Path, names: Sequence[str]) -> Path | None:
-    """Return the folder in `base` or next to it that has one of these names, in any case, or None."""
+    """Return the folder in `base` or next to it with one of these lower-case names, or None.
+
+    The case of the folder's name is ignored. Earlier names take precedence.
+    """
     return next((at for parent in (base, base.parent) if (at := inside(parent, names)) is not None), None)
 
 
 def inside(parent: Path, names: Sequence[str]) -> Path | None:
-    """Return the folder in `parent` with one of these lower-case names, in any case, or None. Earlier names win."""
+    """Return the folder in `parent` with one of these lower-case names, or None.
+
+    The case of the folder's name is ignored. Earlier names take precedence.
+    """
     for name in names:
         if (at := parent / name).is_dir():
             return at
@@ -75,7 +81,7 @@ def owned(
     """Match the sidecar files of a folder to photographs. Returns the file of each photograph, by its name.
 
     paths: the sidecar files in `folder`.
-    known: name of the photograph for each name, without extension, that its sidecar file may have.
+    known: maps each name that a sidecar file may have, without extension, to the name of its photograph.
     what: the kind of sidecar file, such as "mask", for messages.
     example: name of a photograph, for messages.
     without: files to skip.
@@ -119,7 +125,7 @@ def owned(
 
 
 def _series(names: Iterable[str]) -> dict[int, str]:
-    """Return names by the number at their end, before the extension.
+    """Map the numbers at the end of names, before the extension, to the names.
 
     The result is empty unless there are at least two names that differ only in this number.
     """
@@ -144,12 +150,15 @@ _NAME_KEYS: tuple[Callable[[str], str], ...] = (
     lambda name: _INNER_EXTENSION.sub("", _loose(name)),
     lambda name: _INNER_EXTENSION.sub("", _loose(name)).rpartition("/")[2],
 )
-"""Functions that reduce a name to a key, for successive steps of matching. Each ignores more of the name."""
+"""Functions that reduce a name to a key, for successive steps of matching. Each step ignores more of the name."""
 
 
 def _unambiguous(known: Mapping[str, str], step: Callable[[str], str]) -> dict[str, str]:
-    """Map keys to photographs. A key is `step(name)` of a name in `known`. Keys that belong to several photographs are
-    left out."""
+    """Map keys to names of photographs. Keys that belong to several photographs are left out.
+
+    known: as for `owned`.
+    step: function that reduces a name of `known` to a key, one of _NAME_KEYS.
+    """
     if step is str:
         return dict(known)
     owners: dict[str, set[str]] = {}

@@ -43,7 +43,7 @@ def thumbnail_of(image: Float32) -> Thumbnail:
 
 
 def reduced(image: Float32, side: int) -> Float32:
-    """Downscale an image by an integer factor, averaging squares, to a longer side of at most `side` pixels."""
+    """Downscale an image by an integer factor to a longer side of at most `side` pixels, by averaging pixels."""
     factor = -(-max(image.shape[:2]) // side)
     if factor == 1:
         return image

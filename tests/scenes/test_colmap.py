@@ -125,7 +125,7 @@ def test_text_that_was_edited_beside_a_binary_file_is_told(tmp_path: Path) -> No
     for stem in ("images", "points3D"):
         os.utime(folder / f"{stem}.txt", (2000, 2000))
     read, newer = "images.bin, points3D.bin", "images.txt, points3D.txt"
-    told = f"{folder}: {read} is read, and the newer {newer} is not; remove the one that is not wanted"
+    told = f"{folder}: {read} is read, and the newer {newer} is not; remove the outdated one"
     assert warnings_of(lambda: read_model(folder)) == [told]
 
 

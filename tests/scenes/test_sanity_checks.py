@@ -55,7 +55,7 @@ def test_points_behind_all_cameras_are_told_after_a_hundred_steps_and_at_the_end
     found = told(behind, default_device, iterations=6, density=density)
     assert [text.partition(": ")[0] for text in found] == ["step 4", "step 6"]
     assert all("no Gaussian is visible in any of the 8 training views" in text for text in found)
-    assert found[0].endswith("check that both have the same axes, scale and origin")
+    assert found[0].endswith("check that points and cameras have the same axes, scale and origin")
 
 
 def test_pictures_of_one_colour_are_told(scene: Path) -> None:

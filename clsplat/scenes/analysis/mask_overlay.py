@@ -30,7 +30,7 @@ class Masked:
 
     @property
     def left_out(self) -> float:
-        """Fraction of the pixels that are left out."""
+        """Fraction of the photograph's pixels that masks leave out."""
         return float(np.maximum(self.ignored, self.clear).mean())
 
     def drawn(self) -> Float32:

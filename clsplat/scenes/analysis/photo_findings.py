@@ -39,19 +39,21 @@ Kind = Literal[
 ]
 
 EXPOSURE_SPREAD_STOPS = 0.2
-"""Standard deviation of a channel's brightness over the photographs, in stops, from which exposures count as varying.
+"""Exposures count as varying if a channel's brightness varies between photographs by at least this standard deviation,
+in stops.
 
 With locked exposure, occlusion and highlights cause up to 0.1. From about 0.2, learnt gains improve a model.
 """
 DISTANCE_SPREAD_RATIO = 4.0
-"""Ratio of the 90th to the 10th percentile of distance / focal length from which distances count as varying widely.
+"""Distances count as varying widely if the 90th percentile over the photographs of their distance, divided by the focal
+length, is at least this many times the 10th percentile.
 
 At 4, a Gaussian one pixel wide in a near photograph is a quarter of a pixel wide in a far one.
 """
 CUT_OUT_BORDER_FRACTION = 0.9
 """Masks cut an object out of its background if they leave out at least this fraction of the border pixels."""
 SAMPLED_MASKS = 12
-"""Number of masks that are sampled, evenly spaced, to recognise cut-outs. Rounding of the spacing may double it."""
+"""Approximate number of masks, evenly spaced, that are read to recognise cut-outs. Up to twice as many may be read."""
 TRANSPARENT_PIXEL_FRACTION = 0.02
 """Minimum fraction of transparent pixels in a photograph for its alpha to be reported. Seams and corners cover less."""
 WIDE_FISHEYE_DEGREES = 100.0
@@ -59,7 +61,8 @@ WIDE_FISHEYE_DEGREES = 100.0
 FEW_TRAINING_VIEWS = 16
 """Number of training photographs below which they hardly constrain the depth of a scene.
 
-According to publications, training on 12 photographs gives a PSNR 8 dB below training on 100, and on 24 about 3 dB.
+According to publications, training on 12 photographs gives a PSNR 8 dB below training on 100, and training on
+24 gives one about 3 dB below.
 """
 SPARSE_TRAINING_VIEWS = 30
 """Number of training photographs below which unlimited growth overfits (docs/quality.md)."""
@@ -71,14 +74,16 @@ are best with 64 to 85 pixels per Gaussian for 25 photographs of bonsai, and wit
 photographs of fox (docs/quality.md, Few photographs and Growth).
 """
 SUPPORTED_GAUSSIANS_PER_POINT = 1.5
-"""Number of Gaussians per point that few photographs always support, even small ones, as neighbouring pixels of a small
-photograph differ more."""
+"""Minimum of the recommended number of Gaussians, as a multiple of the number of points.
+
+It matters for small photographs, for which MIN_PIXELS_PER_GAUSSIAN allows too few Gaussians: neighbouring pixels differ
+more in small photographs, so fewer pixels per Gaussian suffice.
+"""
 FEW_STEPS_PER_VIEW = 60
 """Steps per training photograph below which high learning rates give better models
 (docs/decisions/0031-high-rates.md)."""
 SHORT_TRAINING_STEPS = range(1000, 10_001)
-"""Numbers of training steps for which high learning rates are recommended, after measurements with 2000 to 7000 steps.
-"""
+"""Numbers of training steps for which high learning rates are recommended. Measurements cover 2000 to 7000 steps."""
 RECOMMENDED_PASSES = 30
 """Number of passes through the training photographs below which a longer schedule is recommended. The paper's 30,000
 steps are 30 passes through 1000 photographs."""
@@ -95,24 +100,25 @@ DUPLICATE_RMS = 1.5 / 255
 FEATURELESS_THUMBNAIL_STD = 8 / 255
 """Standard deviation of a thumbnail up to which it is featureless and never counts as a duplicate."""
 MIN_SKY_PIXEL_FRACTION, MIN_SKY_VIEW_FRACTION = 0.06, 0.3
-"""Minimum fraction of a photograph that a sky covers, and minimum fraction of photographs with a sky for a finding."""
+"""Minimum fraction of a photograph that its sky covers, and minimum fraction of photographs with a sky, for a finding
+about the sky."""
 MAX_SKY_POINT_DENSITY_RATIO = 0.1
 """Maximum density of points in a sky, relative to the mean density in the photograph."""
 MAX_SKY_PIXEL_STEP, MIN_SKY_LUMA = 0.025, 0.45
 """Maximum luma difference of neighbouring thumbnail pixels in a sky, and minimum luma of a sky."""
 MIN_SKY_BLUE_EXCESS = 0.02
-"""Minimum of blue minus red in a blue sky; for a wall in lamplight it is below 0. A sky that is not blue must have a
-luma over MAX_EXPOSURE_COLOUR."""
+"""Minimum difference of blue and red in a blue sky; it is negative for a wall in lamplight. The luma of a sky that is
+not blue must exceed MAX_EXPOSURE_COLOUR."""
 
 
 @dataclass(frozen=True)
 class Finding:
     """A finding about the photographs.
 
-    kind: kind of the problem.
-    text: a clause for the report.
-    options: alternative settings that mitigate the problem, best first, if they depend on the photographs.
-        `recommendations.SETTINGS_BY_FINDING` has the settings that do not.
+    kind: name of the problem, such as "exposure".
+    text: a clause for the report that describes the problem in this scene.
+    options: alternative settings that mitigate the problem, best first, if they depend on the scene. For the same
+        settings in all scenes see `recommendations.SETTINGS_BY_FINDING`.
     """
 
     kind: Kind
@@ -121,9 +127,9 @@ class Finding:
 
 
 def findings(scene: Scene, use: MaskUse = NO_MASKS, iterations: int = 0) -> list[Finding]:
-    """Run all checks on a scene.
+    """Run all checks on a scene. Returns the problems found.
 
-    use: how masks are used.
+    use: the meanings of masks and alpha channels in training.
     iterations: planned number of training steps, 0 if unknown.
     Raises InputError like `Scene.check_pictures`.
     """
@@ -146,12 +152,12 @@ def findings(scene: Scene, use: MaskUse = NO_MASKS, iterations: int = 0) -> list
 
 
 def _sampled_training_views(scene: Scene) -> list[View]:
-    """Return the training views that have thumbnails."""
+    """Return the training views in the sample for which `Scene.thumbnails` has thumbnails."""
     return [view for view in scene.sampled_views if view.split == "train"]
 
 
 def _counted(scene: Scene, count: int) -> str:
-    """Return a number of photographs as text, with the size of the sample if only a sample was inspected."""
+    """Return a number of photographs as text, such as "3", or "3 of 200 sampled" if only a sample was inspected."""
     return f"{count:,}" if scene.decoded_first else f"{count:,} of {len(scene.sampled_views):,} sampled"
 
 
@@ -208,7 +214,10 @@ def _masks(scene: Scene, use: MaskUse) -> Finding | None:
 
 
 def _strange_masks(scene: Scene, reason: str) -> Finding | None:
-    """Report masks that cannot be used. Returns None if no file in their folder fits a photograph."""
+    """Return a finding about masks that cannot be used; None if no file in the mask folder fits a photograph.
+
+    reason: why the masks cannot be used.
+    """
     try:
         count = len(masks_beside(scene.views, strict=False))
     except InputError:
@@ -270,7 +279,7 @@ def _few_steps(scene: Scene, iterations: int) -> Finding | None:
     if iterations not in SHORT_TRAINING_STEPS or iterations >= FEW_STEPS_PER_VIEW * count:
         return None
     each = iterations / count
-    text = f"{iterations:,} steps are {each:.1f} per training photograph ({count:,}): higher learning rates are better"
+    text = f"{iterations:,} steps are {each:.1f} for each of {count:,} training photographs: higher learning rates help"
     return Finding("few steps", text)
 
 
@@ -299,7 +308,7 @@ def _sky_part(visible: VisiblePoints, view: View) -> float:
     """
     pixels = visible.scene.thumbnails[view.name].pixels
     up = visible.up @ view.camera.rotation.T
-    turns = int(np.round(np.arctan2(up[0], -up[1]) / (np.pi / 2))) % 4  # quarter turns that make the picture upright
+    turns = int(np.round(np.arctan2(up[0], -up[1]) / (np.pi / 2))) % 4  # rotations by 90 degrees for an upright picture
     upright = np.rot90(pixels, turns)
     light = upright @ REC601_LUMA
     steps = np.zeros(light.shape)
@@ -311,7 +320,7 @@ def _sky_part(visible: VisiblePoints, view: View) -> float:
         & (steps < MAX_SKY_PIXEL_STEP)
         & ((blue > MIN_SKY_BLUE_EXCESS) | (light > MAX_EXPOSURE_COLOUR))
     )
-    reached = np.logical_and.accumulate(likely, axis=0)  # in a column, sky ends at the first pixel that is unlikely sky
+    reached = np.logical_and.accumulate(likely, axis=0)  # sky ends at the first other pixel of a column
     part = float(reached.mean())
     if part < MIN_SKY_PIXEL_FRACTION or not likely[0].mean() > 0.5:
         return 0.0
@@ -347,7 +356,7 @@ def _blur(scene: Scene) -> Finding | None:
 
 
 def _duplicates(scene: Scene) -> Finding | None:
-    """Find photographs with nearly identical thumbnails."""
+    """Return a finding about photographs with nearly identical thumbnails; None if there are none."""
     by_size: dict[tuple[int, ...], list[str]] = {}
     for view in scene.sampled_views:
         by_size.setdefault(scene.thumbnails[view.name].pixels.shape, []).append(view.name)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recommended training settings (--auto) for the findings about a scene."""
+"""Training settings that are recommended because of the findings about a scene, and applied with --auto."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from clsplat.errors import InputError
 from clsplat.scenes.analysis.photo_findings import Finding, Kind
 
 SCHEDULE_SETTING = "schedule"
-"""Key, among recommended settings, of the name of a schedule: a bundle of learning rates and steps."""
+"""Key in a dictionary of recommended settings. Its value names a schedule: a bundle of learning rates and steps."""
 SETTINGS_BY_FINDING: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
     "exposure": ({"appearance": "exposure"},),
     "scales": ({"antialiased": True},),
@@ -38,25 +38,27 @@ SETTINGS_BY_FINDING: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
 """Alternative settings for each kind of finding, best first. The first one compatible with the other settings is used.
 """
 PASSES_SETTING = "passes"
-"""Key, among recommended settings, of the number of passes through the photographs, which scales the schedule
-(`config.presets.by_passes`)."""
+"""Key in a dictionary of recommended settings. Its value is the number of passes through the photographs that the
+schedule makes after scaling by `config.presets.by_passes`."""
 SCHEDULED_SETTINGS = ("sh_degree_every", "optimiser", "density.stop", "density.noise_rate")
-"""Settings that a schedule changes, except for the number of steps."""
+"""Settings that a schedule changes, apart from the number of steps."""
 ADVICE_BY_FINDING: Mapping[Kind, str] = {
     "sky": "--sky 1000 adds distant initial points for the sky",
     "strange masks": "rename or remove files that are not masks",
     "blur": "leave them out if other photographs show the same",
     "duplicates": "remove the copies",
 }
-"""Advice, by kind of finding, where SETTINGS_BY_FINDING has no settings."""
+"""Advice for the kinds of findings that are not in SETTINGS_BY_FINDING."""
 
 
 @dataclass(frozen=True)
 class Answer:
     """A finding and the settings recommended for it.
 
-    settings: the recommended settings; empty if there are none, or none that is compatible with the other settings.
-    given: name of a setting that the user has set otherwise, so that nothing is recommended; "" for none.
+    settings: the recommended settings. Empty if nothing is known to help, or if all that helps is incompatible with the
+        other settings.
+    given: name of a setting that the user has chosen and every recommendation would change, so that `settings` is
+        empty; else "".
     """
 
     finding: Finding
@@ -65,9 +67,9 @@ class Answer:
 
     @property
     def words(self) -> str:
-        """Text of the finding and its settings, such as "the photographs have masks (--masks ignore)".
+        """Text of the finding and its settings, such as "12 of 20 photographs have masks (--masks ignore)".
 
-        Advice that --auto does not apply comes after a colon.
+        If there is advice that --auto cannot apply, it follows after a colon.
         """
         kind = self.finding.kind
         if advice := ADVICE_BY_FINDING.get(kind):
@@ -92,9 +94,10 @@ def flags(settings: Mapping[str, Any]) -> str:
 def answered(
     found: Sequence[Finding], config: TrainConfig, given: Collection[str] = (), photographs: int = 0
 ) -> tuple[list[Answer], TrainConfig]:
-    """Choose settings for each finding. Returns an answer for each, and the configuration with all these settings.
+    """Choose settings for each finding. Returns the answers, in the same order, and `config` with all their settings.
 
-    given: names of settings that must not change.
+    found: the findings.
+    given: names of settings that the user has chosen, which must not change.
     photographs: number of training photographs, for settings that count passes through them.
     """
     answers = []
@@ -120,7 +123,11 @@ def _options(finding: Finding) -> Sequence[Mapping[str, Any]]:
 
 
 def _touched(option: Mapping[str, Any], given: Collection[str]) -> str:
-    """Return the first setting of `given`, by name, that `option` or its schedule would change; "" for none."""
+    """Return the name of the setting in `given` that `option` would change (the first by name); "" if there is none.
+
+    option: recommended settings. A schedule among them changes further settings.
+    given: names of settings that must not change.
+    """
     names = {*option, *((*SCHEDULED_SETTINGS, "density.start") if SCHEDULE_SETTING in option else ())}
     names |= {"iterations"} if PASSES_SETTING in option else set()
     return min((name for name in given if name in names or name.partition(".")[0] in names), default="")
@@ -132,8 +139,8 @@ def with_settings(
     """Apply recommended settings to a configuration.
 
     given, photographs: as for `answered`.
-    Raises InputError if the settings are incompatible, or if a schedule would override settings that differ from the
-    paper's.
+    Raises InputError if the settings are incompatible, or if a schedule would override values that the user has
+    changed from the paper's.
     """
     changes = dict(settings)
     config = replace(config, iterations=changes.pop("iterations", config.iterations))
@@ -141,8 +148,8 @@ def with_settings(
         paper, values = scheduled("paper", config.iterations), attrgetter(*SCHEDULED_SETTINGS)
         if values(config) != values(paper):
             raise InputError(
-                f"--schedule {name}: would override settings that are not the paper's, expected either the schedule or "
-                "these settings"
+                f"--schedule {name}: would override {', '.join(SCHEDULED_SETTINGS)}, but some of them differ from "
+                "the paper's; expected the paper's values, or no --schedule"
             )
         changes = dict(zip(SCHEDULED_SETTINGS, values(scheduled(name, config.iterations)), strict=True)) | changes
     if (passes := changes.pop(PASSES_SETTING, None)) is not None:
@@ -154,10 +161,10 @@ def with_settings(
 
 
 def paragraph(answers: Sequence[Answer], looked: int, *, auto: bool, sampled: int | None = None) -> str:
-    """Return the report of the findings and the settings for them, in one line.
+    """Return the report of the findings and of the recommended settings, in one line.
 
     looked: number of photographs in the scene.
-    auto: True if the settings are applied.
+    auto: True if --auto was given, so that the settings are applied.
     sampled: number of photographs that were inspected, if not all.
     """
     inspected = f"{looked:,}" if sampled in (None, looked) else f"{sampled:,} of {looked:,}"

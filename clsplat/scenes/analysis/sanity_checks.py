@@ -68,19 +68,19 @@ def of_pictures(
     """Return a warning if a model's renders of these views show no Gaussian or only one colour, else "".
 
     draw: function that renders the image (H, W, 3) and alpha (H, W) of a camera.
-    kind: name of the kind of views, for the message.
+    kind: "training", or another word for these views in the message.
     """
     checked = spread(views, MAX_CHECKED_VIEWS)
     drawn = [draw(view.camera.resized(*_small_size(view.camera))) for view in checked]
     if not any(alpha.any() for _, alpha in drawn):
         return (
             f"no Gaussian is visible in any of the {len(checked)} {kind} views that were checked: the points do not "
-            "lie in front of the cameras; check that both have the same axes, scale and origin"
+            "lie in front of the cameras; check that points and cameras have the same axes, scale and origin"
         )
     if all(_is_flat(image) for image, _ in drawn) and not all(_is_flat(_pixels(view)) for view in checked):
         return (
             f"each picture of the {len(checked)} {kind} views that were checked has a single colour, but the "
-            "photographs do not: check that cameras and points belong together, and settings other than the defaults"
+            "photographs do not: check that cameras and points belong together, and check settings that you changed"
         )
     return ""
 

@@ -16,9 +16,9 @@ from clsplat.scenes.scene import Scene, View
 MAX_SAMPLED_SCENE_POINTS = 4000
 """Maximum number of scene points that are sampled. A larger sample changes a median brightness by less than 0.01."""
 THUMBNAIL_OCCLUSION_DEPTH_RATIO = 1.15
-"""Ratio of a point's depth to that of the nearest point in its cell, above which the point counts as occluded."""
+"""A point counts as occluded if its depth is over this many times that of the nearest point in its occlusion cell."""
 THUMBNAIL_OCCLUSION_CELL_PX = 8
-"""Side of an occlusion cell in thumbnail pixels."""
+"""Side in thumbnail pixels of an occlusion cell, a square in which the nearest point hides farther ones."""
 MIN_POINTS_PER_VIEW = 40
 """Minimum number of visible points in a photograph whose brightness or scale is measured."""
 MIN_EXPOSURE_COLOUR, MAX_EXPOSURE_COLOUR = 0.06, 0.94
@@ -73,9 +73,10 @@ class VisiblePoints:
 
     @cached_property
     def gains(self) -> dict[str, Float64]:
-        """log2 gain (3,) of each view: brightness relative to the scene's point colours, minus the median of all views.
+        """log2 gain (3,) of each view, by the view's name, relative to the median of all views.
 
-        Only points that have colours are used.
+        A gain is the median ratio of the colours that the view shows at points to the colours that the scene gives
+        these points. Points without colours of their own are not used.
         """
         found = {}
         for name, (which, rows, columns, _) in self.places.items():
@@ -89,13 +90,13 @@ class VisiblePoints:
 
     @cached_property
     def exposures(self) -> dict[str, Float64]:
-        """log2 exposure (3,) of each photograph relative to the others. The keys are the views' names.
+        """log2 exposure (3,) of each photograph relative to the other photographs. The keys are the views' names.
 
         Each point is assumed to have the same colour in all photographs, so that differences are due to exposure. The
         fit minimises absolute differences by iteratively reweighted least squares. The scene's own point colours are
         not used. Photographs with fewer than MIN_POINTS_PER_VIEW shared points are left out.
         """
-        if len(self.points) < MIN_POINTS_PER_VIEW:  # return before thumbnails are loaded
+        if len(self.points) < MIN_POINTS_PER_VIEW:  # return early: `places` would load all thumbnails
             return {}
         seen = {name: self._logs(name) for name in self.places}
         counts = np.bincount(np.concatenate([np.empty(0, np.int64), *(which for which, _ in seen.values())]))
@@ -111,7 +112,8 @@ class VisiblePoints:
         return dict(zip(shared, relative_exposures(points, views, colors), strict=True))
 
     def _logs(self, name: str) -> tuple[NDArray[np.int64], Float64]:
-        """Return the points (n,) that are neither too dark nor clipped in a view, and log2 of their colours (n, 3)."""
+        """Return the indices (n,) of points that are neither too dark nor clipped in the view `name`, and log2 of the
+        colours (n, 3) that the view shows there."""
         which, rows, columns, _ = self.places[name]
         pixels = self.scene.thumbnails[name].pixels
         seen, most = (
@@ -125,8 +127,8 @@ class VisiblePoints:
 def relative_exposures(points: NDArray[np.int64], views: NDArray[np.int64], logs: Float64) -> Float64:
     """Estimate the exposures (V, 3) of views from the colours of shared points.
 
-    points, views: (M,) indices; each pair occurs once.
-    logs: (M, 3), log2 colours of these points in these views.
+    points, views: (M,), indices of a point and of a view that shows it; each pair occurs once.
+    logs: (M, 3), log2 of the colours of these points in these views.
 
     Each log colour is modelled as the view's exposure plus the point's colour. The sum of absolute residuals is
     minimised. In each group of views that are connected by points, the weighted mean exposure is 0.
@@ -147,5 +149,8 @@ def relative_exposures(points: NDArray[np.int64], views: NDArray[np.int64], logs
 
 
 def _sums(places: NDArray[np.int64], weights: Float64, values: Float64) -> Float64:
-    """Return sums (K, 3) of weighted values (M, 3), one for each of the K indices in `places` (M,)."""
+    """Return, for each index from 0 to K - 1, the sum of the weighted values that have this index: (K, 3).
+
+    places: (M,), the index of each value. weights: (M,). values: (M, 3).
+    """
     return np.stack([np.bincount(places, weights * column) for column in values.T], axis=1)

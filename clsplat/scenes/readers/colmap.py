@@ -132,16 +132,16 @@ class Tracks:
     by_image: dict[str, NDArray[np.int64]]
 
     def shown_in(self, names: Sequence[str]) -> dict[str, NDArray[np.int64]]:
-        """Return the indices (k,) of the points of each photograph that has any, by the photograph's name.
+        """Return the indices (k,) of the points observed in each photograph, by its name, if there are any.
 
-        names: the photographs' names, which may differ from the images' names as in `photo_names.match`.
+        names: names of the photographs. `photo_names.match` finds the image of each.
         """
         tracked = {name: rows for name, rows in self.by_image.items() if len(rows)}
         return {name: tracked[theirs] for name, theirs in match(names, tracked).names.items()}
 
 
 def read_tracks(folder: Path) -> Tracks:
-    """Read the tracks of the model in `folder`, without observations in images that it lacks.
+    """Read the tracks of the model in `folder`, without observations in images that the model lacks.
 
     Raises InputError like `read_model`.
     """
@@ -172,10 +172,9 @@ def safe_name(name: str) -> bool:
 
 
 def _named(path: Path, name: str) -> str:
-    """Return the name of a picture without a drive, root or "..".
+    """Return the name of a picture without a drive, root or "..", so that it is a path inside the images' folder.
 
-    `photo_names.match` finds a picture with a shortened name by the end of the path. Raises InputError if the
-    remaining name is not a path inside the images' folder.
+    `photo_names.match` then finds the picture by the last parts of its path. Raises InputError if this is impossible.
     """
     inner = name if safe_name(name) else "/".join(part for part in slashed(name).split("/") if part != "..")
     if not safe_name(inner):
@@ -196,7 +195,7 @@ class _Binary:
         return layout.unpack(self.file.read(layout.size))
 
     def need(self, size: int) -> None:
-        """Raise InputError if fewer bytes are left."""
+        """Raise InputError if the file has fewer than `size` bytes left."""
         if size > self.left:
             self._take(size)
 
@@ -286,7 +285,7 @@ def _warn_of_newer_text(folder: Path) -> None:
             edited.append(stem)
     if edited:
         read, not_read = (", ".join(stem + extension for stem in edited) for extension in (".bin", ".txt"))
-        warn(f"{folder}: {read} is read, and the newer {not_read} is not; remove the one that is not wanted")
+        warn(f"{folder}: {read} is read, and the newer {not_read} is not; remove the outdated one")
 
 
 def _check_count(path: Path, count: int) -> None:
@@ -370,7 +369,7 @@ def _binary_images(path: Path) -> Iterator[tuple[int, str, int, tuple[float, ...
 
 
 def _image_lines(path: Path) -> Iterator[tuple[int, str, str]]:
-    """Yield line number, text and expected fields of the first line of each image.
+    """Yield number and text of the first line of each image, and the fields expected in it, for error messages.
 
     An image's second line, with its observations, may be empty, and some tools omit it.
     """
@@ -388,7 +387,8 @@ def _image_lines(path: Path) -> Iterator[tuple[int, str, str]]:
 
 
 def _are_observations(line: str) -> bool:
-    """Return True for a line of observations: a multiple of three words, of which the last is a number and no name."""
+    """Return True for a line of observations (X Y POINT3D_ID ...): its number of words is a multiple of three, and the
+    last word is a number."""
     words = line.split()
     try:
         float(words[-1])
@@ -406,7 +406,7 @@ def _text_images(path: Path) -> Iterator[tuple[int, str, int, tuple[float, ...]]
 
 def _read_points(folder: Path) -> tuple[Float64, Float32]:
     path = _require(folder, "points3D")
-    values = array("d")  # a list of tuples would need six times the memory
+    values = array("d")  # needs a sixth of the memory of a list of tuples
     for row in _binary_points(path) if path.suffix == ".bin" else _text_points(path):
         values.extend(row)
     table = np.frombuffer(values, np.float64).reshape(-1, 6) if values else np.empty((0, 6))
@@ -422,7 +422,7 @@ def _read_points(folder: Path) -> tuple[Float64, Float32]:
         trouble = f"point {index + 1} of {len(table)} has the position and colour {table[index].tolist()}"
         raise corrupt(path, f"{trouble}, expected finite numbers and colours 0 to 255")
     levels = table[:, 3:]
-    whole = bool((levels == np.rint(levels)).all())  # text may have colours from 0 to 1, or of 16 bits
+    whole = bool((levels == np.rint(levels)).all())  # text files may have colours from 0 to 1, or 0 to 65535
     white = full_scale(levels.astype(np.int64) if whole else levels)
     return np.ascontiguousarray(table[:, :3]), np.ascontiguousarray(levels / white, np.float32)
 
@@ -445,13 +445,13 @@ def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
 
 
 def _with_colours(line: str) -> list[str]:
-    """Split a point's line into its fields, with the track as one field. Grey is added if there is only a position."""
+    """Split a point's line into fields; its track is one field. A point with a position only gets a grey colour."""
     words = line.split(maxsplit=8)
     return [*words, "128", "128", "128"] if len(words) == 4 else words
 
 
 def _binary_tracks(path: Path) -> Iterator[tuple[tuple[float, ...], float, tuple[int, ...]]]:
-    """Yield position, error and image ids of each point."""
+    """Yield each point's position, reprojection error, and the ids of the images that show it."""
     layout = struct.Struct("<Q3d3BdQ")
     for file in _records(path, "point", layout.size):
         _, *values, error, length = file.read(layout)

@@ -59,7 +59,8 @@ def read_transforms(
 
     docs/conventions.md (Scenes) lists the keys that are read, in the file or in each frame. `file_path` is relative to
     the file. nerfstudio's `ply_file_path`, `train_filenames`, `val_filenames` and `test_filenames` are honoured.
-    Pictures are held out if `val_filenames` or `test_filenames` lists them, or if `train_filenames` does not.
+    Pictures are held out if `val_filenames` or `test_filenames` lists them, or if `train_filenames` is there and does
+    not list them.
 
     masks: True if masks are used. If False, a warning says that the file's masks are ignored.
     images: another folder with the same pictures.
@@ -123,11 +124,11 @@ def _pictures(path: Path, readers: list[Keys], images: Path | None, missing: Mis
 
 
 def _smaller_folders(lost: list[Path], folder: Path) -> dict[Path, Path]:
-    """Find downscaled copies of picture folders, such as images_2, by the folder that they replace.
+    """Return downscaled copies of picture folders, such as images_2. The keys are the folders that they replace.
 
-    A folder is replaced if it is above a missing picture and holds no pictures itself.
+    A folder is replaced if it has no pictures, and a copy of it has.
 
-    lost: missing pictures.
+    lost: missing pictures, whose folders are considered.
     folder: folder of the transforms.json.
     """
     names = {parent for file in lost for parent in file.parents if folder in parent.parents}
@@ -136,16 +137,16 @@ def _smaller_folders(lost: list[Path], folder: Path) -> dict[Path, Path]:
 
 
 def _moved(file: Path | None, copies: Mapping[Path, Path]) -> Path | None:
-    """Return the path with the outermost folder that has a downscaled copy replaced by the copy; else `file` itself.
+    """Return the path of a picture in a downscaled copy of its folder; `file` itself if there is no copy.
 
-    copies: downscaled copies by the folder that they replace.
+    copies: downscaled copies of folders, by the folder. If several folders of a path have one, the outermost is used.
     """
     usual = next((parent for parent in reversed(file.parents) if parent in copies), None) if file is not None else None
     return file if file is None or usual is None else copies[usual] / file.relative_to(usual)
 
 
 def read_poses(path: Path, size: tuple[int, int] | None = None, lenses: Lenses = "undistort") -> dict[str, Camera]:
-    """Read the cameras of a transforms.json, in the order of the file, as from `cameras_of`. The keys are image names.
+    """Read the cameras of a transforms.json, keyed by image name, in the order of the file.
 
     Pictures need not exist if the file has `w` and `h`. Otherwise a missing picture is assumed to have `size`, (width,
     height). Raises InputError like `read_transforms`. Warns of contradictory keys and of implausible lenses.
@@ -156,7 +157,7 @@ def read_poses(path: Path, size: tuple[int, int] | None = None, lenses: Lenses =
 def read_images(path: Path, size: tuple[int, int] | None = None) -> list[PosedImage]:
     """Read the images of a transforms.json, in the order of the file. Pictures need not exist, as for `read_poses`."""
     readers = _readers(path, load_document(path))
-    with warnings.catch_warnings():  # hide warnings of missing pictures: only their names are needed
+    with warnings.catch_warnings():  # no warnings of missing pictures: only names are needed
         warnings.simplefilter("ignore")
         try:
             files = _pictures(path, readers, None, "skip")
@@ -166,7 +167,8 @@ def read_images(path: Path, size: tuple[int, int] | None = None) -> list[PosedIm
 
 
 def _within(keys: Keys) -> Path:
-    """Return the path of a picture that may not exist: as listed, without ".." and drive if it leaves the folder."""
+    """Return the path of a picture that need not exist: the listed path, without ".." and drive if it leads out of the
+    folder."""
     listed = keys.text("file_path")
     if not listed.isprintable():
         _inside(keys.path.parent, listed, keys.where)
@@ -182,9 +184,9 @@ def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:
 def _images(
     path: Path, frames: list[tuple[Keys, Path]], missing: Sequence[str] = (), *, size: tuple[int, int] | None = None
 ) -> list[PosedImage]:
-    """Return the images of frames.
+    """Return the images of a file's frames.
 
-    frames: values and picture file of each frame.
+    frames: the JSON values and the picture file of each frame.
     missing: names of missing pictures, which the file's split may list.
     size: as for `read_poses`.
     Warns of contradictory keys.
@@ -212,7 +214,10 @@ def _images(
 
 
 def _split(path: Path, readers: list[Keys], images: list[PosedImage], missing: Sequence[str]) -> list[PosedImage]:
-    """Return the images with the split by nerfstudio's keys, such as `train_filenames`; unchanged without such keys."""
+    """Return the images, split into training and test images by nerfstudio's keys; unchanged without such keys.
+
+    The keys are `train_filenames`, `test_filenames` and `val_filenames`. missing: as for `_images`.
+    """
     names = [*(image.name for image in images), *missing]
     known = dict(zip(names, names, strict=True))
     known |= {_plain(keys.text("file_path")): image.name for keys, image in zip(readers, images, strict=True)}
@@ -272,7 +277,9 @@ def read_blender(folder: Path, *, images: Path | None = None, missing: Missing =
     names = {image.name for image in train.images}
     for image in test.images:
         if image.name in names:
-            raise InputError(f"{held_out}: lists {image.name}, which is a training picture too; remove one of them")
+            raise InputError(
+                f"{held_out}: lists {image.name}, which is a training picture too; keep it in one file only"
+            )
     both = [replace(image, split="train") for image in train.images]
     both += [replace(image, split="test") for image in test.images]
     return replace(train, images=both, missing=train.missing + test.missing)
@@ -285,7 +292,7 @@ def _plain(listed: str) -> str:
 
 
 def _find_file(keys: Keys) -> Path:
-    """Return the path of a frame's picture, with the extension that the file may omit; the listed path if missing."""
+    """Return the path of a frame's picture, with the extension that the file may omit; else the listed path."""
     path = Path(os.path.normpath(keys.path.parent / keys.text("file_path").replace("\\", "/")))
     if is_file(path) or not path.name:
         return path
@@ -297,7 +304,7 @@ def _find_file(keys: Keys) -> Path:
 
 
 def _file_of(keys: Keys, key: str) -> Path | None:
-    """Return the mask or depth map of a frame's picture, if the frame names one under `key`."""
+    """Return the path that a frame gives under `key`, for a mask or depth map; None if it gives none."""
     listed = keys.frame.get(key)
     if not isinstance(listed, str) or not listed:
         return None
@@ -337,7 +344,7 @@ def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> tuple[Lens, b
             actual = size
         else:
             actual = _full_size(keys, file)
-        if width is not None:  # the other side follows from the picture's proportions
+        if width is not None:  # compute the missing side from the picture's aspect ratio
             height = width * actual[1] / actual[0]
         elif height is not None:
             width = height * actual[0] / actual[1]

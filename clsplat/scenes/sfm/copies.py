@@ -34,7 +34,8 @@ Programs with such folders are the 3DGS authors' convert.py, Polycam, OpenSfM (u
 (dense/0/images) and others.
 """
 PLAIN_FOLDER_STAGE, UNDISTORTED_FOLDER_STAGE = 1, 2
-"""Stages, as indices in UNDISTORTION_FOLDERS: of photographs in folders with other names, and of undistorted ones."""
+"""Indices in UNDISTORTION_FOLDERS: of the stage of photographs in folders that it does not list, and of the stage of
+undistorted photographs."""
 LOSSLESS_EXTENSIONS = (".png", ".tif", ".tiff", ".bmp")
 """Extensions of lossless photographs, which are preferred to their lossy copies."""
 COPY_THUMBNAIL_SIZE_PX = (96, 72)
@@ -55,9 +56,9 @@ MIN_FOLDER_CORRELATION, CORRELATION_SIDE_PX = 0.9, 24
 """Minimum correlation of the pictures in two related folders, and longer side to which the pictures are reduced for it.
 
 The median of FOLDER_PAIR_SAMPLES pairs is compared with the minimum. In the scene fox (k1 0.058, k2 -0.081),
-photographs correlate with their undistorted copies at 0.9995. In six other scenes, with k1 from 0.1 to -0.35,
-they do at 0.93 or more. Successive photographs of these scenes correlate at 0.16 to 0.87, and photographs farther apart
-at 0.45 or less.
+the correlation of photographs with their undistorted copies is 0.9995. In six other scenes, with k1 from 0.1 to -0.35,
+it is at least 0.93. The correlation of successive photographs of these scenes is 0.16 to 0.87, and that of photographs
+farther apart is at most 0.45.
 
 Frames of an almost still video correlate more than pictures and their copies after strong undistortion. So two folders
 of such frames are mistaken for copies.
@@ -65,7 +66,8 @@ of such frames are mistaken for copies.
 FOLDER_PAIR_SAMPLES = 5
 """Number of pairs of pictures that are decoded to compare two folders."""
 MAX_COPY_ASPECT_RATIO_CHANGE = 1.3
-"""Ratio of two aspect ratios from which the pictures are different. Cropping by undistortion changes them by less."""
+"""Two pictures differ if their aspect ratios differ by at least this factor. Cropping after undistortion changes them
+by less."""
 FEATURELESS_STD_LEVELS = 8.0
 """Standard deviation in 255ths below which a picture is featureless, and never counts as a copy."""
 ASPECT_RATIO_TOLERANCE = 0.02
@@ -193,7 +195,7 @@ def thumb_of(pixels: NDArray[Any], alpha: int) -> Thumb:
 
 
 def resolved(copies: dict[str, Copy]) -> dict[str, Copy]:
-    """Return copies with the photographs that are used in the end. In the input, `Copy.kept` may itself be a copy."""
+    """Return the copies, with `Copy.kept` followed until it names a photograph that is not itself a copy."""
 
     def last(name: str) -> str:
         while name in copies:
@@ -204,7 +206,7 @@ def resolved(copies: dict[str, Copy]) -> dict[str, Copy]:
 
 
 def listed(copies: dict[str, Copy]) -> str:
-    """Return copies as text for a message: the first of them in the order of names."""
+    """Return text for a message with examples of the copies, such as "b.jpg is a.jpg, smaller"."""
     return examples(f"{name} is {copy.kept}, {copy.why}" for name, copy in sorted(copies.items()))
 
 
@@ -224,8 +226,8 @@ class _Staged:
     """A photograph, classified by the names of its folders: UNDISTORTION_FOLDERS, or names such as images_2.
 
     head: path up to the last folder with such a name, "" for none.
-    stage: largest index in UNDISTORTION_FOLDERS of the folders.
-    factor: factor by which the photograph is downscaled, by the folder's name.
+    stage: index in UNDISTORTION_FOLDERS of the latest stage that a folder in the path is named after.
+    factor: factor by which the photograph is downscaled, according to the folder's name.
     """
 
     name: str
@@ -240,9 +242,9 @@ class _Staged:
 
 
 class _Pictures:
-    """Sizes and thumbnails of the pictures in a folder, read on demand.
+    """Sizes and thumbnails of the pictures in a folder, read on demand, to compare its sub-folders.
 
-    groups: groups of photographs with the same name in related folders.
+    groups: groups of photographs with the same name in related folders. Their `head` names the folders to compare.
     """
 
     def __init__(self, folder: Path, groups: Sequence[Sequence[_Staged]]) -> None:
@@ -313,8 +315,8 @@ class _Pictures:
 def _staged(names: Iterable[str]) -> list[list[_Staged]]:
     """Group photographs with the same stem in the same folders, ignoring folders that `_Staged` classifies.
 
-    Each group has at least two kinds (`_Staged.kind`). Folders above a folder of undistorted pictures are also ignored,
-    as another program may have made them.
+    Each group has photographs of at least two kinds (`_Staged.kind`). Folders above a folder of undistorted pictures
+    are also ignored, as another program may have made them.
     """
     groups: dict[tuple[Hashable, ...], list[_Staged]] = defaultdict(list)
     for name in names:
@@ -346,8 +348,8 @@ def _plain_stem(name: str) -> str:
 def _alike(names: Iterable[str]) -> list[list[_Place]]:
     """Group photographs that may be copies according to their names.
 
-    The photographs of a group have the same stem. They are in one folder, in sibling folders, or in a folder and its
-    sub-folder, or in sub-folders of these with the same names.
+    The photographs of a group have the same stem. They are in one folder, in sibling folders, in a folder and its
+    sub-folder, or in equally named sub-folders of such folders.
     """
     groups: dict[tuple[Hashable, ...], list[_Place]] = defaultdict(list)
     for name in names:
@@ -363,11 +365,12 @@ def _alike(names: Iterable[str]) -> list[list[_Place]]:
 def _found(
     groups: Iterable[list[P]], rank: Callable[[P], tuple[Hashable, ...]], why: Callable[[P, P], str]
 ) -> dict[str, Copy]:
-    """Find the copies in each group: photographs that match an earlier one in the order of `rank`.
+    """Find the copies in each group: photographs that show the same as a better photograph of the group.
 
-    The earlier photograph may itself be a copy.
+    The better photograph may itself be a copy.
 
-    why: function of the earlier and the later photograph that returns the text for `Copy.why`; "" if they differ.
+    rank: sort key of a photograph; better photographs have smaller keys.
+    why: function of the better and the other photograph that returns the text for `Copy.why`; "" if they differ.
     """
     copies: dict[str, Copy] = {}
     for group in groups:
@@ -381,9 +384,10 @@ def _found(
 
 
 def _of_same_bytes(folder: Path, names: Sequence[str]) -> dict[str, Copy]:
-    """Find files with the same bytes as another file.
+    """Find files with the same bytes. Returns the copies by name.
 
-    The file in the earliest of UNDISTORTION_FOLDERS is used; if there are several, the one with the shortest name.
+    Of equal files, the one whose folder has the earliest stage in UNDISTORTION_FOLDERS is used. If there are several,
+    the one with the shortest name is used.
     """
     alike: dict[tuple[object, ...], list[str]] = {}
     keys: tuple[Callable[[Path], object], ...] = (lambda path: path.stat().st_size, _middle, short_digest)
@@ -425,7 +429,7 @@ def _numbered(folder: str) -> tuple[str, int]:
 def _is_downscaled(factor: int, by: int, whole: tuple[int, int], size: tuple[int, int]) -> bool:
     """Return True if two pictures' sizes agree with the factors in the names of their folders.
 
-    factor, by: factors of the larger and of the smaller picture.
+    factor, by: the factors of downscaling of the larger and of the smaller picture.
     whole, size: width and height of the larger and of the smaller picture.
     """
     return factor < by and all(abs(side * by / factor - long) <= by for side, long in zip(size, whole, strict=True))

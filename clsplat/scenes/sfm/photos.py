@@ -55,7 +55,7 @@ class Photo:
 
 
 def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path], dict[str, list[Path]]]:
-    """Find the photographs below a folder, sorted by name; and the files that are left out, by reason.
+    """Return the photographs below a folder, sorted by name, and the files that are left out, keyed by the reason.
 
     Hidden files and folders are skipped, as is `excluded` (the output, if it is inside). Raises InputError for a folder
     that does not exist, cannot be read, or has no photographs.
@@ -114,11 +114,13 @@ def fingerprint(folder: Path, photos: Sequence[Path], settings: str) -> str:
 def stage_photos(
     folder: Path, photos: Sequence[Path], target: Path, report: Callable[[float], None], threads: int
 ) -> list[Photo]:
-    """Put every photograph under `target`, upright and under its name, and decode it once. Returns descriptions.
+    """Put a copy of every photograph, or a link to it, under `target`, and decode it once. Returns the photographs.
 
-    pycolmap ignores the EXIF orientation and cannot read some formats. So rotated photographs, and files whose contents
-    have such a format, are rewritten. Other files are linked, or copied if the file system cannot link. pycolmap would
-    silently skip broken photographs. Raises InputError that names the first photograph that does not decode.
+    pycolmap ignores the EXIF orientation and cannot read some formats. So photographs with an orientation, or in such a
+    format, are rewritten upright. Other files are linked, or copied if the file system has no links. Raises InputError
+    that names the first photograph that does not decode, as pycolmap would silently skip it.
+
+    report: called with the fraction of the photographs that are done.
     """
     staged: list[Photo] = []
     compared = to_compare([photo_name(folder, path) for path in photos])
@@ -195,7 +197,7 @@ def _write_upright(path: Path, copy: Path, spec: Any) -> None:
     upright = oiio.ImageBufAlgo.reorient(oiio.ImageBuf(native_name(path)))
     upright.specmod().attribute("Orientation", 1)
     upright.specmod().attribute("Compression", "jpeg:98" if copy.suffix.lower() in (".jpg", ".jpeg") else "lzw")
-    with require_room(copy, jpeg_room(spec)):  # libjpeg ends the process when it cannot write
+    with require_room(copy, jpeg_room(spec)):  # libjpeg would end the process if it could not write
         written = not upright.has_error and upright.write(native_name(copy))
     if not written:
         if error := room_error(copy.parent):

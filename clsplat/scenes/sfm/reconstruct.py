@@ -67,7 +67,7 @@ class SfmSettings:
     shared_camera: which photographs share a camera, as in `photos.camera_groups`.
     max_image_size: longest side in pixels for finding features. The undistorted photographs keep their size.
     max_features: maximum number of features in a photograph.
-    seed: the same seed gives the same cameras; up to 80 photographs, bit by bit.
+    seed: seed of random numbers. For up to 80 photographs, the same seed gives cameras with the same bits.
     """
 
     matching: Matching = "auto"
@@ -108,15 +108,15 @@ def reconstruct(
     The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points) and `sfm.json`. The
     folder is created when all files are complete. An existing result for the same photographs and settings is reused.
 
-    threads: all cores if None.
+    threads: number of CPU threads; None for one per core.
     overwrite: replace a result of other photographs.
     masks: use of masks and alpha. No features are found in masked pixels. The masks are written to the output too, as
         `masks/IMAGE.jpg.png`, with white for kept pixels.
-    progress: function that is called in every stage, with a text and a fraction or None.
+    progress: function that is called with the name of a stage, and the fraction that is done, or None if unknown.
 
     Of several copies of a photograph, one is used (`clsplat.scenes.sfm.copies`).
 
-    Warns of copies, and of photographs that cannot be placed, have an unreadable format, or lost their alpha. Raises
+    Warns of copies, and of photographs that get no pose, have an unreadable format, or lost their alpha. Raises
     InputError for a folder without photographs, a photograph that does not decode, and an existing output that must not
     be replaced. Also raises InputError if the cameras cannot be recovered. Raises ClsplatError if pycolmap fails. After
     KeyboardInterrupt no files remain.
@@ -170,7 +170,7 @@ def _staged_photos(
 ) -> list[sfm_photos.Photo]:
     """Put the photographs under `target`. Returns the photographs that are not copies, and warns of copies.
 
-    copies: by name, the copies that were found by their names.
+    copies: copies that were found before the photographs were decoded, by name.
     Raises InputError if too few photographs remain.
     """
     photos = sfm_photos.stage_photos(
@@ -209,7 +209,10 @@ def _staged_masks(
 def sfm_task(
     settings: SfmSettings, photos: list[sfm_photos.Photo], masked: list[str], work: Path, threads: int
 ) -> dict[str, Any]:
-    """Return the task for the worker process (`clsplat.scenes.sfm.worker.Worker`), as values for JSON."""
+    """Return the task for the worker process (`clsplat.scenes.sfm.worker.Worker`), as values for JSON.
+
+    masked: names of the photographs with a mask. work: folder for the photographs, masks and intermediate files.
+    """
     many = len(photos) > MAX_EXHAUSTIVE_PHOTOS
     return {
         "masks": masked,
@@ -226,7 +229,7 @@ def sfm_task(
 
 
 def _write_record(folder: Path, fingerprint: str, photos: list[sfm_photos.Photo], result: dict[str, Any]) -> None:
-    """Write sfm.json into the folder of the result."""
+    """Write sfm.json, the record of a reconstruction, into the folder of the result."""
     missing = sorted({photo.name for photo in photos} - set(result["registered"]))
     record = {"fingerprint": fingerprint, "photos": len(photos), "unregistered": missing, **result}
     record["files"] = _sizes(folder)
@@ -242,7 +245,7 @@ def _warn_of_losses(
     result: folder of the undistorted photographs.
     """
     if missing := sorted({photo.name for photo in photos} - set(registered)):
-        warn(f"{images}: {_listed(missing)} could not be placed and will not be used")
+        warn(f"{images}: no camera pose was found for {_listed(missing)}, which will not be used")
     lost = _without_their_alpha(photos, registered, result)
     if lost and (masks is None or masks.alpha == "blend"):
         loss = "lost their alpha when they were undistorted: their images in the scene are opaque"
@@ -305,7 +308,7 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
         return False
     complete = (output / "sparse/0/images.bin").is_file() and (output / "images").is_dir()
     files = record.get("files")
-    was = files if isinstance(files, dict) else {}  # a record may have no such list
+    was = files if isinstance(files, dict) else {}  # sfm.json may lack the list of files
     now = _sizes(output)
     changed = sorted(name for name, size in was.items() if now.get(name) != size)
     if complete and not changed and record.get("fingerprint") == fingerprint:
@@ -360,7 +363,7 @@ def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str,
         finally:
             process.kill()
             process.wait()
-            with contextlib.suppress(OSError):  # closing flushes input, which the worker may not have read
+            with contextlib.suppress(OSError):  # closing sends buffered input, which an ended worker cannot read
                 process.stdin.close()
             process.stdout.close()
     if not answer:
@@ -406,7 +409,7 @@ def _follow(lines: IO[str], database: Path, report: Progress) -> dict[str, Any]:
 
 
 def _rows(database: Path, table: str) -> int:
-    """Return the number of rows in a table that the worker fills; 0 while the table cannot be read."""
+    """Return the number of rows in a table of the worker's database; 0 while the table cannot be read."""
     try:
         name = f"{database.resolve().as_uri()}?mode=ro"
         with contextlib.closing(sqlite3.connect(name, uri=True, timeout=0.1)) as connection:

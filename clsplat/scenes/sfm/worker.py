@@ -61,7 +61,7 @@ class Worker:
         self.match()
         models = self.map(relaxed=False)
         if max((model.num_reg_images() for model in models.values()), default=0) < 0.6 * self.count:
-            # The cameras may be close together, or features few: try again with a smaller angle of the initial pair.
+            # The cameras may be close together, or there may be few features: try again with lower thresholds.
             models |= self.map(relaxed=True)
         if not models:
             self.say(failure=self.evidence())
@@ -89,7 +89,7 @@ class Worker:
         options.sift.max_num_features = self.task["max_features"]
         singles = [names[0] for names in self.task["groups"] if len(names) == 1]
         batches = [(names, pycolmap.CameraMode.SINGLE) for names in self.task["groups"] if len(names) > 1]
-        if singles:  # one call for all: only the photographs of one call are processed in parallel
+        if singles:  # in one call, as only the photographs of one call are processed in parallel
             batches.append((singles, pycolmap.CameraMode.PER_IMAGE))
         for names, mode in batches:
             model = self.task["camera_model"]
@@ -135,7 +135,7 @@ class Worker:
     def map(self, *, relaxed: bool) -> dict[Path, pycolmap.Reconstruction]:
         """Recover camera poses and points by incremental mapping. Returns all models, by their folders.
 
-        relaxed: accept smaller angles and fewer matches.
+        relaxed: accept smaller triangulation angles and fewer matches than by default.
         """
         self.say(stage="cameras again" if relaxed else "cameras", total=self.count)
         options = pycolmap.IncrementalPipelineOptions()

@@ -58,9 +58,9 @@ def from_points(
 
     points: (N, 3), in world units.
     colors: (N, 3) in [0, 1].
-    origin: (3,), origin of the means in the world, by default the world's origin.
+    origin: (3,), point of the world that the Gaussians' means are relative to, by default the world's origin.
     length_unit: the scene's length unit in world units.
-    near: the model's near plane.
+    near: the model's near plane in world units.
 
     The standard deviation is the root of the mean squared distance to the three nearest other points, or to all if
     there are fewer. It has a lower bound (`squared_floor`). The opacity is 0.1, the quaternion 1 0 0 0.
@@ -94,7 +94,7 @@ def from_points(
 
 
 def squared_floor(length_unit: float) -> float:
-    """Return the lower bound, in world units squared, of points' mean squared distances in a scene."""
+    """Return the lower bound of points' mean squared distances, in world units squared (MIN_SQUARED_DISTANCE)."""
     low, high = ORDINARY_UNITS
     return MIN_SQUARED_DISTANCE * (length_unit / min(max(length_unit, low), high)) ** 2
 

@@ -32,18 +32,21 @@ MAX_CHECKED_CLOUD_POINTS = 20_000
 MIN_CLOUD_POINTS_IN_VIEW = 0.05
 """Minimum fraction of a cloud's points that the training photographs show."""
 MAX_CLOUD_DEPTH_RATIO = 30.0
-"""Largest factor between the cloud's and the scene's points in their median distance from the cameras that see them."""
+"""Largest ratio, either way, of the cloud's median distance to that of the scene's points. The distances are from the
+cameras that see the points."""
 MAX_CLOUD_DISTANCE_EXTENTS = 1000.0
 """Maximum distance of a cloud from the cameras, in scene extents. It applies if the scene has no points."""
 VOXEL_SIZE_TOLERANCE = 0.02
 """Relative amount by which the voxel size of a thinned cloud may exceed the smallest sufficient size."""
 MAX_VOXELS_PER_SIDE = 1 << 20
-"""Maximum number of voxels along the longest side of the box, so that three indices fit in 64 bits."""
+"""Maximum number of voxels along the longest side of a cloud's bounding box, so that a voxel's three indices fit in 64
+bits."""
 SKY_IMAGE_SIDE_PX = 400
 """Longer side in pixels to which larger photographs are reduced to find the sky. A sky point covers several pixels of
 the full size."""
 SKY_RADIUS_QUANTILE = 0.95
-"""Quantile of the distances of the scene's points that counts as the farthest distance, and scales the sky sphere."""
+"""Quantile of the points' distances from the middle of the cameras. The radius of the sky sphere is proportional to it,
+or to the scene's extent if that is larger."""
 SKY_OVERSAMPLING = 4
 """Number of candidate directions on the half sphere, per requested point."""
 SKYLINE_COLUMNS = 24
@@ -59,9 +62,9 @@ In photographs farther away, the colour of a point is mixed with its surrounding
 something else in front of the point would have too much weight.
 """
 OCCLUSION_DEPTH_RATIO = 1.05
-"""Ratio of a point's depth to that of the nearest point in its cell, above which the point counts as occluded."""
+"""A point counts as occluded if its depth is over this many times that of the nearest point in its occlusion cell."""
 HIDDEN_POINT_RANK = 1e30
-"""Factor of the ranks of occluded points, by which they exceed the ranks of all visible points.
+"""Factor that makes the ranks of occluded points larger than the ranks of all visible points.
 
 The photographs with the lowest ranks give a point its colour. Where the point is visible, its rank is depth / focal
 length. Where it is occluded, its rank is this factor times its depth relative to the nearest point.
@@ -124,7 +127,7 @@ def with_cloud_beside(scene: Scene) -> Scene:
 
 
 def without_stray_points(points: Float64, scene: Scene, where: object) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the points (N, 3) that are no outliers, compared with all points and the scene's cameras.
+    """Return a mask (N,) of the points (N, 3) that are not outliers, compared with all points and the scene's cameras.
 
     where: the file or scene that the points are from, for the warning about outliers.
     """
@@ -141,17 +144,18 @@ def without_stray_points(points: Float64, scene: Scene, where: object) -> NDArra
 
 
 def check_place(points: Float64, scene: Scene, path: Path) -> None:
-    """Raise InputError for a cloud (N, 3) outside the training photographs, or far nearer or farther than the scene's.
+    """Raise InputError for points (N, 3) of a cloud that do not fit the scene's cameras.
 
-    The distances of the cloud and of the scene's points are compared, from the cameras that see them.
+    Either hardly any of them is in a training photograph, or their median distance from the cameras that see them is
+    far from that of the scene's own points.
     """
     sample = _spread(points)
     seen, depths = _seen(sample, scene)
     advice = "expected points with the axes, scale and origin of the scene's cameras"
     if seen < max(MIN_CLOUD_POINTS_IN_VIEW * len(sample), 1):
         raise InputError(
-            f"{path}: only {100 * seen / len(sample):.1f} % of its points lie in a training photograph; the points lie "
-            f"{_where(points)}, and the cameras {_where(_centres(scene))}; {advice}"
+            f"{path}: only {100 * seen / len(sample):.1f} % of its points lie in a training photograph; their middle "
+            f"is {_where(points)}, and that of the cameras is {_where(_centres(scene))}; {advice}"
         )
     if len(scene.points):
         _, usual = _seen(_spread(scene.points), scene)
@@ -159,8 +163,8 @@ def check_place(points: Float64, scene: Scene, path: Path) -> None:
         usual = scene.extent if depths > MAX_CLOUD_DISTANCE_EXTENTS * scene.extent else depths
     if usual > 0 and not 1 / MAX_CLOUD_DEPTH_RATIO <= depths / usual <= MAX_CLOUD_DEPTH_RATIO:
         raise InputError(
-            f"{path}: its points lie {_where(points)}, at a distance of {depths:.3g} from the cameras that see them, "
-            f"and the scene's points at {usual:.3g}; {advice}"
+            f"{path}: the middle of its points is {_where(points)}, and their distance from the cameras that see them "
+            f"is {depths:.3g}, but that of the scene's points is {usual:.3g}; {advice}"
         )
 
 
@@ -169,7 +173,8 @@ def _spread(points: Float64) -> Float64:
 
 
 def _seen(points: Float64, scene: Scene) -> tuple[int, float]:
-    """Return how many points training photographs show, and their median distance from the cameras that see them."""
+    """Return how many of the points (N, 3) training photographs show, and the median of their distances from the
+    cameras that see them."""
     anywhere = np.zeros(len(points), np.bool_)
     distances: list[Float64] = []
     for view in scene.train_views:
@@ -185,10 +190,10 @@ def _centres(scene: Scene) -> Float64:
 
 
 def _where(points: Float64) -> str:
-    """Return the median position of points and their median distance from it, as text: "about 1 2 3 within 4"."""
+    """Return the median position of points and their median distance from it, as text: "1 2 3 (median distance 4)"."""
     middle = np.median(points, axis=0)
     place = " ".join(f"{value:.4g}" for value in middle)
-    return f"about {place} within {np.median(np.linalg.norm(points - middle, axis=1)):.3g}"
+    return f"{place} (median distance {np.median(np.linalg.norm(points - middle, axis=1)):.3g})"
 
 
 def thinned(cloud: Cloud, limit: int) -> Cloud:
@@ -203,7 +208,7 @@ def thinned(cloud: Cloud, limit: int) -> Cloud:
     side = float((points - low).max())
     if side == 0:
         return Cloud(points[:1], None if cloud.colors is None else cloud.colors[:1])
-    fine, coarse = side / MAX_VOXELS_PER_SIDE, side * 1.01  # a voxel of the coarse size would hold all points
+    fine, coarse = side / MAX_VOXELS_PER_SIDE, side * 1.01  # one voxel of the coarse size holds all points
     if (cells := _cells(points, low, fine)).max() < limit:
         coarse = fine
     while coarse > fine * (1 + VOXEL_SIZE_TOLERANCE):
@@ -218,23 +223,26 @@ def thinned(cloud: Cloud, limit: int) -> Cloud:
 
 
 def _cells(points: Float64, low: Float64, voxel: float) -> NDArray[np.int64]:
-    """Return the index (N,) of each point's voxel among the occupied voxels."""
+    """Return the index (N,) of each point's voxel among the occupied voxels.
+
+    low: (3,), corner of the grid. voxel: side of a voxel. Both are in world units.
+    """
     at = np.floor((points - low) / voxel).astype(np.int64)
     _, cells = np.unique((at[:, 0] << 42) | (at[:, 1] << 21) | at[:, 2], return_inverse=True)
     return np.asarray(cells.reshape(-1), np.int64)
 
 
 def _means(values: NDArray[Any], cells: NDArray[np.int64]) -> Float64:
-    """Return the mean per voxel, (voxels, 3), of values (N, 3), summed in their order."""
+    """Return the mean (voxels, 3) of the points' values (N, 3) in each voxel. cells: (N,), voxel of each point."""
     counts = np.bincount(cells)
     return np.stack([np.bincount(cells, values[:, axis]) / counts for axis in range(3)], axis=1)
 
 
 def sky_points(scene: Scene, count: int) -> tuple[Float64, Float32]:
-    """Return at most `count` points (N, 3) on a sphere around the scene, where it shows sky, and their colours (N, 3).
+    """Return at most `count` points (N, 3) on a sphere around the scene, in directions of the sky, and colours (N, 3).
 
-    A direction above the horizon is sky if, in most photographs that show it, no scene point lies above it in its
-    column strip. Colours are means over the photographs.
+    A direction above the horizon is sky if, in most photographs that show it, no scene point lies above it in the
+    same strip of columns. Colours are means over the photographs that show sky there.
 
     Raises InputError if there is no such direction, no common up direction, or no points in the scene.
     """
@@ -290,8 +298,8 @@ def half_sphere(count: int, up: Float64) -> Float64:
 def _skyline(points: Float64, camera: Camera, view: View) -> NDArray[np.int64]:
     """Return, for each column of a picture, the row above which it shows no scene points.
 
-    The row is the same for all columns of a strip, and also lies above the points of the neighbouring strips. It is 0
-    if these strips have no points: a plain surface has none either, so the strip need not show sky.
+    The row is the same for all columns of a strip, and also lies above the points of the neighbouring strips. If these
+    strips have no points, the row is 0, so that nothing counts as sky: a wall without features has no points either.
     """
     rows, columns, _ = pixels_of(points, camera, view.lens)
     part = np.minimum(columns * SKYLINE_COLUMNS // camera.width, SKYLINE_COLUMNS - 1)
@@ -342,7 +350,10 @@ def photographed(scene: Scene, background: ArrayLike) -> Float32:
 
 
 def _medians(colors: Float32) -> Float32:
-    """Return medians per channel (N, 3) of the finite colours in (N, K, 3), UNSEEN_GREY without any. Sorts in place."""
+    """Return the median per channel of each point's finite colours, (N, 3); UNSEEN_GREY for points without any.
+
+    colors: (N, K, 3), infinite where a point has fewer than K colours. The function sorts the array.
+    """
     counts = np.isfinite(colors).all(axis=2).sum(axis=1)[:, None, None]
     colors.sort(axis=1)
     middles = np.concatenate([np.maximum(counts - 1, 0) // 2, counts // 2], axis=1)

@@ -45,7 +45,7 @@ class KnownDepth:
 
         The results are ascending pixel indices, inverse depths in 1 / world units, and weights, each (k,).
 
-        lens: lens of the depth map; also of the camera, unless the camera is a pinhole camera.
+        lens: the lens of the photograph and its depth map. A camera that is not a pinhole has this lens too.
         """
         if self.path is not None:
             nearness = self._from_map(camera, lens)
@@ -68,7 +68,7 @@ class KnownDepth:
             return np.where(np.isfinite(values), self.fit[0] * values + self.fit[1], 0.0)
 
     def measured(self, values: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return a mask of the values of a metric map that are depths, not marks of unknown depth."""
+        """Return a mask of a metric map's values: True for depths, False for values that mean an unknown depth."""
         known: NDArray[np.bool_] = (values > 0) & np.isfinite(values) & ~(self.whole & (values == NO_DEPTH_VALUE))
         return known
 

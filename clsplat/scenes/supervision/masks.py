@@ -29,14 +29,15 @@ DYNAMIC_FOLDER_PREFIX = "dynamic"
 MASK_THRESHOLD = 0.5
 """Minimum mask value of a kept pixel. In a resized mask, also the minimum kept fraction of a kept pixel's area."""
 COMPARED_MASKS = 12
-"""Number of a folder's masks, evenly spaced, that are read to find out what an ambiguous mask means. Rounding of the
-spacing may double it."""
+"""Approximate number of a folder's masks, evenly spaced, that are read to find out what an ambiguous mask means. Up to
+twice as many may be read."""
 VOID_LABEL = 255
 """Label of undefined pixels, as at the object borders in VOC and Cityscapes."""
 MAX_LABEL = 40
-"""Largest label except VOID_LABEL. Soft masks have larger values."""
+"""Largest label except VOID_LABEL. A mask with larger values below a half is a soft mask, not a mask of labels."""
 MAX_LABEL_NOISE_RATIO = 0.01
-"""A mask is black and white with noise, not labels, if labels from 1 cover less than this fraction of white's area."""
+"""A mask counts as black and white with noise, not as labels, if the pixels with labels from 1 are fewer than this
+fraction of the white pixels."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def read_mask(path: Path, *, orient: bool, invert: bool) -> Float32:
     values or the folder's other masks are dark too.
 
     orient: rotate the mask by its EXIF orientation.
-    invert: exchange kept pixels and others.
+    invert: exchange the pixels that are kept and those that are not.
     """
     image = read_image(path, orient=orient)
     pixels = image[:, :, :3]
@@ -186,7 +187,11 @@ def _areas(values: Float32, most: int) -> tuple[int, int] | None:
 
 
 def _like(path: Path) -> list[Path]:
-    """Return a sample of the masks in the folder of a mask. Photographs there are recognised by their names."""
+    """Return a sample of the masks in the folder of the mask `path`, about COMPARED_MASKS, evenly spaced.
+
+    Photographs in the folder are left out. If the name of `path` contains "mask", only files with such names are masks,
+    otherwise only files with other names.
+    """
     named = "mask" in path.stem.lower()
     others = [other for other in find_images(path.parent, deep=False) if ("mask" in other.stem.lower()) == named]
     return others[:: max(len(others) // COMPARED_MASKS, 1)]
@@ -372,7 +377,10 @@ def for_sfm(use: MaskUse) -> MaskUse | None:
 
 
 def after_sfm(use: MaskUse, folder: Path) -> MaskUse:
-    """Return the use of the masks that structure from motion wrote: white is kept, and alpha is included."""
+    """Return how training uses the masks that structure from motion wrote: white is kept, and alpha is included.
+
+    use: the use of the photographs' masks. folder: result of structure from motion.
+    """
     if not (folder / MASK_FOLDERS[0]).is_dir():
         return replace(use, masks="none", invert=False)
     meaning: MaskMeaning = "none" if use.alpha == "blend" else use.alpha
