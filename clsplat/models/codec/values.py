@@ -34,15 +34,14 @@ MAX_UNCHECKED_GAUSSIANS = 1 << 20
 Every real file has more bytes, because the position of a Gaussian takes several. A decompression bomb has fewer.
 """
 OTHER_QUATERNION_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-"""Row i: the components of a quaternion other than component i."""
+"""Row i lists the indices of a quaternion's components other than component i."""
 MAX_FLOAT_HIGHLIGHT = 2.0
 """Largest float colour up to which white is taken to be 1, unless all colours are whole numbers."""
 UNIT_COLOUR_SHARE = 0.95
-"""Fraction of float colours. If at least so many are at most 1, white is taken to be 1, however bright the others are.
-"""
+"""Fraction of float colours that, if they are at most 1, make 1 white, however bright the other colours are."""
 UNIT_RANGE_TOLERANCE = 1e-3
-"""Largest excess of colours over white (relative), and of opacities over [0, 1], from rounding to half floats or
-averaging."""
+"""Largest tolerated excess of opacities over [0, 1], and of colours over white as a fraction of white. Averaging and
+rounding to half floats cause it."""
 GAUSSIAN_ARRAY_NOUNS = ("a position", "a rotation", "a scale", "an opacity", "a colour")
 """Nouns for the arrays of `Gaussians`, for messages."""
 
@@ -138,7 +137,7 @@ def have(count: int) -> str:
 def logits_of(opacity: NDArray[Any], where: Path | str, numbers: int | NDArray[np.intp] = 0) -> Float32:
     """Logits from a file's opacities. NaN stays NaN.
 
-    numbers: index of each Gaussian in the file, or only of the first.
+    numbers: index in the file of each Gaussian, or of the first one if all are consecutive; for messages.
     Raises InputError for opacities outside [0, 1] by more than UNIT_RANGE_TOLERANCE.
     """
     with np.errstate(invalid="ignore"):
@@ -154,12 +153,12 @@ def logits_of(opacity: NDArray[Any], where: Path | str, numbers: int | NDArray[n
 
 
 def colours(dc: Float32) -> Float64:
-    """Colours from SH coefficients of degree 0, any shape."""
+    """Convert SH coefficients of degree 0, an array of any shape, to colours."""
     return 0.5 + SH_C0 * dc.astype(np.float64)
 
 
 def coefficients(rgb: NDArray[Any]) -> Float64:
-    """SH coefficients of degree 0 from colours, any shape."""
+    """Convert colours, an array of any shape, to SH coefficients of degree 0."""
     return (np.asarray(rgb, np.float64) - 0.5) / SH_C0
 
 
@@ -224,8 +223,8 @@ def leave_out_largest(unit: Float64) -> tuple[NDArray[np.intp], Float64]:
 def at_ends(between: NDArray[Any], low: NDArray[Any], high: NDArray[Any], part: NDArray[Any]) -> NDArray[Any]:
     """Replace the NaNs of an interpolation that come from infinite bounds.
 
-    between: the interpolation, low + part * (high - low), with `part` from 0 to 1.
-    If a bound is infinite, the result is `low` at 0, `high` at 1, and infinite between them.
+    between: the interpolated values, low + part * (high - low), with `part` from 0 to 1.
+    Where `low` or `high` is infinite, the result is `low` if `part` is 0, `high` if it is 1, and otherwise low + high.
     """
     finite = np.isfinite(low) & np.isfinite(high)
     if finite.all():
@@ -236,7 +235,7 @@ def at_ends(between: NDArray[Any], low: NDArray[Any], high: NDArray[Any], part: 
 
 
 def read_rows(file: BinaryIO, kind: np.dtype[Any], count: int, path: Path) -> NDArray[Any]:
-    """Read the next `count` records of a file. Raises InputError if the file has fewer."""
+    """Read the next `count` records of dtype `kind` from a file. Raises InputError if the file has fewer."""
     data = file.read(count * kind.itemsize)
     if len(data) != count * kind.itemsize:
         raise InputError(f"{path}: truncated while it was read")
@@ -250,7 +249,7 @@ def all_finite(array: NDArray[Any]) -> bool:
 
 
 def check_writable(path: Path, gaussians: Gaussians, *, least: int = 0, first: int = 0) -> None:
-    """Check Gaussians before they are written to `path`. first: number of the first one in the file, for messages.
+    """Check Gaussians before they are written to `path`. first: index in the file of the first, for messages.
 
     Raises ValueError for invalid arrays (`Gaussians.check`), InputError for non-finite values and for fewer than
     `least` Gaussians.
