@@ -154,8 +154,8 @@ def format_of(path: Path) -> Format:
         head = file.read(FORMAT_HEAD_BYTES)
         if head.startswith(b"ply") and b"end_header" not in head:  # comments may fill the first bytes
             head += file.read(MAX_PLY_HEADER_BYTES)
-    # a name of a format without a signature is believed unless the file begins with the signature of another format;
-    # but a "{", with which JSON begins, may be the first byte of such a file by chance
+    # If the name is of a format without a signature, it counts unless the file begins with another format's signature.
+    # A "{", with which JSON begins, does not show another format: it may be the file's first byte by chance.
     fits = named and (named.recognises(head) if named.recognises else head.lstrip()[:1] == b"{")
     if head.startswith(zipped.ZIP_FILE_MAGIC) and (not fits or named is _row("SOG")):
         return _archive(path, named)
