@@ -92,7 +92,7 @@ class Changing:
 
 def rows_of(matrix: Float64) -> tuple[float, ...]:
     """First three rows of a matrix (4, 4), flattened for `Placement.matrix`."""
-    return tuple(float(value) + 0.0 for value in matrix[:3].ravel())  # + 0.0 turns -0 into 0, for equal bits
+    return tuple(float(value) + 0.0 for value in matrix[:3].ravel())  # -0 + 0.0 is 0: equal matrices get equal bits
 
 
 def grade(gain: Float64, offset: Float64, saturation: float) -> tuple[float, ...]:

@@ -94,7 +94,8 @@ def run(
                 outcomes.append(OUTCOMES_BY_STAGE[name](bench))
             except DriverError:  # the caller may try another kernel shape
                 raise
-            except Exception as error:  # noqa: BLE001  # wrong sizes from a faulty kernel may raise anything
+            except Exception as error:  # noqa: BLE001
+                # A driver may raise any exception, and so may code that uses wrong sizes from a faulty kernel.
                 text = " ".join(str(error).split())[:300]
                 outcomes.append(StageOutcome(trouble=f"{type(error).__name__}: {text}"))
         if digests is not None:

@@ -91,7 +91,7 @@ def of_line(line: str) -> bool | None:
 
 
 class AntialiasStatements:
-    """Statements about antialiasing in a file's header.
+    """Statements about antialiasing in a file's header, from its texts and what `of_line` returns for each.
 
     antialiased: True if the last statement says that the model is antialiased; False without statements.
     contradiction: warning, without the file's name, about statements that disagree; "" if all agree.

@@ -150,13 +150,13 @@ class Asset:
         return result
 
     def accessor(self, index: object, width: int, semantic: str) -> Array:
-        """Values (count, width) of an accessor, as stored in the file. semantic: the attribute's name, for messages."""
+        """Values (count, width) of the accessor at `index`, as stored. semantic: the attribute's name, for messages."""
         said = self.item("accessors", index)
         kind = COMPONENT_DTYPES.get(self.integer(said, "componentType"))
         count, offset = self.integer(said, "count"), self.integer(said, "byteOffset", 0)
         if kind is None:
             found = str(said["componentType"])[:20]
-            raise InputError(f"{self.path}: {semantic} has the componentType {found}, expected 5120 to 5126 but 5124")
+            raise InputError(f"{self.path}: {semantic} has the componentType {found}, expected 5120-5123, 5125 or 5126")
         if ACCESSOR_WIDTHS.get(str(said.get("type"))) != width:
             expected = next(name for name, numbers in ACCESSOR_WIDTHS.items() if numbers == width)
             raise InputError(f"{self.path}: {semantic} has the type {str(said.get('type'))[:20]}, expected {expected}")

@@ -106,7 +106,7 @@ def _k_means(vectors: Float32, size: int, iterations: int) -> tuple[Float32, NDA
         return vectors.mean(axis=0, keepdims=True, dtype=np.float64).astype(np.float32), np.zeros(
             len(vectors), np.int64
         )
-    middle = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)  # centred, since float32 is coarse far from 0
+    middle = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)  # subtracted, since float32 is coarse far from 0
     centred = vectors - middle
     sample = centred[:: max(1, len(vectors) // max(CODEBOOK_SAMPLES, 8 * size))]
     order = np.argsort(np.einsum("ij,j->i", sample, _direction(sample)), kind="stable")

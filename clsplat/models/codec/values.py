@@ -38,7 +38,8 @@ OTHER_QUATERNION_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 
 MAX_FLOAT_HIGHLIGHT = 2.0
 """Largest float colour up to which white is taken to be 1, unless all colours are whole numbers."""
 UNIT_COLOUR_SHARE = 0.95
-"""Fraction of float colours that, if they are at most 1, make 1 white, however bright the other colours are."""
+"""Fraction of a file's float colours. If at least this fraction is at most 1, then 1 is white, however bright the
+other colours are."""
 UNIT_RANGE_TOLERANCE = 1e-3
 """Largest tolerated excess of opacities over [0, 1], and of colours over white as a fraction of white. Averaging and
 rounding to half floats cause it."""
@@ -59,7 +60,7 @@ def row_blocks(count: int, most: int = IO_BLOCK_ROWS) -> Iterator[slice]:
 
 
 def world_means(gaussians: Gaussians, rows: slice | NDArray[Any] = slice(None)) -> Float64:
-    """Means (n, 3) in world coordinates."""
+    """Means (n, 3) in world coordinates, of all Gaussians or of the given rows."""
     return gaussians.means[rows] + gaussians.origin
 
 
@@ -99,13 +100,13 @@ def to_log_scales(gaussians: Gaussians, where: Path | str) -> None:
 def all_to_log_scales(parts: Sequence[tuple[Path | str, Gaussians]], writer: str = "") -> None:
     """Replace the linear scales (standard deviations) of all parts of a file by their logs, in place.
 
-    If at least LOG_SCALES_MIN_NEGATIVE_SHARE of all Gaussians have a negative scale, all scales are logs already. They
-    are kept, with a warning. splat-transform wrote logs before 22 June 2026, and the review draft of
+    If at least LOG_SCALES_MIN_NEGATIVE_SHARE of all Gaussians have a negative scale, all scales are taken for logs and
+    kept, with a warning. splat-transform wrote logs before 22 June 2026, and the review draft of
     KHR_gaussian_splatting asked for them.
 
     parts: for each part of the file, a prefix for messages and the Gaussians.
     writer: name of the program that wrote the file, if it is known to write logs; otherwise "".
-    Raises InputError if some Gaussians have a negative scale, but fewer than that fraction.
+    Raises InputError if some Gaussians have a negative scale, but less than that fraction of all.
     """
     with np.errstate(invalid="ignore"):
         negative = [np.asarray((gaussians.log_scales < 0).any(axis=1)) for _, gaussians in parts]

@@ -152,7 +152,7 @@ def format_of(path: Path) -> Format:
         return named
     with open_input(path, f"a model file with one of the suffixes {' '.join(suffixes())}") as file:
         head = file.read(FORMAT_HEAD_BYTES)
-        if head.startswith(b"ply") and b"end_header" not in head:  # comments may fill the first bytes
+        if head.startswith(b"ply") and b"end_header" not in head:  # a PLY's comments may fill the head
             head += file.read(MAX_PLY_HEADER_BYTES)
     # If the name is of a format without a signature, it counts unless the file begins with another format's signature.
     # A "{", with which JSON begins, does not show another format: it may be the file's first byte by chance.

@@ -155,14 +155,14 @@ def _elements(header: ply_file.PlyHeader) -> tuple[ply_file.Element, ply_file.El
         properties = [(f"f_rest_{index}", "u1") for index in range(len(sh.properties))]
         if len(sh.properties) not in counts or set(properties) != set(sh.properties):
             raise InputError(
-                f"{path}: element sh has unknown properties, expected {' or '.join(map(str, counts))} uchars f_rest_*"
+                f"{path}: element sh has unknown properties, expected {' or '.join(map(str, counts))} f_rest_* as uchar"
             )
         if sh.count != vertex.count:
             raise InputError(f"{path}: element sh has {sh.count} rows, expected {vertex.count} like element vertex")
     for element in header.elements:
         kept = [name for name, _ in element.properties]
         if element.has_list or len(set(kept)) < len(kept):
-            raise InputError(f"{path}: element {element.name} has a list or the same property twice")
+            raise InputError(f"{path}: element {element.name} has a list property, or the same property twice")
     return chunks, vertex, sh
 
 

@@ -156,7 +156,7 @@ def _from_attributes(asset: Asset, name: str, indices: dict[str, Any]) -> Gaussi
     coefficients = [array(semantic, 3) for band in names[: degree + 1] for semantic in band]
     for attribute in (rotation, scale, opacity, *coefficients):
         if len(attribute) != count:
-            raise InputError(f"{asset.path}: {name} has {len(attribute)} values of an attribute, expected {count}")
+            raise InputError(f"{asset.path}: {name} has {count} positions, but an attribute of {len(attribute)} values")
     result, where = values.empty(count, degree), f"{asset.path}: {name}"
     for rows in values.row_blocks(count):
         result.means[rows] = real(position[rows])

@@ -47,9 +47,9 @@ KSPLAT_SECTION_HEADER = np.dtype(
 )  # fmt: skip
 BUCKET_CENTRE_BYTES = 12
 DEFAULT_POSITION_RANGE = 32767
-"""Largest distance of a stored position from its bucket's centre, in steps, that a 0 in the section's header means."""
+"""Largest distance, in steps, of a stored position from its bucket's centre. A header with a 0 means this default."""
 DEFAULT_SH_BOUND = 1.5
-"""Magnitude of an SH bound that the header stores as 0."""
+"""Magnitude of the least and largest SH coefficient. A header with a 0 means this default."""
 SH_VALUES_BY_DEGREE = (0, 9, 24, 45)
 _POSITION_DTYPES, _FLOAT_DTYPES, _SH_DTYPES = ("<f4", "<u2", "<u2"), ("<f4", "<f2", "<f2"), ("<f4", "<f2", "u1")
 
@@ -124,7 +124,10 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) -> list[Section]:
-    """Read the headers of all sections, and check them against the file's size."""
+    """Read the headers of all sections, and check them against the file's size in bytes.
+
+    sections: number of sections. level: compression level.
+    """
     at = KSPLAT_HEADER.itemsize + sections * KSPLAT_SECTION_HEADER.itemsize
     if size < at:
         raise InputError(f"{path}: truncated: has {size} bytes, but its {sections} sections need {at}")

@@ -371,7 +371,7 @@ def _fill(gaussians: Gaussians, block: Block, rest: int) -> None:
 
 def _assemble(blocks: Iterator[Block], count: int, rest: int) -> Gaussians:
     """Copy the blocks into one model of `count` Gaussians."""
-    first = next(blocks)  # first, since it checks that the file has `count` rows
+    first = next(blocks)  # reading the first block checks that the file has `count` rows
     result = values.empty(count, _degree(rest))
     start = 0
     for block in chain([first], blocks):

@@ -350,7 +350,7 @@ def _unpacked_quaternions(pixels: Bytes) -> Float32:
     tag = pixels[:, 3].astype(np.int64) - QUATERNION_TAG_BASE
     three = (pixels[:, :3] * np.float32(2 / 255) - np.float32(1)) * np.float32(0.5**0.5)
     result = packing.restore_largest(np.maximum(tag, 0), three)
-    result[tag < 0] = (1, 0, 0, 0)  # the identity rotation, as in splat-transform
+    result[tag < 0] = (1, 0, 0, 0)  # without a valid index: the identity rotation, as in splat-transform
     return result
 
 
@@ -377,7 +377,8 @@ def write(
             for picture in files:
                 atomic_write(path.with_name(picture.name), picture.read_bytes())
             atomic_write(path, text)
-            for name in {*SH_IMAGE_FILES} - {picture.name for picture in files}:  # of an earlier model of higher degree
+            # an earlier model with higher SH degree may have left these images
+            for name in {*SH_IMAGE_FILES} - {picture.name for picture in files}:
                 path.with_name(name).unlink(missing_ok=True)
             return
         total = sum(picture.stat().st_size for picture in files)

@@ -55,7 +55,7 @@ dependence are 11 dB worse, at 36 dB (docs/formats.md).
 ANTIALIASED_FLAG, EXTENSIONS_FLAG = 1, 2
 COORDINATE_SYSTEM_EXTENSION = 0xADBE0003
 COORDINATE_SYSTEM_SIGNS: tuple[Signs, ...] = (
-    *(RUB_SIGNS, (-1, 1, -1), (1, 1, -1), (-1, -1, -1), RUB_SIGNS),  # unspecified, LDB, RDB, LUB, RUB
+    *(RUB_SIGNS, (-1, 1, -1), (1, 1, -1), (-1, -1, -1), RUB_SIGNS),  # file's axes: unspecified, LDB, RDB, LUB, RUB
     *((-1, 1, 1), (1, 1, 1), (-1, -1, 1), (1, -1, 1)),  # LDF, RDF, LUF, RUF
 )
 """Factors of x, y and z that convert between clsplat's axes and a file's. The index is the value of the file's

@@ -201,7 +201,10 @@ def _blend_grad(bench: CaseBench) -> StageOutcome:
 
 
 def _moments(splats: reference_project.ProjectedTwin, wanted: reference_blend.BlendGradients) -> Float64:
-    """Compute the moments (n, 6) of a slot from the twin's gradients: equations (49) and (25) to (29)."""
+    """Compute the moments (n, 6) of the Gaussians' slots from the twin's gradients.
+
+    The equations are (49) and (25) to (29) of docs/gradients.md.
+    """
     l11, l12, l22 = (WHITENING_FACTOR * splats.whitening).T
     gx, gy = -(WHITENING_FACTOR**2) * wanted.means2d.T
     u = gx / l11

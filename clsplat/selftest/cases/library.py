@@ -47,7 +47,7 @@ from clsplat.stages.splats import ScreenGaussians, ScreenGradients, splats
 from clsplat.stages.values import ValuePass, values, values_grad
 
 VALUES_PER_GAUSSIAN = 5
-"""Number of values per Gaussian in the test: more than the three of blend.cl."""
+"""Number of values per Gaussian in the test: more than the three that blend.cl can blend."""
 WRITTEN_SPLAT_COLUMNS = {name: k for k, name in enumerate(SPLAT) if name != "UNUSED"}
 
 
@@ -187,7 +187,7 @@ def _twin_of_splats(given: Inputs, got: Arrays) -> dict[str, Expected]:
         # an extent depends on a difference of logarithms, which may cancel; the tile test has 0.01 px of slack for it
         "half extents": Expected(wanted.half_extents, 1e-4, 1 + wanted.half_extents, seen),
         "LOG2O": Expected(logs, 1.4e-6, 1.0, seen),  # an ulp of the logarithm changes the opacity by 1e-6
-        "means": Expected(given.means2d[seen], 6e-8, 1.0),  # a fraction of a pixel is rounded, and below 1
+        "means": Expected(given.means2d[seen], 6e-8, 1.0),  # the rounded fractions of a pixel are below 1
         "values": exactly(given.values[seen]),
         "tiles of culled Gaussians": exactly(np.zeros_like(got["tiles of culled Gaussians"])),
     }

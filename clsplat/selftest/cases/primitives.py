@@ -29,8 +29,8 @@ PROBED: dict[str, tuple[float, float, Callable[[Array], Array]]] = {
     "sigmoid": (-80.0, 80.0, lambda x: 1 / (1 + np.exp(-x))),
     "exp2": (-8.5, 0.0, np.exp2),
 }
-"""Tested functions in the order of the rows of probe_elementary: least and greatest argument, and the exact
-function."""
+"""Tested functions by name, in the order of the rows that probe_elementary writes. Each has its least and greatest
+argument, and the exact function."""
 
 
 def _random_arguments(rng: Generator, count: int) -> Inputs:
