@@ -180,7 +180,7 @@ def _short_test(device: Device, stages: Sequence[str]) -> str:
 def examine_device(index: int) -> DriverReport:
     """Run the whole self-test on the `index`-th device, in the kernel shape that is preferred for it.
 
-    If the test passes, a recorded failure in this shape is deleted, unless the kernel that failed then fails again.
+    If the test passes, a recorded failure in this shape is deleted, unless the kernel of that failure fails again.
     """
     device = all_devices()[index]
     shape = wanted_shape(device)

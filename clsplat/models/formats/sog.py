@@ -216,7 +216,7 @@ class _Meta:
         return value
 
     def numbers(self, section: str, key: str, least: int, most: int) -> NDArray[np.float64]:
-        """Numbers of the list `key` in a section of meta.json. Raises InputError unless they are `least` to `most`.
+        """Numbers of the list `key` in a section of meta.json. Raises InputError unless it has `least` to `most`.
 
         JSON has no infinity. So null stands for -inf in the logs of scales, and for NaN elsewhere.
         """
@@ -339,7 +339,7 @@ class _Meta:
         if table.shape[1] % PALETTE_COLUMNS or not bands or said not in (None, bands):
             found = f"{table.shape[1]} pixels wide for {'unstated' if said is None else str(said)[:20]} bands"
             widths = ", ".join(f"{PALETTE_COLUMNS * d * (d + 2)} for {d}" for d in range(1, MAX_SH_DEGREE + 1))
-            raise InputError(f"{self.path}: shN's palette is {found}, expected a width of {widths}")
+            raise InputError(f"{self.path}: shN's palette is {found}, expected a width of {widths} bands")
         colours = table.reshape(-1, width, 3)
         if needed > len(colours):
             raise InputError(f"{self.path}: shN has the index {needed - 1}, but its palette has {len(colours)} entries")
@@ -366,7 +366,7 @@ def write(
     InputError for non-finite values.
     """
     packing.check_writable(path, gaussians, least=1)
-    # an upper bound of the images' bytes: the WebP encoder crashes if the disk is full
+    # An upper bound of the images' bytes is needed, because the WebP encoder crashes if the disk is full.
     room = 24 * len(gaussians) + 64 * min(len(gaussians), MAX_PALETTE_ENTRIES) + (1 << 16)
     with scratch_folder(room) as folder:
         order = packing.morton_order(gaussians.means) if sort else slice(None)

@@ -73,7 +73,7 @@ class UsdPlacement:
 
     @property
     def reach(self) -> tuple[float, float] | None:
-        """First and last time sample of the transforms of the prim and its ancestors; None if there are none.
+        """First and last time sample of the transforms of the prim and its ancestors; None without time samples.
 
         The result is (-inf, inf) if an instancer that contains the prim has velocities, which apply at any time.
         """

@@ -33,7 +33,7 @@ from clsplat.stages.appearance import (
 MIX_RATE_FACTOR = 0.125
 """Learning rate of colour mixes, divided by that of gains."""
 MAX_FALLOFF_OCTAVES, MAX_MIX = 16.0, 0.2
-"""Limits in the kernels: the octaves of a vignette, and the absolute value of a colour mix."""
+"""Limits in the kernels: of a vignette in octaves, and of the absolute value of a colour mix."""
 
 
 def random_gradient(rng: Generator, image: Float32) -> Float32:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The core stages of the self-test: arithmetic, projection, tile lists, blending, and their gradients with Adam. Each
-is compared with its float64 reference on a frozen scene.
+"""The core stages of the self-test: arithmetic, projection, tile lists, blending, the gradients of projection and
+blending, and Adam. Each stage is compared with its float64 reference on a frozen scene.
 
 The reference of a stage gets the device's output of the previous stage, so that errors do not add up. The bounds of the
 errors are STAGE_BOUNDS_ULP of `selftest.result`.

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cases of elementary functions (shared/elementary.h, shared/lanes.h), of radix and bitonic sort, of prefix sums, and
-of tile lists by append."""
+of the tile lists that the stage `append` makes."""
 
 from __future__ import annotations
 
