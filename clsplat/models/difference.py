@@ -24,7 +24,7 @@ ERROR_UNITS = {
 
 
 def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
-    """Largest and mean error of each attribute in ERROR_UNITS, over all Gaussians.
+    """Return the "largest" and the "mean" error over all Gaussians of each attribute in ERROR_UNITS.
 
     Position errors are distances, and rotation errors angles. The error of any other attribute is that of its worst
     component. A scale error is a fraction of the Gaussian's largest scale, because formats clamp the thickness of very

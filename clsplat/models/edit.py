@@ -62,7 +62,7 @@ def drop_sh(gaussians: Gaussians, degree: int) -> Gaussians:
 
 
 def without_empty_bands(gaussians: Gaussians) -> Gaussians:
-    """Drop the highest SH bands if all their coefficients are 0. A lossy format would not store exact zeros."""
+    """Drop the highest SH bands if all their coefficients are 0, since a lossy format would not store exact zeros."""
     degree = gaussians.sh_degree
     while degree and not gaussians.sh[:, degree**2 :].any():
         degree -= 1
@@ -70,7 +70,7 @@ def without_empty_bands(gaussians: Gaussians) -> Gaussians:
 
 
 def exposed(gaussians: Gaussians, gains: Sequence[float]) -> Gaussians:
-    """Scale the colours of a model.
+    """Multiply the colours of a model by `gains`.
 
     gains: three factors of at least 0, one for each channel, or the nine elements of a colour matrix row by row.
     """
@@ -95,7 +95,7 @@ def faded(gaussians: Gaussians, factor: float) -> Gaussians:
         return replace(gaussians, opacity_logits=np.full_like(gaussians.opacity_logits, _INVISIBLE_LOGIT))
     if factor >= 1:
         return gaussians
-    # the logit of f / (1 + exp(-l)) is log(f) - log(1 - f + exp(-l))
+    # for factor f and logit l, the logit of f / (1 + exp(-l)) is log(f) - log(1 - f + exp(-l))
     logits = np.log(factor) - np.logaddexp(np.log1p(-factor), -gaussians.opacity_logits.astype(np.float64))
     return replace(gaussians, opacity_logits=logits.astype(np.float32))
 
@@ -133,7 +133,7 @@ def decompose(matrix: Float64, slack: float = _SIMILARITY_TOLERANCE) -> tuple[fl
     """Scale s, rotation Q (3, 3) and translation t (3,) of a similarity (4, 4).
 
     slack: largest allowed difference of Q^T Q from the identity.
-    Raises InputError if the matrix is not a similarity. Callers put the file's name and "has" before its message.
+    Raises InputError if the matrix is not a similarity. Callers put the file's name and "has" before the message.
     """
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"a transform of {matrix.shape}, expected 4 x 4 finite numbers")
@@ -147,14 +147,14 @@ def decompose(matrix: Float64, slack: float = _SIMILARITY_TOLERANCE) -> tuple[fl
             f"a transform that is not a similarity (its axes deviate by {off:.2g} from right angles or equal lengths), "
             "expected rotation, one scale and translation"
         )
-    u, _, vt = np.linalg.svd(turn)  # the nearest orthogonal matrix
+    u, _, vt = np.linalg.svd(turn)  # u @ vt is the orthogonal matrix nearest to `turn`
     return scale, u @ vt, matrix[:3, 3]
 
 
 def transform(gaussians: Gaussians, matrix: Float64, slack: float = _SIMILARITY_TOLERANCE) -> Gaussians:
     """Transform a model by a similarity (4, 4) of the world. A pure translation keeps rotations and SH bit for bit.
 
-    Raises InputError like `decompose`.
+    slack: largest allowed difference from a similarity, as for `decompose`, whose InputError is raised beyond it.
     """
     scale, turn, shift = decompose(matrix, slack)
     upright = np.allclose(turn, np.eye(3), rtol=0, atol=1e-12)  # no rotation, up to float64 rounding

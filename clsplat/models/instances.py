@@ -76,7 +76,7 @@ class Track(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Changing:
-    """`Track` of a `ModelSeries`: has the placements of `inner`, with the series' Gaussians at the shot's frame."""
+    """`Track` of a `ModelSeries`: places the series' Gaussians of a frame as the track `inner` says for that frame."""
 
     inner: Track
 
@@ -91,8 +91,8 @@ class Changing:
 
 
 def rows_of(matrix: Float64) -> tuple[float, ...]:
-    """First three rows of (4, 4), flattened for `Placement.matrix`."""
-    return tuple(float(value) + 0.0 for value in matrix[:3].ravel())  # + 0.0 turns -0 into 0: equal matrices look alike
+    """First three rows of a matrix (4, 4), flattened for `Placement.matrix`."""
+    return tuple(float(value) + 0.0 for value in matrix[:3].ravel())  # -0 + 0.0 is 0: equal matrices get equal bits
 
 
 def grade(gain: Float64, offset: Float64, saturation: float) -> tuple[float, ...]:
@@ -104,7 +104,10 @@ def grade(gain: Float64, offset: Float64, saturation: float) -> tuple[float, ...
 
 
 def checked(placement: Placement, where: str) -> Placement:
-    """Return the placement. Raises InputError, prefixed with `where`, if its transform is not a similarity."""
+    """Check that a placement's transform is a similarity, and return the placement.
+
+    Raises InputError, prefixed with `where`, if it is not.
+    """
     try:
         decompose(placement.transform, NODE_SIMILARITY_TOLERANCE)
     except InputError as error:
@@ -126,7 +129,7 @@ def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
 def extrapolated(track: Track, frame: float, end: float) -> Placement:
     """Placement of a track at a frame. If the track has no data there, its motion at frame `end` continues.
 
-    end: frame from which the camera is extrapolated, such as the last or the first of the shot.
+    end: frame from which motions are extrapolated, such as the last or the first of the shot.
 
     If `frame` is n whole frames and a fraction beyond the end, the motion over the same fraction just before the end is
     repeated once. Then the motion of the last whole frame is repeated n times, as for cameras (`shots.motion`). Opacity
@@ -156,7 +159,7 @@ def _step(now: Placement, before: Placement) -> Float64:
 
 
 def kind_of(model: Gaussians | ModelSeries) -> Gaussians:
-    """The model itself; for a `ModelSeries`, an empty model with the series' rendering flags and near plane."""
+    """The model itself; for a `ModelSeries`, an empty model that is drawn alike and has the same near plane."""
     return model.kind if isinstance(model, ModelSeries) else model
 
 
@@ -171,8 +174,10 @@ def near_of(models: Sequence[Gaussians | ModelSeries], state: State) -> float:
 
 
 class Ensemble:
-    """Merges the models of a shot for consecutive states, and reuses models whose placement is unchanged. Not
-    thread-safe."""
+    """Merges the models of a shot, placed by one `State` after another. Not thread-safe.
+
+    Models whose placement is unchanged since the last state are reused.
+    """
 
     def __init__(self, models: Sequence[Gaussians | ModelSeries]) -> None:
         self.models = tuple(models)
@@ -185,12 +190,15 @@ class Ensemble:
         The same state again returns the same object.
         """
         if self._last is None or self._last[0] != state:
-            self._last = None  # frees its memory before the next model is allocated
+            self._last = None  # frees the old merged model before the next is allocated
             self._last = state, merge([self._one(index, placement) for index, placement in enumerate(state)])
         return self._last[1]
 
     def moved(self, state: State, after: State) -> Gaussians | None:
-        """The merged model of `state`, but with the means of the state `after`; None if no model moves."""
+        """Merged model with the rows of `at(state)` and the means of the state `after`; None if no model moves.
+
+        Only its means are of use: SH coefficients above degree 0 are left out, and opacities are those of the models.
+        """
         if [(now.matrix, now.frame) for now in state] == [(then.matrix, then.frame) for then in after]:
             return None
         moved = []

@@ -53,7 +53,10 @@ class Mesh:
         return inside
 
     def _winding_numbers(self, points: Float64) -> Float64:
-        """Winding numbers (n,): solid angle of the triangles over 4 pi (Van Oosterom and Strackee 1983)."""
+        """Winding numbers (n,) of the mesh around points (n, 3).
+
+        A winding number is the solid angle of all triangles over 4 pi (Van Oosterom and Strackee 1983).
+        """
         a, b, c = (self.corners[None, :, k] - points[:, None] for k in range(3))
         la, lb, lc = (np.linalg.norm(side, axis=2) for side in (a, b, c))
         triple = np.einsum("ijk,ijk->ij", a, np.cross(b, c))
@@ -119,8 +122,10 @@ def _check_counts(path: Path, points: int, triangles: int) -> None:
 
 
 def read_here(path: Path) -> Float64:
-    """Corners (T, 3, 3) of a USD stage's triangles, without the test of `survive`. A damaged file may crash the
-    process."""
+    """Read the corners (T, 3, 3) of a USD stage's triangles in this process, which a damaged file may crash.
+
+    `survive` calls this function in another process first.
+    """
     from pxr import UsdGeom, UsdUtils
 
     delegate = UsdUtils.CoalescingDiagnosticDelegate()  # suppresses the messages that USD would print
@@ -143,16 +148,19 @@ def _of_prim(path: Path, mesh: Any, time: float, world_from_mesh: Float64) -> Fl
     )
     _check_counts(path, len(points), max(len(counts), len(indices) - 2 * len(counts)))
     points = np.array(points, np.float64).reshape(-1, 3)
-    points = points @ world_from_mesh[:3, :3] + world_from_mesh[3, :3]  # USD multiplies row vectors
+    points = points @ world_from_mesh[:3, :3] + world_from_mesh[3, :3]  # USD's matrices multiply row vectors
     indices, counts = list(indices), list(counts)
     ends = np.cumsum([0, *counts])
     if ends[-1] != len(indices):
-        raise InputError(f"{path}: {mesh.GetPath()} has {len(indices):,} indices of faces, expected {ends[-1]:,}")
+        raise InputError(f"{path}: {mesh.GetPath()} has {len(indices):,} faceVertexIndices, expected {ends[-1]:,}")
     return _fans(path, points, [indices[begin:end] for begin, end in pairwise(ends)])
 
 
 def _fans(path: Path, points: Float64, polygons: list[list[int]]) -> Float64:
-    """Corners (T, 3, 3) of polygons that are divided into triangle fans."""
+    """Divide polygons into triangle fans. Returns the corners (T, 3, 3) of all triangles.
+
+    polygons: for each polygon, the indices of its corners in `points` (n, 3).
+    """
     fans = [(own[0], one, next_one) for own in polygons for one, next_one in pairwise(own[1:])]
     if fans and not 0 <= min(map(min, fans)) <= max(map(max, fans)) < len(points):
         raise InputError(f"{path}: has faces with indices beyond its {len(points):,} points; is it damaged?")

@@ -35,8 +35,8 @@ class ModelSeries:
     """A model that changes over time, given by samples at some frames. Thread-safe.
 
     Between two samples Gaussians are interpolated, means linearly, if each row is the same Gaussian in both; otherwise
-    the nearer sample is used. Before the first and after the last sample, that sample is used. Unless `held` is set,
-    its means continue to move: the motion on the inner side of the sample is mirrored.
+    the nearer sample is used. Before the first sample the first is used, after the last sample the last. Unless `held`
+    is set, its means move on: in a time t beyond the sample by as much as in the time t on the sample's other side.
     """
 
     def __init__(
@@ -61,12 +61,15 @@ class ModelSeries:
         self.count = len(first)
         """Number of Gaussians in the first sample."""
         self.kind = take(first, slice(0))
-        """Empty model with the rendering flags of all samples."""
+        """Empty model with `antialiased` and `by_rays` of all samples, and the near plane of the first."""
         self._known[0] = Future()
         self._known[0].set_result(first)
 
     def at(self, frame: float) -> Gaussians:
-        """Gaussians at a frame. Raises InputError if a sample cannot be read, or has other rendering flags."""
+        """Gaussians at a frame.
+
+        Raises InputError if a sample cannot be read, or if its `antialiased` or `by_rays` differs from the first's.
+        """
         with self._lock:
             inside = min(max(frame, self.frames[0]), self.frames[-1])
             if inside != frame and not self.held:
@@ -137,7 +140,7 @@ class ModelSeries:
         self._known.move_to_end(index)
         later = self._wanted[bisect_right(self._wanted, index) :][:1]
         oldest = [other for other in self._known if other not in (index, *later)]
-        for other in oldest[: max(len({*self._known, *later}) - most, 0)]:  # frees memory before the next is read
+        for other in oldest[: max(len({*self._known, *later}) - most, 0)]:  # frees memory for the next sample
             del self._known[other]
         for other in later:
             self._future(other)
@@ -158,7 +161,7 @@ class ModelSeries:
                     f"{self.where}: frame {self.frames[index]:g} is {_alike(sample, what)}, frame {self.frames[0]:g} "
                     f"is {_alike(self.kind, what)}, expected models that are drawn alike"
                 )
-        # all frames get the near plane of the first
+        # all samples get the near plane of the first
         return sample if sample.near == self.kind.near else replace(sample, near=self.kind.near)
 
     def _follows(self, index: int) -> bool:
@@ -171,8 +174,8 @@ class ModelSeries:
         if not self._told:
             self._told = True
             warn(
-                f"{self.where}: Gaussians do not keep their order from frame to frame; motion channels have "
-                "the camera's motion only"
+                f"{self.where}: Gaussians do not keep their order from frame to frame, so motion channels show "
+                "only the camera's motion"
             )
 
 
@@ -227,6 +230,6 @@ def _normalised(quaternions: Float64) -> Float64:
 
 
 def _means_from(model: Gaussians, other: Gaussians) -> Float32:
-    """Means of a model relative to the origin of another."""
+    """Means (n, 3) of `model`, relative to the origin of the model `other`."""
     shift = model.origin - other.origin
     return (model.means + shift).astype(np.float32) if shift.any() else model.means

@@ -29,7 +29,7 @@ Mask = NDArray[np.bool_] | EllipsisType
 
 
 class Inputs(SimpleNamespace):
-    """Inputs of a case by name, arrays and numbers. Images are (H, W, ...)."""
+    """Inputs of a case: arrays and numbers, as attributes. Images are (H, W, ...)."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -46,8 +46,8 @@ class Expected:
     """The twin's values of a result, and how the device's values are compared with them.
 
     bound: the largest allowed error. A comment beside each bound gives the reason for it.
-    magnitudes: the sizes to which errors are relative, by element. None: the error is the relative error in the 2-norm
-    of all values.
+    magnitudes: for each element, the number by which its error is divided. None: the error is the 2-norm of all errors,
+    divided by the 2-norm of all values.
     compared: mask of the elements that are compared; all other elements depend on rounding.
     exact: True for results that must be equal, such as integers.
     """
@@ -59,8 +59,11 @@ class Expected:
     exact: bool = False
 
     def error_of(self, got: Array) -> float:
-        """The largest error of the device's values `got`, relative to the magnitudes; if `exact`, the number of wrong
-        elements."""
+        """Return the error of the device's values `got`, which is compared with `bound`.
+
+        It is the largest error after division by the magnitudes, or without them the relative error in the 2-norm. If
+        `exact`, it is the number of wrong elements.
+        """
         if got.shape != self.values.shape:
             return float("inf")
         found, wanted = got[self.compared], self.values[self.compared]
@@ -89,7 +92,7 @@ class Deviation(NamedTuple):
 
 
 def faults(found: Mapping[str, Deviation]) -> list[str]:
-    """Describe each error that exceeds its bound, by the name of the result."""
+    """Describe each error that exceeds its bound. found: the errors and bounds, by the names of the results."""
     return [f"{name} {error:.2g} over {bound:g}" for name, (error, bound) in found.items() if not error <= bound]
 
 
@@ -101,13 +104,13 @@ class Case:
     a group has.
     random: function that makes random inputs of a size.
     launch: function that launches the kernels, and returns a function that reads the results.
-    twin: function from inputs and the device's results to the wanted values by name. It gets the results because a
-    gradient, for example, depends on the device's projection.
+    twin: function from inputs and the device's results to the wanted values by name. It is given the device's results
+    because a gradient, for example, depends on the device's projection.
     frozen: function from a frozen scene of the self-test to a list of inputs; None if the case is not a stage of the
     self-test.
     digested: names of the results in the self-test's digest, in order.
     by_shape: True if the kernels or their launches depend on the kernel shape.
-    own_bits_of_groups: True if kernel shapes with several items have another digest than those with one item.
+    own_bits_of_groups: True if the bits, and so the digest, depend on whether a kernel shape has one or several items.
     """
 
     sizes: Sequence[Any]
@@ -155,5 +158,5 @@ def read_of(**arrays: DeviceArray) -> Read:
 
 
 def fresh_readback(device: Device) -> DeviceArray:
-    """A READBACK array of zeros on the device: no step has stopped."""
+    """Upload a READBACK array of zeros, which says that no step has stopped."""
     return upload(device, np.zeros(len(READBACK), np.uint32))

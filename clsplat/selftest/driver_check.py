@@ -82,14 +82,17 @@ class DriverReport:
         names = " and ".join(otherwise)
         reason = f"this device does not follow IEEE 754 in {names}" if otherwise else "the reason is not known"
         return (
-            f"can be trusted, but its bits are not those of other devices in {', '.join(self.other_bits)}: {reason}; "
-            "every error is within its bound"
+            f"can be trusted, but its results of {', '.join(self.other_bits)} are not bit for bit those of other "
+            f"devices: {reason}; every error is within its bound"
         )
 
 
 def examine(index: int, shape: Shape, stages: Sequence[str] = SELFTEST_STAGES, *, quick: bool = False) -> DriverReport:
-    """Test the `index`-th device in a worker process. stages: some of SELFTEST_STAGES, in that order and with all of
-    FORWARD_STAGES."""
+    """Test the `index`-th device in a worker process, in the kernel shape `shape`.
+
+    stages: some of SELFTEST_STAGES in their order, and among them all FORWARD_STAGES.
+    quick: use only the two smaller frozen scenes, and build only the kernels that the stages use.
+    """
     report = DriverReport(wanted=tuple(stages))
     begun, seconds = "starting", driver_timeout()
     words = [str(index), shape.label, ",".join(stages), *(["quick"] if quick else [])]
@@ -160,12 +163,12 @@ def _short_test(device: Device, stages: Sequence[str]) -> str:
     """
     wanted = [name for name in SELFTEST_STAGES if name in FORWARD_STAGES or name in stages]
     report = examine(device.index, device.shape, wanted, quick=True)
-    if report.crashed and not report.hung:  # once more: another program may have killed the driver's linker
+    if report.crashed and not report.hung:  # try again: another program may have killed the driver's linker
         report = examine(device.index, device.shape, wanted, quick=True)
     if report.crashed:
         return report.end
     if report.end:
-        raise DriverError(f"{title(device.cl_device)}: its test could not be made: {report.end}; {_ADVICE}")
+        raise DriverError(f"{title(device.cl_device)}: its driver could not be tested: {report.end}; {_ADVICE}")
     if report.failure:
         raise DeviceError(f"{title(device.cl_device)}: the driver {report.verdict}; {_ADVICE}")
     if report.other_bits:
@@ -177,7 +180,7 @@ def _short_test(device: Device, stages: Sequence[str]) -> str:
 def examine_device(index: int) -> DriverReport:
     """Run the whole self-test on the `index`-th device, in the kernel shape that is preferred for it.
 
-    If the test passes, a recorded failure in this shape is deleted, unless the kernel that failed then fails again.
+    If the test passes, a recorded failure in this shape is deleted, unless the kernel of that failure fails again.
     """
     device = all_devices()[index]
     shape = wanted_shape(device)

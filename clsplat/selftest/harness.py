@@ -52,8 +52,10 @@ class StageOutcome:
     otherwise: tuple[str, ...] = ()
 
     def compared(self, parts: Mapping[str, tuple[Array, Array]], **wrong: int) -> StageOutcome:
-        """The outcome with the errors of the values by name. parts: (got, wanted) of float results; wrong: for integer
-        results, the numbers of wrong elements."""
+        """Copy of this outcome with the errors of the stage's results, by the results' names.
+
+        parts: the device's and the wanted values of float results; wrong: numbers of wrong elements of integer results.
+        """
         errors = {name: error_of(got, wanted) for name, (got, wanted) in parts.items()}
         counts = ", ".join(f"{count} {name.replace('_', ' ')} wrong" for name, count in wrong.items() if count)
         return replace(self, errors=errors, trouble=self.trouble or counts)
@@ -71,7 +73,7 @@ def joined(outcomes: Sequence[StageOutcome]) -> StageOutcome:
 
 
 def error_of(got: Array, wanted: Array) -> tuple[float, float]:
-    """The largest absolute error, and the largest error in ulp; infinite if a value is not finite.
+    """The largest absolute error of `got`, and its largest error in ulp; infinite if a value is not finite.
 
     The ulp is that of the wanted value or of the array's root mean square, whichever is larger, because a sum that
     cancels has no accurate digits.
@@ -96,8 +98,10 @@ def digest_of(arrays: Sequence[Array]) -> str:
 
 
 def cropped(planes: Array, size: Camera | tuple[int, int]) -> Array:
-    """Crop padded planes (rows, stride) or (C, rows, stride) to (H, W) or (H, W, C). size: a camera, or (width,
-    height)."""
+    """Crop padded planes (rows, stride) or (C, rows, stride) to an image (H, W) or (H, W, C).
+
+    size: the image's (width, height), or a camera of that size.
+    """
     width, height = (size.width, size.height) if isinstance(size, Camera) else size
     inside = planes[..., :height, :width]
     return inside.transpose(1, 2, 0) if inside.ndim == 3 else inside

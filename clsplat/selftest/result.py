@@ -111,5 +111,5 @@ class Result:
 
     @property
     def passed(self) -> bool:
-        """True if the stage can be trusted. Bits that differ from the digest are no failure."""
+        """True if the stage can be trusted. Bits that differ from the digest are not a failure."""
         return not self.trouble and self.ulp <= self.bound

@@ -31,7 +31,10 @@ def hashed(seed: int, count: int) -> NDArray[np.uint64]:
 
 
 def evenly(seed: int, shape: tuple[int, ...], low: float, high: float, steps: int = HASH_STEPS) -> NDArray[np.float64]:
-    """Random numbers in [low, high) with few binary digits, so that each is exact in float32."""
+    """Random numbers in [low, high) with few binary digits, so that each is exact in float32.
+
+    steps: number of equally spaced values from which numbers are chosen.
+    """
     values = (hashed(seed, int(np.prod(shape))) >> np.uint64(20)) % np.uint64(steps)
     return low + (high - low) / steps * values.astype(np.float64).reshape(shape)
 

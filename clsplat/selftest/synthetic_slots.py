@@ -18,13 +18,13 @@ from clsplat.selftest.scenes import evenly
 from clsplat.stages.project import Slots
 
 SLOT_MOMENTS = slice(SLOT.index("G"), SLOT.index("GVV") + 1)
-"""Columns of a slot: the sum of g, then the first and second moments of g."""
+"""Columns of a slot: the sum of g (docs/gradients.md), then the first and second moments of g."""
 SLOT_COLOURS = slice(SLOT.index("RED"), SLOT.index("BLUE") + 1)
 """Columns of a slot: the gradient with respect to red, green and blue."""
 
 
 def slot_sums(bench: CaseBench, slots: Array) -> Float64:
-    """Sum each Gaussian's slots in float64. Returns (n, SLOT_PLAIN)."""
+    """Sum the slots (pairs, SLOT_PLAIN) of each Gaussian in float64. Returns (n, SLOT_PLAIN)."""
     sums = np.zeros((bench.model.count, SLOT_PLAIN))
     np.add.at(
         sums, bench.lists.gaussian_from_sorted.get(), slots[bench.lists.slot_from_sorted.get()].astype(np.float64)

@@ -52,15 +52,21 @@ DEFAULT_DEFINES: dict[str, dict[str, object]] = {
 
 @cache
 def stored_digests() -> dict[str, str | dict[str, str]]:
-    """The stored digests by "scene/stage": one digest for all drivers and kernel shapes, or a digest for each shape
-    where the order of sums depends on the shape."""
+    """The stored digests by "scene/stage".
+
+    A stage has one digest for all drivers and kernel shapes, or one for each shape if the order of its sums depends on
+    the shape.
+    """
     digests: dict[str, str | dict[str, str]] = json.loads(DIGESTS_PATH.read_text())["digests"]
     return digests
 
 
 def shape_label(device: Device) -> str:
-    """The label of the device's kernel shape in digests.json: with the number of work-items that share a tile, and
-    without sub-groups."""
+    """The label of the device's kernel shape in digests.json.
+
+    Its number of items is the number of work-items that share a tile. It leaves out whether work-items sum within
+    sub-groups.
+    """
     return replace(device.shape, items=tile_items(device), subgroups=False).label
 
 
@@ -86,9 +92,10 @@ def run(
         for bench in benches:
             try:
                 outcomes.append(OUTCOMES_BY_STAGE[name](bench))
-            except DriverError:  # The caller may try another kernel shape.
+            except DriverError:  # the caller may try another kernel shape
                 raise
-            except Exception as error:  # noqa: BLE001  # drivers, and sizes from a wrong kernel, raise anything
+            except Exception as error:  # noqa: BLE001
+                # A driver may raise any exception, and so may code that uses wrong sizes from a faulty kernel.
                 text = " ".join(str(error).split())[:300]
                 outcomes.append(StageOutcome(trouble=f"{type(error).__name__}: {text}"))
         if digests is not None:
@@ -123,8 +130,12 @@ def _result(name: str, benches: list[CaseBench], outcomes: list[StageOutcome]) -
 
 
 def _child(index: int, shape: str, stages: Sequence[str], *, quick: bool) -> None:
-    """Build all kernels and run the stages on the `index`-th device. Prints a line of JSON before each step and for
-    each result. quick: build only the kernels that the stages use."""
+    """Build all kernels and run the stages on the `index`-th device, in the kernel shape with the label `shape`.
+
+    Prints a line of JSON before each step and for each result.
+
+    quick: use only the two smaller frozen scenes, and build only the kernels that the stages use.
+    """
     end_with_parent()
     tell(begins="opening the device")
     device = Device(all_devices()[index]).with_shape(shape)

@@ -145,7 +145,7 @@ def test_what_the_system_kills_is_not_the_drivers_fault(
 ) -> None:
     standing("kill", 1)
     assert call("eval", scene, trained, tmp_path / "new") == 1
-    assert "its test could not be made: the process was ended by signal 9 in probe.cl" in error_of(capsys)
+    assert "its driver could not be tested: the process was ended by signal 9 in probe.cl" in error_of(capsys)
     assert not any(entry.failed for entry in driver_records.entries(standing_device.cl_device).values())
 
 

@@ -74,7 +74,7 @@ def test_levels_of_which_it_cannot_be_known(tmp_path: Path) -> None:
     path, model = tmp_path / "model.ply", lopsided(400, degree=0)
     model.opacity_logits = np.arange(400, dtype=np.float32) % 36
     model.save(path)
-    with pytest.raises(InputError, match=r"up to 35, expected .* these may be percentages or levels from 0 to 255$"):
+    with pytest.raises(InputError, match=r"up to 35, which may be percentages or levels .* at least 40$"):
         formats.load(path, activated="opacities")
 
 

@@ -192,7 +192,7 @@ def test_writing_tells_how_far_it_is(tmp_path: Path) -> None:
     told: list[tuple[str, float | None]] = []
     sog.write(tmp_path / "a.sog", lopsided(300), progress=lambda stage, part: told.append((stage, part)))
     parts = [part for _, part in told]
-    assert {stage for stage, _ in told} == {"SOG: 256 sets of SH coefficients for 300 Gaussians"}
+    assert {stage for stage, _ in told} == {"SOG: choosing 256 sets of SH coefficients for 300 Gaussians"}
     assert parts[0] == 0 and parts == sorted(parts) and len(parts) > 8 and 0.5 < parts[-1] <= 1
 
 
@@ -277,7 +277,7 @@ def test_one_number_is_called_so(tmp_path: Path) -> None:
     sog.write(tmp_path / "meta.json", lopsided(100, degree=2))
     as_version_1(tmp_path)
     for given, said in (
-        (["x"], "mins of shN in meta.json is no list of numbers, expected a finite number"),
+        (["x"], "mins of shN in meta.json is not a list of numbers, expected a finite number"),
         ([1, 2], "mins of shN in meta.json has 2 numbers, expected 1"),
     ):
         change(tmp_path, lambda meta, given=given: meta["shN"].update(mins=given))
@@ -335,7 +335,7 @@ NULLS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "missing": (lambda meta: meta["scales"].pop("codebook"), r"scales in meta\.json has no codebook"),
     "words": (
         lambda meta: meta["shN"].update(codebook=["x", None]),
-        r"codebook of shN in meta\.json is no list of numbers, expected 1 to 256 finite numbers",
+        r"codebook of shN in meta\.json is not a list of numbers, expected 1 to 256 finite numbers",
     ),
     "too many": (
         lambda meta: meta["means"].update(maxs=[1.0] * 4),
@@ -370,7 +370,7 @@ def test_an_archive_cannot_unpack_to_more_than_its_gaussians(tmp_path: Path) -> 
     said = r"bomb\.sog: quats\.webp has more than \d+ bytes unpacked"
     assert peak_of(lambda: refuses(said, sog.read, bomb)) < 8 << 20
     path.write_bytes(b"PK\3\4 and nothing more")
-    refuses(r"model\.sog: is no \.sog archive", sog.read, path)
+    refuses(r"model\.sog: is not a \.sog archive", sog.read, path)
 
 
 def test_null_at_the_head_of_a_codebook_is_a_scale_of_0(tmp_path: Path) -> None:

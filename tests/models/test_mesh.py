@@ -81,7 +81,7 @@ def Xform "a"
     mesh = read_mesh(written(tmp_path, text, "cube.usda"))
     wanted = (np.abs((POINTS - [0.5, 0, 0]) / [0.5, 1, 1]) < 1).all(axis=1)
     np.testing.assert_array_equal(mesh.holds(POINTS), wanted)
-    with pytest.raises(InputError, match=r"bad.usda: /a/cube has 24 indices of faces, expected 25"):
+    with pytest.raises(InputError, match=r"bad.usda: /a/cube has 24 faceVertexIndices, expected 25"):
         read_mesh(written(tmp_path, text.replace("[4, 4, 4, 4, 4, 4]", "[4, 4, 4, 4, 4, 5]"), "bad.usda"))
 
 

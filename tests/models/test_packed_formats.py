@@ -156,10 +156,10 @@ def test_a_splat_by_hand(tmp_path: Path) -> None:
     for data, message in (
         (record[:-1], "31 bytes"),
         (b"", "0 bytes"),
-        (struct.pack("<6f8B", 1, np.nan, 3, 1, 1, 1, *TURN), "a position of Gaussian 0; expected some that"),
+        (struct.pack("<6f8B", 1, np.nan, 3, 1, 1, 1, *TURN), "a position of Gaussian 0; expected at least one"),
         (record * 100 + struct.pack("<6f8B", 1, 2, 3, 1, -1, 1, *TURN), "Gaussian 100 has the scales 1 -1 1"),
         (bytes(64), r"not a \.splat file \(rotations of length 2\.00"),
-        (struct.pack("<6f8B", 1, 2, 3, 1, np.inf, 1, *TURN), "a scale of Gaussian 0; expected some that"),
+        (struct.pack("<6f8B", 1, 2, 3, 1, np.inf, 1, *TURN), "a scale of Gaussian 0; expected at least one"),
     ):
         assert_refused(path, data, message)
 
@@ -211,7 +211,7 @@ def test_records_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
         (4100, b"\xff\xff\xff\xff", "section 0 ends at byte"),
         (4108, b"\xff\xff\xff\xff", "section 0 ends at byte"),
         (4116, b"\5", "buckets of 5 bytes"),
-        (4128, b"\xff\xff\xff\x7f", "2147483647 full and 2 other buckets"),
+        (4128, b"\xff\xff\xff\x7f", "2147483647 full and 2 partly filled buckets"),
         (4104, b"\1", "but its buckets have fewer"),
         (4132, b"\xff\xff\xff\x7f", "section 0 ends at byte"),
         (4136, b"\4", "SH of degree 4"),

@@ -198,7 +198,7 @@ def test_rounding_otherwise_is_told_and_forgiven(
     report = DriverReport(results)
     assert report.failure == ""
     assert any(result.same_bits is False for result in results)
-    assert "can be trusted, but its bits are not those of other devices" in report.verdict
+    assert "are not bit for bit those of other devices" in report.verdict
     told = {"x / y": "division", "sqrt(y)": "square root"}.get(words.partition(": ")[2], "the reason is not known")
     assert told in report.verdict
 
@@ -442,7 +442,7 @@ def test_a_memory_that_does_not_parse(text: bytes, untrusting: Path) -> None:
 
 def test_other_bits_are_a_warning(untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(BREAK_KERNEL_VARIABLE, "arithmetic: x / y => (x / y) * 1.00000012f")
-    with pytest.warns(UserWarning, match=r"its bits are not those of other devices in arithmetic: .* division"):
+    with pytest.warns(UserWarning, match=r"results of arithmetic are not bit for bit .*: .* division"):
         driver_check.require(default_device, FORWARD_STAGES)
     assert untrusting.exists()
 

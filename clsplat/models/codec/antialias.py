@@ -59,7 +59,7 @@ def _plain(word: str) -> str:
 
 
 def _switch(word: str) -> bool | None:
-    """Boolean that a word such as "on", or a number 0 or 1, stands for; None for other words."""
+    """Return the Boolean that a word such as "on", or the number 0 or 1, stands for; None for any other word."""
     try:
         return {1.0: True, 0.0: False}.get(float(word))
     except ValueError:
@@ -67,7 +67,7 @@ def _switch(word: str) -> bool | None:
 
 
 def _meaning(key: str, value: object) -> bool | None:
-    """True if a key and its value mean antialiased, False if not antialiased, None if they mean neither."""
+    """True if a header's key and value say that the model is antialiased, False if they deny it, else None."""
     key = _plain(key.rpartition(".")[2])  # a key may name its sections first: pipeline.model.rasterize_mode
     word = str(value).strip().lower()
     mode = ANTIALIAS_MODE_WORDS.get(_plain(word))
@@ -81,7 +81,7 @@ def _meaning(key: str, value: object) -> bool | None:
 
 
 def of_line(line: str) -> bool | None:
-    """True if a header comment means antialiased, False if not antialiased, None if it means neither."""
+    """True if a header comment says that the model is antialiased, False if it denies it, else None."""
     if _plain(line.strip("\"' ")) in _STANDALONE_WORDS or (
         _COMMAND_LINE_FLAG.search(line) and not _NEGATION.search(line)
     ):
@@ -91,11 +91,12 @@ def of_line(line: str) -> bool | None:
 
 
 class AntialiasStatements:
-    """Statements about antialiasing in a file's header.
+    """Statements about antialiasing in a file's header, from its texts and what `of_line` returns for each.
 
-    antialiased: True if the last statement says antialiased; False without statements.
+    antialiased: True if the last statement says that the model is antialiased; False without statements.
     contradiction: warning, without the file's name, about statements that disagree; "" if all agree.
-    not_understood: warning about the first text that only mentions antialiasing; "" if there are statements.
+    not_understood: warning about the first text that mentions antialiasing but states nothing; "" if any text is a
+        statement.
     """
 
     def __init__(self, places: Iterable[tuple[str, bool | None]]) -> None:

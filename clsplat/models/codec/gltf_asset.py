@@ -67,7 +67,7 @@ class Asset:
         except ValueError as error:
             raise InputError(f"{path}: its JSON does not parse ({error}); is it a glTF file?") from None
         if not isinstance(document, dict):
-            raise InputError(f"{path}: its JSON is no object, expected a glTF file")
+            raise InputError(f"{path}: its JSON is not an object, expected a glTF file")
         asset = cls(path, document, binary, size)
         version = as_object(document.get("asset")).get("version")
         if not str(version).startswith("2."):
@@ -136,7 +136,7 @@ class Asset:
         def vector(key: str, default: list[float]) -> NDArray[np.float64]:
             values = numbers(node.get(key, default))
             if values.shape != (len(default),) or not np.isfinite(values).all():
-                raise InputError(f"{self.path}: {key} of node {index} is no list of {len(default)} numbers")
+                raise InputError(f"{self.path}: {key} of node {index} is not a list of {len(default)} numbers")
             return values
 
         if "matrix" in node:
@@ -150,13 +150,13 @@ class Asset:
         return result
 
     def accessor(self, index: object, width: int, semantic: str) -> Array:
-        """Values (count, width) of an accessor, as stored in the file. semantic: the attribute's name, for messages."""
+        """Values (count, width) of the accessor at `index`, as stored. semantic: the attribute's name, for messages."""
         said = self.item("accessors", index)
         kind = COMPONENT_DTYPES.get(self.integer(said, "componentType"))
         count, offset = self.integer(said, "count"), self.integer(said, "byteOffset", 0)
         if kind is None:
             found = str(said["componentType"])[:20]
-            raise InputError(f"{self.path}: {semantic} has the componentType {found}, expected 5120 to 5126 but 5124")
+            raise InputError(f"{self.path}: {semantic} has the componentType {found}, expected 5120-5123, 5125 or 5126")
         if ACCESSOR_WIDTHS.get(str(said.get("type"))) != width:
             expected = next(name for name, numbers in ACCESSOR_WIDTHS.items() if numbers == width)
             raise InputError(f"{self.path}: {semantic} has the type {str(said.get('type'))[:20]}, expected {expected}")
@@ -173,7 +173,7 @@ class Asset:
         return values.view(_Normalised) if said.get("normalized") is True and item.kind != "f" else values
 
     def view(self, index: object) -> NDArray[np.uint8]:
-        """Bytes of a buffer view."""
+        """Bytes of the buffer view at an index of the document's list "bufferViews"."""
         said = self.item("bufferViews", index)
         if "EXT_meshopt_compression" in as_object(said.get("extensions", {})):
             raise InputError(f"{self.path}: is compressed with EXT_meshopt_compression, which is not supported")
@@ -196,12 +196,12 @@ class Asset:
             else:
                 data = self.outside(str(said["uri"]))
             if len(data) < length:
-                raise InputError(f"{self.path}: truncated: buffer {index} needs {length} bytes but has {len(data)}")
+                raise InputError(f"{self.path}: truncated: buffer {index} should have {length} bytes, has {len(data)}")
             self.buffers[index] = data
         return self.buffers[index]
 
     def outside(self, uri: str) -> NDArray[np.uint8]:
-        """Bytes of a data: URI, or of a file in the same folder or a sub-folder."""
+        """Bytes of a buffer outside the .glb: of a data: URI, or of a file in the same folder or a sub-folder."""
         if uri.startswith("data:"):
             try:
                 return np.frombuffer(base64.b64decode(uri.partition(";base64,")[2], validate=True), np.uint8)
@@ -213,7 +213,7 @@ class Asset:
             folder = Path(os.path.realpath(self.path)).parent
             file = Path(os.path.realpath(folder / name))
             inside = not parts.scheme and not parts.netloc and name and file.is_relative_to(folder)
-        except ValueError:  # the name has a zero byte, or an invalid address in brackets
+        except ValueError:  # the URI has a zero byte, or an invalid address in brackets
             inside = False
         if not inside:
             raise InputError(f"{self.path}: has its buffer in {uri[:80]!r}, expected a file beside it")
@@ -228,11 +228,11 @@ def sh_attributes(degree: int) -> list[str]:
 
 
 class _Normalised(np.ndarray[Any, Any]):
-    """Integers that encode fractions of their maximum."""
+    """Values of a normalised glTF accessor: integers that encode fractions of their dtype's maximum."""
 
 
 def real(values: Array) -> NDArray[np.float32]:
-    """Values as float32; normalised integers become fractions of their maximum."""
+    """Convert an accessor's values to float32; normalised integers become fractions of their dtype's maximum."""
     floats = np.asarray(values).astype(np.float32)
     if isinstance(values, _Normalised):
         floats = np.maximum(floats / np.float32(np.iinfo(values.dtype).max), np.float32(-1))
@@ -244,12 +244,12 @@ def _map(path: Path, start: int, size: int) -> NDArray[np.uint8]:
         return np.empty(0, np.uint8)
     try:
         return np.memmap(path, np.uint8, "r", start, (size,))
-    except OSError as error:  # for example, the file is larger than the address space
+    except OSError as error:  # memmap fails if, for example, the file is larger than the address space
         raise InputError(f"{path}: {size} bytes cannot be read ({error.strerror})") from None
 
 
 def _chunks(file: BinaryIO, size: int, path: Path) -> tuple[bytes, tuple[int, int] | None]:
-    """JSON of a .glb, and offset and length of its buffer; None without a buffer."""
+    """JSON of a .glb, and the offset and length in bytes of its binary buffer, or None if it has no buffer."""
     head = file.read(16)
     if len(head) < 16:
         raise InputError(f"{path}: truncated: has {size} bytes, expected a .glb")
@@ -257,7 +257,7 @@ def _chunks(file: BinaryIO, size: int, path: Path) -> tuple[bytes, tuple[int, in
     if version != 2 or kind != GLB_JSON_CHUNK:
         raise InputError(f"{path}: has .glb version {version}, first chunk {kind:#x}, expected version 2 and JSON")
     if length > min(MAX_DOCUMENT_BYTES, size - 20):
-        raise InputError(f"{path}: truncated: its JSON needs {length} bytes but has {size - 20}")
+        raise InputError(f"{path}: truncated: its JSON should have {length} bytes, but {size - 20} are left")
     text = file.read(length)
     head = file.read(8)
     if len(head) < 8:
@@ -267,7 +267,7 @@ def _chunks(file: BinaryIO, size: int, path: Path) -> tuple[bytes, tuple[int, in
     if kind != GLB_BIN_CHUNK:
         return text, None
     if have > size - start:
-        raise InputError(f"{path}: truncated: its buffer needs {have} bytes but has {size - start}")
+        raise InputError(f"{path}: truncated: its buffer should have {have} bytes, but {size - start} are left")
     return text, (start, have)
 
 

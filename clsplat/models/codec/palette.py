@@ -21,11 +21,11 @@ PRINCIPAL_AXIS_SAMPLES, POWER_ITERATIONS = 128, 30
 
 
 def codebook(values: NDArray[np.float32], size: int = 256) -> Float32:
-    """Codebook (size,) in ascending order that approximates values by their nearest entry with a small squared error.
+    """Return `size` ascending numbers, chosen so that replacing each value by the nearest makes a small squared error.
 
     If there are more distinct values than entries, the density of the initial entries is proportional to the cube root
-    of the density of the values. This is optimal for many entries (Panter and Dite 1951). Lloyd iterations improve the
-    entries.
+    of the density of the values. This is optimal for many entries (Panter and Dite 1951). Lloyd iterations then improve
+    the entries.
     """
     ordered = np.sort(values.ravel())
     distinct = np.unique(ordered) if len(ordered) <= CODEBOOK_SAMPLES else _thinned(ordered)
@@ -50,18 +50,20 @@ def _thinned(ordered: Float32) -> Float32:
 
 
 def nearest(entries: NDArray[np.floating], values: NDArray[np.floating]) -> NDArray[np.intp]:
-    """Index of each value's nearest entry, in the shape of `values`. The entries must ascend."""
+    """Index of the entry nearest to each value, in the shape of `values`. The entries must be in ascending order."""
     return np.searchsorted((entries[1:] + entries[:-1]) / 2, values)
 
 
 def palette(
     vectors: Float32, size: int, iterations: int = 10, progress: Callable[[float], None] = lambda part: None
 ) -> tuple[Float32, NDArray[np.int64]]:
-    """Palette (size, d) of vectors (n, d), and each vector's index (n,) in the palette.
+    """Return a palette (size, d) that approximates `vectors` (n, d), and the index (n,) in it of each vector's entry.
 
-    k-means on two levels. The first divides the vectors into clusters. The second divides each cluster into its share
-    of the palette's entries, which grows with its squared error. The cost is n d sqrt(size) instead of n d size.
+    The method is k-means on two levels. The first level divides the vectors into clusters. The second divides each
+    cluster further, and each part gives an entry of the palette. The larger a cluster and its squared error, the more
+    entries it gets. The cost is n d sqrt(size) instead of n d size.
 
+    iterations: largest number of Lloyd iterations of each k-means.
     progress: function that is called with the finished fraction.
     """
     count, width = vectors.shape
@@ -93,7 +95,9 @@ def palette(
 
 
 def _k_means(vectors: Float32, size: int, iterations: int) -> tuple[Float32, NDArray[np.int64]]:
-    """Centres (size, d), and the index (n,) of each vector's nearest centre, by Lloyd iterations.
+    """Divide `vectors` (n, d) into clusters. Returns their centres (size, d), and each vector's nearest centre (n,).
+
+    The method is Lloyd's, with at most `iterations` iterations.
 
     If there are many vectors, the iterations use a sample of them. The initial centres lie along the direction of
     largest variance. A centre without vectors stays unchanged.
@@ -102,7 +106,7 @@ def _k_means(vectors: Float32, size: int, iterations: int) -> tuple[Float32, NDA
         return vectors.mean(axis=0, keepdims=True, dtype=np.float64).astype(np.float32), np.zeros(
             len(vectors), np.int64
         )
-    middle = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)  # centred, since float32 is coarse far from 0
+    middle = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)  # subtracted, since float32 is coarse far from 0
     centred = vectors - middle
     sample = centred[:: max(1, len(vectors) // max(CODEBOOK_SAMPLES, 8 * size))]
     order = np.argsort(np.einsum("ij,j->i", sample, _direction(sample)), kind="stable")
@@ -133,8 +137,8 @@ def _direction(vectors: Float32) -> Float32:
 def _nearest_centres(vectors: Float32, centres: Float32) -> NDArray[np.int64]:
     """Index of each vector's nearest centre, which has the smallest |c|^2 / 2 - v c = (|v - c|^2 - |v|^2) / 2.
 
-    The tiles are so small that the BLAS library does not split them among threads. Threads would make the search
-    several times slower on a busy machine.
+    The products v c are computed in blocks so small that the BLAS library does not split them among threads. Threads
+    would make the search several times slower on a busy machine.
     """
     halves = np.float32(0.5) * np.einsum("ij,ij->i", centres, centres)
     columns = [

@@ -79,7 +79,8 @@ class PlyHeader:
     path: the file, for messages.
     format: "ascii" or a key of PLY_BYTE_ORDERS.
     size: the header's length in bytes, `end_header` included.
-    origin: `Gaussians.origin`, for the means in the element `ply.LOCAL_MEANS_ELEMENT`; None if the file has none.
+    origin: point in the world that the means in the element `ply.LOCAL_MEANS_ELEMENT` are relative to; None if no
+        comment states it.
     near, by_rays: `Gaussians.near` and `Gaussians.by_rays`, from the header's comments.
     """
 
@@ -148,7 +149,7 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
     for line in _header_lines(file, path):
         words = line.decode("ascii", "replace").split()
         if not words or words[0] in ("comment", "obj_info"):
-            given = numbers(words[3:])  # empty for other comments, which are not numbers
+            given = numbers(words[3:])  # empty in comments of other kinds, which have words here
             if words[:3] == ORIGIN_COMMENT:
                 origin = given if len(given) == 3 and np.isfinite(given).all() else None
             if words[:3] == NEAR_PLANE_COMMENT:
@@ -182,12 +183,12 @@ Block = dict[str, NDArray[Any]]
 
 
 def read_vertices(file: BinaryIO, header: PlyHeader, what: str) -> Iterator[Block]:
-    """Yield the vertices in blocks of rows. A block has the column of each property, by the property's name.
+    """Yield the vertices in blocks of rows. A block maps each property's name to its column.
 
-    The file's length is checked before the first block, so the caller may then allocate `count` rows. The check is
-    exact for a binary file; an ascii file must have at least two bytes per number. Raises InputError.
+    The file's length is checked before the first block, so the caller may then allocate memory for all vertices. The
+    check is exact for a binary file; an ascii file must have at least two bytes per number. Raises InputError.
 
-    what: noun for a vertex, for messages.
+    what: noun for one vertex in messages, such as "Gaussian".
     """
     path, vertex = header.path, header.vertex
     names = [name for name, _ in vertex.properties]
@@ -230,9 +231,9 @@ def _text_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
 
 
 def _parse_row(words: list[bytes], where: str) -> list[float]:
-    """Numbers of a row of text. They may be non-finite as Microsoft's C library writes them, such as 1.#INF.
+    """Parse a row of numbers. NaN and infinity may be written as by Microsoft's C library, such as 1.#INF.
 
-    Raises InputError, prefixed with `where`.
+    Raises InputError, prefixed with `where`, for any other text.
     """
     found = []
     for word in words:
@@ -263,7 +264,7 @@ def _ascii_blocks(file: BinaryIO, header: PlyHeader, what: str) -> Iterator[Bloc
             if len(words) != width:
                 raise InputError(f"{path}: {what} {first + index} has {len(words)} values, expected {width}")
             if max(map(len, words), default=0) > MAX_NUMBER_TEXT_BYTES:
-                raise InputError(f"{path}: {what} {first + index} has a value that is no number")
+                raise InputError(f"{path}: {what} {first + index} has a value that is not a number")
         if len(rows) < count:
             raise InputError(f"{path}: truncated: has {first + len(rows)} {what}s, expected {vertex.count}")
         if too_many:

@@ -27,7 +27,7 @@ Activated = Literal["opacities", "scales", "both"]
 """Values that a file stores as opacities instead of logits, or as scales instead of logs."""
 
 DRAWN_QUATERNION_SQUARES = (1e-29, 1e29)
-"""Squared lengths of quaternions that are left as they are; project.cl accepts 1e-30 to 1e30."""
+"""Range of the squared lengths of quaternions that are left as they are; project.cl accepts 1e-30 to 1e30."""
 MIN_GAUSSIANS_FOR_ENCODING_WARNINGS = 100
 """Least number of Gaussians from whose values the encoding can be guessed."""
 BYTE_LOGIT_ERROR = 0.02
@@ -35,7 +35,7 @@ BYTE_LOGIT_ERROR = 0.02
 LARGEST_USEFUL_LOGIT = 20.0
 """Largest logit that changes an opacity in float32. Opacities stored as levels from 0 to 255 exceed it."""
 MAX_HANDMADE_LOGITS = 10
-"""Largest number of distinct logits in a handmade model."""
+"""A model with at most this many distinct logits is taken to be made by hand and not trained."""
 TRAINED_OPACITY_SPREAD = (0.35, 0.93)
 """Two bounds. In a trained model, 1 % of the opacities are below the first even after pruning, and the largest is above
 the second.
@@ -60,7 +60,7 @@ about equal on both sides.
 
 
 def replace_infinities(gaussians: Gaussians) -> None:
-    """Replace infinite logits, of opacities 0 and 1, and infinite log scales, of scales 0, by finite ones, in place."""
+    """Replace infinite logits (opacities 0 and 1) and log scales of -inf (scales of 0) by finite values, in place."""
     logits, scales = gaussians.opacity_logits, gaussians.log_scales
     if not values.all_finite(logits):
         ends = values.logits(np.array([0.0, 1.0]))
@@ -86,7 +86,7 @@ def without_rotation(gaussians: Gaussians) -> NDArray[np.bool_]:
 def repaired(gaussians: Gaussians, where: Path | str, activated: Activated | None = None) -> Gaussians:
     """Repair or leave out Gaussians with invalid values (see the module). Works in place unless some are left out.
 
-    activated: values to convert to logits or logs, because the file stores opacities or scales.
+    activated: what the file stores as opacities or scales, and is converted to logits or logs; None for nothing.
     where: prefix of messages.
     Warns once for each kind of repair, with the Gaussians' indices in the file. Raises InputError if no Gaussian is
     left.
@@ -106,7 +106,7 @@ def repaired(gaussians: Gaussians, where: Path | str, activated: Activated | Non
             f"{name} of Gaussian {first}"
         )
         if bad == len(good):
-            raise InputError(f"{found}; expected some that are finite; is it damaged?")
+            raise InputError(f"{found}; expected at least one with finite values; is the file damaged?")
         warn(f"{found}; {'it is' if bad == 1 else 'they are'} left out")
         gaussians = take(gaussians, good)
     _turn(gaussians, numbers, len(good), where)
@@ -170,8 +170,8 @@ def _spread(opacities: Float32) -> bool:
 def _white(logits: Float32) -> float:
     """The stored value that stands for an opacity of 1.
 
-    It is 100 for percentages, and 255 or a wider type's maximum for levels. Both are whole numbers; their largest value
-    tells them apart (PERCENTAGE_MAXIMA). For all other values it is 1."""
+    It is 100 for percentages, and 255 or a wider type's maximum for integer levels. Percentages and levels are whole
+    numbers, told apart by the largest of them (PERCENTAGE_MAXIMA). For all other values it is 1."""
     whole = (
         logits.max() > LARGEST_USEFUL_LOGIT
         and bool((logits == np.rint(logits)).all())
@@ -206,9 +206,8 @@ def _deactivated(gaussians: Gaussians, which: Activated, numbers: NDArray[np.int
         white, most = _white(logits), float(logits.max())
         if white > PERCENTAGE_MAXIMA[1] and most < PERCENTAGE_MAXIMA[0]:
             raise InputError(
-                f"{where}: opacities are whole numbers up to {most:g}, expected 0 to 1, or some over "
-                f"{PERCENTAGE_MAXIMA[0]:g}; "
-                "these may be percentages or levels from 0 to 255"
+                f"{where}: opacities are whole numbers up to {most:g}, which may be percentages or levels from 0 to "
+                f"255; expected fractions from 0 to 1, or a largest opacity of at least {PERCENTAGE_MAXIMA[0]:g}"
             )
         opacity = logits / np.float32(white)
         near = (opacity >= -BYTE_LOGIT_ERROR) & (opacity <= 1 + BYTE_LOGIT_ERROR)

@@ -34,15 +34,15 @@ MAX_UNCHECKED_GAUSSIANS = 1 << 20
 Every real file has more bytes, because the position of a Gaussian takes several. A decompression bomb has fewer.
 """
 OTHER_QUATERNION_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-"""Row i: the components of a quaternion other than component i."""
+"""Row i lists the indices of a quaternion's components other than component i."""
 MAX_FLOAT_HIGHLIGHT = 2.0
 """Largest float colour up to which white is taken to be 1, unless all colours are whole numbers."""
 UNIT_COLOUR_SHARE = 0.95
-"""Fraction of float colours. If at least so many are at most 1, white is taken to be 1, however bright the others are.
-"""
+"""Fraction of a file's float colours. If at least this fraction is at most 1, then 1 is white, however bright the
+other colours are."""
 UNIT_RANGE_TOLERANCE = 1e-3
-"""Largest excess of colours over white (relative), and of opacities over [0, 1], from rounding to half floats or
-averaging."""
+"""Largest tolerated excess of opacities over [0, 1], and of colours over white as a fraction of white. Averaging and
+rounding to half floats cause it."""
 GAUSSIAN_ARRAY_NOUNS = ("a position", "a rotation", "a scale", "an opacity", "a colour")
 """Nouns for the arrays of `Gaussians`, for messages."""
 
@@ -60,7 +60,7 @@ def row_blocks(count: int, most: int = IO_BLOCK_ROWS) -> Iterator[slice]:
 
 
 def world_means(gaussians: Gaussians, rows: slice | NDArray[Any] = slice(None)) -> Float64:
-    """Means (n, 3) in world coordinates."""
+    """Means (n, 3) in world coordinates, of all Gaussians or of the given rows."""
     return gaussians.means[rows] + gaussians.origin
 
 
@@ -100,13 +100,13 @@ def to_log_scales(gaussians: Gaussians, where: Path | str) -> None:
 def all_to_log_scales(parts: Sequence[tuple[Path | str, Gaussians]], writer: str = "") -> None:
     """Replace the linear scales (standard deviations) of all parts of a file by their logs, in place.
 
-    If at least LOG_SCALES_MIN_NEGATIVE_SHARE of all Gaussians have a negative scale, all scales are logs already. They
-    are kept, with a warning. splat-transform wrote logs before 22 June 2026, and the review draft of
+    If at least LOG_SCALES_MIN_NEGATIVE_SHARE of all Gaussians have a negative scale, all scales are taken for logs and
+    kept, with a warning. splat-transform wrote logs before 22 June 2026, and the review draft of
     KHR_gaussian_splatting asked for them.
 
     parts: for each part of the file, a prefix for messages and the Gaussians.
     writer: name of the program that wrote the file, if it is known to write logs; otherwise "".
-    Raises InputError if some Gaussians have a negative scale, but fewer than that fraction.
+    Raises InputError if some Gaussians have a negative scale, but less than that fraction of all.
     """
     with np.errstate(invalid="ignore"):
         negative = [np.asarray((gaussians.log_scales < 0).any(axis=1)) for _, gaussians in parts]
@@ -138,7 +138,7 @@ def have(count: int) -> str:
 def logits_of(opacity: NDArray[Any], where: Path | str, numbers: int | NDArray[np.intp] = 0) -> Float32:
     """Logits from a file's opacities. NaN stays NaN.
 
-    numbers: index of each Gaussian in the file, or only of the first.
+    numbers: index in the file of each Gaussian, or of the first one if all are consecutive; for messages.
     Raises InputError for opacities outside [0, 1] by more than UNIT_RANGE_TOLERANCE.
     """
     with np.errstate(invalid="ignore"):
@@ -154,12 +154,12 @@ def logits_of(opacity: NDArray[Any], where: Path | str, numbers: int | NDArray[n
 
 
 def colours(dc: Float32) -> Float64:
-    """Colours from SH coefficients of degree 0, any shape."""
+    """Convert SH coefficients of degree 0, an array of any shape, to colours."""
     return 0.5 + SH_C0 * dc.astype(np.float64)
 
 
 def coefficients(rgb: NDArray[Any]) -> Float64:
-    """SH coefficients of degree 0 from colours, any shape."""
+    """Convert colours, an array of any shape, to SH coefficients of degree 0."""
     return (np.asarray(rgb, np.float64) - 0.5) / SH_C0
 
 
@@ -224,8 +224,8 @@ def leave_out_largest(unit: Float64) -> tuple[NDArray[np.intp], Float64]:
 def at_ends(between: NDArray[Any], low: NDArray[Any], high: NDArray[Any], part: NDArray[Any]) -> NDArray[Any]:
     """Replace the NaNs of an interpolation that come from infinite bounds.
 
-    between: the interpolation, low + part * (high - low), with `part` from 0 to 1.
-    If a bound is infinite, the result is `low` at 0, `high` at 1, and infinite between them.
+    between: the interpolated values, low + part * (high - low), with `part` from 0 to 1.
+    Where `low` or `high` is infinite, the result is `low` if `part` is 0, `high` if it is 1, and otherwise low + high.
     """
     finite = np.isfinite(low) & np.isfinite(high)
     if finite.all():
@@ -236,7 +236,7 @@ def at_ends(between: NDArray[Any], low: NDArray[Any], high: NDArray[Any], part: 
 
 
 def read_rows(file: BinaryIO, kind: np.dtype[Any], count: int, path: Path) -> NDArray[Any]:
-    """Read the next `count` records of a file. Raises InputError if the file has fewer."""
+    """Read the next `count` records of dtype `kind` from a file. Raises InputError if the file has fewer."""
     data = file.read(count * kind.itemsize)
     if len(data) != count * kind.itemsize:
         raise InputError(f"{path}: truncated while it was read")
@@ -250,7 +250,7 @@ def all_finite(array: NDArray[Any]) -> bool:
 
 
 def check_writable(path: Path, gaussians: Gaussians, *, least: int = 0, first: int = 0) -> None:
-    """Check Gaussians before they are written to `path`. first: number of the first one in the file, for messages.
+    """Check Gaussians before they are written to `path`. first: index in the file of the first, for messages.
 
     Raises ValueError for invalid arrays (`Gaussians.check`), InputError for non-finite values and for fewer than
     `least` Gaussians.

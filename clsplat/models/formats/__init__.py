@@ -84,7 +84,7 @@ UNIT_QUATERNION_LOSS = "nothing but the quaternions' lengths and the logits of o
 _ZIPPED_MODEL = zipped.ZipReader(
     lambda path: is_model_name(path) and path.suffix.lower() != ZIP_SUFFIX,
     lambda path, head: _has_mark(path, head),  # noqa: PLW0108
-    lambda path: resolve(path),  # noqa: PLW0108  # defined below the table
+    lambda path: resolve(path),  # noqa: PLW0108  # `resolve` is defined below
 )
 
 MODEL_FORMATS: tuple[Format, ...] = (
@@ -120,7 +120,7 @@ def suffixes(*, writable: bool = False) -> list[str]:
 
 
 def _named(path: Path) -> Format | None:
-    """Format whose suffix matches the file's name, the longest suffix first; None if none matches."""
+    """Format with the longest suffix that the file's name ends with; None if it ends with no format's suffix."""
     name = path.name.lower()
     fits = [
         (len(suffix), row)
@@ -132,7 +132,10 @@ def _named(path: Path) -> Format | None:
 
 
 def format_of_name(path: str | os.PathLike[str], *, writable: bool = False) -> Format:
-    """Format of the file's suffix. Raises InputError for an unknown suffix and, if `writable`, a read-only format."""
+    """Format that the suffix of a file's name belongs to.
+
+    Raises InputError for an unknown suffix and, if `writable`, for a read-only format.
+    """
     named = _named(Path(path))
     known = " ".join(suffixes(writable=writable))
     if named is None:
@@ -143,15 +146,16 @@ def format_of_name(path: str | os.PathLike[str], *, writable: bool = False) -> F
 
 
 def format_of(path: Path) -> Format:
-    """Format by the file's name, unless the first bytes belong to another format. Raises InputError."""
+    """Format of a file: the format of its name, unless the first bytes belong to another. Raises InputError."""
     named = _named(path)
     if named is not None and path.is_dir():  # the reader checks if a folder is valid
         return named
     with open_input(path, f"a model file with one of the suffixes {' '.join(suffixes())}") as file:
         head = file.read(FORMAT_HEAD_BYTES)
-        if head.startswith(b"ply") and b"end_header" not in head:  # long comments push the properties further down
+        if head.startswith(b"ply") and b"end_header" not in head:  # a PLY's comments may fill the head
             head += file.read(MAX_PLY_HEADER_BYTES)
-    # a format without a signature yields to the signature of another format, except to the "{" of JSON
+    # If the name is of a format without a signature, it counts unless the file begins with another format's signature.
+    # A "{", with which JSON begins, does not show another format: it may be the file's first byte by chance.
     fits = named and (named.recognises(head) if named.recognises else head.lstrip()[:1] == b"{")
     if head.startswith(zipped.ZIP_FILE_MAGIC) and (not fits or named is _row("SOG")):
         return _archive(path, named)
@@ -163,7 +167,7 @@ def _archive(path: Path, named: Format | None) -> Format:
     """Format of a zip archive whose name is not that of a .zip or OpenUSD file.
 
     The format is SOG if the archive contains SOG's meta.json, or has SOG's suffix and contains no other model.
-    Otherwise it is a zipped model.
+    Otherwise it is a zipped model. named: the format of the archive's name; None if the suffix is unknown.
     """
     names = _ZIPPED_MODEL.names(path)
     is_sog = sog.SOG_META_FILE in names or (named is _row("SOG") and not names)
@@ -175,7 +179,10 @@ def _row(name: str) -> Format:
 
 
 def _has_mark(path: Path, head: bytes) -> bool:
-    """True if a file has a model's name, and its first bytes have one of the format's `marks`."""
+    """True if a file has the name of a model format, and its first bytes, `head`, contain one of the format's `marks`.
+
+    The name is enough if the format has no marks.
+    """
     named = _named(path)
     return named is not None and (not named.marks or any(mark in head for mark in named.marks))
 
@@ -218,8 +225,8 @@ def model_path(path: Path) -> Path:
 def load(path: str | os.PathLike[str], *, activated: Activated | None = None, check_encoding: bool = True) -> Gaussians:
     """Read a model file of any format, and repair its values (`repair.repaired`).
 
-    activated: values to convert to logits or logs, because the file stores opacities or scales.
-    check_encoding: warn if the file seems to need `activated`.
+    activated: what the file stores as opacities or scales, and is converted to logits or logs; None for nothing.
+    check_encoding: warn if the values look as if `activated` were needed.
     Raises InputError.
     """
     path, row = resolve(Path(path))

@@ -121,7 +121,7 @@ def write(path: Path, gaussians: Gaussians, *, comments: Sequence[str] = ()) -> 
 
 
 def order(gaussians: Gaussians) -> NDArray[np.int64]:
-    """Index (n,) of the Gaussian in each row of a written file: along a Morton curve through the positions."""
+    """Index (n,) of the Gaussian in each row of a written file, which is sorted along a Morton curve by position."""
     return packing.morton_order(gaussians.means)
 
 
@@ -155,14 +155,14 @@ def _elements(header: ply_file.PlyHeader) -> tuple[ply_file.Element, ply_file.El
         properties = [(f"f_rest_{index}", "u1") for index in range(len(sh.properties))]
         if len(sh.properties) not in counts or set(properties) != set(sh.properties):
             raise InputError(
-                f"{path}: element sh has unknown properties, expected {' or '.join(map(str, counts))} uchars f_rest_*"
+                f"{path}: element sh has unknown properties, expected {' or '.join(map(str, counts))} f_rest_* as uchar"
             )
         if sh.count != vertex.count:
             raise InputError(f"{path}: element sh has {sh.count} rows, expected {vertex.count} like element vertex")
     for element in header.elements:
         kept = [name for name, _ in element.properties]
         if element.has_list or len(set(kept)) < len(kept):
-            raise InputError(f"{path}: element {element.name} has a list or the same property twice")
+            raise InputError(f"{path}: element {element.name} has a list property, or the same property twice")
     return chunks, vertex, sh
 
 
@@ -173,7 +173,10 @@ def _rows(file: BinaryIO, header: ply_file.PlyHeader, element: ply_file.Element,
 
 
 def _bounds(file: BinaryIO, header: ply_file.PlyHeader, chunks: ply_file.Element) -> NDArray[np.float32]:
-    """Bounds of each chunk, (chunks, 3, 2, 3): of position, log scale and colour; minimum and maximum; components."""
+    """Read the bounds of each chunk, (chunks, 3, 2, 3).
+
+    The second axis is position, log scale and colour; the third minimum and maximum; the last the component.
+    """
     table = _rows(file, header, chunks, slice(0, chunks.count))
     bounds = np.zeros((chunks.count, 18), np.float32)
     bounds[:, 15:] = 1
@@ -184,18 +187,21 @@ def _bounds(file: BinaryIO, header: ply_file.PlyHeader, chunks: ply_file.Element
 
 
 def _fields(words: NDArray[Any], layout: tuple[tuple[int, int], ...]) -> NDArray[np.float32]:
-    """Bit fields (n, fields) of words (n,), scaled to [0, 1]. layout: shift and number of bits of each field."""
+    """Bit fields (n, fields) of 32-bit words (n,), scaled to [0, 1]. layout: each field's shift and number of bits."""
     columns = [(words >> shift & (1 << bits) - 1) / np.float32((1 << bits) - 1) for shift, bits in layout]
     return np.stack(columns, axis=1).astype(np.float32)
 
 
 def _unpack(block: NDArray[Any], bounds: NDArray[np.float32], result: Gaussians, rows: slice) -> None:
-    """Unpack rows of `vertex` into the model. bounds (n, 3, 2, 3): bounds of each row's chunk, as in `_bounds`."""
+    """Unpack `block`, rows of the element `vertex`, into the given rows of the model `result`.
+
+    bounds (n, 3, 2, 3): bounds of each row's chunk, as in `_bounds`.
+    """
 
     def between(words: NDArray[Any], layout: tuple[tuple[int, int], ...], what: int) -> NDArray[np.float32]:
         part = _fields(words, layout)
         low, high = bounds[:, what, 0], bounds[:, what, 1]
-        with np.errstate(invalid="ignore"):  # infinite bounds give NaN
+        with np.errstate(invalid="ignore"):  # NaN at infinite bounds
             return packing.at_ends(low * (1 - part) + high * part, low, high, part)
 
     words = {name: block[name].astype(np.uint32) for name in PACKED_PROPERTIES}
@@ -209,7 +215,7 @@ def _unpack(block: NDArray[Any], bounds: NDArray[np.float32], result: Gaussians,
 
 
 def _values(gaussians: Gaussians, rows: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
-    """Values of Gaussians that a chunk has bounds of: position, log scale and colour, float64 (n, 3) each."""
+    """Positions, log scales and colours of Gaussians, float64 (n, 3) each. Chunks have bounds of these values."""
     return (
         packing.world_means(gaussians, rows),
         np.clip(gaussians.log_scales[rows].astype(np.float64), -MAX_LOG_SCALE, MAX_LOG_SCALE),
@@ -218,14 +224,20 @@ def _values(gaussians: Gaussians, rows: NDArray[np.int64]) -> tuple[NDArray[Any]
 
 
 def _ranges(*values: NDArray[Any]) -> NDArray[np.float32]:
-    """Bounds (chunks, 3, 2, 3) of values, as in `_bounds`. The last chunk may be partial."""
+    """Compute the bounds of each chunk, (chunks, 3, 2, 3) as in `_bounds`. The last chunk may be partial.
+
+    values: positions, log scales and colours (n, 3) of Gaussians in the file's order.
+    """
     at = np.arange(0, len(values[0]), CHUNK_GAUSSIANS)
     ends = [[np.minimum.reduceat(column, at), np.maximum.reduceat(column, at)] for column in values]
     return np.asarray(ends, np.float32).transpose(2, 0, 1, 3)
 
 
 def _pack(gaussians: Gaussians, rows: NDArray[np.int64], ranges: NDArray[np.float32]) -> NDArray[Any]:
-    """Pack Gaussians into rows of `vertex`, (n, 4) uint32. ranges: bounds of their chunks, as in `_bounds`."""
+    """Pack Gaussians into rows of the element `vertex`, (n, 4) uint32.
+
+    rows: indices of the Gaussians. ranges: bounds of their chunks, as in `_bounds`.
+    """
     bounds = ranges[np.arange(len(rows)) // CHUNK_GAUSSIANS].astype(np.float64)
 
     def fields(parts: NDArray[Any], layout: tuple[tuple[int, int], ...]) -> NDArray[np.uint32]:

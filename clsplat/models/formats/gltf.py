@@ -60,7 +60,8 @@ GLB_MAGIC = 0x46546C67
 FLOAT32_COMPONENT, UINT16_COMPONENT = 5126, 5123
 MAX_GLB_BYTES = (1 << 32) - 1
 LOG_SCALE_WRITER, LOG_SCALE_WRITER_FIXED_VERSION = re.compile(r"splat-transform v?(\d+)\.(\d+)(?:\..*)?"), (2, 7)
-"""Pattern of splat-transform's name and version, and its first version that writes scales. Earlier ones write logs."""
+"""Pattern of splat-transform's name and version, and its first version that writes linear scales. Earlier versions
+write logs of scales."""
 Rows = Callable[[slice], Array]
 """Function that returns the values of an attribute for a slice of Gaussians."""
 
@@ -81,14 +82,14 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def side_files(path: Path) -> list[Path]:
-    """The .bin file of a .gltf."""
+    """The path of the .bin file of a .gltf, in a list; empty for a .glb."""
     return [path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else []
 
 
 def read(path: Path) -> Gaussians:
     """Read all primitives with Gaussians in the scene, merged into one model. Raises InputError."""
     asset = Asset.open(path)
-    primitives = list(asset.primitives())  # a list, so that their number is checked before any is read
+    primitives = list(asset.primitives())  # as a list, all are counted before the first is read
     if not primitives:
         raise InputError(f"{path}: has no primitive with {GAUSSIAN_EXTENSION} in its scene, expected at least one")
     scaled: list[tuple[str, Gaussians]] = []
@@ -109,7 +110,10 @@ def _writer_of_logs(asset: Asset) -> str:
 
 
 def _gaussians(asset: Asset, name: str, primitive: dict[str, Any], scaled: list[tuple[str, Gaussians]]) -> Gaussians:
-    """Read the Gaussians of a primitive, in clsplat's axes. If their scales are linear, append them to `scaled`."""
+    """Read the Gaussians of a primitive, in clsplat's axes.
+
+    scaled: list to which Gaussians whose `log_scales` still holds linear scales are added, with a prefix for messages.
+    """
     said = as_object(primitive["extensions"][GAUSSIAN_EXTENSION])
     kernel, space = said.get("kernel", "ellipse"), said.get("colorSpace", GLTF_COLOR_SPACES[0])
     if kernel != "ellipse":
@@ -130,7 +134,10 @@ def _gaussians(asset: Asset, name: str, primitive: dict[str, Any], scaled: list[
 
 
 def _from_attributes(asset: Asset, name: str, indices: dict[str, Any]) -> Gaussians:
-    """Read the Gaussians of a primitive from its attributes. `log_scales` has linear scales, as the file does."""
+    """Read the Gaussians of a primitive from its attributes. Their `log_scales` still holds the file's linear scales.
+
+    name: the primitive's name, for messages. indices: for each attribute, the index of its accessor.
+    """
 
     def array(semantic: str, width: int) -> Array:
         if semantic not in indices:
@@ -149,7 +156,7 @@ def _from_attributes(asset: Asset, name: str, indices: dict[str, Any]) -> Gaussi
     coefficients = [array(semantic, 3) for band in names[: degree + 1] for semantic in band]
     for attribute in (rotation, scale, opacity, *coefficients):
         if len(attribute) != count:
-            raise InputError(f"{asset.path}: {name} has {len(attribute)} values of an attribute, expected {count}")
+            raise InputError(f"{asset.path}: {name} has {count} positions, but an attribute of {len(attribute)} values")
     result, where = values.empty(count, degree), f"{asset.path}: {name}"
     for rows in values.row_blocks(count):
         result.means[rows] = real(position[rows])
@@ -168,6 +175,7 @@ def write(
     """Write a .glb, or a .gltf with a .bin. Each file is written atomically, the .bin first.
 
     spz_compression: use the draft KHR_gaussian_splatting_compression_spz_2, which few viewers read.
+    color_space: the model's colour space, one of GLTF_COLOR_SPACES.
     Raises InputError for non-finite values, and for a .glb of more than 4 GiB.
     """
     if color_space not in GLTF_COLOR_SPACES:
@@ -197,7 +205,7 @@ def write(
 
 
 def _attributes(gaussians: Gaussians, color_space: str) -> dict[str, Rows]:
-    """Attributes by name, in the order of the buffer and in glTF's axes."""
+    """Functions that return each attribute's values in glTF's axes, by the attribute's name, in the buffer's order."""
 
     def rotation(rows: slice) -> Array:
         unit = values.unit_quaternions(gaussians.quaternions[rows]) * axes.quaternion_signs(LUF_SIGNS)
@@ -235,7 +243,7 @@ def _blocks(attributes: Iterable[Rows], count: int) -> Iterator[memoryview]:
 
 
 class GaussianNode(TypedDict):
-    """JSON object of the node that has the written mesh. translation: the model's origin, if it is not 0."""
+    """JSON object of a written file's only node. translation: the model's origin in glTF's axes, if it is not 0."""
 
     mesh: int
     translation: NotRequired[list[float]]
@@ -244,7 +252,7 @@ class GaussianNode(TypedDict):
 def _document(
     path: Path, gaussians: Gaussians, spz_compression: bool, color_space: str
 ) -> tuple[dict[str, Any], Iterable[bytes | memoryview]]:
-    """The glTF file's JSON object, without its key `buffers`, and the parts of its only buffer in order."""
+    """Build the glTF file's JSON object, still without the key `buffers`, and the contents of its only buffer."""
     count = len(gaussians)
     attributes = _attributes(gaussians, color_space)
     samples = {name: rows_of(slice(0, 1)) for name, rows_of in attributes.items()}
@@ -294,7 +302,7 @@ def _document(
 
 
 def _spz_blob(path: Path, gaussians: Gaussians) -> bytes:
-    """The model as an SPZ file, with means relative to `origin`, which is the node's translation."""
+    """Bytes of the model as an SPZ file. Its means are relative to the origin, which the node's translation adds."""
     local = replace(gaussians, origin=np.zeros(3))
     blob = io.BytesIO()
     spz.write_to(blob, local, spz.header_for(path, local, 2))

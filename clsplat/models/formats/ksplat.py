@@ -47,9 +47,9 @@ KSPLAT_SECTION_HEADER = np.dtype(
 )  # fmt: skip
 BUCKET_CENTRE_BYTES = 12
 DEFAULT_POSITION_RANGE = 32767
-"""Largest distance of a stored position from its bucket's centre, in steps, if the section's header stores 0."""
+"""Largest distance, in steps, of a stored position from its bucket's centre. A header with a 0 means this default."""
 DEFAULT_SH_BOUND = 1.5
-"""Magnitude of both SH bounds if the header stores 0."""
+"""Magnitude of the least and largest SH coefficient. A header with a 0 means this default."""
 SH_VALUES_BY_DEGREE = (0, 9, 24, 45)
 _POSITION_DTYPES, _FLOAT_DTYPES, _SH_DTYPES = ("<f4", "<u2", "<u2"), ("<f4", "<f2", "<f2"), ("<f4", "<f2", "u1")
 
@@ -61,7 +61,7 @@ class Section:
     count: number of Gaussians.
     start: byte offset of the first Gaussian.
     kind: dtype of a record.
-    step, middle: world units per unit of a stored position, and the stored position at the centre of a bucket.
+    step, middle: world units per step of a stored position, and the number of steps stored for a bucket's centre.
     centres: (buckets, 3), the buckets' centres in world units; None at level 0.
     ends: (buckets,), index of the first Gaussian after each bucket; None at level 0.
     """
@@ -124,7 +124,10 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) -> list[Section]:
-    """Read the headers of all sections, and check them against the file's size."""
+    """Read the headers of all sections, and check them against the file's size in bytes.
+
+    sections: number of sections. level: compression level.
+    """
     at = KSPLAT_HEADER.itemsize + sections * KSPLAT_SECTION_HEADER.itemsize
     if size < at:
         raise InputError(f"{path}: truncated: has {size} bytes, but its {sections} sections need {at}")
@@ -139,7 +142,7 @@ def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) 
         start = at + lengths + buckets
         end = start + kind.itemsize * head["room"]
         if head["count"] > head["room"] or end > size:
-            found = f"has {head['count']} Gaussians, where {head['room']} fit"
+            found = f"has {head['count']} Gaussians, but room for {head['room']}"
             raise InputError(f"{name} ends at byte {end} of {size}, and {found}; is the file damaged?")
         centres = ends = None
         if level:
@@ -169,14 +172,16 @@ def _record(level: int, degree: int) -> np.dtype[Any]:
 
 
 def _ends(head: dict[str, Any], partial: NDArray[np.int64], name: str) -> NDArray[np.int64]:
-    """Index of the first Gaussian after each bucket, full buckets first.
+    """Index of the first Gaussian after each bucket of a section. Full buckets come first.
 
+    head: the section's header. partial: numbers of Gaussians in the partly filled buckets.
     Raises InputError if the buckets hold fewer Gaussians than the section has.
     """
     full = head["full"]
     if full + len(partial) > head["buckets"]:
         raise InputError(
-            f"{name} has {full} full and {len(partial)} other buckets, expected at most {head['buckets']} in all"
+            f"{name} has {full} full and {len(partial)} partly filled buckets, expected at most {head['buckets']} "
+            "in all"
         )
     lengths = np.concatenate([np.full(full, head["bucket_size"], np.int64), partial])
     ends = np.cumsum(lengths)

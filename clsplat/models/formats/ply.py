@@ -57,9 +57,10 @@ ROTATION_PROPERTIES = ("rot_0", "rot_1", "rot_2", "rot_3")
 MIP_FILTER_PROPERTY = "filter_3D"
 """Property in Mip-Splatting's files: the filter size that Mip-Splatting's renderer adds to the scales."""
 LOCAL_MEANS_ELEMENT = "clsplat_local"
-"""Element with the exact means, relative to the origin."""
+"""Element of the PLY with the exact means, which are relative to the model's origin."""
 RGB_PROPERTY_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-"""Names, in upper or lower case, of the colour properties in nerfstudio's exports and point files, in place of f_dc."""
+"""Names, in upper or lower case, of the colour properties that nerfstudio's exports and point files have in place of
+f_dc."""
 REQUIRED_PLY_PROPERTIES = (*POSITION_PROPERTIES, *DC_PROPERTIES, "opacity", *SCALE_PROPERTIES, *ROTATION_PROPERTIES)
 
 
@@ -97,7 +98,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def read_whole_numbers(path: Path, name: str) -> NDArray[np.int64]:
-    """Values (n,) of an integer property, without the Gaussians that `repair.repaired` leaves out.
+    """Read the values (n,) of an integer property of all Gaussians that `repair.repaired` does not leave out.
 
     Raises InputError like `read`, and if the property is missing or has values that are not 32-bit integers.
     """
@@ -221,7 +222,7 @@ def write_rows(
 
 
 def _header(gaussians: Gaussians, count: int, names: Sequence[str], comments: Sequence[str]) -> bytes:
-    """Header of a 3DGS PLY, up to and including `end_header`. names: properties of a Gaussian."""
+    """Header of a 3DGS PLY, up to and including `end_header`. names: names of a Gaussian's properties."""
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     far = bool(gaussians.origin.any())
     if far:
@@ -247,8 +248,10 @@ def check_comments(comments: Sequence[str]) -> None:
 
 
 def _local_means(file: BinaryIO, header: PlyHeader) -> Float32 | None:
-    """Means (n, 3) of LOCAL_MEANS_ELEMENT; None if it does not follow the vertices. Raises InputError if it
-    is too short."""
+    """Read the exact means (n, 3) from the element LOCAL_MEANS_ELEMENT; None if it does not follow the vertices.
+
+    Raises InputError if the file ends within the element.
+    """
     wanted = Element(LOCAL_MEANS_ELEMENT, header.vertex.count, [(name, "f4") for name in POSITION_PROPERTIES])
     behind = len(header.before) + 1
     if header.format == "ascii" or header.elements[behind : behind + 1] != [wanted]:
@@ -266,7 +269,10 @@ def _local_means(file: BinaryIO, header: PlyHeader) -> Float32 | None:
 
 
 def _subtract_origin(origin: Float64, gaussians: Gaussians, local: Float32 | None, path: Path) -> None:
-    """Make the means relative to the origin. Uses the exact means `local` unless another tool has moved the vertex."""
+    """Make the means relative to `origin`, in place.
+
+    local: exact means (n, 3), used for all vertices that no other tool has moved since; None if the file has none.
+    """
     world = gaussians.means.astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
         means = (world - origin).astype(np.float32)
@@ -325,14 +331,14 @@ def _rgb_names(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def _convert_colours(gaussians: Gaussians, vertex: Element) -> None:
-    """Convert colours that were read in place of f_dc to SH coefficients, in place."""
+    """Convert `gaussians.sh` to SH coefficients if it holds colours, because the file has them instead of f_dc."""
     if (names := _colour_names(vertex)) != DC_PROPERTIES:
         kinds = {np.dtype(kind) for name, kind in vertex.properties if name in names}
         whole = all(kind.kind in "iu" for kind in kinds)
         levels = gaussians.sh[:, 0]
         finite = levels[np.isfinite(levels)]  # an ascii file may have non-finite values in an integer property
         kind = np.dtype("u1") if kinds == {np.dtype("u1")} else np.dtype("i8")
-        with np.errstate(invalid="ignore"):  # numbers that do not fit the type
+        with np.errstate(invalid="ignore"):  # numbers may not fit the integer type
             white = values.full_scale(finite.astype(kind) if whole else finite)
         gaussians.sh[:, 0] = values.coefficients(levels / white)
 
@@ -365,7 +371,7 @@ def _fill(gaussians: Gaussians, block: Block, rest: int) -> None:
 
 def _assemble(blocks: Iterator[Block], count: int, rest: int) -> Gaussians:
     """Copy the blocks into one model of `count` Gaussians."""
-    first = next(blocks)  # checks the count, so comes before the allocation
+    first = next(blocks)  # reading the first block checks that the file has `count` rows
     result = values.empty(count, _degree(rest))
     start = 0
     for block in chain([first], blocks):

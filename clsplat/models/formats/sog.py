@@ -71,7 +71,7 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def _is_antialiased(path: Path, meta: dict[str, Any]) -> bool:
-    """True if meta.json says in `antialias` or `model` that the model is antialiased. Warns if this is unclear."""
+    """True if a key of meta.json, such as `antialias`, says that the model is antialiased. Warns if this is unclear."""
     said = antialias.of_object(meta)
     if said.warning:
         warn(f"{path}: {SOG_META_FILE} {said.warning}")
@@ -104,7 +104,7 @@ def _opened(path: Path) -> Iterator[tuple[Path, dict[str, Any], PictureFile]]:
         try:
             archive = zipfile.ZipFile(file)
         except (zipfile.BadZipFile, ValueError, NotImplementedError, EOFError) as error:
-            raise InputError(f"{path}: is no .sog archive ({error})") from None
+            raise InputError(f"{path}: is not a .sog archive ({error})") from None
         with archive:
             members = _members(archive)
             unpacked = partial(_unpacked, path, archive, members, folder / "file.webp")
@@ -127,9 +127,9 @@ def _names(folder: Path) -> list[str]:
 
 
 def _match_case(name: str, names: Iterable[str]) -> str:
-    """The entry of `names` that equals a file's name if case is ignored, as on Windows and macOS.
+    """Return the entry of `names` that equals `name` if case is ignored, as on Windows and macOS.
 
-    It is `name` itself unless exactly one entry matches.
+    Returns `name` itself if it is an entry, and if not exactly one entry matches.
     """
     names = list(names)
     alike = [other for other in names if other.lower() == name.lower()] if name not in names else []
@@ -147,7 +147,7 @@ def _parsed(path: Path, text: str | bytes) -> dict[str, Any]:
 
 
 def _beside(path: Path, name: str, _limit: int) -> Path:
-    """The file of an image in the folder of a meta.json. Raises InputError."""
+    """Find the file of the image `name` in the folder of the meta.json `path`. Raises InputError."""
     folder = Path(os.path.realpath(path)).parent
     try:
         picture = Path(os.path.realpath(folder / name))
@@ -165,7 +165,10 @@ def _beside(path: Path, name: str, _limit: int) -> Path:
 def _unpacked(
     path: Path, archive: zipfile.ZipFile, members: dict[str, str], target: Path, name: str, limit: int
 ) -> Path:
-    """Unpack a file of a .sog, of at most `limit` bytes, to `target`. Returns `target`. members: from `_members`."""
+    """Unpack the file `name` of a .sog archive to `target`, and return `target`. members: result of `_members`.
+
+    Raises InputError if the archive lacks the file, or if it has more than `limit` bytes.
+    """
     stored = _match_case(name, members)
     try:
         with archive.open(members.get(stored, stored)) as source, target.open("wb") as file:
@@ -176,7 +179,7 @@ def _unpacked(
                     raise InputError(f"{path}: {plain(name)[:80]} has more than {limit} bytes unpacked")
                 try:
                     file.write(block)
-                    file.flush()  # a write error at the end would look like a read error
+                    file.flush()  # else close would raise write errors, as if reading had failed
                 except OSError as error:
                     raise write_error(target, error) from None
     except KeyError:
@@ -213,7 +216,7 @@ class _Meta:
         return value
 
     def numbers(self, section: str, key: str, least: int, most: int) -> NDArray[np.float64]:
-        """The list `key` of a section, of `least` to `most` numbers.
+        """Numbers of the list `key` in a section of meta.json. Raises InputError unless it has `least` to `most`.
 
         JSON has no infinity. So null stands for -inf in the logs of scales, and for NaN elsewhere.
         """
@@ -233,18 +236,18 @@ class _Meta:
         array = numbers([null if empty else number for empty, number in zip(nulls, value, strict=True)])
         if array.shape != (len(value),) or not np.isfinite(array[~np.array(nulls)]).all():
             expected = "a finite number" if count == "1" else f"{count} finite numbers"
-            raise InputError(f"{where} is no list of numbers, expected {expected}")
+            raise InputError(f"{where} is not a list of numbers, expected {expected}")
         return array
 
     def picture(self, section: str, index: int, channels: int, *, least: int | None = None) -> Bytes:
-        """Bytes (height, width, channels) of an image.
+        """Read the bytes (height, width, channels) of an image.
 
-        section, index: key of meta.json, and the image's index in its list of files.
-        least: required number of pixels; None requires one for each Gaussian.
+        section, index: a section of meta.json, and the image's index in that section's list of files.
+        least: smallest allowed number of pixels; None means one for each Gaussian.
         """
         names = self.section(section).get("files")
         if not isinstance(names, list) or len(names) <= index or not isinstance(names[index], str):
-            raise InputError(f"{self.path}: {section} in {SOG_META_FILE} has no file {index}")
+            raise InputError(f"{self.path}: {section} in {SOG_META_FILE} has no file at index {index}")
         least = self.count if least is None else least
         file = self.file(names[index], MAX_UNCHECKED_IMAGE_BYTES + 8 * least)
         try:
@@ -254,7 +257,7 @@ class _Meta:
             if pixels < least or spec.nchannels < channels:
                 raise InputError(
                     f"{file}: is {spec.width} x {spec.height} with {spec.nchannels} channels, expected at least "
-                    f"{least} pixels with {channels}"
+                    f"{least} pixels with {channels} channels"
                 )
             decoded = source.read_image(oiio.UINT8)
             reason = error_of(source)
@@ -305,13 +308,15 @@ class _Meta:
         width = {"scales": (3, 3), "sh0": (4, 4), "shN": (1, 1)}[section]
         low, high = (self.numbers(section, key, *width)[:3] for key in ("mins", "maxs"))
         part = values / 255
-        with np.errstate(invalid="ignore"):  # infinite bounds give NaN
+        with np.errstate(invalid="ignore"):  # NaN at infinite bounds
             return packing.at_ends(low + (high - low) * part, low, high, part).astype(np.float32)
 
     def warn_of_nulls(self, entries: Float32, indices: Bytes) -> None:
         """Warn of nulls in the codebook of scales, except at its beginning.
 
         The entries are in increasing order, so that nulls at the beginning stand for -inf, the log of a scale of 0.
+
+        entries: the codebook, with -inf for null. indices: the Gaussians' indices (n, 3) into the codebook.
         """
         null = np.isinf(entries)
         if (count := int(null.sum())) and null[int((~null).argmax()) :].any():
@@ -323,7 +328,7 @@ class _Meta:
             )
 
     def rest(self) -> Float32:
-        """SH coefficients above degree 0, (n, K - 1, 3)."""
+        """Read the SH coefficients above degree 0, (n, K - 1, 3), from the palette and its indices."""
         labels = self.pixels("shN", 1, 2).astype(np.uint32)
         label = labels[:, 0] | labels[:, 1] << 8
         needed = int(label.max()) + 1
@@ -333,8 +338,8 @@ class _Meta:
         bands = next((degree for degree in range(1, MAX_SH_DEGREE + 1) if degree * (degree + 2) == width), 0)
         if table.shape[1] % PALETTE_COLUMNS or not bands or said not in (None, bands):
             found = f"{table.shape[1]} pixels wide for {'unstated' if said is None else str(said)[:20]} bands"
-            expected = ", ".join(f"{PALETTE_COLUMNS * d * (d + 2)} for {d}" for d in range(1, MAX_SH_DEGREE + 1))
-            raise InputError(f"{self.path}: shN's palette is {found}, expected {expected}")
+            widths = ", ".join(f"{PALETTE_COLUMNS * d * (d + 2)} for {d}" for d in range(1, MAX_SH_DEGREE + 1))
+            raise InputError(f"{self.path}: shN's palette is {found}, expected a width of {widths} bands")
         colours = table.reshape(-1, width, 3)
         if needed > len(colours):
             raise InputError(f"{self.path}: shN has the index {needed - 1}, but its palette has {len(colours)} entries")
@@ -345,7 +350,7 @@ def _unpacked_quaternions(pixels: Bytes) -> Float32:
     tag = pixels[:, 3].astype(np.int64) - QUATERNION_TAG_BASE
     three = (pixels[:, :3] * np.float32(2 / 255) - np.float32(1)) * np.float32(0.5**0.5)
     result = packing.restore_largest(np.maximum(tag, 0), three)
-    result[tag < 0] = (1, 0, 0, 0)  # the identity rotation, as in splat-transform
+    result[tag < 0] = (1, 0, 0, 0)  # without a valid index: the identity rotation, as in splat-transform
     return result
 
 
@@ -361,7 +366,7 @@ def write(
     InputError for non-finite values.
     """
     packing.check_writable(path, gaussians, least=1)
-    # an upper bound of the images' bytes: the WebP encoder crashes if the disk is full
+    # An upper bound of the images' bytes is needed, because the WebP encoder crashes if the disk is full.
     room = 24 * len(gaussians) + 64 * min(len(gaussians), MAX_PALETTE_ENTRIES) + (1 << 16)
     with scratch_folder(room) as folder:
         order = packing.morton_order(gaussians.means) if sort else slice(None)
@@ -372,7 +377,8 @@ def write(
             for picture in files:
                 atomic_write(path.with_name(picture.name), picture.read_bytes())
             atomic_write(path, text)
-            for name in {*SH_IMAGE_FILES} - {picture.name for picture in files}:  # left by a model of higher SH degree
+            # an earlier model with higher SH degree may have left these images
+            for name in {*SH_IMAGE_FILES} - {picture.name for picture in files}:
                 path.with_name(name).unlink(missing_ok=True)
             return
         total = sum(picture.stat().st_size for picture in files)
@@ -384,7 +390,11 @@ def write(
 
 
 def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int, progress: Progress) -> dict[str, Any]:
-    """Write a model's images to a folder, and return the contents of meta.json. order: Gaussian of each pixel."""
+    """Write a model's images to a folder, and return the contents of meta.json.
+
+    order: index (n,) of the Gaussian in each pixel, or a slice of all.
+    iterations: number of k-means iterations for the palette of SH coefficients.
+    """
     count = len(gaussians)
     width = 4 * math.ceil(math.sqrt(count) / 4)
     height = 4 * math.ceil(count / width / 4)
@@ -435,7 +445,7 @@ def _palette(
 ) -> dict[str, Any]:
     count, width = rest.shape[:2]
     size = min(MAX_PALETTE_ENTRIES, 1 << (count.bit_length() - 1))
-    stage = f"SOG: {size:,} sets of SH coefficients for {count:,} Gaussians"
+    stage = f"SOG: choosing {size:,} sets of SH coefficients for {count:,} Gaussians"
     progress(stage, 0.0)
     sets, labels = palette(rest.reshape(count, -1), size, iterations, lambda part: progress(stage, part))
     entries = codebook(sets)
@@ -463,7 +473,7 @@ def _write_webp(path: Path, pixels: Bytes) -> None:
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
     spec.attribute("compression", "lossless")
-    spec.attribute("oiio:UnassociatedAlpha", 1)  # so that OpenImageIO does not divide colours by alpha
+    spec.attribute("oiio:UnassociatedAlpha", 1)  # otherwise OpenImageIO divides colours by alpha
     name = native_name(path)
     output = oiio.ImageOutput.create(name)
     if output is None or not output.open(name, spec) or not output.write_image(pixels) or not output.close():

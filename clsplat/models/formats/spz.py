@@ -55,10 +55,11 @@ dependence are 11 dB worse, at 36 dB (docs/formats.md).
 ANTIALIASED_FLAG, EXTENSIONS_FLAG = 1, 2
 COORDINATE_SYSTEM_EXTENSION = 0xADBE0003
 COORDINATE_SYSTEM_SIGNS: tuple[Signs, ...] = (
-    *(RUB_SIGNS, (-1, 1, -1), (1, 1, -1), (-1, -1, -1), RUB_SIGNS),  # unspecified, LDB, RDB, LUB, RUB
+    *(RUB_SIGNS, (-1, 1, -1), (1, 1, -1), (-1, -1, -1), RUB_SIGNS),  # file's axes: unspecified, LDB, RDB, LUB, RUB
     *((-1, 1, 1), (1, 1, 1), (-1, -1, 1), (1, -1, 1)),  # LDF, RDF, LUF, RUF
 )
-"""Signs between clsplat's axes and a file's, by value of its coordinate system extension. Larger values have z up."""
+"""Factors of x, y and z that convert between clsplat's axes and a file's. The index is the value of the file's
+coordinate system extension. Larger values have z up, which clsplat does not read."""
 MAX_EXTENSION_BYTES = 1 << 20
 MAX_ZSTD_WINDOW_BYTES = 1 << 27
 """Largest window in bytes that a Zstandard frame may require: the default limit of the Zstandard library."""
@@ -71,7 +72,7 @@ class SpzHeader:
     """Header of an SPZ file.
 
     degree: SH degree.
-    fractional_bits: bits after the point of positions.
+    fractional_bits: number of bits after the binary point of a position.
     streams, table: number of Zstandard streams, and byte offset of their table; 0 before version 4.
     """
 
@@ -85,7 +86,7 @@ class SpzHeader:
 
     @property
     def widths(self) -> dict[str, int]:
-        """Bytes of each attribute of a Gaussian, in the file's order."""
+        """Number of bytes of each attribute of a Gaussian, by name and in the file's order."""
         rest = 3 * (self.degree * (self.degree + 2))
         rotations = 3 if self.version == 2 else 4
         widths = {"positions": 9, "alphas": 1, "colours": 3, "scales": 3, "rotations": rotations}
@@ -144,7 +145,10 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
 
 
 def _open(file: BinaryIO, size: int, path: Path) -> tuple[SpzHeader, Any]:
-    """Read a file's header. Also returns the stream that continues after it in versions 2 and 3; None in version 4."""
+    """Read a file's header. Returns the header, and the stream with the attributes.
+
+    The stream is None in version 4, which has a stream for each attribute (`_zstd_streams`).
+    """
     head = file.read(32)
     if head[:4] == SPZ_MAGIC and head[4:8] == struct.pack("<I", 4):
         if len(head) < 32:
@@ -179,7 +183,10 @@ def _check(header: SpzHeader, path: Path) -> None:
 
 
 def _axis_signs(extensions: bytes, path: Path) -> Signs:
-    """Signs of the axes from the extensions. An extension is its type and length, 32 bits each, and its bytes."""
+    """Factors of x, y and z between clsplat's axes and the file's, from the bytes of all extensions.
+
+    An extension consists of its type, its length in bytes (32 bits each) and its contents.
+    """
     at, system = 0, b""
     while len(extensions) - at >= 8:
         kind, length = struct.unpack_from("<II", extensions, at)
@@ -198,7 +205,7 @@ def _axis_signs(extensions: bytes, path: Path) -> Signs:
 
 @dataclass
 class _Slice:
-    """Reads at most the next `left` bytes of a file."""
+    """Stream of the next `left` bytes of a file."""
 
     file: BinaryIO
     left: int
@@ -242,7 +249,7 @@ def _next(stream: Stream, count: int, path: Path, what: str) -> bytes:
 
 
 def _rest(stream: Any, path: Path) -> bytes:
-    """Bytes after the Gaussians, at most MAX_EXTENSION_BYTES + 1. A read to the end also verifies gzip's checksum."""
+    """Read the bytes after the Gaussians, at most MAX_EXTENSION_BYTES + 1. At the end, gzip verifies its checksum."""
     with _decompressing(path, "at its end"):
         return bytes(stream.read(MAX_EXTENSION_BYTES + 1))
 
@@ -295,7 +302,7 @@ def _unpack(
 
 
 def _fixed(block: Bytes) -> Float32:
-    """Convert bytes (n, 9) to signed 24-bit integers (n, 3)."""
+    """Convert bytes (n, 9), low byte first, to signed 24-bit integers (n, 3), in float32."""
     wide = np.zeros((len(block), 3, 4), np.uint8)
     wide[:, :, 1:] = block.reshape(-1, 3, 3)
     return (wide.view("<i4")[:, :, 0] >> 8).astype(np.float32)
@@ -453,9 +460,9 @@ def _to_smallest_three(unit: Float32) -> Bytes:
 
 
 def _to_sh(rest: Float32, sh_bits: tuple[int, int]) -> Bytes:
-    """Bytes of SH coefficients (n, K - 1, 3) in clsplat's axes.
+    """Convert the SH coefficients above degree 0, (n, K - 1, 3) in clsplat's axes, to bytes.
 
-    sh_bits: number of bits of band 1 and of the higher bands.
+    sh_bits: numbers of bits to which band 1, and the higher bands, are rounded.
     """
     coefficients = rest.shape[1]
     steps = np.array([1 << (8 - sh_bits[0 if index < 3 else 1]) for index in range(coefficients)], np.int16)[:, None]

@@ -8,7 +8,8 @@ Specification: https://openusd.org/release/api/class_usd_vol_particle_field3_d_g
   do not change it. The reader applies the prims' transforms. An `origin` becomes the translation of the parent prim.
 - Values are float32 (the reader accepts half): linear scales, opacities in [0, 1], unit quaternions. SH coefficients
   are stored by Gaussian, in clsplat's order and signs.
-- Hints: perspective projection, sorted by depth along the camera's axis, as clsplat renders.
+- The writer sets the hints for other renderers to what clsplat does: perspective projection, and sorting by depth along
+  the camera's axis.
 - Colour space: as named by the attribute of the SH coefficients, their prim, or its nearest ancestor. The default is
   sRGB, as in 3DGS.
 - A prim without SH has primvars:displayColor, linear by default, and displayOpacity if it lacks opacities.
@@ -85,7 +86,7 @@ def survive(path: Path, call: str = "clsplat.models.formats.usd:read_here", **ar
 
 
 def _is_safe_text(file: BinaryIO) -> bool:
-    """True if a file is USD text that refers to no other file and has few levels, so that it cannot crash USD."""
+    """True if a file is USD text that refers to no other file and nests few prims, so that it cannot crash USD."""
     if file.read(5) != b"#usda":
         return False
     levels = 0
@@ -105,7 +106,7 @@ def _lives(call: str, arguments: str, path: str, *_: int) -> bool:
     )
     words = [sys.executable, "-c", code, path, arguments]
     done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, check=False)
-    return done.returncode in (0, 1)  # 1: a Python exception, which the caller will get too
+    return done.returncode in (0, 1)  # 1 is a Python exception, which the caller will raise too
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -130,7 +131,10 @@ def readable(path: Path) -> Iterator[None]:
 
 
 def open_stage(path: Path, name: str | Path, *load: Any) -> Any:
-    """Open the USD stage `name`, with `load` for `Usd.Stage.Open`. Raises InputError, prefixed with `path`."""
+    """Open the file `name` as a USD stage. Raises InputError, prefixed with `path`.
+
+    load: further arguments of `Usd.Stage.Open`, such as whether to load payloads.
+    """
     from pxr import Tf, Usd
 
     with suppress(Tf.ErrorException):
@@ -140,14 +144,17 @@ def open_stage(path: Path, name: str | Path, *load: Any) -> Any:
 
 
 def _open(path: Path) -> Any:
-    """Open a stage without payloads. Raises InputError unless all its layers are in the file's folder or below it."""
+    """Open a stage, but do not load its payloads.
+
+    Raises InputError unless all layers of the stage are in the file's folder or below it.
+    """
     from pxr import Ar, Usd, UsdUtils
 
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # suppresses the messages that USD would print
     stage = open_stage(path, os.path.realpath(path), Usd.Stage.LoadNone)
     folder = Path(os.path.realpath(path)).parent
     for layer in stage.GetUsedLayers():
-        file = Ar.SplitPackageRelativePathOuter(layer.realPath)[0]  # a layer in a .usdz gives the .usdz
+        file = Ar.SplitPackageRelativePathOuter(layer.realPath)[0]  # of a layer in a .usdz, the .usdz
         if file and not Path(os.path.realpath(file)).is_relative_to(folder):
             raise InputError(f"{path}: refers to {layer.realPath}, expected layers in the same folder or below it")
     del diagnostics
@@ -161,7 +168,7 @@ def read(path: Path) -> Gaussians:
 
 
 def read_here(path: Path) -> Gaussians:
-    """Read a stage like `read`, but without the test of `survive`: a damaged file may crash the process."""
+    """Read a stage like `read`, but do not call `survive` first: a damaged file may crash this process."""
     stage = _open(path)
     from pxr import Usd
 
@@ -204,7 +211,10 @@ def recorded_space(path: Path) -> str:
 
 
 def space_of(path: Path, prims: Sequence[Any]) -> str:
-    """clsplat's name for the colour space of the prims with SH; sRGB without SH. Raises InputError if they differ."""
+    """clsplat's name for the colour space of all prims that have SH coefficients; sRGB if no prim has any.
+
+    Raises InputError if the colour spaces of the prims differ.
+    """
     spaces: dict[str, object] = {}
     for prim in prims:
         if attribute := _coefficients(prim):
@@ -222,7 +232,10 @@ def _coefficients(prim: Any) -> Any:
 
 
 def _space(attribute: Any, usual: str) -> str:
-    """clsplat's name for an attribute's colour space; `usual` if neither the attribute nor a prim above names one."""
+    """clsplat's name for an attribute's colour space, which the attribute, its prim or an ancestor states.
+
+    usual: result if none of them states one.
+    """
     name, prim = str(attribute.GetColorSpace() if attribute.HasColorSpace() else ""), attribute.GetPrim()
     while not name and prim and not prim.IsPseudoRoot():
         given = prim.GetAttribute("colorSpace:name")
@@ -232,7 +245,10 @@ def _space(attribute: Any, usual: str) -> str:
 
 
 def _array(where: str, prim: Any, name: str, time: Any, width: int, count: int | None) -> Float32 | None:
-    """Values (count, width) of a prim's attribute `name` or its half variant `name`h; None if neither has a value."""
+    """Values (count, width) of a prim's attribute `name`, or of its half-float variant, whose name ends in h.
+
+    Returns None if neither attribute has a value. count: number of rows that are needed; None for all.
+    """
     for key in (name, f"{name}h"):
         attribute = prim.GetAttribute(key)
         value = attribute.Get(time) if attribute else None

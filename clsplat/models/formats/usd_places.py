@@ -73,9 +73,9 @@ class UsdPlacement:
 
     @property
     def reach(self) -> tuple[float, float] | None:
-        """First and last time sample of the transforms of the prim and its ancestors; None if there are none.
+        """First and last time sample of the transforms of the prim and its ancestors; None without time samples.
 
-        -inf and inf if an instancer has velocities.
+        The result is (-inf, inf) if an instancer that contains the prim has velocities, which apply at any time.
         """
         times = [time for prim in _above(self.prim, self.instance and self.instance.root) for time in _samples_of(prim)]
         instance = self.instance
@@ -89,7 +89,8 @@ class UsdPlacement:
 class PointInstance:
     """An instance of a prototype in a PointInstancer.
 
-    root: the prim of the prototype.
+    key: identifies the instance in its instancer.
+    root: the prototype's prim.
     """
 
     instancer: Instancer
@@ -245,10 +246,11 @@ class Instancer:
 
 @dataclass
 class _StageFindings:
-    """Prims with Gaussians, and prims that are not drawn, which a traversal of a USD stage has found.
+    """Results of a traversal of a USD stage: placements of prims with Gaussians, and prims that are not drawn.
 
     where: prefix of errors.
     kinds: type names of prims with Gaussians.
+    places: the placements in the stage's order.
     unused: descriptions, by path, of prims with Gaussians that no instance draws.
     shapes: descriptions, by path, of prims without Gaussians, which clsplat does not draw.
     """
@@ -263,7 +265,7 @@ class _StageFindings:
         """Collect the prims with Gaussians among `prims`. Raises InputError.
 
         root: prim of the prototype that contains the prims; None outside of instancers.
-        name: name of the instance.
+        instance, name: the instance that contains the prims, and its name; None and "" outside of instancers.
         chain: paths of the instancers that contain the prims.
         """
         from pxr import UsdGeom
@@ -310,8 +312,8 @@ class _StageFindings:
 def find_places(stage: Any, where: object, kinds: Collection[str]) -> tuple[list[UsdPlacement], list[str]]:
     """Placements of all prims of the types `kinds`, in the stage's order, and descriptions of prims that are not drawn.
 
-    Prims that are not drawn are those that another USD renderer would draw, and those that refer to a file that cannot
-    be opened. Raises InputError, prefixed with `where`.
+    Descriptions are of prims that other USD renderers would draw but clsplat does not, of prims with Gaussians that no
+    instance draws, and of prims that refer to a file that cannot be opened. Raises InputError, prefixed with `where`.
     """
     from pxr import Usd
 
@@ -333,14 +335,14 @@ def _lost(stage: Any) -> list[str]:
 
 
 def _of_prototypes() -> Any:
-    """USD predicate for the prims of a prototype that are drawn, including undefined prims."""
+    """USD predicate that selects the prims of a prototype that are drawn, also prims that are only overs."""
     from pxr import Usd
 
     return Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded & ~Usd.PrimIsAbstract)
 
 
 def _of_classes() -> Any:
-    """USD predicate like `_of_prototypes`, but also for prims of classes, which are never drawn."""
+    """USD predicate like `_of_prototypes` that also selects the prims of classes, which are never drawn."""
     from pxr import Usd
 
     return Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
@@ -353,7 +355,7 @@ def _code(time: float) -> Any:
 
 
 def _above(prim: Any, root: Any) -> Iterator[Any]:
-    """The prim and its ancestors, up to and including `root`, if it is given."""
+    """Yield the prim and its ancestors, up to and including `root`. If `root` is None, yield all ancestors."""
     while prim and not prim.IsPseudoRoot():
         yield prim
         if root and prim == root:
@@ -362,7 +364,10 @@ def _above(prim: Any, root: Any) -> Iterator[Any]:
 
 
 def _world_from_prim(prim: Any, instance: PointInstance | None, code: Any) -> tuple[Any, bool]:
-    """USD's matrix from a prim, in an instance or outside, to the world, and the prim's visibility."""
+    """USD's matrix from a prim to the world at a time code, and True if the prim is visible.
+
+    instance: the instance that contains the prim; None outside of instancers.
+    """
     from pxr import UsdGeom
 
     cache = UsdGeom.XformCache(code)
@@ -385,7 +390,7 @@ def _local(prim: Any, code: Any) -> Any:
 
 
 def _turn_of(matrix: Any, scales: Any) -> Any:
-    """The rotation nearest to USD's matrix after division by the scales; the quotient may have a slight shear."""
+    """Divide USD's matrix by the scales, and return the nearest rotation, since the quotient may be sheared a bit."""
     from pxr import Gf
 
     rows = np.array(matrix)[:3, :3] / np.array(scales, np.float64)[:, None]

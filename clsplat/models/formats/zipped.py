@@ -41,7 +41,7 @@ ENCRYPTED_FLAG = 1
 
 def recognises(head: bytes) -> bool:
     """True if a file begins like a zip archive."""
-    return head.startswith((ZIP_FILE_MAGIC, b"PK\x05\x06"))  # the second is of an archive without files
+    return head.startswith((ZIP_FILE_MAGIC, b"PK\x05\x06"))  # an archive without files begins with the second
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def _parts(member: zipfile.ZipInfo) -> tuple[str, ...]:
-    """Path of a file in an archive, as its folders and its name."""
+    """Split the path of a file in an archive into its folders and its name."""
     return PurePosixPath(member.filename.replace("\\", "/")).parts
 
 
@@ -171,7 +171,7 @@ def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo, folder: Path) -> 
         while block := source.read(1 << 20):  # zipfile stops at the size that the archive states
             try:
                 file.write(block)
-                file.flush()  # a write error at the end would look like a read error
+                file.flush()  # else close would raise write errors, as if reading had failed
             except OSError as error:
                 raise write_error(target, error) from None
 

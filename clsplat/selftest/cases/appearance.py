@@ -33,7 +33,7 @@ from clsplat.stages.appearance import (
 MIX_RATE_FACTOR = 0.125
 """Learning rate of colour mixes, divided by that of gains."""
 MAX_FALLOFF_OCTAVES, MAX_MIX = 16.0, 0.2
-"""Limits in the kernels: the octaves of a vignette, and the absolute value of a colour mix."""
+"""Limits in the kernels: of a vignette in octaves, and of the absolute value of a colour mix."""
 
 
 def random_gradient(rng: Generator, image: Float32) -> Float32:
@@ -42,7 +42,7 @@ def random_gradient(rng: Generator, image: Float32) -> Float32:
 
 
 def random_moments(rng: Generator, shape: tuple[int, ...], size: float) -> Float32:
-    """First and second moments of Adam, (2, *shape), for gradients near `size`; in a third of the cases zero."""
+    """First and second moments of Adam, (2, *shape), for gradients near `size`. In a third of the calls all are 0."""
     moments = np.stack([rng.standard_normal(shape) * size, rng.uniform(0.1, 1, shape) * size**2])
     return (moments * (rng.random() > 1 / 3)).astype(np.float32)
 
@@ -57,8 +57,11 @@ def frozen_pictures(bench: CaseBench, photograph_seed: int, gradient_seed: int) 
 
 
 def _random(model: ColourModel, rng: Generator, size: tuple[int, int]) -> Inputs:
-    """Random inputs: gains of 1/256 to 256, other entries up to their limits, gradients of any magnitude, and principal
-    points inside and outside the picture."""
+    """Random inputs of a colour model.
+
+    Gains are 1/256 to 256, other entries are within their limits, gradients are of any magnitude, and principal points
+    are inside and outside the picture.
+    """
     image, photograph = random_pictures(rng, size)
     by_image = random_gradient(rng, image)
     scale = float(np.abs(by_image).sum())
@@ -135,14 +138,19 @@ def _pictures_read(given: Inputs, target: DeviceArray, gradient: DeviceArray) ->
 
 
 def moment(values: Float64) -> Expected:
-    """The expected values of a moment of Adam. The bound: beta2 in float32 is off by 1e-8, which is 1e-5 of 1 - beta2 =
-    1e-3."""
+    """Expect these values of a moment of Adam.
+
+    The bound covers the error of beta2: in float32 it is off by 1e-8, which is 1e-5 of 1 - beta2 = 1e-3.
+    """
     return Expected(values, 3e-5, np.abs(values).max())
 
 
 def stepped(values: Float64, rate: float | Float64) -> Expected:
-    """The expected values after a step of Adam. The bound: the error of beta2 is 1e-5 of a step, and a sum of 16 floats
-    may nearly cancel."""
+    """Expect these values after a step of Adam with learning rate `rate`.
+
+    The bound covers the error of beta2, which is 1e-5 of a step, and gradients that are nearly cancelling sums of 16
+    floats.
+    """
     return Expected(values, 1e-4, rate + 1e-2 * np.abs(values))
 
 
@@ -154,7 +162,7 @@ def _developed(model: ColourModel, given: Inputs, squared: Float64) -> Expected:
     own, lens = entries[given.taken.photograph], lenses[given.taken.lens]
     wanted = twin.developed(photograph, own, lens, squared)
     if model.sums == GAIN_ENTRIES:
-        return Expected(wanted, 3e-7, wanted)  # two roundings: 2^log and a quotient
+        return Expected(wanted, 3e-7, wanted)  # the bound covers the roundings of 2^log and of a quotient
     white, none = np.ones_like(photograph), np.zeros_like(own)
     octaves, most = (np.log2(twin.developed(white, none, each, squared)) for each in (lens, -np.abs(lens)))
     largest = np.maximum(np.abs(wanted), photograph / np.exp2(own[:GAIN_ENTRIES])).max(axis=2, keepdims=True)

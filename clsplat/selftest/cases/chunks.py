@@ -40,7 +40,7 @@ SIZES = (1, CHUNK_ROWS + 1, CHUNK_ROWS, 3 * CHUNK_ROWS + 129, 65)
 
 
 def _some_chunks(rng: Generator, count: int) -> NDArray[np.uint32]:
-    """Choose the first chunk and about 70 % of the others. count: number of rows of the model."""
+    """Numbers of chunks at random: the first and about 70 % of the others. count: number of rows of the model."""
     taken = rng.random(-(-count // CHUNK_ROWS)) < 0.7
     taken[0] = True
     return np.flatnonzero(taken).astype(np.uint32)
@@ -51,8 +51,10 @@ def _listed(device: Device, given: Inputs) -> ChunkList:
 
 
 def _random_bounds(rng: Generator, count: int) -> Inputs:
-    """Random means and log scales: of any magnitude, infinite, or NaN. numbers: the chunks whose bounds are
-    computed."""
+    """Random inputs for bounds of chunks: means and log scales of any magnitude, infinite, or NaN.
+
+    numbers: numbers of the chunks whose bounds are computed.
+    """
     gaussians = random_scene(rng, count).gaussians
     for array in (gaussians.means, gaussians.log_scales):
         values = array * 10 ** rng.uniform(-3, 9, (count, 1))
@@ -101,11 +103,11 @@ BOUNDS_CASE = Case(
 
 MOMENTS = ("first", "second")
 CURRENT = ("current_totals", "current_largest")
-"""Statistics of contributions that each view changes."""
+"""Names of the statistics of contributions to which every view is added."""
 BEGIN = 0.5
 """Value of the statistics in CURRENT before the view."""
 STEP = 7
-"""Number of the step of Adam, from 1."""
+"""Number of the tested step of Adam. The first step of a training has number 1."""
 AREA = 2.0
 """Factor of contributions: full-resolution pixels per pixel of the image."""
 
@@ -160,14 +162,16 @@ def _frozen_steps(bench: CaseBench) -> list[Inputs]:
 
 
 def _rows(given: Inputs) -> NDArray[np.int64]:
-    """The model's rows that take part in the step, in order."""
+    """Indices of the model's rows in the chunks that take part in the step, in ascending order."""
     rows = np.arange(len(given.gaussians))
     return rows[np.isin(rows // CHUNK_ROWS, given.numbers)]
 
 
 def _slots(device: Device, projected: Projected, values: Array) -> Slots:
-    """Fill the slots of all pairs. values: (rows, SLOT_PLAIN), the values that all slots of a Gaussian have, by row of
-    the launch."""
+    """Fill the slots of all pairs with synthetic gradients.
+
+    values: (rows, SLOT_PLAIN), for each row of the launch, the values of every slot of its Gaussian.
+    """
     counts = projected.tile_counts.get().astype(np.int64)
     every = np.repeat(values, counts[: len(values)], axis=0)
     if len(every) == 0:
@@ -184,7 +188,7 @@ def _launch_step(device: Device, work: Workspace, given: Inputs) -> Read:
     contributions[: len(rows)] = given.contributions[rows]
     by_row = upload(device, contributions)
     past = counts[len(rows) :].copy()
-    # If a broken kernel shows rows past the model, statistics must not be written past its end.
+    # A faulty kernel may make rows past the model visible, but statistics have no rows there.
     counts[len(rows) :] = 0
     some = Projected(some.splats, upload(device, counts), chunks=chunks)
     screen = Screen(upload(device, np.zeros((chunks.rows, 2), np.float32)), by_row)
@@ -222,8 +226,10 @@ def _flat(model: DeviceGaussians) -> Array:
 
 
 def _twin_of_step(given: Inputs, got: Arrays) -> dict[str, Expected]:
-    """The twin's values of the listed rows after a step over the whole model. The projection and its gradient are the
-    device's, because other stages test them."""
+    """Expected values of the rows in the step's chunks: the twin's, after a step over the whole model.
+
+    The twin gets the projection and its gradient from the device, because other stages test these.
+    """
     rows, counts = _rows(given), got.pop("whole counts")
     listed = np.isin(np.arange(len(counts)), rows)
     columns = [index for index, name in enumerate(SPLAT) if name != "UNUSED"]
@@ -274,8 +280,8 @@ STATE = ("parameters", "first", "second")
 def _random_missed(rng: Generator, count: int) -> Inputs:
     """Random inputs of catch-up: moments of any magnitude, some of them zero, of which only some chunks are caught up.
 
-    last: the last step that each chunk to catch up has taken, by the chunk's number.
-    first_step: number of the table's first step, at most that of the first step that any chunk missed.
+    last: for each chunk to catch up, by its number, the number of the last step that it has taken.
+    first_step: number of the first step in `rates`. No chunk missed an earlier step.
     rates: learning rates by the step's number and by parameter group.
     every: number of steps between updates of the SH bands from degree 1 on.
     """
@@ -284,7 +290,7 @@ def _random_missed(rng: Generator, count: int) -> Inputs:
     last = {chunk: before + int(rng.integers(span)) for chunk in range(chunks) if chunk == 0 or rng.random() < 0.7}
     made: dict[str, Arrays] = {name: {} for name in STATE}
     for group, shape in group_shapes(count, int(rng.choice([1, 4, 9, 16]))).items():
-        size = 10 ** rng.uniform(-9, 6, shape)  # far above Adam's epsilon
+        size = 10 ** rng.uniform(-9, 6, shape)  # moments far above Adam's epsilon
         made["parameters"][group] = rng.standard_normal(shape).astype(np.float32)
         made["first"][group] = (rng.standard_normal(shape) * size * (rng.random(shape) < 0.9)).astype(np.float32)
         made["second"][group] = (rng.uniform(0.1, 1.0, shape) * size**2).astype(np.float32)
@@ -337,10 +343,10 @@ def _twin_of_catch_up(given: Inputs, got: Arrays) -> dict[str, Expected]:
             into.append(values.ravel())
     parameters, first, second, moves, listed = (np.concatenate(found) for found in made.values())
     wanted = {
-        # As long as a parameter moves, each step rounds it by 6e-8 of its size: up to 150 steps. The betas in float32
-        # are off by 3e-8, which is 1e-6 of a movement over some 30 steps.
+        # Parameters move for up to 150 steps, and each step rounds them by 6e-8 of their size.
+        # The betas in float32 are off by 3e-8, which changes a movement over some 30 steps by 1e-6 of it.
         "parameters": Expected(parameters, 1e-5, moves, listed),
-        # In each of up to 300 steps a moment is rounded, and beta1 or beta2 is off by up to 2.6e-8.
+        # In each of up to 300 steps a moment is rounded, and multiplied by a beta that is off by up to 2.6e-8.
         "first": Expected(first, 3e-5, np.abs(first), listed),
         "second": Expected(second, 3e-5, second, listed),
     }
@@ -367,10 +373,11 @@ MADE_WORDS = 4999
 
 
 def _records_of(words: NDArray[np.uint32], slots: NDArray[np.int64], coefficients: int) -> Inputs:
-    """A pool whose slots are filled with words, and records for some of the slots.
+    """Inputs of copies between a pool of chunks and records: the contents of the pool, and records for some slots.
 
-    slots: the slots that are copied.
+    slots: numbers of the slots that are copied.
     words: 32-bit words that fill the pool; in reverse order they fill the records.
+    coefficients: number of SH coefficients of a Gaussian.
     """
     fields: dict[str, tuple[int, ...]] = {"logit": (), "mean": (3,), "rest": (coefficients - 1, 3)}
     record = record_type(fields)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The core stages of the self-test: arithmetic, projection, tile lists, blending, and their gradients with Adam. Each
-is compared with its float64 reference on a frozen scene.
+"""The core stages of the self-test: arithmetic, projection, tile lists, blending, the gradients of projection and
+blending, and Adam. Each stage is compared with its float64 reference on a frozen scene.
 
 The reference of a stage gets the device's output of the previous stage, so that errors do not add up. The bounds of the
 errors are STAGE_BOUNDS_ULP of `selftest.result`.
@@ -162,7 +162,7 @@ def _blend(bench: CaseBench) -> StageOutcome:
     wanted, clear = bench.blend_reference()
     image, transmittance = (cropped(planes, camera)[clear] for planes in outcome.arrays[:2])
     exact = (wanted.image[clear], wanted.transmittance[clear])
-    # In a frame as small as this, a GPU divides a tile among more work-items. The bits must be the same.
+    # In so small a frame, a GPU divides a tile among more work-items than usual. The bits must be the same.
     other = blend(device, bench.work, bench.lists, bench.inputs)
     wrong = int((other.image.get() != outcome.arrays[0]).sum())
     parts = {"image": (image, exact[0]), "transmittance": (transmittance, exact[1])}
@@ -201,7 +201,10 @@ def _blend_grad(bench: CaseBench) -> StageOutcome:
 
 
 def _moments(splats: reference_project.ProjectedTwin, wanted: reference_blend.BlendGradients) -> Float64:
-    """Compute the moments (n, 6) of a slot from the twin's gradients: equations (49) and (25) to (29)."""
+    """Compute the moments (n, 6) of the Gaussians' slots from the twin's gradients.
+
+    The equations are (49) and (25) to (29) of docs/gradients.md.
+    """
     l11, l12, l22 = (WHITENING_FACTOR * splats.whitening).T
     gx, gy = -(WHITENING_FACTOR**2) * wanted.means2d.T
     u = gx / l11

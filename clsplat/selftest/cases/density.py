@@ -26,8 +26,8 @@ from clsplat.stages.project import Projected, Screen
 
 MARK_RULES = MarkRules(gradient=2.0, cut_off=(3.0, 40), large=0.5, transparent=-1.0, oversized=2.0, oversized_half=1.5)
 MIN_RADIUS_MARGIN = 1e-4
-"""Least relative distance of a radius from a whole number of pixels at which rounding cannot change the radius in whole
-pixels."""
+"""Relative distance of a radius from a whole number of pixels. Below it, rounding errors may change the radius when it
+is rounded up to whole pixels."""
 
 
 def _random(rng: Generator, count: int) -> Inputs:
@@ -74,7 +74,7 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
         radii = np.maximum(radii, np.ceil(radius))
     found = got["radii"]
     radii = np.where(doubtful & (np.abs(found - radii) <= 1), found, radii)
-    # the bound covers the rounding of a square root and two sums
+    # the bound covers the roundings of a square root and of two sums
     return {"gradient_sums": Expected(sums, 1e-6, sums), "seen": exactly(seen), "radii": exactly(radii)}
 
 
@@ -89,7 +89,10 @@ STATISTICS_CASE = Case(
 
 
 def _random_marks(rng: Generator, count: int) -> Inputs:
-    """Random statistics, scales and opacities: at the rules' thresholds, next to them, and not finite."""
+    """Random inputs of the rules that mark rows.
+
+    Statistics, scales and opacities equal a rule's threshold, are the next float to it, or are not finite.
+    """
 
     def values(*around: float, size: tuple[int, ...] = (count,)) -> Float32:
         at = np.array(around, np.float32)

@@ -17,13 +17,14 @@ from clsplat.stages.loss_terms import DepthTerm
 
 NEARNESS_SLOTS = SlotFields(nearness=True)
 DEPTH_LOSS_FACTOR = 0.125
-"""Factor of the depth loss."""
+"""Factor of the depth loss in the tested sum of losses."""
 MIN_NEARNESS_DIFFERENCE = 1e-5
-"""Least difference of nearness at which rounding does not change the sign of the gradient."""
+"""Least difference between rendered and known nearness for a pixel's gradient to be compared. Below it, rounding may
+change the gradient's sign."""
 
 
 def of_depth(bench: CaseBench) -> StageOutcome:
-    """Test the nearness of the scene and the depth loss, with synthetic known depths. A quarter of these is missing.
+    """Test the nearness of the scene, and the depth loss with synthetic known depths, of which a quarter is missing.
 
     The digest leaves out the gradients of pairs, because the order of their sums depends on the kernel shape.
     """
@@ -70,7 +71,7 @@ def of_depth(bench: CaseBench) -> StageOutcome:
 
 
 def _slots(bench: CaseBench, blended: Blended, gradient: DeviceArray) -> Array:
-    """Launch the gradient of blending, and sum each Gaussian's slots (n, fields) in float64."""
+    """Launch the gradient of blending, and return the float64 sums (n, fields) of each Gaussian's slots."""
     lists, pixels = bench.lists, (bench.inputs, blended, gradient)
     slots = blend_grad(bench.device, bench.work, lists, *pixels, fields=NEARNESS_SLOTS).get()
     sums = np.zeros((bench.model.count, NEARNESS_SLOTS.floats))

@@ -21,7 +21,8 @@ from clsplat.stages.grid import GRID_SHAPE, Grids, apply_grid, centre_grids, gri
 GRID_PHOTOGRAPH = 1
 """Index of the photograph whose grid is tested; there are two photographs."""
 MIN_LEVEL_DISTANCE = 1e-4
-"""Least distance of a luminance from a level at which rounding does not change which two levels are interpolated."""
+"""Least distance of a luminance from a level of the grid for a pixel's gradient to be compared. Below it, rounding may
+change between which two levels the grid is interpolated."""
 
 
 def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
@@ -79,7 +80,7 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
     centred = reference.centre(held)
     return {
         "seen": Expected(seen, 1.2e-6, max(1.0, terms.max())),  # the bound covers about twelve roundings
-        # sums of a hundred terms with both signs
+        # the bound covers sums of a hundred terms with both signs
         "gradient": Expected(by_image, 1e-5, compared=np.abs(level - np.rint(level)) > MIN_LEVEL_DISTANCE),
         "by grid": Expected(by_grid, 1e-5),
         "first": moment(first),

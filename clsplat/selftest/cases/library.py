@@ -47,7 +47,7 @@ from clsplat.stages.splats import ScreenGaussians, ScreenGradients, splats
 from clsplat.stages.values import ValuePass, values, values_grad
 
 VALUES_PER_GAUSSIAN = 5
-"""Number of values per Gaussian in the test: more than the three of blend.cl."""
+"""Number of values per Gaussian in the test: more than the three that blend.cl can blend."""
 WRITTEN_SPLAT_COLUMNS = {name: k for k, name in enumerate(SPLAT) if name != "UNUSED"}
 
 
@@ -124,7 +124,7 @@ def random_splats(
     """Random projected Gaussians of a few pixels, spread over an image and slightly past its edges. About a tenth has a
     radius of 0 and is culled.
 
-    Every two Gaussians have equal depths.
+    Gaussians 2 i and 2 i + 1 have equal depths.
 
     opaque: fraction of Gaussians with opacity 1, whose alpha reaches its cap.
     depth: number of values per Gaussian.
@@ -182,12 +182,12 @@ def _twin_of_splats(given: Inputs, got: Arrays) -> dict[str, Expected]:
     size = np.abs(wanted.whitenings).max(axis=1, keepdims=True, initial=0)
     logs = np.log2(opacities)
     return {
-        # three roundings, of a root and two quotients; relative to the largest entry, because l12 may be near 0
+        # the bound covers three roundings; errors are relative to a row's largest entry, because l12 may be near 0
         "whitening": Expected(wanted.whitenings, 5e-7, size, seen),
-        # the extent depends on a difference of logarithms; the tile test has 0.01 px of slack
+        # an extent depends on a difference of logarithms, which may cancel; the tile test has 0.01 px of slack for it
         "half extents": Expected(wanted.half_extents, 1e-4, 1 + wanted.half_extents, seen),
         "LOG2O": Expected(logs, 1.4e-6, 1.0, seen),  # an ulp of the logarithm changes the opacity by 1e-6
-        "means": Expected(given.means2d[seen], 6e-8, 1.0),  # the fraction of a pixel is a float32 below 1
+        "means": Expected(given.means2d[seen], 6e-8, 1.0),  # the rounded fractions of a pixel are below 1
         "values": exactly(given.values[seen]),
         "tiles of culled Gaussians": exactly(np.zeros_like(got["tiles of culled Gaussians"])),
     }
@@ -219,7 +219,7 @@ def of_values(bench: CaseBench) -> StageOutcome:
 
     def launch() -> tuple[DeviceArray, ScreenGradients]:
         pixels = bench.work.array("value_pixels", (*size, VALUES_PER_GAUSSIAN))
-        pixels.fill(0.0)  # blend.cl computes the first three
+        pixels.fill(0.0)  # so that no result of the previous run is left
         values(device, of, pixels, first=0)
         into = ScreenGradients(
             *(bench.work.array(f"by_{name}", (n, width) if width else (n,)) for name, width in widths.items())
@@ -281,7 +281,11 @@ def harmonics_inputs(device: Device, given: Inputs) -> Harmonics:
 
 
 def launch_harmonics(device: Device, work: Workspace, given: Inputs, *, add: bool = False, start: float = -7.0) -> Read:
-    """Launch harmonics and harmonics_grad. add: add to the gradients; start: value of colours and gradients before."""
+    """Launch harmonics and harmonics_grad.
+
+    add: True to add to the gradients, False to overwrite them.
+    start: value of all colours and gradients before the launches.
+    """
     inputs = harmonics_inputs(device, given)
     shapes = ((inputs.count, 3), given.sh.shape, (inputs.count, 3))
     colours, d_sh, d_directions = (allocate(device, shape, np.float32) for shape in shapes)

@@ -23,9 +23,10 @@ from clsplat.stages.target import target
 Size = tuple[int, int]
 
 ALPHA_LOSS_WEIGHT = 0.5
-"""Weight of the alpha loss."""
+"""Weight of the alpha loss in the tested sum of losses."""
 MIN_LOSS_DIFFERENCE = 1e-6
-"""Least difference of alphas or colours at which rounding does not change the sign of the gradient."""
+"""Least difference between render and photograph, in alpha or colour, for a pixel's gradient to be compared. Below it,
+rounding may change the gradient's sign."""
 
 
 def random_pictures(rng: Generator, size: Size) -> tuple[Float32, Float32]:
@@ -59,8 +60,10 @@ def _read(result: Loss, size: Size) -> Arrays:
 
 
 def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
-    """Compute the loss with the photograph as planes, then with the interleaved photograph, if the kernel can read
-    it."""
+    """Compute the loss with the photograph in planes, then with the interleaved photograph if the kernel reads it.
+
+    "photograph" in the results is the number of other results that differ between the two.
+    """
     size, background = given.size, upload(device, np.zeros(3, np.float32))
     image, photograph = (upload(device, planes_of(each)) for each in (given.image, given.photograph))
     first = _read(loss(device, work, image, photograph, *size, given.weight), size)
@@ -162,7 +165,7 @@ def _twin_of_masks(given: Inputs, got: Arrays) -> dict[str, Expected]:
         "gradient": Expected(gradient, 1e-5, compared=sure),
         "gradient by transmittance": Expected(by_left, 1e-6, compared=np.abs(1 - left - alpha) > MIN_LOSS_DIFFERENCE),
         "masked pixels": exactly(np.zeros_like(got["masked pixels"])),
-        # in masked windows, terms of SSIM cancel
+        # terms of SSIM cancel in windows with masked pixels
         "loss": Expected(np.array([total]), 1e-6, max(1.0, total, counts.size / counts.sum())),
     }
 
@@ -204,7 +207,7 @@ def _twin_of_depth_loss(given: Inputs, _: Arrays) -> dict[str, Expected]:
     nearness, aims, weights = given.wide("nearness", "aims", "weights")
     value, gradient = depth_loss(nearness, aims, weights, given.factor)
     return {
-        "gradient": Expected(gradient, 3e-7, np.abs(gradient)),  # one rounding of a product
+        "gradient": Expected(gradient, 3e-7, np.abs(gradient)),  # the bound covers one rounding of a product
         # The two pictures are equal, so the loss is the depth term alone.
         "loss": Expected(np.array([value]), 1e-6, max(1.0, value)),
     }

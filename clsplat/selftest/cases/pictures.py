@@ -53,7 +53,8 @@ DIGESTED_FEATURE_PLACES = [
 ]
 """Columns of the features that the self-test's digests cover. Other features are compared only with the twin."""
 MIN_NORMAL_COSINE = 1e-4
-"""Least cosine between a normal and the direction to the camera at which rounding does not change the visible side."""
+"""Least absolute cosine between a normal and the direction to the camera for the normal to be compared. Below it,
+rounding may change which side the camera sees."""
 MIN_TRANSMITTANCE_MARGIN = 1e-5
 """Least absolute margin for a pixel to be compared: the distance of the transmittance from 0.5 and from the ends of
 slices, and the difference between the two largest weights."""
@@ -135,8 +136,10 @@ def _deep(bench: CaseBench) -> StageOutcome:
 def random_deep_pictures(
     rng: Generator, size: tuple[int, int], count: int | None = None, bins: int | None = None
 ) -> Inputs:
-    """Random deep pictures (P, bins, H, W, 5) with 0 to `bins` slices per pixel, and weights (P, H, W) whose sum is
-    1."""
+    """Random deep pictures (P, bins, H, W, 5) with 0 to `bins` slices per pixel, and their weights (P, H, W).
+
+    The weights of each pixel add up to 1. count: number of pictures P. None chooses `count` or `bins` at random.
+    """
     count, bins = count or int(rng.choice([1, 2, 3, DEEP_PICTURES])), bins or int(rng.choice([1, 4, 7, 40]))
     shape = (count, bins, size[1], size[0])
     # Alpha is so low that some light passes all slices.
@@ -152,15 +155,17 @@ def random_deep_pictures(
 
 
 def _frozen_deep_pictures(bench: CaseBench) -> list[Inputs]:
-    """Four deep pictures: the scene's own twice, shifted, and upside down. They have equal depths, and together more
-    slices than fit."""
+    """Four deep pictures: the scene's own, a shifted copy, an upside-down copy, and an unchanged copy.
+
+    Slices of different pictures have equal depths, and all together are more than the merged picture can hold.
+    """
     planes = bench.slices.get()
     pictures = np.stack([planes, np.roll(planes, 3, axis=3), planes[:, :, ::-1], planes]).transpose(0, 1, 3, 4, 2)
     return [Inputs(pictures=pictures, weights=np.full((4, *planes.shape[2:]), 0.25, np.float32))]
 
 
 def launch_deep_merge(device: Device, work: Workspace, given: Inputs) -> Read:
-    """Launch deep_merge.cl."""
+    """Merge the deep pictures by deep_merge.cl."""
     count, bins, height, width, floats = given.pictures.shape
     planes = np.ascontiguousarray(given.pictures.transpose(0, 1, 4, 2, 3)).reshape(count, bins, floats, -1)
     weights = upload(device, np.ascontiguousarray(given.weights.reshape(count, -1)))
@@ -229,8 +234,10 @@ def _rays(bench: CaseBench) -> StageOutcome:
 
 
 def _camera_of(camera: Camera, model: CameraModel) -> Camera:
-    """A camera of this model. For a pinhole it is the frozen scene's camera along rays. For other models it is in the
-    middle of the scene, with Gaussians all around it, at the poles and on the seam too."""
+    """Camera of the given model for a frozen scene. For a pinhole it is the scene's camera, drawn along rays.
+
+    For other models it is in the middle of the scene, with Gaussians all around, also at a panorama's poles and seam.
+    """
     if model.is_pinhole:
         return camera.along_rays(by_rays=True)
     middle = np.array([0.25, -0.125, 4.0])
@@ -262,7 +269,7 @@ def _of_rays(bench: CaseBench, projection: str, camera: Camera) -> StageOutcome:
     parts = _tangent_parts(tangents, shown, splats)
     if bench.model.count <= MAX_GAUSSIANS_FOR_REFERENCE:
         picture = every_pixel.render(gaussians, camera, bench.frozen.background.astype(np.float64))
-        # The margin is larger here: float32 directions are off by 1e-7, at pixels 0.1 radians wide.
+        # The margin is three times as large, because float32 directions are off by 1e-7 at pixels 0.1 radians wide.
         clear = picture.margin > 3 * MIN_DECISION_MARGIN
         solid = clear & (picture.alpha > 0.5)
         parts["image"] = (cropped(image, camera)[clear], picture.image[clear])
@@ -276,7 +283,10 @@ def _of_rays(bench: CaseBench, projection: str, camera: Camera) -> StageOutcome:
 
 
 def _tangent_parts(tangents: reference_rays.Tangents, shown: Any, splats: Array) -> dict[str, tuple[Array, Array]]:
-    """Splat columns of the visible Gaussians: the device's values paired with the reference's."""
+    """Splat columns of the visible Gaussians, by name: the device's values paired with the reference's.
+
+    shown: mask (n,) of the visible Gaussians. splats: the device's splats of these alone.
+    """
 
     def column(*names: str) -> Array:
         return splats[:, [RAY.index(name) for name in names]]

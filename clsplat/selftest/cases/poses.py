@@ -64,8 +64,8 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Expected]:
     degree = given.gaussians.sh_degree
     wanted = reference(means, quaternions, sh, given.camera, degree, by)
     got |= {"by rotation": got["sums"][:3], "by translation": got["sums"][3:]}
-    # Terms have both signs, so a sum of 4000 terms is only about 60 times as large as one. The error is that of rounded
-    # partial sums.
+    # The bounds cover the roundings of partial sums.
+    # Terms have both signs, so that a sum of 4000 terms is only about 60 times as large as a term.
     return {"by rotation": Expected(wanted[:3], 2e-6), "by translation": Expected(wanted[3:], 2e-6)}
 
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cases of elementary functions (shared/elementary.h, shared/lanes.h), of radix and bitonic sort, of prefix sums, and
-of tile lists by append."""
+of the tile lists that the stage `append` makes."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ PROBED: dict[str, tuple[float, float, Callable[[Array], Array]]] = {
     "sigmoid": (-80.0, 80.0, lambda x: 1 / (1 + np.exp(-x))),
     "exp2": (-8.5, 0.0, np.exp2),
 }
-"""Tested functions in the order of the rows of probe_elementary: least and greatest argument, and the exact
-function."""
+"""Tested functions by name, in the order of the rows that probe_elementary writes. Each has its least and greatest
+argument, and the exact function."""
 
 
 def _random_arguments(rng: Generator, count: int) -> Inputs:
@@ -51,7 +51,7 @@ def _twin_of_probe(given: Inputs, _: Arrays) -> dict[str, Expected]:
         "exp": Expected(exact["exp"], 2.4e-7, exact["exp"]),  # 2 ulp, from the polynomial and the range reduction
         "log2": Expected(exact["log2"], 2.4e-7, np.maximum(np.abs(exact["log2"]), 1)),  # errors near 0 are absolute
         "sigmoid": Expected(exact["sigmoid"], 3.6e-7, exact["sigmoid"]),  # 3 ulp
-        "exp2": Expected(exact["exp2"], 2.1e-7, exact["exp2"]),  # 0.8e-7 of the polynomial, plus rounding
+        "exp2": Expected(exact["exp2"], 2.1e-7, exact["exp2"]),  # the polynomial's 0.8e-7, and rounding
     }
 
 
@@ -167,7 +167,7 @@ def splats_of_boxes(boxes: NDArray[np.int64], depths: NDArray[np.float32]) -> ND
 
 
 def tiles_of_boxes(boxes: NDArray[np.int64], tiles_x: int) -> list[NDArray[np.int64]]:
-    """List the numbers of each box's tiles in ascending order."""
+    """Return the numbers of each box's tiles in ascending order. tiles_x: number of tiles in a row of the image."""
     return [
         (np.arange(y0, y1)[:, None] * tiles_x + np.arange(x0, x1)).ravel() for x0, x1, y0, y1 in boxes.astype(np.int64)
     ]
@@ -207,7 +207,10 @@ def _random_boxes(rng: Generator, count: int) -> Inputs:
 
 
 def _frozen_boxes(bench: CaseBench) -> list[Inputs]:
-    """Two inputs: with different depths, and with many equal depths. Some boxes are as wide as the image."""
+    """Two inputs for tile lists: one with different depths, one with many equal depths.
+
+    Some boxes are as wide as the image.
+    """
     rng, tiles = np.random.default_rng(61), (13, 9)
     count = 4000 if bench.frozen.name == "crowd" else 400
     depths = rng.uniform(0.1, 100, count), rng.integers(1, 4, count)
@@ -240,7 +243,7 @@ def _launch_append(device: Device, work: Workspace, given: Inputs) -> Read:
 
 
 def _digits(lengths: NDArray[np.integer]) -> NDArray[np.int64]:
-    """The numbers of binary digits of the lengths."""
+    """Number of binary digits of each length."""
     return np.array([int(length).bit_length() for length in lengths], np.int64)
 
 

@@ -37,11 +37,13 @@ ADAM_RATES = {name: 2.0**-power for power, name in enumerate(PARAMETER_GROUPS, 3
 
 
 def _random_step(rng: Generator, count: int) -> Inputs:
-    """Random gradients of 1e-15 to 1e6, with moments of any magnitude or zero. rows: Adam updates all elements ("all"),
-    those with a gradient ("sparse"), or those of visible Gaussians ("late")."""
+    """Random inputs of a step of Adam: gradients of 1e-15 to 1e6, with moments of any magnitude or zero.
+
+    rows: the step updates all elements ("all"), elements with a gradient ("sparse"), or visible Gaussians ("late").
+    """
     step = int(rng.choice([1, 2, 10, 1000, 30_000, 10_000_000]))
     later, rows = step > 1, str(rng.choice(["all", "sparse", "late"]))
-    # In some vectors all rows are visible, and in some none.
+    # Some vectors of consecutive rows are all visible, some partly, and some not at all.
     visible = (rng.random(count) < 0.5) | (np.arange(count) >= 2 * count // 3)
     visible[: count // 3] = False
     made: dict[str, Arrays] = {name: {} for name in ADAM_ENDS}
@@ -80,7 +82,7 @@ def _frozen_steps(bench: CaseBench) -> list[Inputs]:
 
 
 def uploaded_groups(device: Device, arrays: Mapping[str, Arrays]) -> list[DeviceGaussians]:
-    """Upload sets of arrays by parameter group to the device."""
+    """Upload several sets of arrays, such as parameters and moments, each with one array per parameter group."""
     found = []
     for groups in arrays.values():
         count, rest, _ = groups["sh_rest"].shape
@@ -153,7 +155,7 @@ def _random_missed(rng: Generator, count: int) -> Inputs:
     last[0] = first_step
     made: dict[str, Arrays] = {name: {} for name in ("parameters", "first", "second")}
     for group, shape in group_shapes(count, int(rng.choice([1, 16]))).items():
-        size = 10 ** rng.uniform(-9, 6, shape)  # far above Adam's epsilon
+        size = 10 ** rng.uniform(-9, 6, shape)  # moments far above Adam's epsilon
         made["parameters"][group] = rng.standard_normal(shape).astype(np.float32)
         made["first"][group] = (rng.standard_normal(shape) * size * (rng.random(shape) < 0.9)).astype(np.float32)
         made["second"][group] = (rng.uniform(0.1, 1.0, shape) * size**2).astype(np.float32)
@@ -206,11 +208,11 @@ def _twin_of_settle(given: Inputs, got: Arrays) -> dict[str, Expected]:  # noqa:
     parameters, first, second, moves = (np.concatenate(found) for found in made.values())
     mark = given.step + (not given.all_rows)
     return {
-        # The bound covers a rounding of the sum and a few of the movement. The betas in float32 are off by 3e-8, which
-        # is 1e-6 of a sum over some 30 steps.
+        # The bound covers one rounding of the sum, and a few roundings of the movement.
+        # The betas in float32 are off by 3e-8, which changes a sum over some 30 steps by 1e-6 of it.
         "parameters": Expected(parameters, 3e-6, moves),
-        "first": Expected(first, 2e-5, np.abs(first)),  # beta1 is off by 2.6e-8: 7e-6 after 256 steps
-        "second": Expected(second, 1e-5, second),  # beta2 is off by 1.3e-8: 3e-6 after 256 steps
+        "first": Expected(first, 2e-5, np.abs(first)),  # beta1 is off by 2.6e-8, its power after 256 steps by 7e-6
+        "second": Expected(second, 1e-5, second),  # beta2 is off by 1.3e-8, its power after 256 steps by 3e-6
         "last": exactly(np.where(taken, mark, given.last).astype(np.uint32)),
     }
 
@@ -288,7 +290,7 @@ NOISE_CASE = Case(
 
 
 def random_scene(rng: Generator, count: int) -> Inputs:
-    """A random camera and Gaussians with SH of degree 1, most of them in front of it and some behind it."""
+    """A random camera, and Gaussians with SH of degree 1, most of them in front of the camera and some behind it."""
     rotation = Rotation.random(random_state=rng).as_matrix()
     camera = Camera(70, 50, 60.0, 65.0, 30.0, 27.0, rotation, rng.normal(size=3))
     depths = rng.uniform(1.0, 6.0, count) * np.where(np.arange(count) % 5 == 3, -1, 1)

@@ -46,7 +46,7 @@ CASES: dict[str, Case] = {
     "statistics": STATISTICS_CASE,
     "marks": MARKS_CASE,
 }
-"""Cases by name. Those with inputs from a frozen scene (`frozen`) are stages of the self-test."""
+"""Cases by name. A case with inputs from a frozen scene (`Case.frozen`) is a stage of the self-test."""
 
 OUTCOMES_BY_STAGE: dict[str, Callable[[CaseBench], StageOutcome]] = {
     **{name: case.outcome for name, case in CASES.items() if case.frozen is not None},
