@@ -55,7 +55,10 @@ class DeviceChoice:
         return services.open_device(self.selector)
 
     def trusted(self, services: Services, *stages: Sequence[str]) -> Device:
-        """Open the device and run the short self-test of `stages`. Raises InputError, DeviceError and DriverError."""
+        """Open the device and run the short self-test. Raises InputError, DeviceError and DriverError.
+
+        stages: the names of the stages to test, as one sequence; if not given, the stages of training.
+        """
         return services.require(self.open(services), *stages)
 
 
@@ -87,7 +90,7 @@ class SeveralDevices(DeviceOptions):
 
     @property
     def count(self) -> int:
-        """Number of devices named."""
+        """Number of devices that --device names."""
         return len(device_names(self.selector))
 
     def open_all(self, services: Services) -> list[Device]:

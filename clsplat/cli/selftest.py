@@ -100,9 +100,10 @@ def record(info: DeviceInfo, report: DriverReport) -> dict[str, object]:
 
 
 def _bug_report(records: list[dict[str, object]]) -> dict[str, object]:
-    """Return the content of --report: facts about the installation, and `records` with limits, failures and times.
+    """Return the content of --report: facts about the installation and about each device.
 
-    Times are measured only on devices that can be trusted.
+    records: the entry of each device (`record`), to which this adds the device's limits, failures, and times. Times are
+    measured only on devices that can be trusted.
     """
     from clsplat.cli.doctor import lines
     from clsplat.device.context import all_devices

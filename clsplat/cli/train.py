@@ -63,8 +63,8 @@ class TrainVerb(Verb):
     If not given: with --max-host-mem, cache/ in the run's folder until the training has finished; otherwise none."""
     scratch: Annotated[str | None, arg(metavar="DIR")] = None
     """Folder, on a local disk, for Gaussians that do not fit in --max-host-mem. A file in it, at most 2.2 times as
-    large as parameters and moments, stays after the training, as checkpoints need it. If not given: scratch/ in the
-    run's folder."""
+    large as the parameters and Adam's moments, stays after the training, as checkpoints need it. If not given:
+    scratch/ in the run's folder."""
     auto: Flag = False
     """Adapt settings to findings on the scene, such as --appearance exposure if the photographs' exposures differ.
     Settings given as flags stay. The findings are printed even without --auto."""
@@ -86,8 +86,8 @@ class TrainVerb(Verb):
     """Names of the settings given on the command line."""
 
     def completed(self, given: Collection[str]) -> TrainVerb:
-        """Take the settings from the resumed run, or from preset and schedule, and adapt them to the number of
-        devices."""
+        """Return the arguments with the settings of the resumed run, or of preset and schedule, for this number of
+        devices. Flags in `given` override them."""
         verb = self._with_settings(given)
         if "points" in given and verb.config.points:  # an absolute path, so that the run can be resumed from any folder
             verb = replace(verb, config=replace(verb.config, points=str(Path(verb.config.points).absolute())))

@@ -94,7 +94,7 @@ def run(verb: ViewVerb, services: Services) -> int:
     signals = handled((signal.SIGINT, *endings()), lambda *_: stopped.set())
     with signals, closing(Server(viewing, world, address)) as server:
         _print_address(server)
-        with suppress(TrialInterrupted):  # raised if Ctrl-C comes while a driver builds or tries a kernel
+        with suppress(TrialInterrupted):  # Ctrl-C raises this error while a driver builds or tries a kernel
             while not stopped.is_set():
                 if not viewing.work():
                     viewing.wait(MAX_SIGNAL_WAIT_SECONDS)

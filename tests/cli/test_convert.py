@@ -206,8 +206,8 @@ def test_psnr_before_and_after_with_cameras_that_move_along(scene: Path, tmp_pat
     assert found["after"] > 38
     assert convert(source, tmp_path / "same.ply", "--scene", scene, "--test-every", 0, "--background", "white") == 0
     said = capsys.readouterr().out
-    assert f"{len(cameras())} views" in said
-    assert "between the renders 120.00" in said, "the same numbers give the same frames"
+    assert f"PSNR of {len(cameras())} views" in said
+    assert "between the two renders: 120.00" in said, "the same numbers give the same frames"
 
 
 @pytest.mark.parametrize(
@@ -216,8 +216,8 @@ def test_psnr_before_and_after_with_cameras_that_move_along(scene: Path, tmp_pat
         (["--crop", "1,2,3"], "--crop 1,2,3: expected 6 numbers"),
         (["--crop=0,0,0,1,-1,1"], "expected X0 <= X1"),
         (["--crop=0,0,0,1,nan,1"], "expected 6 numbers"),
-        (["--crop=90,90,90,91,91,91"], "--crop: none of the 300 Gaussians remains"),
-        (["--crop-sphere", "0,0,0,-1"], "--crop-sphere: none of the 300"),
+        (["--crop=90,90,90,91,91,91"], "--crop: removes all 300 Gaussians"),
+        (["--crop-sphere", "0,0,0,-1"], "--crop-sphere: removes all 300"),
         (["--transform", "1,2"], "expected 16 numbers"),
         (["--transform", "1,0,0,0,0,2,0,0,0,0,1,0,0,0,0,1"], "not a similarity"),
         (["--scale", "0"], "--scale 0.0: expected"),

@@ -90,8 +90,8 @@ class RenderVerb(Verb):
     """Write alpha too, like --channels rgb,alpha, without a background. It is premultiplied in EXR and TIFF, straight
     in PNG."""
     exr: ExrDepth = DEFAULT_EXR_DEPTH
-    """Bits of the floats in EXR, 16 or 32, for colour, alpha and normals. Depths, positions and motion always have
-    32."""
+    """Floats in EXR files for colour, alpha and normals: half has 16 bits, float 32. Depths, positions and motion are
+    always float."""
     parts: Parts = "one"
     """one: all channels of an EXR file in one part; several: one part for colour with alpha, and one for each other
     channel."""
@@ -155,7 +155,10 @@ class RenderVerb(Verb):
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
 
     def completed(self, given: Collection[str]) -> RenderVerb:
-        """Take the rasterizer's settings from the preset, or without one from the run, and the lenses from the run."""
+        """Return the arguments with the rasterizer's settings of --preset, or else of the run, and the run's --lenses.
+
+        Flags in `given` override them. Raises InputError.
+        """
         from clsplat.models.formats import model_path
         from clsplat.runs.run import Run, is_run
 
@@ -173,7 +176,7 @@ class RenderVerb(Verb):
 
     @property
     def is_video(self) -> bool:
-        """True if all frames go into one file."""
+        """True if the output is a video, one file with all frames."""
         from clsplat.images.frame_files import VIDEO_SUFFIXES
 
         return self.extension in VIDEO_SUFFIXES
