@@ -42,7 +42,7 @@ class ColourModel:
 
     @property
     def pixel_bytes(self) -> int:
-        """Bytes of the gradient's partial sums per pixel of a photograph, padding included."""
+        """Memory of the gradient's partial sums in bytes per pixel of a photograph, padding included."""
         return -(-2 * self.sums // 3)
 
 

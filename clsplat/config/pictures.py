@@ -76,7 +76,10 @@ class FramingConfig:
             raise InputError(f"--supersample {self.supersample}: expected 1 to {_MAX_SUPERSAMPLES}")
 
     def check_model(self, model: CameraModel) -> None:
-        """Raise InputError for a panorama with a filter wider than a pixel, as it has no pixels beyond its edges."""
+        """Raise InputError if `model` is a panorama and the filter is wider than a pixel.
+
+        A panorama has no pixels beyond its edges, which such a filter needs.
+        """
         if self.supersample > 1 and self.filter != "box" and model.wraps:
             raise InputError(f"--filter {self.filter}: needs pixels beyond a panorama's edges; use --filter box")
 
@@ -114,7 +117,7 @@ class WarpConfig:
     COLMAP model or a transforms.json."""
 
     def check(self, channels: Collection[str] = ()) -> None:
-        """Raise InputError for settings that exclude each other, and for channels that distortion makes undefined."""
+        """Raise InputError if both settings are given, or if distortion makes one of `channels` undefined."""
         if self.stmap and self.distort:
             raise InputError("--stmap and --distort exclude each other: both distort the picture")
         flag = "--stmap" if self.stmap else "--distort" if self.distort else ""
@@ -207,7 +210,7 @@ class SamplingConfig:
     def sample_times(self) -> list[float]:
         """Time of each sample, in frames relative to the frame.
 
-        The times are spread over the open shutter. Without motion blur all are its middle.
+        The times are spread over the interval in which the shutter is open. Without motion blur all are its middle.
         """
         if not self.on or self.samples == 1:
             return [self.middle]
@@ -236,7 +239,7 @@ class SamplingConfig:
 def stratified_times(count: int) -> tuple[float, ...]:
     """Stratified samples of the time in (0, 1): `count` times, one in each of as many equal intervals.
 
-    The times are in the order of the ranks of van der Corput's sequence, uncorrelated with the lens samples.
+    The order of the times follows van der Corput's sequence, so that time and position on the lens are uncorrelated.
     """
     times = [0.0] * count
     by_mirrored_digits = sorted(range(count), key=lambda index: f"{index:b}"[::-1])
@@ -257,7 +260,7 @@ class PictureConfig:
     def check(self, *, whole: bool = True) -> None:
         """Raise InputError naming the first setting whose value is invalid.
 
-        whole: see `SamplingConfig.check`.
+        whole: True for complete settings; False for flags to which a USD stage may still add the focus.
         """
         self.framing.check()
         self.sampling.check(whole=whole)
@@ -322,7 +325,7 @@ Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwa
 class Encoding:
     """Encoding of picture files and videos.
 
-    depth: type of the floats in EXR files.
+    depth: type of colour, alpha and normals in EXR files: "half" or "float".
     parts: "one" part for all channels of an EXR file, or "several".
     compression: compression of EXR files.
     bits: bits per channel, 8 or 16 for PNG and TIFF, 10 or 16 for DPX.

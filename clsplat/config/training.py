@@ -63,8 +63,8 @@ class OptimiserConfig:
     sh_rest_every: int = 1
     """Steps between updates of the higher SH bands (approximate above 1)."""
     cooldown: int = 0
-    """Number of final steps over which every learning rate falls exponentially, to cooldown-to times its value. 0: the
-    rates do not fall."""
+    """Number of final steps over which every learning rate falls exponentially, to cooldown-to times its value. 0: no
+    cooldown."""
     cooldown_to: float = 0.1
     """Fraction of every learning rate that is left after the cooldown; more than 0, at most 1."""
     beta1: float = 0.9
@@ -89,11 +89,11 @@ class OptimiserConfig:
         check_rules(self, "--optimiser.", rules)
         if self.late and self.sparse:
             raise InputError("--optimiser.late: excludes --optimiser.sparse, which drops the missed steps")
-        if self.late and self.beta1**2 >= self.beta2:  # else the sum over missed steps diverges
+        if self.late and self.beta1**2 >= self.beta2:  # the sum of a parameter's missed updates diverges
             raise InputError(
                 f"--optimiser.late: expected beta1^2 < beta2, but beta1 is {self.beta1} and beta2 {self.beta2}"
             )
-        if self.means_rate > 0 and self.means_rate_end == 0:  # a rate falling log-linearly to 0 is 0 at every step
+        if self.means_rate > 0 and self.means_rate_end == 0:  # log-linear decay to 0 would be 0 at once
             raise InputError("--optimiser.means-rate-end 0.0: expected more than 0; the rate falls to it log-linearly")
 
 
@@ -219,7 +219,7 @@ class TrainConfig:
     sh_degree_every: int = 1000
     """Steps after which the SH degree in use rises by one, from 0 to sh-degree."""
     dssim_weight: float = 0.2
-    """Weight of D-SSIM (structural dissimilarity) in the loss, 0 to 1. L1 (mean absolute difference) has the rest."""
+    """Weight w of D-SSIM (structural dissimilarity) in the loss, 0 to 1. L1 (mean absolute difference) has 1 - w."""
     background: Background = "black"
     """Background behind the Gaussians and behind images with alpha. random: a new colour each step, and black in
     evaluations."""
@@ -338,7 +338,7 @@ class TrainConfig:
     two measurements in a row, training goes back to the best cameras and stops refining. At most 8 views are
     measured, when refinement begins and at every tenth of the training. Their poses are as given, or moved by the mean
     motion of the refined poses, whichever fits better. A warning at the end reports if aligning the views raises the
-    PSNR by more than this. 0 turns the measurements and the warning off. Without held-out views there are none."""
+    PSNR by more than this. 0 turns the measurements and the warning off. Without held-out views nothing is measured."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
@@ -417,9 +417,9 @@ class TrainConfig:
             raise InputError(f"--depth-maps {self.depth_maps}: no depth maps are used, expected --depth maps too")
 
     def changed(self, name: str, value: Any) -> TrainConfig:
-        """Return a copy with one setting changed.
+        """Return a copy in which the setting `name` has the value `value`.
 
-        name: such as "seed", or with its group such as "density.stop".
+        name: such as "seed", or, for a setting of a group, "density.stop".
         """
         group, dot, setting = name.partition(".")
         return replace(self, **{group: replace(getattr(self, group), **{setting: value}) if dot else value})
@@ -439,7 +439,7 @@ class TrainConfig:
         return MaskUse(self.masks, self.alpha, self.invert_masks)
 
     def rounds_photos(self, photographs: int) -> bool:
-        """True if pixels are rounded to 8 bits. photographs: number of training photographs."""
+        """True if --photos rounds pixels to 8 bits per channel. photographs: number of training photographs."""
         return self.photos == "8bit" or (self.photos == "auto" and photographs >= MANY_PHOTOGRAPHS)
 
     @property
@@ -465,7 +465,7 @@ class TrainConfig:
 
     @property
     def alpha_loss(self) -> float:
-        """Weight of the alpha loss; 0 without one."""
+        """Weight of the alpha loss; 0 unless masks or alpha channels mean transparent."""
         return self.alpha_weight if "transparent" in (self.masks, self.alpha) else 0.0
 
     def on_devices(self, count: int, *, explicit: bool) -> TrainConfig:
