@@ -47,7 +47,7 @@ class ScratchFiles:
         return self.folder / f"{self._owner}-{secrets.token_hex(4)}{SCRATCH_SUFFIX}"
 
     def is_own(self, path: Path) -> bool:
-        """True for a file that only this training can need."""
+        """True if only this training can need `path`: the name begins with `owner`, or it is in the run's scratch/."""
         inside = self._run is not None and path.parent == (self._run.path / "scratch").absolute()
         return path.name.startswith(self._owner) or inside
 
@@ -56,7 +56,7 @@ class ScratchFiles:
         return self.is_own(path) and path.parent == self.folder
 
     def follow(self, store: ChunkStore) -> None:
-        """Protect slots of a store's file that checkpoints name. Measure the file's rate if it is on a network disk."""
+        """Protect the slots of `store` that checkpoints need. Measure the speed of a file on a network disk."""
         assert store.path is not None
         path = store.path
         store.release, store.file.moved = lambda: self._release(path), self._count
