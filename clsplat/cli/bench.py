@@ -50,7 +50,7 @@ class BenchVerb(Verb):
     rasterizer: BenchSwitches = field(default_factory=BenchSwitches)
 
     def completed(self, given: Collection[str]) -> BenchVerb:
-        """Return the arguments with the rasterizer's settings of --preset, except for those in `given`."""
+        """Return the arguments with the rasterizer's settings of --preset, except for the flags that are `given`."""
         switches = RASTERIZER_PRESETS[self.preset].switches()
         return replace(self, rasterizer=with_given(switches, self.rasterizer, given, "rasterizer."))
 

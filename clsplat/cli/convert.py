@@ -85,7 +85,7 @@ class ConversionReport(TypedDict):
 
 @dataclass(frozen=True)
 class ConvertVerb(Verb):
-    """Convert a model to the format of the output file's ending, with optional edits, and report its errors.
+    """Convert a model to the format of the output file's ending, with optional edits, and report the errors.
 
     Edits are made in this order: merge, crop, prune, transform, rotate, scale, translate, drop-sh. Only --scene and
     --prune-contribution need a device. docs/formats.md describes the formats.
@@ -98,9 +98,8 @@ class ConvertVerb(Verb):
     overwrite: Flag = False
     """Replace an existing file, even the source."""
     activated: Annotated[Literal["opacities", "scales", "both"] | None, arg(metavar="opacities|scales|both")] = None
-    """Read the source's opacities (0 to 1, to 100 or to 255), its scales, or both as plain values. This is for a file
-    that stores such values instead of the usual logits and logarithms. A warning names files that seem to store
-    them."""
+    """Read the source's opacities (0 to 1, 0 to 100 or 0 to 255), its scales, or both as plain values. Use this for a
+    file that stores plain values instead of the usual logits and logarithms. A warning names files that seem to."""
     merge: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
     """Add the Gaussians of these model files."""
     crop: Annotated[str | None, arg(metavar="X0,Y0,Z0,X1,Y1,Z1")] = None
@@ -149,7 +148,7 @@ class ConvertVerb(Verb):
 
 
 def run(verb: ConvertVerb, services: Services) -> int:
-    """Convert the model and print its errors. Errors in the command line are reported before anything is written."""
+    """Convert the model and print the errors of its attributes. Checks the command line before it writes anything."""
     from clsplat.images import colour
     from clsplat.models import difference, edit
     from clsplat.models.formats import colour_space, format_of, format_of_name, load, save
@@ -199,9 +198,10 @@ def run(verb: ConvertVerb, services: Services) -> int:
     print(difference.table(result["errors"]))
     if verb.scene is not None:
         scene = result["scene"]
-        of, least = f"PSNR of {len(scene['views'])} views", scene["least_between"]
-        print(f"{of} against photographs: {scene['before']:.2f} dB before conversion, {scene['after']:.2f} dB after")
-        print(f"{of} between the two renders: {scene['between']:.2f} dB on average, {least:.2f} dB at the lowest")
+        count, before, after = len(scene["views"]), scene["before"], scene["after"]
+        print(f"PSNR of {count} views against photographs: {before:.2f} dB before conversion, {after:.2f} dB after it")
+        mean, least = scene["between"], scene["least_between"]
+        print(f"PSNR between the two renders of a view: {mean:.2f} dB on average, {least:.2f} dB at the lowest")
     return 0
 
 
@@ -241,7 +241,7 @@ def _described(path: Path, form: Format, gaussians: Gaussians) -> ModelFile:
 def _edited(
     verb: ConvertVerb, services: Services, source: NamedModel, others: Sequence[NamedModel], matrix: Float64 | None
 ) -> Gaussians:
-    """Return the source model after all edits, in the order listed by --help. Raises InputError if none remains.
+    """Return the source model after all edits, in the order listed by --help. Raises InputError if it is empty.
 
     source, others: paths and models of the source and of --merge.
     matrix: (4, 4), the transform of the edits; None if they do not transform the model.

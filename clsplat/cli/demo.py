@@ -45,7 +45,7 @@ class DemoVerb(Verb):
     """Write a town of NxM city blocks of 60 metres, without training. A larger town has the photographs of a smaller
     one, byte for byte."""
     town_photos: Annotated[int, arg(metavar="COUNT")] = TownConfig.photos
-    """Photographs of each block: three in ten straight down, four in ten at a slant, three in ten in its streets."""
+    """Photographs of each block: three in ten look straight down, four in ten at a slant, three in ten from streets."""
     town_size: Annotated[str, arg(metavar="WxH")] = f"{TownConfig.width}x{TownConfig.height}"
     """Size of the photographs in pixels."""
     town_rig: TownRig = TownConfig.rig

@@ -47,8 +47,8 @@ class EvalVerb(Verb):
     resolution: OptionalInt = None
     """Longest image side in pixels; 0 keeps the images' size up to 1600. If not given: the run's setting, else 0."""
     missing: Annotated[Missing | None, arg(metavar="few|skip|error")] = None
-    """Treatment of pictures that the scene lists but that are missing, as for train. If not given: the run's setting,
-    else few."""
+    """Handling of pictures that the scene lists but that are missing. few: at most a tenth may be missing. skip: any
+    number. error: none. If not given: the run's setting, else few."""
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
     """Background behind the Gaussians and behind images with alpha. If not given: the run's setting, else black."""
     corrected: Flag = False

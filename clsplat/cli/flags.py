@@ -93,6 +93,7 @@ def grouped_help(kind: type, prog: str, groups: Groups, width: int | None = None
 
     kind: dataclass of the verb's arguments.
     prog: the call that usage shows, such as "clsplat render".
+    groups: titles of the groups, and the flags in each.
     width: characters in a line; by default the terminal's width, at most 100.
     """
     width = min(width or shutil.get_terminal_size().columns, 100)

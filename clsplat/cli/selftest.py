@@ -32,8 +32,8 @@ class SelftestVerb(Verb):
     """Test every device: build the kernels, run each stage on frozen scenes, compare with float64 and stored digests.
 
     The exit status is 1 if a driver cannot be trusted. train, eval, render, view, bench, demo and a convert that
-    renders run a short form of this test the first time they use a device; CLSPLAT_TRUST_DRIVER=1 skips it. Kernel
-    shapes with which a driver failed are tried again here.
+    renders run a short form of this test the first time they use a device; CLSPLAT_TRUST_DRIVER=1 skips it. This verb
+    also tries again the kernel shapes with which a driver failed before.
     """
 
     device: Annotated[str | None, arg(metavar="DEVICE")] = "all"

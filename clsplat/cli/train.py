@@ -86,8 +86,8 @@ class TrainVerb(Verb):
     """Names of the settings given on the command line."""
 
     def completed(self, given: Collection[str]) -> TrainVerb:
-        """Return the arguments with the settings of the resumed run, or of preset and schedule, for this number of
-        devices. Flags in `given` override them."""
+        """Return the arguments with the settings of the resumed run, or of preset and schedule. Flags that are `given`
+        override these. A batch of 1 becomes one view per device."""
         verb = self._with_settings(given)
         if "points" in given and verb.config.points:  # an absolute path, so that the run can be resumed from any folder
             verb = replace(verb, config=replace(verb.config, points=str(Path(verb.config.points).absolute())))

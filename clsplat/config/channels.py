@@ -65,8 +65,8 @@ FRAME_CHANNELS: dict[str, Channel] = {
     "count": Channel(("count",), "whole", "count", "whole", "count", note="of Gaussians"),
     "id": Channel(("id",), "whole", "id", "whole", "index", note="of Gaussians"),
 }
-"""Channels of `--channels` except Cryptomattes, in the order of a file and of the kernels' planes. The v of motion and
-backward points up in files, whereas y points down in docs/channels.md."""
+"""Channels of `--channels` except Cryptomattes, in the order of a file and of the kernels' planes. The v of the
+channels motion and backward points up in files, whereas y points down in docs/channels.md."""
 
 CRYPTOMATTE_LAYERS = 3
 """Number of layers of a Cryptomatte. Each layer stores the ids and coverages of two objects."""

@@ -15,7 +15,7 @@ from clsplat.errors import InputError
 WHOLE_NUMBER_LIMIT = 1 << 62
 """Whole numbers must be smaller than this in magnitude, so that config.toml can hold them."""
 _BYTE_SIZE_PATTERN = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([kmgt]?)(i?b)?\s*", re.IGNORECASE)
-"""Memory size such as 1.5GiB, in groups: number, prefix, ending."""
+"""Pattern of a memory size such as 1.5GiB. Its groups are the number, the prefix (k, m, g or t) and the ending."""
 Rule = tuple[tuple[str, ...], Callable[[float], bool], str]
 """Rule for settings: names of the settings, a predicate that is True for valid values and False for NaN, and the
 expectation in words."""

@@ -210,7 +210,8 @@ class SamplingConfig:
     def sample_times(self) -> list[float]:
         """Time of each sample, in frames relative to the frame.
 
-        The times are spread over the interval in which the shutter is open. Without motion blur all are its middle.
+        The times are spread over the interval in which the shutter is open. Without motion blur all
+        are the middle of this interval.
         """
         if not self.on or self.samples == 1:
             return [self.middle]

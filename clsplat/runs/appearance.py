@@ -88,8 +88,8 @@ def looks_of_run(run: Run | None) -> Look:
 def held_out_looks(record: Mapping[str, Any] | None) -> Look:
     """Return a function that gives renders the appearance of held-out photographs.
 
-    record: content of appearance.json; None if nothing was learnt. The function returns the renders of photographs
-    that `record` does not list unchanged.
+    record: content of appearance.json; None if nothing was learnt. The function leaves a render unchanged if `record`
+    does not list the photograph.
     """
     return _looks(_rows_in(record, "held_out") if record is not None else {})
 

@@ -64,7 +64,7 @@ def locked(folder: Path, verb: str) -> Iterator[None]:
 def _take(path: Path, folder: Path) -> IO[bytes]:
     """Open the lock file `path` of `folder`, and lock it. Raises InputError if another process holds the lock."""
     while True:
-        file = open(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0)  # noqa: SIM115  # `_give_back` closes it
+        file = open(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0)  # noqa: SIM115  # `_give_back` closes the file
         try:
             try_lock(file)
         except OSError as error:

@@ -139,7 +139,13 @@ class Run:
     def save_model_rows(
         self, model: Gaussians, count: int, rows: Callable[[int, int], Gaussians], space: str = "sRGB"
     ) -> None:
-        """Write model.ply of a model that is not in memory as a whole. The arguments are those of `ply.write_rows`."""
+        """Write model.ply of a model that is not in memory as a whole.
+
+        model: Gaussians with the origin, near plane, SH degree and other properties of the whole model.
+        count: number of Gaussians of the whole model.
+        rows: function that returns the Gaussians [start, stop).
+        space: the colour space that the model was trained in.
+        """
         ply.write_rows(self.model_path, model, count, rows, comments=[comment(space)])
 
     def write_eval(self, result: Mapping[str, Any]) -> None:
@@ -207,7 +213,7 @@ class Run:
     def save_checkpoint(self, step: int, arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) -> Path:
         """Write checkpoints/step-STEP.npz atomically and keep the latest two.
 
-        arrays, state: as in `write_checkpoint`.
+        arrays, state: arrays and JSON values by name, the content of the checkpoint.
         Checkpoints of later steps are removed, because training has gone back to an earlier step.
         """
         self.checkpoints_path.mkdir(parents=True, exist_ok=True)
@@ -229,8 +235,8 @@ class Run:
     def manifests(self) -> list[tuple[Path, Manifest]]:
         """Return paths and manifests of the checkpoints whose Gaussians are in scratch files, the earliest first.
 
-        Damaged checkpoints are left out. If a checkpoint is known to be intact, later ones are left out too. Raises
-        OSError if a checkpoint cannot be read now.
+        Damaged checkpoints are left out, and so are checkpoints after the latest that was found intact. Raises OSError
+        if a checkpoint cannot be read now.
         """
         found = []
         for step, path in self.checkpoints():
@@ -326,7 +332,7 @@ def run_of(model: Path) -> Run | None:
 
 
 def check_output(path: Path, *, resume: bool, overwrite: bool) -> None:
-    """Raise InputError if a run may not be created, or with `resume` not be resumed, at `path`. Writes nothing."""
+    """Raise InputError if a run cannot be created at `path`, or not be resumed there if `resume` is True."""
     if resume and overwrite:
         raise InputError("--resume and --overwrite exclude each other")
     if path.exists() and not path.is_dir():

@@ -33,7 +33,7 @@ class ScratchFiles:
 
     folder: folder for new files, which other trainings may use too.
     owner: beginning of the files' names (`owner_of`).
-    run: run whose checkpoints name files; None without checkpoints.
+    run: run whose checkpoints need files; None if the training writes no checkpoints.
     """
 
     def __init__(self, folder: Path, owner: str, run: Run | None) -> None:
@@ -56,7 +56,7 @@ class ScratchFiles:
         return self.is_own(path) and path.parent == self.folder
 
     def follow(self, store: ChunkStore) -> None:
-        """Protect the slots of `store` that checkpoints need. Measure the speed of a file on a network disk."""
+        """Protect the slots of `store` that checkpoints need. If its file is on a network disk, measure its speed."""
         assert store.path is not None
         path = store.path
         store.release, store.file.moved = lambda: self._release(path), self._count

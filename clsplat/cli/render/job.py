@@ -286,7 +286,7 @@ def _plan_lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan])
 
 
 def _sizes(frames: Sequence[dict[str, Any]]) -> list[str]:
-    """Return the distinct picture sizes as texts. If a picture is a part of the frame, add its position there."""
+    """Return the distinct picture sizes as texts. If a picture is a part of the frame, the text gives its position."""
     sizes = {(frame["width"], frame["height"], tuple(frame.get("window", ()))) for frame in frames}
     texts = []
     for width, height, window in sorted(sizes):
@@ -303,7 +303,7 @@ def _samples(job: Job) -> str:
         words.append(f"shutter from {opens:g} to {closes:g} frames")
     words.append(f"lens in focus at {sampling.focus:g}" if sampling.has_lens else "")
     if framing.supersample > 1:
-        words.append(f"{framing.supersample}x{framing.supersample} per pixel, {framing.filter} filter")
+        words.append(f"{framing.supersample}x{framing.supersample} samples per pixel, {framing.filter} filter")
     return ", ".join(word for word in words if word)
 
 

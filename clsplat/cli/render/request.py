@@ -57,7 +57,7 @@ def checked(flags: RenderVerb) -> Request:
     Raises InputError, and DeviceError for a device that does not exist.
     """
     if flags.cameras is None:
-        check_around(flags.path, among_own=True)  # without the model, it is not known whether it has cameras
+        check_around(flags.path, among_own=True)  # assume that the run has cameras: they are read later
     channels = parse_channels(f"{flags.channels},alpha" if flags.alpha or flags.deep else flags.channels)
     check_format(flags.output, channels, video=True)
     flags.video.check()
@@ -121,7 +121,8 @@ def _check_deep(flags: RenderVerb, pictures: PictureConfig, channels: tuple[str,
     if flags.extension != ".exr":
         raise InputError(f"--deep: {flags.output} cannot hold deep samples, expected an .exr file")
     if over := [name for name in channels if name not in ("rgb", "alpha")]:
-        raise InputError(f"--deep: deep files have their own depths, but no {', '.join(over)}, expected --channels rgb")
+        names = ", ".join(over)
+        raise InputError(f"--deep: deep EXR cannot hold {names} besides its own depths, expected --channels rgb")
     if flags.parts != "one":
         raise InputError("--deep and --parts several exclude each other: a deep file has one part")
 

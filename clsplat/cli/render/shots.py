@@ -105,7 +105,8 @@ def with_stage(
     """Return picture settings with a USD stage's data window, shutter and lens, and the stage settings not applied.
 
     source: the stage's file, for messages.
-    shot: the shot read from the stage. Its first frame gives the shutter and the lens.
+    shot: the shot read from the stage, with its data window.
+    tasks: the frames of the shot. The first gives the shutter and the lens.
     Raises InputError for a data window without a pixel.
     """
     unapplied = (*_lens_unapplied(pictures.sampling, tasks), *_pixel_aspect_unapplied(tasks[0]))
