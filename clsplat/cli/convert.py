@@ -85,7 +85,7 @@ class ConversionReport(TypedDict):
 
 @dataclass(frozen=True)
 class ConvertVerb(Verb):
-    """Convert a model to the format of the output file's ending, with optional edits, and report the errors.
+    """Convert a model to the format of the output file's ending, with optional edits, and report rounding errors.
 
     Edits are made in this order: merge, crop, prune, transform, rotate, scale, translate, drop-sh. Only --scene and
     --prune-contribution need a device. docs/formats.md describes the formats.
@@ -99,7 +99,8 @@ class ConvertVerb(Verb):
     """Replace an existing file, even the source."""
     activated: Annotated[Literal["opacities", "scales", "both"] | None, arg(metavar="opacities|scales|both")] = None
     """Read the source's opacities (0 to 1, 0 to 100 or 0 to 255), its scales, or both as plain values. Use this for a
-    file that stores plain values instead of the usual logits and logarithms. A warning names files that seem to."""
+    file that stores plain values instead of the usual logits and logarithms. Files that seem to do so cause a warning.
+    """
     merge: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
     """Add the Gaussians of these model files."""
     crop: Annotated[str | None, arg(metavar="X0,Y0,Z0,X1,Y1,Z1")] = None
@@ -148,7 +149,7 @@ class ConvertVerb(Verb):
 
 
 def run(verb: ConvertVerb, services: Services) -> int:
-    """Convert the model and print the errors of its attributes. Checks the command line before it writes anything."""
+    """Convert the model and print how far values were rounded. Checks the command line before it writes anything."""
     from clsplat.images import colour
     from clsplat.models import difference, edit
     from clsplat.models.formats import colour_space, format_of, format_of_name, load, save

@@ -66,7 +66,7 @@ class DemoVerb(Verb):
     """Replace an earlier town in the output folder."""
 
     def completed(self, given: Collection[str]) -> DemoVerb:
-        """Return the arguments. Raises InputError for a flag of the town without --town, or of training with it."""
+        """Return the arguments. Raises InputError for a flag without effect, such as --iterations with --town."""
         others = ("iterations", "device") if self.town is not None else ("town_", "seed", "overwrite")
         if wrong := sorted(name for name in given if name.startswith(others)):
             flag = wrong[0].replace("_", "-")

@@ -36,7 +36,8 @@ VERBS = {
     "view": "Look at a model in the browser: the device renders, the page shows it.",
     "report": "Write a run's report: one self-contained HTML file with curves, pictures, figures and settings.",
     "compare": "Compare runs in a table: scores, Gaussians, times, and the settings that differ.",
-    "convert": "Convert a model to the format of the output file's ending, with optional edits, and report the errors.",
+    "convert": "Convert a model to the format of the output file's ending, with optional edits, and report rounding "
+    "errors.",
     "info": "Describe a model file: format, count, SH, bounds, scales, opacities, colour space and values that are "
     "not finite.",
     "bench": "Measure each stage of a frame and of a training step, and the limits of the device in the same run.",

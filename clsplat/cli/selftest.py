@@ -64,7 +64,7 @@ def run(verb: SelftestVerb, _: Services) -> int:
             print(table(report))
             print(f"This driver {report.verdict}.", flush=True)
             if report.remembered:
-                print(f"The driver's kernel shape is still not used: {report.remembered}.", flush=True)
+                print(f"The kernel shape that failed stays disabled: {report.remembered}.", flush=True)
     records = [record(info, report) for info, report in zip(devices, reports, strict=True)]
     if verb.json:
         print(json.dumps(records, indent=2))

@@ -182,7 +182,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     if earlier is not None:
         check_steps_left(earlier, config, "--iterations")
     if len(scene.points) == 1:  # initial sizes are distances between points
-        warn(f"{source}: has a single point, so that training starts with one Gaussian of almost no size")
+        warn(f"{source}: has a single point, expected several: training starts with one Gaussian of almost no size")
     changed = earlier is not None and scene_record.check(
         earlier, scene, source, config.resolution, accept=verb.accept_changes
     )
@@ -207,7 +207,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
 
 
 def _flags_of_machine(verb: TrainVerb) -> str:
-    """Return the given flags about devices and memory, as text. No file records them, so resuming needs them again."""
+    """Return the flags about devices and memory as text for the command that resumes the run. No file records them."""
     given = {
         "--device": verb.device.selector,
         "--max-device-mem": verb.device.max_device_mem,
@@ -219,7 +219,7 @@ def _flags_of_machine(verb: TrainVerb) -> str:
 
 
 def _stages(config: TrainConfig) -> tuple[str, ...]:
-    """Names of the self-test's stages that training with these settings uses."""
+    """Return the names of the self-test's stages that training with these settings uses."""
     from clsplat.selftest.result import (
         APPEARANCE_STAGES,
         CHUNK_STAGES,
@@ -265,7 +265,7 @@ def _train_run(
 ) -> None:
     """Train the run with a progress bar. If training is interrupted, the error's message says how to resume.
 
-    page: context manager that serves the viewer's page; None without --view.
+    page: function that returns a context manager, which serves the viewer's page; None without --view.
     """
     from clsplat.training.forecast import Forecast
 

@@ -102,7 +102,7 @@ def run(verb: ViewVerb, services: Services) -> int:
 
 
 def training_view(options: PageOptions) -> Callable[[Scene, TrainConfig], AbstractContextManager[TrainingView]]:
-    """Return a context manager that serves the viewer's page while a scene is trained.
+    """Return a function that opens a context, in which the viewer's page is served while a scene is trained.
 
     Raises InputError at once if the page cannot be served, before anything is trained or written.
     """

@@ -138,10 +138,10 @@ class SamplingConfig:
     """Motion blur: shutter angle in degrees, centred on the frame; 360 is the time between frames, 0 is no blur. If not
     given: the shutter of a USD stage, else none."""
     shutter_open: float | None = None
-    """Time at which the shutter opens, in frames relative to the frame, such as -0.25. Replaces --shutter-angle,
-    together with --shutter-close."""
+    """Time at which the shutter opens, in frames before (-) or after the frame's time, such as -0.25. Replaces
+    --shutter-angle, together with --shutter-close."""
     shutter_close: float | None = None
-    """Time at which the shutter closes, in frames relative to the frame, such as 0.25."""
+    """Time at which the shutter closes, in frames before (-) or after the frame's time, such as 0.25."""
     f_stop: float | None = None
     """Depth of field: f-number of the lens, such as 2.8. Its focal length is the camera's, on a sensor of
     --sensor-width. If neither this nor --aperture is given: the lens of a USD stage, else everything is in focus.
@@ -189,7 +189,7 @@ class SamplingConfig:
 
     @property
     def shutter(self) -> tuple[float, float]:
-        """Times at which the shutter opens and closes, in frames relative to the frame."""
+        """Times at which the shutter opens and closes, in frames. 0 is the time of the frame."""
         if self.shutter_open is not None and self.shutter_close is not None:
             return self.shutter_open, self.shutter_close
         half = (self.shutter_angle or 0.0) / 720
@@ -197,7 +197,7 @@ class SamplingConfig:
 
     @property
     def middle(self) -> float:
-        """Time half way between opening and closing, in frames relative to the frame."""
+        """Time half way between opening and closing of the shutter, in frames. 0 is the time of the frame."""
         begin, end = self.shutter
         return 0.5 * (begin + end)
 
@@ -208,7 +208,7 @@ class SamplingConfig:
 
     @property
     def sample_times(self) -> list[float]:
-        """Time of each sample, in frames relative to the frame.
+        """Time of each sample, in frames. 0 is the time of the frame.
 
         The times are spread over the interval in which the shutter is open. Without motion blur all
         are the middle of this interval.

@@ -29,8 +29,8 @@ Photos = Literal["auto", "exact", "8bit"]
 ViewOrderKind = Literal["random", "near"]
 
 MANY_PHOTOGRAPHS = 300
-"""Number of training photographs from which photographs are decoded when a step first needs them, not before training.
---photos auto then stores them with 8 bits per channel."""
+"""Number of training photographs that counts as many: from it on, a photograph is decoded only when a step first needs
+it, and --photos auto stores photographs with 8 bits per channel."""
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ class TrainConfig:
     """Views whose gradients are summed before the model changes. Each view still counts as a step. Learning rates and
     Adam's constants are scaled for the batch (Zhao et al. 2024). If not given: one view for each device."""
     seed: int = 0
-    """Seed of everything random. The same seed on the same device gives the same model."""
+    """Seed of all random numbers. The same seed on the same device gives the same model."""
     sh_degree: int = 3
     """Highest degree of the spherical harmonics (SH): how finely colours depend on the viewing direction, 0 (not at
     all) to 3."""
@@ -262,8 +262,8 @@ class TrainConfig:
     fewer than 300 training photographs, else 8bit."""
     view_order: ViewOrderKind = "random"
     """Order of the photographs in each pass through all of them. near: clusters of photographs that show the same
-    things, by their positions and viewing directions; four clusters take turns. More of a step's Gaussians were then in
-    view a few steps before. This may cost some PSNR."""
+    things, by their positions and viewing directions; four clusters take turns. Then a step
+    shows more of the Gaussians that were in view a few steps before. This may cost some PSNR."""
     test_every: int = TEST_EVERY
     """Every n-th view by name is held out, including the first; 0 holds out none. A data set's own split takes
     precedence."""
@@ -320,7 +320,7 @@ class TrainConfig:
     covers changes by place and brightness, such as in edited photographs. none: photographs are used unchanged."""
     appearance_rate: float = 2e-3
     """Learning rate of appearance, for base-2 logarithms of gains, or for coefficients of a grid. It is multiplied by
-    the root of the number of photographs. For gains, a training of fewer than 10,000 steps raises it in proportion."""
+    the root of the number of photographs and, for gains in a training of fewer than 10,000 steps, by 10,000 / steps."""
     refine_poses: bool = False
     """Refine the poses of all training views but two while the model is trained. refined/ in the run has the cameras as
     a COLMAP model. eval.json has the PSNR of held-out views after aligning them with the model. Not with batches."""
@@ -329,7 +329,7 @@ class TrainConfig:
     angle in radians, times the scene's length unit."""
     refine_lenses: bool = False
     """Refine focal lengths and principal points while the model is trained. Photographs with the same lens share them.
-    refined/ in the run has them. Only for photographs without distortion, and not with batches."""
+    refined/ in the run has the refined cameras. Only for photographs without distortion, and not with batches."""
     lens_reach: float = 2.0
     """Approximate limit, over a training, of the change of the focal length and the principal point, in percent of the
     focal length."""

@@ -23,7 +23,7 @@ MAX_LOG2_GAIN = 16.0
 """Largest magnitude of a gain's base-2 logarithm, of a vignette's coefficients, and of the base-2 logarithm of the
 fraction of light that a vignette leaves."""
 MAX_CHANNEL_MIX = 0.25
-"""Exclusive limit of the magnitude of a channel mix. Below it the matrix of any six mixes can be inverted."""
+"""Largest magnitude of a channel mix. The matrix of any six mixes up to this size can be inverted."""
 KINDS_WITH_GAINS = ("exposure", "ppisp")
 """Values of --appearance whose files have gains, which a render can apply."""
 EXPECTED_APPEARANCE_FILE = "a file that clsplat train --appearance writes"
@@ -191,5 +191,5 @@ def _row(record: Any) -> Row:
 def _numbers(name: str, values: Any, count: int, most: float) -> Float64:
     numbers = [float(value) for value in values] if isinstance(values, list) else []
     if len(numbers) != count or not all(math.isfinite(value) and abs(value) <= most for value in numbers):
-        raise ValueError(f"{name} is {values}, expected {count} numbers of at most {most:g}")
+        raise ValueError(f"{name} is {values}, expected {count} numbers from {-most:g} to {most:g}")
     return np.array(numbers)

@@ -34,7 +34,7 @@ NPY_HEADER = re.compile(
     r"\{'descr': '([<>|][biufc]\d{1,2})', 'fortran_order': (False|True), "
     r"'shape': \(((?:\d{1,18}(?:, \d{1,18}){0,7},?)?)\), \} *\n"
 )
-"""Header text that np.save writes before a numeric array."""
+"""Pattern of the header that np.save writes before a numeric array. Groups: dtype, Fortran order, shape."""
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -124,7 +124,7 @@ def read_checkpoint(path: Path, expected: int | None = None) -> Checkpoint:
             raise ValueError(f"its arrays differ from the arrays that were written ({other})")
         for name, array in arrays.items():
             if digest_of(array) != digests[name]:
-                raise ValueError(f"{name} has changed since it was written: its sha256 differs")
+                raise ValueError(f"array {name!r} has changed since it was written: its sha256 differs")
     if expected is not None and step != expected:
         raise ValueError(f"the file contains step {step}, but its name says step {expected}")
     return Checkpoint(step, arrays, state, manifest_of(arrays, state))

@@ -245,5 +245,5 @@ def _close(a: list[float], b: list[float]) -> bool:
 
 
 def _listed(what: str, names: list[str]) -> str:
-    """Return a text such as "3 views missing now (a.png, b.png, c.png)". what: such as "missing now"."""
+    """Return a text such as "3 views missing now (a.png, b.png, c.png)". what: text after the count."""
     return f"{len(names):,} {'view' if len(names) == 1 else 'views'} {what} ({examples(names)})"

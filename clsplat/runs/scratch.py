@@ -52,7 +52,7 @@ class ScratchFiles:
         return path.name.startswith(self._owner) or inside
 
     def may_write(self, path: Path) -> bool:
-        """True for a file that this training may continue to write: its own, in its folder."""
+        """True if this training may continue to write to `path`: only it can need the file, which is in `folder`."""
         return self.is_own(path) and path.parent == self.folder
 
     def follow(self, store: ChunkStore) -> None:

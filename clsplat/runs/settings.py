@@ -56,7 +56,7 @@ _ADDED_SETTINGS: dict[str, tuple[str, Any]] = {
 """Settings that earlier versions did not have, each with an older setting and a value. A config.toml that has the older
 setting but not the new one gets the value for the new one. The value keeps the behaviour of earlier versions."""
 _RETIRED_VALUES = {("train.rasterizer.extent", "constant")}
-"""Values that a setting no longer has. The setting's default replaces them."""
+"""Settings and values that only earlier versions allowed. The setting's default replaces such a value."""
 
 
 def config_text(config: TrainConfig, scene: Path | None) -> str:

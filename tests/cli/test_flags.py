@@ -79,7 +79,7 @@ def test_what_is_said_is_the_fields_docstring_and_default(capsys: Capture, monke
     wide = " ".join(render_help(capsys, monkeypatch, 100).split())
     for part in (
         f"More are smoother, and take proportionally longer. (default: {SamplingConfig().samples})",
-        "--shutter-open FLOAT Time at which the shutter opens, in frames relative to the frame, such as -0.25",
+        "--shutter-open FLOAT Time at which the shutter opens, in frames before (-) or after the",
         "--eye both|left|right Eyes of --stereo to render. One eye alone is useful for a video",
         "--rasterizer.transmittance-min FLOAT Stop at a pixel before the Gaussian that would reduce",
         "-o, --output PATTERN File names of the images",

@@ -60,10 +60,10 @@ class RenderVerb(Verb):
     them, or steps in their order such as 'rotate=0,90,0 scale=2 translate=1,0,0'. A JSON file can hold key frames or a
     matrix for each frame (docs/shot.md)."""
     path: Annotated[Literal["turntable", "spiral", "through"] | None, arg(metavar="turntable|spiral|through")] = None
-    """Path made from the cameras, instead of the cameras themselves. turntable: around their common focus; spiral: two
-    such turns, rising and sinking; through: along the cameras in their order, smoothed. Frames count from 1.
-    Without --cameras, the path is made from the cameras of a run's photographs. For a model file it goes around the
-    whole model if that is an object, or around the most detailed part of a scene."""
+    """Path made from the cameras, instead of the cameras themselves. turntable: once around the point that they
+    look at; spiral: twice around it, rising and sinking; through: along the cameras in their order, smoothed. Frames
+    count from 1. Without --cameras, the path is made from the cameras of a run's photographs. For a model file it goes
+    around the whole model if that is an object, or around the most detailed part of a scene."""
     up: Annotated[str | None, arg(metavar="AXIS|X,Y,Z")] = None
     """Up direction of a path around a model, without --cameras: x, y, z, -x, -y, -z or three numbers. If not given: -y,
     as in a COLMAP scene. With --up, the path goes around a run's model too. Write --up=-z if the value begins with a

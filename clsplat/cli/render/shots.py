@@ -47,7 +47,7 @@ def shots_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[str,
 
 
 def _cameras_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[str, Shot]:
-    """Return the shot of --cameras or of --path for each eye, in which a still camera is a single frame."""
+    """Return the shot of --cameras or of --path by the eye's name. A still camera is a shot of a single frame."""
     pairs, size = flags.pairs, (flags.width, flags.height)
     paths = _stage_cameras(pairs, flags.cameras, flags.usd_camera) if pairs.of_stage else {}
     if flags.cameras is None:
