@@ -34,13 +34,14 @@ class BenchVerb(Verb):
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT")] = None
     """Size of the frame in pixels. If not given: the camera's, or 1024x768 for the synthetic scene."""
     repeat: int = 5
-    """Number of measurements of each kind of frame and step. Times are their medians."""
+    """Number of times that each frame and each step is measured. The printed times are medians."""
     preset: Preset = "default"
     """Bundle of rasterizer settings: exact and default approximate nothing, fast approximates a little. A --rasterizer
     flag overrides it."""
     plot: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Also measure every setting of the rasterizer, and draw two plots (.svg or .png). For NAME.svg: NAME-switches.svg
-    with the gain of each exact switch, and NAME-error.svg with time and error of the approximate settings."""
+    """Also measure every setting of the rasterizer, and draw two plots (.svg or .png). With NAME.svg,
+    NAME-switches.svg shows the time that each setting saves without changing pictures, and NAME-error.svg the time and
+    error of each approximate setting."""
     overwrite: Flag = False
     """Replace existing plots."""
     device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
@@ -49,13 +50,13 @@ class BenchVerb(Verb):
     rasterizer: BenchSwitches = field(default_factory=BenchSwitches)
 
     def completed(self, given: Collection[str]) -> BenchVerb:
-        """Take the rasterizer's settings from the preset, except for those specified by flags."""
+        """Return the arguments with the rasterizer's settings of --preset, except for the flags that are `given`."""
         switches = RASTERIZER_PRESETS[self.preset].switches()
         return replace(self, rasterizer=with_given(switches, self.rasterizer, given, "rasterizer."))
 
 
 def run(verb: BenchVerb, services: Services) -> int:
-    """Measure the stages and print their times. Errors in the command line are reported before any measurement."""
+    """Measure and print the times of the stages of a frame and of a training step. Checks the command line first."""
     from clsplat.bench import settings as tradeoff
     from clsplat.bench import stages as bench_stages
     from clsplat.bench import workload as bench_subject

@@ -85,7 +85,7 @@ class ConversionReport(TypedDict):
 
 @dataclass(frozen=True)
 class ConvertVerb(Verb):
-    """Convert a model to the format of the output file's ending, with optional edits, and report the loss.
+    """Convert a model to the format of the output file's ending, with optional edits, and report rounding errors.
 
     Edits are made in this order: merge, crop, prune, transform, rotate, scale, translate, drop-sh. Only --scene and
     --prune-contribution need a device. docs/formats.md describes the formats.
@@ -98,9 +98,9 @@ class ConvertVerb(Verb):
     overwrite: Flag = False
     """Replace an existing file, even the source."""
     activated: Annotated[Literal["opacities", "scales", "both"] | None, arg(metavar="opacities|scales|both")] = None
-    """Read the source's opacities (0 to 1, to 100 or to 255), its scales, or both as plain values. This is for a file
-    that stores such values instead of the usual logits and logarithms. A warning names files that seem to store
-    them."""
+    """Read the source's opacities (0 to 1, 0 to 100 or 0 to 255), its scales, or both as plain values. Use this for a
+    file that stores plain values instead of the usual logits and logarithms. Files that seem to do so cause a warning.
+    """
     merge: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
     """Add the Gaussians of these model files."""
     crop: Annotated[str | None, arg(metavar="X0,Y0,Z0,X1,Y1,Z1")] = None
@@ -110,8 +110,8 @@ class ConvertVerb(Verb):
     prune_opacity: Annotated[float | None, arg(metavar="FLOAT")] = None
     """Leave out Gaussians with an opacity below this value, from 0 to 1."""
     prune_contribution: Annotated[float | None, arg(metavar="PIXELS")] = None
-    """Leave out Gaussians that contribute less than this number of pixels to every picture of --cameras. This is alpha
-    times transmittance, summed over the picture, like --density.min-contribution in training."""
+    """Leave out Gaussians that contribute less than this number of pixels to every picture of --cameras. A
+    contribution is alpha times transmittance, summed over the picture, like --density.min-contribution in training."""
     cameras: Annotated[Path | None, arg(metavar="PATH")] = None
     """Cameras for --prune-contribution, in any format that `clsplat render` reads."""
     transform: Annotated[str | None, arg(metavar="FILE|M00,M01,...")] = None
@@ -135,8 +135,8 @@ class ConvertVerb(Verb):
     """Bits of an SPZ file's spherical harmonics, 1 to 8, for band 1 and for the bands above. Fewer bits make a smaller
     file with less accurate reflections. 6,6 if not given; SPZ's own library uses 5,4."""
     scene: ScenePath = None
-    """Measure PSNR on this scene's held-out views before and after, and between the two renders. For a run's own scene,
-    masked-out pixels are left out."""
+    """Measure PSNR on this scene's held-out views before and after conversion, and between the two renders. If it is
+    the scene of the run, pixels that its masks exclude are not measured."""
     test_every: int = TEST_EVERY
     """Every n-th view of --scene in name order is held out. 0: all views are measured."""
     resolution: int = 0
@@ -149,7 +149,7 @@ class ConvertVerb(Verb):
 
 
 def run(verb: ConvertVerb, services: Services) -> int:
-    """Convert the model, and print the loss. Errors in the command line are reported before anything is written."""
+    """Convert the model and print how far values were rounded. Checks the command line before it writes anything."""
     from clsplat.images import colour
     from clsplat.models import difference, edit
     from clsplat.models.formats import colour_space, format_of, format_of_name, load, save
@@ -171,21 +171,16 @@ def run(verb: ConvertVerb, services: Services) -> int:
     save(verb.target, edited, comments=comments, progress=StageProgress(after=SILENT_WRITE_SECONDS), **options)
     if space != colour_space(verb.target):
         warn(f"{verb.target}: {target_format.name} cannot store the colour space, {space}; readers will assume sRGB")
-    read = load(verb.target, check_encoding=False)  # warnings about encodings were printed for the source already
+    read = load(verb.target, check_encoding=False)  # reading the source has already warned of odd encodings
+    kind = target_format.name
     if not isclose(read.near, edited.near, rel_tol=NEAR_PLANE_RELATIVE_TOLERANCE):
-        warn(
-            f"{verb.target}: {target_format.name} cannot store the near plane, which is {edited.near:.4g}; readers "
-            f"will use {read.near:.4g}"
-        )
+        warn(f"{verb.target}: {kind} cannot store the near plane {edited.near:.4g}; readers will use {read.near:.4g}")
     if read.antialiased != edited.antialiased:
-        warn(
-            f"{verb.target}: {target_format.name} cannot store antialiasing; readers will draw small or distant "
-            "Gaussians too thick"
-        )
+        warn(f"{verb.target}: {kind} cannot store antialiasing; readers will draw small or distant Gaussians too thick")
     if read.by_rays != edited.by_rays:
         warn(
-            f"{verb.target}: {target_format.name} cannot store drawing along rays; readers will show large "
-            "Gaussians outside the picture as a haze"
+            f"{verb.target}: {kind} cannot store projection along rays; readers will project Gaussians onto the image "
+            "plane, and show large ones outside the picture as a haze"
         )
     written = edit.take(edited, target_format.order(edited)) if target_format.order else edited
     result: ConversionReport = {
@@ -204,8 +199,10 @@ def run(verb: ConvertVerb, services: Services) -> int:
     print(difference.table(result["errors"]))
     if verb.scene is not None:
         scene = result["scene"]
-        print(f"{len(scene['views'])} views  PSNR {scene['before']:.2f} dB before, {scene['after']:.2f} after; between "
-              f"the renders {scene['between']:.2f}, at least {scene['least_between']:.2f}")  # fmt: skip
+        count, before, after = len(scene["views"]), scene["before"], scene["after"]
+        print(f"PSNR of {count} views against photographs: {before:.2f} dB before conversion, {after:.2f} dB after it")
+        mean, least = scene["between"], scene["least_between"]
+        print(f"PSNR between the two renders of a view: {mean:.2f} dB on average, {least:.2f} dB at the lowest")
     return 0
 
 
@@ -245,7 +242,11 @@ def _described(path: Path, form: Format, gaussians: Gaussians) -> ModelFile:
 def _edited(
     verb: ConvertVerb, services: Services, source: NamedModel, others: Sequence[NamedModel], matrix: Float64 | None
 ) -> Gaussians:
-    """Apply all edits to the source, in the order listed by --help. Raises InputError if no Gaussian remains."""
+    """Return the source model after all edits, in the order listed by --help. Raises InputError if it is empty.
+
+    source, others: paths and models of the source and of --merge.
+    matrix: (4, 4), the transform of the edits; None if they do not transform the model.
+    """
     from clsplat.models import edit
 
     gaussians = source[1]
@@ -260,7 +261,10 @@ def _edited(
 
 
 def _of_format(verb: ConvertVerb, target: Format) -> dict[str, Any]:
-    """Return the flags for the target's format as options of `save`. Raises InputError for a flag of another format."""
+    """Return the format's flags, such as --spz-version, as keyword arguments of `save`.
+
+    Raises InputError for a flag of another format.
+    """
     flags = (
         ("up", verb.up and verb.up.upper(), "up_axis", "OpenUSD"),
         ("spz-version", verb.spz_version, "version", "SPZ"),
@@ -298,13 +302,13 @@ def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:
     if len(other) and distance > edit.MAX_WORLD_OFFSET_SIZES * float(other.means.std(axis=0).max()):
         step = float(np.spacing(np.float32(distance)))
         warn(
-            f"--merge {path}: its origin is {distance:.6g} world units from that of {first_path}; its positions are "
-            f"rounded to {step:.2g}. Is only one of the two georeferenced?"
+            f"--merge {path}: its origin is {distance:.6g} world units from the origin of {first_path}, so that its "
+            f"positions are rounded to {step:.2g} world units. Is only one of the two models georeferenced?"
         )
 
 
 def _similarity(verb: ConvertVerb) -> Float64 | None:
-    """Matrix (4, 4) that applies --transform, --rotate, --scale and --translate, in this order; None without them.
+    """Return the matrix (4, 4) of --transform, --rotate, --scale and --translate, in this order; None without them.
 
     Raises InputError.
     """
@@ -335,7 +339,10 @@ def _similarity(verb: ConvertVerb) -> Float64 | None:
 
 
 def _numbers(flag: str, text: str, count: int) -> list[float]:
-    """Parse finite numbers, separated by commas or spaces; brackets are ignored. Raises InputError."""
+    """Parse `count` finite numbers, separated by commas or spaces; brackets are ignored. Raises InputError.
+
+    flag: name of the flag whose value is `text`, for the message.
+    """
     words = text.translate(str.maketrans("[],;", "    ")).split()
     try:
         values = [float(word) for word in words]
@@ -347,7 +354,7 @@ def _numbers(flag: str, text: str, count: int) -> list[float]:
 
 
 def _thinned(verb: ConvertVerb, services: Services, gaussians: Gaussians) -> Gaussians:
-    """Crop and prune the Gaussians by the flags. Raises InputError if no Gaussian remains."""
+    """Return the Gaussians that the --crop and --prune flags keep. Raises InputError if no Gaussian remains."""
     from clsplat.models import edit
     from clsplat.rendering.contributions import largest_contributions
     from clsplat.shots import choose_shot
@@ -355,7 +362,7 @@ def _thinned(verb: ConvertVerb, services: Services, gaussians: Gaussians) -> Gau
     def keep(flag: str, rows: Any) -> None:
         nonlocal gaussians
         if not rows.any():
-            raise InputError(f"--{flag}: none of the {len(gaussians):,} Gaussians remains")
+            raise InputError(f"--{flag}: removes all {len(gaussians):,} Gaussians, expected some to remain")
         gaussians = gaussians if rows.all() else edit.take(gaussians, rows)
 
     if verb.crop is not None:

@@ -37,7 +37,7 @@ class DemoVerb(Verb):
     """Folder for all results: a new folder, or the folder of an earlier demo, whose content is replaced. For a town: a
     new folder."""
     iterations: int = DEMO_ITERATIONS
-    """Training steps. A few hundred are enough to test the pipeline, but show less of the scene."""
+    """Training steps. A few hundred are enough to test the pipeline, but the model then has less detail."""
     device: Annotated[DeviceChoice, arg(name="")] = field(default_factory=DeviceChoice)
     json: Flag = False
     """Print the evaluation as JSON on standard output; for a town its settings and counts."""
@@ -45,7 +45,7 @@ class DemoVerb(Verb):
     """Write a town of NxM city blocks of 60 metres, without training. A larger town has the photographs of a smaller
     one, byte for byte."""
     town_photos: Annotated[int, arg(metavar="COUNT")] = TownConfig.photos
-    """Photographs of each block: three in ten straight down, four in ten at a slant, three in ten in its streets."""
+    """Photographs of each block: three in ten look straight down, four in ten at a slant, three in ten from streets."""
     town_size: Annotated[str, arg(metavar="WxH")] = f"{TownConfig.width}x{TownConfig.height}"
     """Size of the photographs in pixels."""
     town_rig: TownRig = TownConfig.rig
@@ -66,7 +66,7 @@ class DemoVerb(Verb):
     """Replace an earlier town in the output folder."""
 
     def completed(self, given: Collection[str]) -> DemoVerb:
-        """Return the arguments. Raises InputError for a town's flag without --town, or a training's with --town."""
+        """Return the arguments. Raises InputError for a flag without effect, such as --iterations with --town."""
         others = ("iterations", "device") if self.town is not None else ("town_", "seed", "overwrite")
         if wrong := sorted(name for name in given if name.startswith(others)):
             flag = wrong[0].replace("_", "-")
@@ -74,7 +74,7 @@ class DemoVerb(Verb):
                 f"--{flag}: has no effect with --town, which trains nothing; omit --town, or give --{flag} to clsplat "
                 "train"
                 if self.town is not None
-                else f"--{flag}: has an effect only with --town, expected it too, such as --town 2x2"
+                else f"--{flag}: has an effect only with --town, expected --town too, such as --town 2x2"
             )
         return self
 

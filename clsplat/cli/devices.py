@@ -34,7 +34,7 @@ def run(verb: DevicesVerb, _: Services) -> int:
     rows = [("", "name", "kind", "units", "memory", "platform", "version", "shape")]
     for info in devices:
         memory = f"{info.memory_bytes / 2**30:.1f} GiB"
-        version = info.version.split("  ")[0]  # PoCL appends its build options after two spaces
+        version = info.version.split("  ")[0]  # PoCL's version ends in two spaces and its build options
         words = (info.name, info.kind, str(info.compute_units), memory, info.platform, version, info.shape)
         rows.append((str(info.index), *words))
     print("\n".join(aligned(rows, left=range(len(rows[0])))))

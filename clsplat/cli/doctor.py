@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from clsplat.device.drivers.diagnostics import Diagnostic
 
 _REQUIREMENT = re.compile(r"([A-Za-z0-9_.-]+).*?(?:extra == ['\"](\w+)['\"])?$")
-"""Package name, and the extra that needs it, in a requirement of the installed metadata."""
+"""Pattern of a requirement in the metadata of the installed package. Group 1 is the required package, group 2 the extra
+of clsplat that requires it, if any."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,8 @@ def _packages() -> list[Diagnostic]:
         match = _REQUIREMENT.match(text)
         assert match is not None, text
         name, extra = match[1], match[2]
-        if name == "clsplat" or (";" in text and not extra):  # skip clsplat itself, and packages for some systems
+        # skip clsplat itself, and packages that only some systems or versions of Python need
+        if name == "clsplat" or (";" in text and not extra):
             continue
         version = _version(name)
         if extra:

@@ -47,8 +47,8 @@ class EvalVerb(Verb):
     resolution: OptionalInt = None
     """Longest image side in pixels; 0 keeps the images' size up to 1600. If not given: the run's setting, else 0."""
     missing: Annotated[Missing | None, arg(metavar="few|skip|error")] = None
-    """Treatment of pictures that the scene lists but that are missing, as for train. If not given: the run's setting,
-    else few."""
+    """Handling of pictures that the scene lists but that are missing. few: at most a tenth may be missing. skip: any
+    number. error: none. If not given: the run's setting, else few."""
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
     """Background behind the Gaussians and behind images with alpha. If not given: the run's setting, else black."""
     corrected: Flag = False
@@ -127,7 +127,9 @@ def _evaluate(verb: EvalVerb, services: Services) -> int:
 
 
 def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | None) -> tuple[Scene, list[View]]:
-    """Load the scene and find its held-out views. Flags override the run's settings. Raises InputError.
+    """Return the loaded scene, and its held-out views with the lenses that the run refined. Raises InputError.
+
+    Flags override the run's settings.
 
     trained: the run of the model; None for a model without a run.
     """
@@ -148,7 +150,7 @@ def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | N
 def _warn_of_doubts(
     trained: Run | None, draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: list[View]
 ) -> None:
-    """Warn of views that the run was trained on, of changed views, of views of another scene, and of wrong renders.
+    """Warn of views that the run was trained on, changed views, views of another scene, and renders without content.
 
     trained: the run of the model; None for a model without a run.
     draw: function that renders a camera to (image, alpha).

@@ -36,7 +36,7 @@ class Option:
 
     names: the flag's names on the command line; empty for a positional argument.
     text: the help of the annotation, else the docstring of the dataclass field.
-    off: name of the flag that switches this one off, "" for none.
+    off: name of the flag that sets this one to False, such as "--no-report"; empty if there is no such flag.
     """
 
     names: tuple[str, ...]
@@ -53,7 +53,7 @@ class Option:
 
     @property
     def told(self) -> str:
-        """Help text, followed by the default value unless the default is None, False or empty."""
+        """Help text, followed by "(required)", or by the default value unless that is None, False or empty."""
         silent = self.default is None or self.default is False or self.default in ("", ())
         if self.required:
             return f"{self.text} (required)"
@@ -93,6 +93,7 @@ def grouped_help(kind: type, prog: str, groups: Groups, width: int | None = None
 
     kind: dataclass of the verb's arguments.
     prog: the call that usage shows, such as "clsplat render".
+    groups: titles of the groups, and the flags in each.
     width: characters in a line; by default the terminal's width, at most 100.
     """
     width = min(width or shutil.get_terminal_size().columns, 100)
@@ -117,14 +118,19 @@ def grouped_help(kind: type, prog: str, groups: Groups, width: int | None = None
 
 
 def unknown_flags(arguments: Sequence[str], kind: type, prog: str) -> str:
-    """Return a one-line message about unknown flags, with similar names; empty if all flags are known."""
+    """Return a one-line message about unknown flags, with similar names; empty if all flags are known.
+
+    arguments: words of the command line after the verb.
+    kind: dataclass of the verb's arguments.
+    prog: the call that the message shows, such as "clsplat render".
+    """
     known = ["--help", "--help-verbose"]
     for option in options(kind):
         known += [*option.names, option.off] if option.off else option.names
     given = dict.fromkeys(word.partition("=")[0] for word in arguments if word.startswith("--") and word != "--")
     wrong = [word for word in given if word.replace("_", "-") not in known]
     told = [
-        f"{word} is no flag, " + (f"did you mean {found}?" if (found := near(word, known)) else "") for word in wrong
+        f"{word} is not a flag, " + (f"did you mean {found}?" if (found := near(word, known)) else "") for word in wrong
     ]
     return " ".join(f"{text}expected one of {prog} --help;" if text.endswith(" ") else text for text in told).rstrip(
         ";"

@@ -55,7 +55,7 @@ def _run(arguments: list[str], services: Services) -> int:
             with terminable():
                 verb = parse(arguments)
                 return int(verb_module(type(verb).__name__.removesuffix("Verb").lower()).run(verb, services))
-        except SystemExit as error:  # raised after --help, and after the report of a wrong call
+        except SystemExit as error:  # `parse` raises this after the help or after reporting a wrong call
             return error.code if isinstance(error.code, int) else 1
         except KeyboardInterrupt as error:
             if debug:

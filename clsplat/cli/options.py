@@ -37,7 +37,10 @@ class Verb:
     groups: ClassVar[Groups] = ()
 
     def completed(self, given: Collection[str]) -> Verb:
-        """Return the arguments, with flags that are not in `given` set from a run or a preset. Raises InputError."""
+        """Return the arguments, with settings of a run or a preset for flags that are not given. Raises InputError.
+
+        given: names of the flags on the command line, such as "rasterizer.alpha_min".
+        """
         del given
         return self
 
@@ -55,7 +58,10 @@ class DeviceChoice:
         return services.open_device(self.selector)
 
     def trusted(self, services: Services, *stages: Sequence[str]) -> Device:
-        """Open the device and run the short self-test of `stages`. Raises InputError, DeviceError and DriverError."""
+        """Open the device and run the short self-test. Raises InputError, DeviceError and DriverError.
+
+        stages: the names of the stages to test, as one sequence; if not given, the stages of training.
+        """
         return services.require(self.open(services), *stages)
 
 
@@ -87,7 +93,7 @@ class SeveralDevices(DeviceOptions):
 
     @property
     def count(self) -> int:
-        """Number of devices named."""
+        """Number of devices that --device names."""
         return len(device_names(self.selector))
 
     def open_all(self, services: Services) -> list[Device]:
@@ -110,9 +116,11 @@ class PageOptions:
 
 
 def with_given(settings: Settings, parsed: Settings, given: Collection[str], prefix: str = "") -> Settings:
-    """Return `parsed` from the command line, with flags that are not in `given` set from `settings`.
+    """Return the settings from the command line, with values of a run or a preset for flags that are not given.
 
-    settings: settings of a run or a preset, of the same dataclass as `parsed`.
+    settings: settings of the run or the preset.
+    parsed: settings from the command line, of the same dataclass.
+    given: names of the flags on the command line.
     prefix: beginning of the flags' names, such as "rasterizer.".
     """
     changes: dict[str, Any] = {}

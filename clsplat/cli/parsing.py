@@ -36,7 +36,8 @@ VERBS = {
     "view": "Look at a model in the browser: the device renders, the page shows it.",
     "report": "Write a run's report: one self-contained HTML file with curves, pictures, figures and settings.",
     "compare": "Compare runs in a table: scores, Gaussians, times, and the settings that differ.",
-    "convert": "Convert a model to the format of the output file's ending, with optional edits, and report the loss.",
+    "convert": "Convert a model to the format of the output file's ending, with optional edits, and report rounding "
+    "errors.",
     "info": "Describe a model file: format, count, SH, bounds, scales, opacities, colour space and values that are "
     "not finite.",
     "bench": "Measure each stage of a frame and of a training step, and the limits of the device in the same run.",
@@ -114,7 +115,7 @@ def _trouble(arguments: Sequence[str], called: type[Verb] | None, said: str) -> 
     if not word or word in VERBS:
         return said
     found = near(word, list(VERBS))
-    return f"{word} is no verb, did you mean {found}?" if found else said
+    return f"{word} is not a verb, did you mean {found}?" if found else said
 
 
 def _text_rules() -> tyro.constructors.ConstructorRegistry:
@@ -177,7 +178,7 @@ def _wide() -> Iterator[None]:
 def _unboxed(report: str) -> str:
     """Extract tyro's message from the box that it has drawn: on one line, without the advice below the box's rule."""
     words: list[str] = []
-    # if standard output is not UTF-8, the box is drawn without box characters, and its first rule is below the title
+    # if standard output is not UTF-8, tyro draws no box characters, and its first rule is the line below the title
     titled = "╭" in report
     for line in report.splitlines():
         text = line.strip("│ ").strip()
@@ -210,5 +211,5 @@ def tell(line: str) -> None:
     """Print a line to standard error. If it cannot be written, the exit status still reports the error."""
     try:
         print(line, file=sys.stderr, flush=True)
-    except OSError:  # discard the text: flushed by the interpreter at exit, it would change the exit status
+    except OSError:  # discard the line: the interpreter's attempt to write it at exit would change the exit status
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())

@@ -32,8 +32,8 @@ class SelftestVerb(Verb):
     """Test every device: build the kernels, run each stage on frozen scenes, compare with float64 and stored digests.
 
     The exit status is 1 if a driver cannot be trusted. train, eval, render, view, bench, demo and a convert that
-    renders run a short form of this test the first time they use a device; CLSPLAT_TRUST_DRIVER=1 skips it. Kernel
-    shapes with which a driver failed are tried again here.
+    renders run a short form of this test the first time they use a device; CLSPLAT_TRUST_DRIVER=1 skips it. This verb
+    also tries again the kernel shapes with which a driver failed before.
     """
 
     device: Annotated[str | None, arg(metavar="DEVICE")] = "all"
@@ -64,7 +64,7 @@ def run(verb: SelftestVerb, _: Services) -> int:
             print(table(report))
             print(f"This driver {report.verdict}.", flush=True)
             if report.remembered:
-                print(f"The driver's kernel shape is still not used: {report.remembered}.", flush=True)
+                print(f"The kernel shape that failed stays disabled: {report.remembered}.", flush=True)
     records = [record(info, report) for info, report in zip(devices, reports, strict=True)]
     if verb.json:
         print(json.dumps(records, indent=2))
@@ -100,9 +100,10 @@ def record(info: DeviceInfo, report: DriverReport) -> dict[str, object]:
 
 
 def _bug_report(records: list[dict[str, object]]) -> dict[str, object]:
-    """Return the content of --report: facts about the installation, and `records` with limits, failures and times.
+    """Return the content of --report: facts about the installation and about each device.
 
-    Times are measured only on devices that can be trusted.
+    records: the entry of each device (`record`), to which this adds the device's limits, failures, and times. Times are
+    measured only on devices that can be trusted.
     """
     from clsplat.cli.doctor import lines
     from clsplat.device.context import all_devices

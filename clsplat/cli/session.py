@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Functions that several verbs share: the services that tests replace, loading of a scene, and choice of devices."""
+"""Functions that several verbs share: `Services`, which tests replace, loading of a scene, and choice of devices."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 
 
 def imported(name: str) -> Callable[..., Any]:
-    """Return a stand-in for the function of this dotted name. Importing it only when called keeps --help fast."""
+    """Return a function that imports and calls the function `name`, such as "clsplat.api.train".
+
+    As the import waits for the first call, --help is fast.
+    """
     module, _, member = name.rpartition(".")
 
     def call(*arguments: Any, **named: Any) -> Any:
@@ -61,9 +64,10 @@ def load_scene(
     lenses: Lenses = "undistort",
     missing: Missing = "few",
 ) -> Scene:
-    """Load the scene and print its warnings.
+    """Load the scene in the folder `path`, print its warnings, and return it.
 
     test_views: (test_every, test_most), which choose the held-out views.
+    The other arguments are those of `clsplat.load_scene`.
     """
     scene = services.load_scene(
         path,

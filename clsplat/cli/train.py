@@ -63,8 +63,8 @@ class TrainVerb(Verb):
     If not given: with --max-host-mem, cache/ in the run's folder until the training has finished; otherwise none."""
     scratch: Annotated[str | None, arg(metavar="DIR")] = None
     """Folder, on a local disk, for Gaussians that do not fit in --max-host-mem. A file in it, at most 2.2 times as
-    large as parameters and moments, stays after the training, as checkpoints need it. If not given: scratch/ in the
-    run's folder."""
+    large as the parameters and Adam's moments, stays after the training, as checkpoints need it. If not given:
+    scratch/ in the run's folder."""
     auto: Flag = False
     """Adapt settings to findings on the scene, such as --appearance exposure if the photographs' exposures differ.
     Settings given as flags stay. The findings are printed even without --auto."""
@@ -86,8 +86,8 @@ class TrainVerb(Verb):
     """Names of the settings given on the command line."""
 
     def completed(self, given: Collection[str]) -> TrainVerb:
-        """Take the settings from the resumed run, or from preset and schedule, and adapt them to the number of
-        devices."""
+        """Return the arguments with the settings of the resumed run, or of preset and schedule. Flags that are `given`
+        override these. A batch of 1 becomes one view per device."""
         verb = self._with_settings(given)
         if "points" in given and verb.config.points:  # an absolute path, so that the run can be resumed from any folder
             verb = replace(verb, config=replace(verb.config, points=str(Path(verb.config.points).absolute())))
@@ -182,7 +182,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     if earlier is not None:
         check_steps_left(earlier, config, "--iterations")
     if len(scene.points) == 1:  # initial sizes are distances between points
-        warn(f"{source}: has a single point, so that training starts with one Gaussian of almost no size")
+        warn(f"{source}: has a single point, expected several: training starts with one Gaussian of almost no size")
     changed = earlier is not None and scene_record.check(
         earlier, scene, source, config.resolution, accept=verb.accept_changes
     )
@@ -207,7 +207,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
 
 
 def _flags_of_machine(verb: TrainVerb) -> str:
-    """Return the given flags about devices and memory, as text. No file records them, so resuming needs them again."""
+    """Return the flags about devices and memory as text for the command that resumes the run. No file records them."""
     given = {
         "--device": verb.device.selector,
         "--max-device-mem": verb.device.max_device_mem,
@@ -219,7 +219,7 @@ def _flags_of_machine(verb: TrainVerb) -> str:
 
 
 def _stages(config: TrainConfig) -> tuple[str, ...]:
-    """Names of the self-test's stages that training with these settings uses."""
+    """Return the names of the self-test's stages that training with these settings uses."""
     from clsplat.selftest.result import (
         APPEARANCE_STAGES,
         CHUNK_STAGES,
@@ -265,7 +265,7 @@ def _train_run(
 ) -> None:
     """Train the run with a progress bar. If training is interrupted, the error's message says how to resume.
 
-    page: context manager that serves the viewer's page; None without --view.
+    page: function that returns a context manager, which serves the viewer's page; None without --view.
     """
     from clsplat.training.forecast import Forecast
 

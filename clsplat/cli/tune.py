@@ -42,7 +42,8 @@ def run(verb: TuneVerb, _: Services) -> int:
     device = all_devices()[info.index]
     if verb.forget:
         save_shape(device, None)
-        print(f"{info.name} ({info.version.split('  ')[0]}): now the default, {default_shape(device)}", file=sys.stderr)
+        version, shape = info.version.split("  ")[0], default_shape(device)
+        print(f"{info.name} ({version}): uses the default kernel shape, {shape}, from now on", file=sys.stderr)
         return 0
     trials, best = tune(device, info.index, lambda shape: print(f"trying {shape.words}", file=sys.stderr))
     if verb.json:

@@ -94,7 +94,7 @@ def run(verb: ViewVerb, services: Services) -> int:
     signals = handled((signal.SIGINT, *endings()), lambda *_: stopped.set())
     with signals, closing(Server(viewing, world, address)) as server:
         _print_address(server)
-        with suppress(TrialInterrupted):  # raised if Ctrl-C comes while a driver builds or tries a kernel
+        with suppress(TrialInterrupted):  # Ctrl-C raises this error while a driver builds or tries a kernel
             while not stopped.is_set():
                 if not viewing.work():
                     viewing.wait(MAX_SIGNAL_WAIT_SECONDS)
@@ -102,7 +102,7 @@ def run(verb: ViewVerb, services: Services) -> int:
 
 
 def training_view(options: PageOptions) -> Callable[[Scene, TrainConfig], AbstractContextManager[TrainingView]]:
-    """Return a context manager that serves the viewer's page while a scene is trained.
+    """Return a function that opens a context, in which the viewer's page is served while a scene is trained.
 
     Raises InputError at once if the page cannot be served, before anything is trained or written.
     """

@@ -28,7 +28,8 @@ class Channel:
     source: the kernel that computes the values. "image": blend.cl. "features": features.cl, for channels.cl to blend.
     "depths": channels.cl, into planes after the features. "whole": channels.cl, into an array of integers. "shares":
     coverages of a Cryptomatte, blended like features, one for each object.
-    kernel: the channel's name in the kernels, which get a feature's offset as FEATURE_NAME.
+    kernel: the channel's name in the kernels. For "depth", the macro FEATURE_DEPTH is the offset of this feature in a
+    Gaussian's row of features.
     signs: factors from the kernel's values to the file's, one for each float; empty if all are 1.
     note: explanation for --help. Consecutive channels with the same note are listed together.
     """
@@ -64,11 +65,11 @@ FRAME_CHANNELS: dict[str, Channel] = {
     "count": Channel(("count",), "whole", "count", "whole", "count", note="of Gaussians"),
     "id": Channel(("id",), "whole", "id", "whole", "index", note="of Gaussians"),
 }
-"""Channels of `--channels` except Cryptomattes, in the order of a file and of the kernels' planes. The v of motion and
-backward points up in files, whereas y points down in docs/channels.md."""
+"""Channels of `--channels` except Cryptomattes, in the order of a file and of the kernels' planes. The v of the
+channels motion and backward points up in files, whereas y points down in docs/channels.md."""
 
 CRYPTOMATTE_LAYERS = 3
-"""Layers of a Cryptomatte, with two objects each."""
+"""Number of layers of a Cryptomatte. Each layer stores the ids and coverages of two objects."""
 
 
 def _matte(name: str) -> Channel:
@@ -77,7 +78,7 @@ def _matte(name: str) -> Channel:
 
 
 CRYPTOMATTE_CHANNELS: dict[str, Channel] = {"objects": _matte("cryptoobject"), "semantic": _matte("cryptosemantic")}
-"""Cryptomatte channels of `--channels`. While rendering, each has a plane of floats for every object."""
+"""Cryptomatte channels, by their name in `--channels`. While rendering, each has a plane of coverages per object."""
 WRITABLE_CHANNELS = ChainMap(CRYPTOMATTE_CHANNELS, FRAME_CHANNELS)
 """Every channel that a file may have, in file order: FRAME_CHANNELS come first."""
 
@@ -86,7 +87,7 @@ DEEP_CHANNELS = ("R", "G", "B", "A", "Z", "ZBack")
 
 
 def in_words(*sources: Source) -> str:
-    """Join the names and notes of all channels of these sources to English text, for --help."""
+    """Return the names and notes of all channels with these values of `Channel.source`, as English text for --help."""
     rows = [(name, row.note) for name, row in WRITABLE_CHANNELS.items() if row.source in sources]
     groups = [[*group] for _, group in groupby(rows, lambda row: row[1] or row[0])]
     return _and([_and([name for name, _ in group]) + (f" ({group[0][1]})" if group[0][1] else "") for group in groups])
@@ -97,18 +98,24 @@ def _and(words: Sequence[str]) -> str:
 
 
 def floats_of(source: Source) -> dict[str, int]:
-    """Number of floats of each channel with this source, by the channel's kernel name, in the order of the planes."""
+    """Return the number of floats of each channel with this `Channel.source`, by the channel's name in the kernels.
+
+    The order is that of the channels' planes on the device.
+    """
     return {channel.kernel: len(channel.names) for channel in FRAME_CHANNELS.values() if channel.source == source}
 
 
 def feature_names(names: Iterable[str]) -> tuple[str, ...]:
-    """Kernel names of the channels in `names` that are features, in the order of the planes."""
+    """Return the names in the kernels of those channels among `names` whose source is "features".
+
+    The order is that of the channels' planes on the device.
+    """
     asked = set(names)
     return tuple(row.kernel for name, row in FRAME_CHANNELS.items() if name in asked and row.source == "features")
 
 
 def light_and_rest(names: Iterable[str]) -> tuple[list[str], list[str]]:
-    """Split channels into those averaged over a frame's samples (`Channel.is_light`), and the others."""
+    """Split channel names in two lists: those averaged over a frame's samples (`Channel.is_light`), and the others."""
     asked = list(names)
     return [name for name in asked if WRITABLE_CHANNELS[name].is_light], [
         name for name in asked if not WRITABLE_CHANNELS[name].is_light

@@ -15,14 +15,14 @@ from clsplat.errors import InputError
 WHOLE_NUMBER_LIMIT = 1 << 62
 """Whole numbers must be smaller than this in magnitude, so that config.toml can hold them."""
 _BYTE_SIZE_PATTERN = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([kmgt]?)(i?b)?\s*", re.IGNORECASE)
-"""Memory size such as 1.5GiB, in groups: number, prefix, ending."""
+"""Pattern of a memory size such as 1.5GiB. Its groups are the number, the prefix (k, m, g or t) and the ending."""
 Rule = tuple[tuple[str, ...], Callable[[float], bool], str]
 """Rule for settings: names of the settings, a predicate that is True for valid values and False for NaN, and the
 expectation in words."""
 
 
 def check_rules(config: object, prefix: str, rules: tuple[Rule, ...]) -> None:
-    """Raise InputError for the first setting that breaks its rule, naming its flag.
+    """Raise InputError for the first setting of `config` that breaks its rule, naming its flag.
 
     prefix: beginning of the settings' flags, such as "--density.".
     """
@@ -34,7 +34,7 @@ def check_rules(config: object, prefix: str, rules: tuple[Rule, ...]) -> None:
 
 
 def check_kinds(config: object, prefix: str) -> None:
-    """Raise InputError for the first setting that has the wrong type or is too large for config.toml.
+    """Raise InputError for the first setting of `config` that has the wrong type or is too large for config.toml.
 
     prefix: beginning of the settings' flags, such as "--density.".
     """
@@ -46,7 +46,7 @@ def check_kinds(config: object, prefix: str) -> None:
 
 
 def misfit(kind: Any, value: object) -> str | None:
-    """Describe the values that a field of type `kind` takes; None if `value` is valid."""
+    """Return in words which values a setting of the type `kind` may have, or None if `value` is one of these."""
     if get_origin(kind) is Literal:
         fits, expected = isinstance(value, str) and value in get_args(kind), f"one of {', '.join(get_args(kind))}"
     elif get_origin(kind) is tuple:
@@ -66,7 +66,7 @@ def misfit(kind: Any, value: object) -> str | None:
 
 
 def _is_truth(value: object) -> bool:
-    return type(value).__name__ in ("bool", "bool_")  # NumPy's Boolean type is bool or bool_, by version
+    return type(value).__name__ in ("bool", "bool_")  # NumPy's Boolean type is named bool_ before version 2
 
 
 def _is_whole(value: object) -> bool:
@@ -74,7 +74,7 @@ def _is_whole(value: object) -> bool:
 
 
 def check_steps(flag: str, steps: tuple[int, ...]) -> None:
-    """Raise InputError unless the steps are at least 1 and increase."""
+    """Raise InputError, naming `flag`, unless all steps are at least 1 and each is larger than the one before."""
     if any(step < 1 for step in steps) or list(steps) != sorted(set(steps)):
         raise InputError(f"{flag} {','.join(map(str, steps))}: expected steps of at least 1, in ascending order")
 

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 TEST_EVERY = 8
-"""Distance between held-out views in the order of names, starting with the first view."""
+"""Default of --test-every: every eighth view in the order of names is held out, starting with the first."""
 TEST_MOST = 200
-"""Maximum number of held-out views."""
+"""Default of --test-most: the maximum number of held-out views."""
 VIEWER_HOST, VIEWER_PORT = "127.0.0.1", 8080
 """Address and port of the viewer's server."""
 DEMO_ITERATIONS = 2000

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 GAIN_ENTRIES = 3
-"""Number of gains of a photograph, one for each colour channel. They are the photograph's first entries."""
+"""Number of gains of a photograph, one for each colour channel. They are the first values learnt for a photograph."""
 
 
 @dataclass(frozen=True)
@@ -16,9 +16,9 @@ class ColourModel:
     """An appearance model that removes a photograph's own colours pixel by pixel.
 
     stem: value of the setting `appearance`, and name of the formulas: kernels/STEM.cl and clsplat/reference/STEM.py.
-    of_photograph: number of learnt entries of a photograph, by their name in appearance.json. The first three are
+    of_photograph: number of values learnt for each photograph, by their name in appearance.json. The first three are
     base-2 logarithms of gains; the others are coefficients from -0.2 to 0.2.
-    of_lens: number of learnt entries of a lens, by their name: three base-2 logarithms, or none.
+    of_lens: number of values learnt for each lens, by their name: three base-2 logarithms, or none.
     """
 
     stem: str
@@ -27,22 +27,22 @@ class ColourModel:
 
     @property
     def entries(self) -> int:
-        """Number of learnt entries of a photograph."""
+        """Number of values learnt for each photograph."""
         return sum(self.of_photograph.values())
 
     @property
     def lens_entries(self) -> int:
-        """Number of learnt entries of a lens; 0 if the model has none."""
+        """Number of values learnt for each lens; 0 if the model learns nothing for lenses."""
         return sum(self.of_lens.values())
 
     @property
     def sums(self) -> int:
-        """Number of sums over pixels that make up the gradient: one for each entry of photograph and lens."""
+        """Number of sums over pixels in the gradient: one for each value learnt for the photograph or its lens."""
         return self.entries + self.lens_entries
 
     @property
     def pixel_bytes(self) -> int:
-        """Bytes of the gradient's partial sums per pixel of a photograph, padding included."""
+        """Memory of the gradient's partial sums in bytes per pixel of a photograph, padding included."""
         return -(-2 * self.sums // 3)
 
 

@@ -76,7 +76,10 @@ class FramingConfig:
             raise InputError(f"--supersample {self.supersample}: expected 1 to {_MAX_SUPERSAMPLES}")
 
     def check_model(self, model: CameraModel) -> None:
-        """Raise InputError for a panorama with a filter wider than a pixel, as it has no pixels beyond its edges."""
+        """Raise InputError if `model` is a panorama and the filter is wider than a pixel.
+
+        A panorama has no pixels beyond its edges, which such a filter needs.
+        """
         if self.supersample > 1 and self.filter != "box" and model.wraps:
             raise InputError(f"--filter {self.filter}: needs pixels beyond a panorama's edges; use --filter box")
 
@@ -114,7 +117,7 @@ class WarpConfig:
     COLMAP model or a transforms.json."""
 
     def check(self, channels: Collection[str] = ()) -> None:
-        """Raise InputError for settings that exclude each other, and for channels that distortion makes undefined."""
+        """Raise InputError if both settings are given, or if distortion makes one of `channels` undefined."""
         if self.stmap and self.distort:
             raise InputError("--stmap and --distort exclude each other: both distort the picture")
         flag = "--stmap" if self.stmap else "--distort" if self.distort else ""
@@ -135,10 +138,10 @@ class SamplingConfig:
     """Motion blur: shutter angle in degrees, centred on the frame; 360 is the time between frames, 0 is no blur. If not
     given: the shutter of a USD stage, else none."""
     shutter_open: float | None = None
-    """Time at which the shutter opens, in frames relative to the frame, such as -0.25. Replaces --shutter-angle,
-    together with --shutter-close."""
+    """Time at which the shutter opens, in frames before (-) or after the frame's time, such as -0.25. Replaces
+    --shutter-angle, together with --shutter-close."""
     shutter_close: float | None = None
-    """Time at which the shutter closes, in frames relative to the frame, such as 0.25."""
+    """Time at which the shutter closes, in frames before (-) or after the frame's time, such as 0.25."""
     f_stop: float | None = None
     """Depth of field: f-number of the lens, such as 2.8. Its focal length is the camera's, on a sensor of
     --sensor-width. If neither this nor --aperture is given: the lens of a USD stage, else everything is in focus.
@@ -186,7 +189,7 @@ class SamplingConfig:
 
     @property
     def shutter(self) -> tuple[float, float]:
-        """Times at which the shutter opens and closes, in frames relative to the frame."""
+        """Times at which the shutter opens and closes, in frames. 0 is the time of the frame."""
         if self.shutter_open is not None and self.shutter_close is not None:
             return self.shutter_open, self.shutter_close
         half = (self.shutter_angle or 0.0) / 720
@@ -194,7 +197,7 @@ class SamplingConfig:
 
     @property
     def middle(self) -> float:
-        """Time half way between opening and closing, in frames relative to the frame."""
+        """Time half way between opening and closing of the shutter, in frames. 0 is the time of the frame."""
         begin, end = self.shutter
         return 0.5 * (begin + end)
 
@@ -205,9 +208,10 @@ class SamplingConfig:
 
     @property
     def sample_times(self) -> list[float]:
-        """Time of each sample, in frames relative to the frame.
+        """Time of each sample, in frames. 0 is the time of the frame.
 
-        The times are spread over the open shutter. Without motion blur all are its middle.
+        The times are spread over the interval in which the shutter is open. Without motion blur all
+        are the middle of this interval.
         """
         if not self.on or self.samples == 1:
             return [self.middle]
@@ -236,7 +240,7 @@ class SamplingConfig:
 def stratified_times(count: int) -> tuple[float, ...]:
     """Stratified samples of the time in (0, 1): `count` times, one in each of as many equal intervals.
 
-    The times are in the order of the ranks of van der Corput's sequence, uncorrelated with the lens samples.
+    The order of the times follows van der Corput's sequence, so that time and position on the lens are uncorrelated.
     """
     times = [0.0] * count
     by_mirrored_digits = sorted(range(count), key=lambda index: f"{index:b}"[::-1])
@@ -257,7 +261,7 @@ class PictureConfig:
     def check(self, *, whole: bool = True) -> None:
         """Raise InputError naming the first setting whose value is invalid.
 
-        whole: see `SamplingConfig.check`.
+        whole: True for complete settings; False for flags to which a USD stage may still add the focus.
         """
         self.framing.check()
         self.sampling.check(whole=whole)
@@ -322,7 +326,7 @@ Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwa
 class Encoding:
     """Encoding of picture files and videos.
 
-    depth: type of the floats in EXR files.
+    depth: type of colour, alpha and normals in EXR files: "half" or "float".
     parts: "one" part for all channels of an EXR file, or "several".
     compression: compression of EXR files.
     bits: bits per channel, 8 or 16 for PNG and TIFF, 10 or 16 for DPX.

@@ -8,7 +8,7 @@ from typing import Literal
 
 PointsUse = Literal["replace", "join"]
 DEFAULT_MAX_FILE_POINTS = 200_000
-"""Default maximum number of points from a file. Scanners write tens of millions."""
+"""Default maximum number of points from a file, because scanners write tens of millions."""
 SKY_RADIUS_RATIO = 10.0
 """Radius of the sphere of sky points, divided by the distance of the scene's farthest points from its middle.
 

@@ -29,8 +29,8 @@ Photos = Literal["auto", "exact", "8bit"]
 ViewOrderKind = Literal["random", "near"]
 
 MANY_PHOTOGRAPHS = 300
-"""Number of training photographs from which photographs are decoded when a step first needs them, not before training.
---photos auto then stores them with 8 bits per channel."""
+"""Number of training photographs that counts as many: from it on, a photograph is decoded only when a step first needs
+it, and --photos auto stores photographs with 8 bits per channel."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class OptimiserConfig:
     sh_rest_every: int = 1
     """Steps between updates of the higher SH bands (approximate above 1)."""
     cooldown: int = 0
-    """Number of final steps over which every learning rate falls exponentially, to cooldown-to times its value. 0: the
-    rates do not fall."""
+    """Number of final steps over which every learning rate falls exponentially, to cooldown-to times its value. 0: no
+    cooldown."""
     cooldown_to: float = 0.1
     """Fraction of every learning rate that is left after the cooldown; more than 0, at most 1."""
     beta1: float = 0.9
@@ -89,11 +89,11 @@ class OptimiserConfig:
         check_rules(self, "--optimiser.", rules)
         if self.late and self.sparse:
             raise InputError("--optimiser.late: excludes --optimiser.sparse, which drops the missed steps")
-        if self.late and self.beta1**2 >= self.beta2:  # else the sum over missed steps diverges
+        if self.late and self.beta1**2 >= self.beta2:  # the sum of a parameter's missed updates diverges
             raise InputError(
                 f"--optimiser.late: expected beta1^2 < beta2, but beta1 is {self.beta1} and beta2 {self.beta2}"
             )
-        if self.means_rate > 0 and self.means_rate_end == 0:  # a rate falling log-linearly to 0 is 0 at every step
+        if self.means_rate > 0 and self.means_rate_end == 0:  # log-linear decay to 0 would be 0 at once
             raise InputError("--optimiser.means-rate-end 0.0: expected more than 0; the rate falls to it log-linearly")
 
 
@@ -212,14 +212,14 @@ class TrainConfig:
     """Views whose gradients are summed before the model changes. Each view still counts as a step. Learning rates and
     Adam's constants are scaled for the batch (Zhao et al. 2024). If not given: one view for each device."""
     seed: int = 0
-    """Seed of everything random. The same seed on the same device gives the same model."""
+    """Seed of all random numbers. The same seed on the same device gives the same model."""
     sh_degree: int = 3
     """Highest degree of the spherical harmonics (SH): how finely colours depend on the viewing direction, 0 (not at
     all) to 3."""
     sh_degree_every: int = 1000
     """Steps after which the SH degree in use rises by one, from 0 to sh-degree."""
     dssim_weight: float = 0.2
-    """Weight of D-SSIM (structural dissimilarity) in the loss, 0 to 1. L1 (mean absolute difference) has the rest."""
+    """Weight w of D-SSIM (structural dissimilarity) in the loss, 0 to 1. L1 (mean absolute difference) has 1 - w."""
     background: Background = "black"
     """Background behind the Gaussians and behind images with alpha. random: a new colour each step, and black in
     evaluations."""
@@ -262,8 +262,8 @@ class TrainConfig:
     fewer than 300 training photographs, else 8bit."""
     view_order: ViewOrderKind = "random"
     """Order of the photographs in each pass through all of them. near: clusters of photographs that show the same
-    things, by their positions and viewing directions; four clusters take turns. More of a step's Gaussians were then in
-    view a few steps before. This may cost some PSNR."""
+    things, by their positions and viewing directions; four clusters take turns. Then a step
+    shows more of the Gaussians that were in view a few steps before. This may cost some PSNR."""
     test_every: int = TEST_EVERY
     """Every n-th view by name is held out, including the first; 0 holds out none. A data set's own split takes
     precedence."""
@@ -320,7 +320,7 @@ class TrainConfig:
     covers changes by place and brightness, such as in edited photographs. none: photographs are used unchanged."""
     appearance_rate: float = 2e-3
     """Learning rate of appearance, for base-2 logarithms of gains, or for coefficients of a grid. It is multiplied by
-    the root of the number of photographs. For gains, a training of fewer than 10,000 steps raises it in proportion."""
+    the root of the number of photographs and, for gains in a training of fewer than 10,000 steps, by 10,000 / steps."""
     refine_poses: bool = False
     """Refine the poses of all training views but two while the model is trained. refined/ in the run has the cameras as
     a COLMAP model. eval.json has the PSNR of held-out views after aligning them with the model. Not with batches."""
@@ -329,7 +329,7 @@ class TrainConfig:
     angle in radians, times the scene's length unit."""
     refine_lenses: bool = False
     """Refine focal lengths and principal points while the model is trained. Photographs with the same lens share them.
-    refined/ in the run has them. Only for photographs without distortion, and not with batches."""
+    refined/ in the run has the refined cameras. Only for photographs without distortion, and not with batches."""
     lens_reach: float = 2.0
     """Approximate limit, over a training, of the change of the focal length and the principal point, in percent of the
     focal length."""
@@ -338,7 +338,7 @@ class TrainConfig:
     two measurements in a row, training goes back to the best cameras and stops refining. At most 8 views are
     measured, when refinement begins and at every tenth of the training. Their poses are as given, or moved by the mean
     motion of the refined poses, whichever fits better. A warning at the end reports if aligning the views raises the
-    PSNR by more than this. 0 turns the measurements and the warning off. Without held-out views there are none."""
+    PSNR by more than this. 0 turns the measurements and the warning off. Without held-out views nothing is measured."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
@@ -417,9 +417,9 @@ class TrainConfig:
             raise InputError(f"--depth-maps {self.depth_maps}: no depth maps are used, expected --depth maps too")
 
     def changed(self, name: str, value: Any) -> TrainConfig:
-        """Return a copy with one setting changed.
+        """Return a copy in which the setting `name` has the value `value`.
 
-        name: such as "seed", or with its group such as "density.stop".
+        name: such as "seed", or, for a setting of a group, "density.stop".
         """
         group, dot, setting = name.partition(".")
         return replace(self, **{group: replace(getattr(self, group), **{setting: value}) if dot else value})
@@ -439,7 +439,7 @@ class TrainConfig:
         return MaskUse(self.masks, self.alpha, self.invert_masks)
 
     def rounds_photos(self, photographs: int) -> bool:
-        """True if pixels are rounded to 8 bits. photographs: number of training photographs."""
+        """True if --photos rounds pixels to 8 bits per channel. photographs: number of training photographs."""
         return self.photos == "8bit" or (self.photos == "auto" and photographs >= MANY_PHOTOGRAPHS)
 
     @property
@@ -465,7 +465,7 @@ class TrainConfig:
 
     @property
     def alpha_loss(self) -> float:
-        """Weight of the alpha loss; 0 without one."""
+        """Weight of the alpha loss; 0 unless masks or alpha channels mean transparent."""
         return self.alpha_weight if "transparent" in (self.masks, self.alpha) else 0.0
 
     def on_devices(self, count: int, *, explicit: bool) -> TrainConfig:

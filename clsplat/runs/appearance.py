@@ -20,9 +20,10 @@ from clsplat.runs.run import Run, run_of
 MAX_APPEARANCE_BYTES = 1 << 28
 """Maximum size of appearance.json in bytes."""
 MAX_LOG2_GAIN = 16.0
-"""Limit of the magnitude of gains, and of a vignette's coefficients and falloff, in octaves."""
+"""Largest magnitude of a gain's base-2 logarithm, of a vignette's coefficients, and of the base-2 logarithm of the
+fraction of light that a vignette leaves."""
 MAX_CHANNEL_MIX = 0.25
-"""Exclusive limit of the magnitude of a channel mix. Below it the matrix of any six mixes can be inverted."""
+"""Largest magnitude of a channel mix. The matrix of any six mixes up to this size can be inverted."""
 KINDS_WITH_GAINS = ("exposure", "ppisp")
 """Values of --appearance whose files have gains, which a render can apply."""
 EXPECTED_APPEARANCE_FILE = "a file that clsplat train --appearance writes"
@@ -33,16 +34,17 @@ MAX_CENTRE_PICTURE_SIZES = 100.0
 Row = Mapping[str, Any]
 """Entry of one photograph in appearance.json, parsed by `_row`."""
 Look = Callable[[str, Image], Image]
-"""Function of a held-out photograph's name and a render (H, W, 3): the render with that photograph's appearance."""
+"""Function that takes a held-out photograph's name and a render (H, W, 3), and returns the render with the photograph's
+appearance."""
 
 
 def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
-    """Gains, or a colour matrix, that give a run's model the appearance of one photograph.
+    """Return the gains, or a colour matrix, that give a run's model the appearance of one photograph.
 
     model: the run's folder, or a file in it.
     photograph: its name in the data set, with or without leading folders and extension.
-    Returns three gains, or the nine entries of a 3 x 3 matrix by rows if channels mix. A held-out photograph has the
-    gains that follow from its EXIF exposure, or 1, and no mixes. Raises InputError.
+    Returns three gains, or the nine entries of a 3 x 3 matrix by rows if channels mix. The gains of a held-out
+    photograph follow from its EXIF exposure, or are 1; its channels do not mix. Raises InputError.
     """
     run = run_of(model)
     path = run.appearance_path if run is not None else None
@@ -75,15 +77,20 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
 
 
 def looks_of_run(run: Run | None) -> Look:
-    """Function that gives renders the appearance of held-out photographs, as a run's appearance.json records it. In a
-    run without this file renders stay unchanged. Raises InputError."""
+    """Return a function that gives renders the appearance of held-out photographs, from the run's appearance.json.
+
+    Without a run or without this file, the function returns renders unchanged. Raises InputError.
+    """
     path = run.appearance_path if run is not None else None
     return _looks({} if path is None or not path.exists() else _read(path, _document(path), "held_out"))
 
 
 def held_out_looks(record: Mapping[str, Any] | None) -> Look:
-    """Function that gives renders the appearance of held-out photographs, from the content of an appearance.json.
-    Renders of photographs without an entry stay unchanged."""
+    """Return a function that gives renders the appearance of held-out photographs.
+
+    record: content of appearance.json; None if nothing was learnt. The function leaves a render unchanged if `record`
+    does not list the photograph.
+    """
     return _looks(_rows_in(record, "held_out") if record is not None else {})
 
 
@@ -103,7 +110,7 @@ def _looks(rows: Mapping[str, Row]) -> Look:
 
 
 def unmixing(mixes: Float64) -> Float64:
-    """Matrix (3, 3) that undoes the channel mixes (6,) (docs/gradients.md, "Colours and vignettes")."""
+    """Return the matrix (3, 3) that undoes the channel mixes (6,) (docs/gradients.md, "Colours and vignettes")."""
     matrix = np.eye(3)
     for c, (next_share, last_share) in enumerate(mixes.reshape(3, 2)):
         matrix[c, c] += next_share + last_share
@@ -113,7 +120,7 @@ def unmixing(mixes: Float64) -> Float64:
 
 
 def inverse(matrix: Float64) -> Float64:
-    """Inverse of a matrix (3, 3) by cofactors. Unlike LAPACK's, it has the same bits on every processor."""
+    """Return the inverse of a matrix (3, 3) by cofactors. Unlike LAPACK's, it has the same bits on every processor."""
     columns = np.stack([np.cross(matrix[(row + 1) % 3], matrix[(row + 2) % 3]) for row in range(3)], axis=1)
     first, second, third = (matrix[0] * columns[:, 0]).tolist()
     result: Float64 = columns / (first + second + third)
@@ -121,10 +128,10 @@ def inverse(matrix: Float64) -> Float64:
 
 
 def _light(vignette: Float64, centre: Float64, width: int, height: int) -> Float64:
-    """Fraction of light that a lens with a vignette transmits, by pixel (H, W).
+    """Return the fraction of light that a lens with a vignette transmits, for each pixel (H, W).
 
-    vignette: (3,), coefficients of the falloff.
-    centre: (2,), as fractions of the picture's width and height.
+    vignette: (3,), coefficients of the falloff from the centre.
+    centre: (2,), the vignette's centre, as fractions of the picture's width and height.
     """
     across, down = np.arange(width) + 0.5 - centre[0] * width, np.arange(height) + 0.5 - centre[1] * height
     s = 4 * (across**2 + down[:, None] ** 2) / (width**2 + height**2)
@@ -157,14 +164,14 @@ def _rows_in(record: Any, key: str) -> dict[str, Row]:
 
 
 def _ends(name: str) -> list[str]:
-    """Shorter names that identify a photograph: without extension and without leading folders."""
+    """Return the short names of a photograph. For a/b.png: a/b.png, b.png, a/b and b."""
     parts = name.split("/")
     whole = ["/".join(parts[start:]) for start in range(len(parts))]
     return whole + [end.rpartition(".")[0] for end in whole if "." in end]
 
 
 def _row(record: Any) -> Row:
-    """Parsed entry of a photograph: gains (3,), optional mixes (6,), optional vignette (3,) with its centre (2,).
+    """Parse the entry of a photograph: gains (3,), optional mixes (6,), optional vignette (3,) with its centre (2,).
 
     Raises ValueError, TypeError, KeyError or OverflowError.
     """
@@ -184,5 +191,5 @@ def _row(record: Any) -> Row:
 def _numbers(name: str, values: Any, count: int, most: float) -> Float64:
     numbers = [float(value) for value in values] if isinstance(values, list) else []
     if len(numbers) != count or not all(math.isfinite(value) and abs(value) <= most for value in numbers):
-        raise ValueError(f"{name} is {values}, expected {count} numbers of at most {most:g}")
+        raise ValueError(f"{name} is {values}, expected {count} numbers from {-most:g} to {most:g}")
     return np.array(numbers)

@@ -34,7 +34,7 @@ NPY_HEADER = re.compile(
     r"\{'descr': '([<>|][biufc]\d{1,2})', 'fortran_order': (False|True), "
     r"'shape': \(((?:\d{1,18}(?:, \d{1,18}){0,7},?)?)\), \} *\n"
 )
-"""Header text that np.save writes before a numeric array."""
+"""Pattern of the header that np.save writes before a numeric array. Groups: dtype, Fortran order, shape."""
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -59,7 +59,7 @@ class Checkpoint:
 
 
 def unusable(checkpoint: Checkpoint, why: str) -> InputError:
-    """Error for a checkpoint that is intact, but that a training cannot continue from because of `why`."""
+    """Return the error for an intact checkpoint from which a training cannot continue. why: the reason."""
     advice = "is it from another run or version?"
     return InputError(f"checkpoint of step {checkpoint.step}: {why}; {advice}")
 
@@ -75,7 +75,7 @@ def read_arrays(path: Path, expected: str) -> Arrays:
     """Read all numeric arrays of an np.savez file, by name.
 
     expected: name of the expected kind of file, for messages.
-    Raises ValueError, InputError or an error of zipfile if the file is anything else. np.load does not read it, as that
+    Raises ValueError, InputError or an error of zipfile if the file is anything else. np.load is not used, because it
     trusts the array size in the header, and decompresses members.
     """
     arrays: Arrays = {}
@@ -108,7 +108,7 @@ def write_checkpoint(path: Path, step: int, arrays: Mapping[str, NDArray[Any]], 
 def read_checkpoint(path: Path, expected: int | None = None) -> Checkpoint:
     """Read a checkpoint, and check that its arrays are as `write_checkpoint` wrote them.
 
-    expected: the step that it must have, if given.
+    expected: the step that the checkpoint must be of; None for any.
     Raises ValueError, InputError or an error of zipfile.
     """
     arrays = read_arrays(path, "a checkpoint")
@@ -121,20 +121,20 @@ def read_checkpoint(path: Path, expected: int | None = None) -> Checkpoint:
     if digests is not None:
         if not isinstance(digests, dict) or arrays.keys() != digests.keys():
             other = examples(sorted(arrays.keys() ^ set(digests)))[:200] if isinstance(digests, dict) else "no list"
-            raise ValueError(f"its arrays are not those that were written ({other})")
+            raise ValueError(f"its arrays differ from the arrays that were written ({other})")
         for name, array in arrays.items():
             if digest_of(array) != digests[name]:
-                raise ValueError(f"{name} has changed since it was written: its sha256 differs")
+                raise ValueError(f"array {name!r} has changed since it was written: its sha256 differs")
     if expected is not None and step != expected:
-        raise ValueError(f"it contains step {step}, but its name says step {expected}")
+        raise ValueError(f"the file contains step {step}, but its name says step {expected}")
     return Checkpoint(step, arrays, state, manifest_of(arrays, state))
 
 
 def scene_of(path: Path) -> str | None:
-    """Digest of the scene that a checkpoint was trained on; None if it records none or the file is damaged."""
+    """Return the digest of the scene that a checkpoint was trained on; None if not recorded, or the file is damaged."""
     try:
         scene = _part(path)[1].get("scene")
-    except Exception:  # noqa: BLE001  # as in load_latest_checkpoint, which reports the damage
+    except Exception:  # noqa: BLE001  # a damaged file raises any error; `load_latest_checkpoint` reports it
         return None
     return scene if isinstance(scene, str) else None
 
@@ -142,18 +142,18 @@ def scene_of(path: Path) -> str | None:
 def read_manifest(path: Path) -> Manifest | None:
     """Read the manifest of a checkpoint; None if the Gaussians are among its arrays, or the file is damaged.
 
-    Raises OSError if the file cannot be read now. That is no damage: the checkpoint may need its scratch file.
+    Raises OSError if the file cannot be read now. It may still be intact, and need its scratch file.
     """
     try:
         return manifest_of(*_part(path, *MANIFEST_ARRAYS))
     except (OSError, MemoryError):
         raise
-    except Exception:  # noqa: BLE001  # as in load_latest_checkpoint, which reports the damage
+    except Exception:  # noqa: BLE001  # a damaged file raises any error; `load_latest_checkpoint` reports it
         return None
 
 
 def _part(path: Path, *names: str) -> tuple[Arrays, dict[str, Any]]:
-    """Read the state of a checkpoint, and those of the arrays `names` that it has. Digests are not checked."""
+    """Read a checkpoint's state, and those of its arrays that `names` lists. Digests are not checked."""
     arrays: Arrays = {}
     with open_input(path, "a checkpoint") as file, ZipFile(_Bounded(file)) as archive:
         for name in {*names, STATE_KEY} & {name.removesuffix(".npy") for name in archive.namelist()}:
@@ -166,9 +166,9 @@ def _part(path: Path, *names: str) -> tuple[Arrays, dict[str, Any]]:
 
 
 class _Bounded:
-    """File whose `read` allocates no more than the bytes that remain.
+    """Open file whose `read` allocates no more memory than the remaining bytes of the file need.
 
-    zipfile asks for the sizes that headers claim, and `read` of a file allocates as many bytes as it is asked for.
+    zipfile reads as many bytes as headers claim, and Python's `read` allocates the whole size that is asked for.
     """
 
     def __init__(self, file: BinaryIO) -> None:
@@ -181,7 +181,7 @@ class _Bounded:
 
 
 def _array(data: bytes, name: str) -> NDArray[Any]:
-    """Parse a numeric array in np.save's format. Raises ValueError."""
+    """Parse a numeric array in np.save's format. Raises ValueError. name: name of the array, for messages."""
     length = int.from_bytes(data[8:10], "little")
     text = data[10 : 10 + length].decode("latin-1")
     match = NPY_HEADER.fullmatch(text) if data[:8] == NPY_MAGIC else None

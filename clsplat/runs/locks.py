@@ -28,17 +28,19 @@ content."""
 _LOCK_HELD_ERRNOS = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
 """Error numbers of the system if another process holds the lock."""
 _NO_LOCKING_ERRNOS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL, errno.EIO)
-"""Error numbers of the system if the file system has no locks."""
+"""Error numbers of the system if the file system does not support locks."""
 _held: dict[str, int] = {}
-"""Number of times that this process has entered the lock of each folder."""
+"""Number of times that this process has taken the lock of each folder and not yet released it."""
 
 
 @contextmanager
 def locked(folder: Path, verb: str) -> Iterator[None]:
-    """Hold the exclusive write lock of an existing folder. A process that holds it may enter again.
+    """Hold the exclusive write lock of an existing folder. A process that holds the lock may take it again.
+
+    verb: verb of clsplat, such as "train", to name this process in the error of others.
 
     Raises InputError, which names the process that holds the lock, and OSError if no file can be created there.
-    On a file system without locks it warns and keeps no other process out.
+    On a file system without locks this only warns.
     """
     key = os.path.realpath(folder)
     if key in _held:
@@ -62,7 +64,7 @@ def locked(folder: Path, verb: str) -> Iterator[None]:
 def _take(path: Path, folder: Path) -> IO[bytes]:
     """Open the lock file `path` of `folder`, and lock it. Raises InputError if another process holds the lock."""
     while True:
-        file = open(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0)  # noqa: SIM115  # closed by `_give_back`
+        file = open(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0)  # noqa: SIM115  # `_give_back` closes the file
         try:
             try_lock(file)
         except OSError as error:
@@ -85,7 +87,7 @@ def _take(path: Path, folder: Path) -> IO[bytes]:
 
 
 def try_lock(file: IO[bytes]) -> None:
-    """Lock the file at once. Raises OSError if another process holds the lock, or if there are no locks."""
+    """Lock the file without waiting. Raises OSError if another process holds the lock, or locks are not supported."""
     file.seek(_LOCKED_BYTE_OFFSET)
     if sys.platform == "win32":
         import msvcrt

@@ -12,8 +12,10 @@ from clsplat.scenes.scene import View
 
 
 def through_refined(views: Sequence[View], run: Run | None) -> list[View]:
-    """Copies of the views with the lenses that `run` has refined, and their own poses. Raises InputError like
-    `read_cameras`."""
+    """Return copies of the views with the lenses that `run` has refined; poses stay. Raises InputError.
+
+    run: None, or a run without refined lenses, leaves the views unchanged.
+    """
     if run is None or not run.config.refine_lenses or not run.refined_path.is_dir():
         return list(views)
     cameras, seen = read_cameras(run.refined_path), []

@@ -52,6 +52,8 @@ SCRATCH_NAME = re.compile(rf"[0-9a-f]{{{OWNER_DIGITS}}}-[0-9a-f]{{8}}{re.escape(
 class Run:
     """A run folder. `Run.create` makes one, `Run.open` opens an existing one.
 
+    scene: path of the scene; None if config.toml does not record it.
+    resuming: True if training continues an earlier run in this folder.
     scratch_path: folder of the scratch files, which may be outside the run folder.
     """
 
@@ -137,7 +139,13 @@ class Run:
     def save_model_rows(
         self, model: Gaussians, count: int, rows: Callable[[int, int], Gaussians], space: str = "sRGB"
     ) -> None:
-        """Write model.ply of a model that is not in memory as a whole. The arguments are those of `ply.write_rows`."""
+        """Write model.ply of a model that is not in memory as a whole.
+
+        model: Gaussians with the origin, near plane, SH degree and other properties of the whole model.
+        count: number of Gaussians of the whole model.
+        rows: function that returns the Gaussians [start, stop).
+        space: the colour space that the model was trained in.
+        """
         ply.write_rows(self.model_path, model, count, rows, comments=[comment(space)])
 
     def write_eval(self, result: Mapping[str, Any]) -> None:
@@ -145,18 +153,18 @@ class Run:
         atomic_write(self.eval_path, (json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
 
     def write_appearance(self, record: Mapping[str, Any], tables: Mapping[str, NDArray[Any]] | None = None) -> None:
-        """Write appearance.json, and appearance.npz for the tables that are too large for it."""
+        """Write `record` to appearance.json, and `tables`, arrays too large for JSON, to appearance.npz."""
         if tables:
             with atomic_writer(self.appearance_path.with_suffix(".npz")) as file:
                 np.savez(file, **dict[str, Any](tables))
         atomic_write(self.appearance_path, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
 
     def model_record(self) -> dict[str, Any]:
-        """Record with `step` and `seconds` of model.ply, if they are known.
+        """Return a record with the `step` and `seconds` of model.ply; empty if they are not known.
 
-        It is eval.json, which is written after the model. Without a usable eval.json, or with one that is older than
-        the model, it is the last record of metrics.jsonl. That may be of a later step than the model, if the run was
-        resumed and then stopped.
+        The record is eval.json, which is written after the model. If eval.json is not usable, or older than the model,
+        the record is the last of metrics.jsonl. This may be of a later step than the model, if the run was resumed and
+        then stopped.
         """
         with suppress(OSError, ValueError, InputError):
             if self.eval_path.stat().st_mtime_ns < self.model_path.stat().st_mtime_ns:
@@ -176,11 +184,11 @@ class Run:
         try:
             with open(self.metrics_path, "a", encoding="utf-8", newline="\n") as file:
                 file.write(line + "\n")
-        except OSError as error:  # the system's error for a full disk names no file
+        except OSError as error:  # the system's error for a full disk does not name the file
             raise write_error(self.metrics_path, error, needs=len(line) + 1) from None
 
     def read_metrics(self) -> list[dict[str, Any]]:
-        """Records of metrics.jsonl, without an incomplete last line, which a crash leaves."""
+        """Return the records of metrics.jsonl, without an incomplete last line, which a crash may leave."""
         return [record for _, record in self._metrics_lines()]
 
     def truncate_metrics(self, step: int) -> None:
@@ -205,7 +213,7 @@ class Run:
     def save_checkpoint(self, step: int, arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) -> Path:
         """Write checkpoints/step-STEP.npz atomically and keep the latest two.
 
-        arrays, state: as in `write_checkpoint`.
+        arrays, state: arrays and JSON values by name, the content of the checkpoint.
         Checkpoints of later steps are removed, because training has gone back to an earlier step.
         """
         self.checkpoints_path.mkdir(parents=True, exist_ok=True)
@@ -225,10 +233,10 @@ class Run:
         return sorted((int(match[1]), path) for match, path in matches if match)
 
     def manifests(self) -> list[tuple[Path, Manifest]]:
-        """Paths and manifests of the checkpoints whose Gaussians are in scratch files, the earliest first.
+        """Return paths and manifests of the checkpoints whose Gaussians are in scratch files, the earliest first.
 
-        Damaged checkpoints are left out, and checkpoints later than the latest one that is known to be intact. Raises
-        OSError if a checkpoint cannot be read now.
+        Damaged checkpoints are left out, and so are checkpoints after the latest that was found intact. Raises OSError
+        if a checkpoint cannot be read now.
         """
         found = []
         for step, path in self.checkpoints():
@@ -248,23 +256,23 @@ class Run:
         return True
 
     def _located(self, manifest: Manifest) -> Manifest:
-        """The manifest with the current path of its scratch file: in `scratch_path`, or where it was made."""
+        """Return the manifest with the path of its scratch file: in `scratch_path` if it is there, else as recorded."""
         here = self.scratch_path.absolute() / manifest.path.name
         return replace(manifest, path=here) if here.is_file() else manifest
 
     def _verified(self, checkpoint: Checkpoint) -> Checkpoint:
-        """The checkpoint, after verifying its scratch file. Raises ValueError or ScratchError if chunks changed."""
+        """Return the checkpoint after verifying the chunks in its scratch file. Raises ValueError or ScratchError."""
         if checkpoint.manifest is None:
             return checkpoint
         if SCRATCH_NAME.fullmatch(checkpoint.manifest.path.name) is None:
-            raise ValueError(f"it names {checkpoint.manifest.path}, expected a scratch file (*{SCRATCH_SUFFIX})")
+            raise ValueError(f"its manifest names {checkpoint.manifest.path}, expected a file *{SCRATCH_SUFFIX}")
         manifest = self._located(checkpoint.manifest)
         with closing(ChunkStore.opened(manifest, writable=False)) as store:
             store.verify()
         return replace(checkpoint, manifest=manifest)
 
     def load_latest_checkpoint(self) -> Checkpoint | None:
-        """The latest intact checkpoint; None if there are no checkpoints.
+        """Return the latest intact checkpoint; None if there are no checkpoints.
 
         A damaged checkpoint is skipped with a warning. In a run that is resumed, metrics.jsonl is truncated to the
         checkpoint's step, and temporary files of a killed process are removed. Raises InputError if there are
@@ -295,8 +303,10 @@ class Run:
 
 
 def model_file(path: Path) -> Path:
-    """Path of the model file for a run's folder, a model folder or a model file. Raises InputError for a run without a
-    model."""
+    """Return the path of the model file of a run's folder or a model's folder, or `path` if it is a file.
+
+    Raises InputError for a run without a model.
+    """
     if not path.is_dir():
         return path
     if not is_run(path) and (model := model_path(path)) != path:
@@ -317,12 +327,12 @@ def is_run(path: Path) -> bool:
 
 
 def run_of(model: Path) -> Run | None:
-    """The run that a model belongs to, if any: `model` itself, or the folder that contains it."""
+    """Return the run that a model belongs to: the folder `model`, or the folder that contains it; None if no run."""
     return next((Run.open(path) for path in (model, model.parent) if is_run(path)), None)
 
 
 def check_output(path: Path, *, resume: bool, overwrite: bool) -> None:
-    """Raise InputError if a run may not be created at `path`. Writes nothing."""
+    """Raise InputError if a run cannot be created at `path`, or not be resumed there if `resume` is True."""
     if resume and overwrite:
         raise InputError("--resume and --overwrite exclude each other")
     if path.exists() and not path.is_dir():
@@ -335,7 +345,7 @@ def check_output(path: Path, *, resume: bool, overwrite: bool) -> None:
     elif path.is_dir():
         foreign = sorted(entry.name for entry in path.iterdir() if not entry.name.startswith("."))
         if foreign:
-            raise InputError(f"{path}: holds other files ({foreign[0]}) and is no run, expected an empty or new folder")
+            raise InputError(f"{path}: is not a run but has files ({foreign[0]}), expected an empty or new folder")
 
 
 def owned_files(path: Path) -> list[Path]:

@@ -33,7 +33,7 @@ _EXPECTED_SCENE_RECORD = "the record of a run's scene"
 
 
 def record_of(scene: Scene, resolution: int) -> dict[str, Any]:
-    """Content of scene.json. Reads every photograph that has no digest yet.
+    """Return the content of scene.json. Reads every photograph whose digest is not known yet.
 
     resolution: value of the setting `resolution`.
     """
@@ -66,13 +66,13 @@ def _view(view: View, digest: str | None) -> dict[str, Any]:
 
 
 def digest_of(record: dict[str, Any]) -> str:
-    """Digest of a recorded scene, 32 hexadecimal digits. The version that wrote the record does not change it."""
+    """Return the digest of a recorded scene, 32 hexadecimal digits. It does not depend on clsplat's version."""
     scene = {key: value for key, value in record.items() if key not in ("clsplat", "earlier", "length_unit")}
     return hashlib.sha256(json.dumps(scene, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def known_digests(record: dict[str, Any] | None) -> set[str]:
-    """Digests of a record's scene and of the earlier scenes that it replaced."""
+    """Return the digests of a recorded scene and of the run's earlier scenes; empty without a record."""
     return {digest_of(record), *record.get("earlier", [])} if record is not None else set()
 
 
@@ -85,7 +85,7 @@ def write(run: Run, scene: Scene) -> None:
 
 
 def read(run: Run) -> dict[str, Any] | None:
-    """Content of scene.json; None if the file is missing, as in runs of earlier versions. Raises InputError."""
+    """Return the content of scene.json; None if it is missing, as in runs of earlier versions. Raises InputError."""
     path = run.path / SCENE_RECORD_FILE_NAME
     if not path.exists():
         return None
@@ -111,13 +111,13 @@ def read(run: Run) -> dict[str, Any] | None:
 
 
 def length_unit_of(record: dict[str, Any]) -> float | None:
-    """Length unit with which the recorded training began; None for the extent, as in runs of earlier versions."""
+    """Return the length unit with which the training began, from scene.json. None: it was the scene's extent."""
     unit = record.get("length_unit")
     return None if unit is None else float(unit)
 
 
 def own_cameras(run: Run | None) -> list[Camera]:
-    """Cameras of all photographs of a run, training and held-out, sorted by name; empty if they are not recorded.
+    """Return the cameras of a run's training and held-out photographs, sorted by name; empty if not recorded.
 
     Raises InputError like `read`.
     """
@@ -135,7 +135,7 @@ def own_cameras(run: Run | None) -> list[Camera]:
 
 
 def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    """Short descriptions of the differences between a run's recorded scene and the scene as it is now.
+    """Return short descriptions of the differences between two records of a run's scene: the earlier one and now.
 
     If --resolution has changed, two differences are left out: changed sizes, and changed pixels of a photograph that is
     now read from another file.
@@ -163,8 +163,7 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
             changed[held_out].append(name)
     changes = [_listed(what, names) for what, names in changed.items() if names]
     if earlier["points"] != now["points"] and not changes:
-        counts = f"{earlier['points']['count']:,} then, {now['points']['count']:,} now"
-        changes.append(f"other points ({counts})")
+        changes.append(f"other points ({earlier['points']['count']:,} before, {now['points']['count']:,} now)")
     return changes
 
 
@@ -214,7 +213,7 @@ def keep(run: Run, scene: Scene, *, resuming: bool) -> None:
 
 
 def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
-    """Reasons, as texts, why scores of these views do not count as held-out scores of the run's scene."""
+    """Return the reasons, as texts, why scores of these views do not count as held-out scores of the run's scene."""
     try:
         record = read(run)
     except InputError:
@@ -240,11 +239,11 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
 
 
 def _close(a: list[float], b: list[float]) -> bool:
-    """True if two vectors agree within CAMERA_RELATIVE_TOLERANCE of their largest number."""
+    """True if two vectors differ by at most CAMERA_RELATIVE_TOLERANCE times their largest component's magnitude."""
     one, other = np.array(a), np.array(b)
     return bool(np.abs(one - other).max() <= CAMERA_RELATIVE_TOLERANCE * max(np.abs(one).max(), np.abs(other).max()))
 
 
 def _listed(what: str, names: list[str]) -> str:
-    """Text such as "3 views missing now (a.png, b.png, c.png)"."""
+    """Return a text such as "3 views missing now (a.png, b.png, c.png)". what: text after the count."""
     return f"{len(names):,} {'view' if len(names) == 1 else 'views'} {what} ({examples(names)})"

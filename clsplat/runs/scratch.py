@@ -33,7 +33,7 @@ class ScratchFiles:
 
     folder: folder for new files, which other trainings may use too.
     owner: beginning of the files' names (`owner_of`).
-    run: run whose checkpoints name files; None without checkpoints.
+    run: run whose checkpoints need files; None if the training writes no checkpoints.
     """
 
     def __init__(self, folder: Path, owner: str, run: Run | None) -> None:
@@ -47,16 +47,16 @@ class ScratchFiles:
         return self.folder / f"{self._owner}-{secrets.token_hex(4)}{SCRATCH_SUFFIX}"
 
     def is_own(self, path: Path) -> bool:
-        """True for a file that only this training can need."""
+        """True if only this training can need `path`: the name begins with `owner`, or it is in the run's scratch/."""
         inside = self._run is not None and path.parent == (self._run.path / "scratch").absolute()
         return path.name.startswith(self._owner) or inside
 
     def may_write(self, path: Path) -> bool:
-        """True for a file that this training may continue to write: its own, in its folder."""
+        """True if this training may continue to write to `path`: only it can need the file, which is in `folder`."""
         return self.is_own(path) and path.parent == self.folder
 
     def follow(self, store: ChunkStore) -> None:
-        """Protect slots of a store's file that checkpoints name. Measure the file's rate if it is on a network disk."""
+        """Protect the slots of `store` that checkpoints need. If its file is on a network disk, measure its speed."""
         assert store.path is not None
         path = store.path
         store.release, store.file.moved = lambda: self._release(path), self._count

@@ -56,11 +56,11 @@ _ADDED_SETTINGS: dict[str, tuple[str, Any]] = {
 """Settings that earlier versions did not have, each with an older setting and a value. A config.toml that has the older
 setting but not the new one gets the value for the new one. The value keeps the behaviour of earlier versions."""
 _RETIRED_VALUES = {("train.rasterizer.extent", "constant")}
-"""Values that a setting no longer has. The setting's default replaces them."""
+"""Settings and values that only earlier versions allowed. The setting's default replaces such a value."""
 
 
 def config_text(config: TrainConfig, scene: Path | None) -> str:
-    """Content of config.toml."""
+    """Return the text of config.toml with these settings. scene: path of the scene, or None to leave it out."""
     document: dict[str, Any] = {"clsplat": package_version()}
     if scene is not None:
         document["scene"] = str(scene)
@@ -74,7 +74,7 @@ def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
 
 
 def parse_config(text: str, path: Path) -> tuple[TrainConfig, Path | None]:
-    """Settings and scene path from the text of config.toml. Warns of settings of earlier versions that are ignored.
+    """Return settings and scene path from the text of config.toml. Warns of ignored settings of earlier versions.
 
     path: path of the file, for messages.
     Raises InputError.
@@ -86,7 +86,7 @@ def parse_config(text: str, path: Path) -> tuple[TrainConfig, Path | None]:
     for key in document:
         if key not in ("clsplat", "scene", "train"):
             raise InputError(
-                f"{path}: has {key!r}, which is no setting; expected only clsplat, scene and the tables of train"
+                f"{path}: has {key!r}, which is not a setting; expected only clsplat, scene and the tables of train"
             )
     scene = document.get("scene")
     if scene is not None and not (isinstance(scene, str) and scene):
@@ -120,7 +120,7 @@ def _from_table(cls: type[T], table: Any, path: Path, where: str, passed_over: l
                 passed_over.append(f"{name} = {value!r:.100}")
             continue
         if key not in names:
-            raise InputError(f"{path}: [{where}] has {key!r}, which is no setting there; {_meant(key, where)}")
+            raise InputError(f"{path}: [{where}] has {key!r}, which is not a setting there; {_meant(key, where)}")
         if is_dataclass(types[key]):
             values[key] = _from_table(types[key], value, path, name, passed_over)
         else:
@@ -132,7 +132,10 @@ def _from_table(cls: type[T], table: Any, path: Path, where: str, passed_over: l
 
 
 def _meant(key: str, where: str) -> str:
-    """Hint at the table that has a setting of the name `key`, or of a similar one, for a message."""
+    """Return a hint for a message: the table that has the setting `key` or one of a similar name.
+
+    where: name of the table that has the unknown `key`.
+    """
     tables = {"train": TrainConfig} | {
         f"train.{name}": kind for name, kind in get_type_hints(TrainConfig).items() if is_dataclass(kind)
     }

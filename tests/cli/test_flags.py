@@ -79,7 +79,7 @@ def test_what_is_said_is_the_fields_docstring_and_default(capsys: Capture, monke
     wide = " ".join(render_help(capsys, monkeypatch, 100).split())
     for part in (
         f"More are smoother, and take proportionally longer. (default: {SamplingConfig().samples})",
-        "--shutter-open FLOAT Time at which the shutter opens, in frames relative to the frame, such as -0.25",
+        "--shutter-open FLOAT Time at which the shutter opens, in frames before (-) or after the",
         "--eye both|left|right Eyes of --stereo to render. One eye alone is useful for a video",
         "--rasterizer.transmittance-min FLOAT Stop at a pixel before the Gaussian that would reduce",
         "-o, --output PATTERN File names of the images",
@@ -103,26 +103,26 @@ NO_NUMBER = "could not convert string to float"
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ([*CALL, "--shutter-angel", "180"], "--shutter-angel is no flag, did you mean --shutter-angle?"),
-        ([*CALL, "--shutter-angel=180"], "--shutter-angel is no flag, did you mean --shutter-angle?"),
-        ([*CALL, "--colourspace", "ACEScg"], "--colourspace is no flag, did you mean --colorspace?"),
-        ([*CALL, "--colour_space", "ACEScg"], "--colour_space is no flag, did you mean --colorspace?"),
-        ([*CALL, "--fps", "25"], "--fps is no flag, did you mean --video.fps?"),
-        ([*CALL, "--shutter", "180"], "--shutter is no flag, did you mean --shutter-angle?"),
+        ([*CALL, "--shutter-angel", "180"], "--shutter-angel is not a flag, did you mean --shutter-angle?"),
+        ([*CALL, "--shutter-angel=180"], "--shutter-angel is not a flag, did you mean --shutter-angle?"),
+        ([*CALL, "--colourspace", "ACEScg"], "--colourspace is not a flag, did you mean --colorspace?"),
+        ([*CALL, "--colour_space", "ACEScg"], "--colour_space is not a flag, did you mean --colorspace?"),
+        ([*CALL, "--fps", "25"], "--fps is not a flag, did you mean --video.fps?"),
+        ([*CALL, "--shutter", "180"], "--shutter is not a flag, did you mean --shutter-angle?"),
         (
             [*CALL, "--Frames", "1", "--over-scan", "5"],
-            "--Frames is no flag, did you mean --frames? --over-scan is no flag, did you mean --overscan?",
+            "--Frames is not a flag, did you mean --frames? --over-scan is not a flag, did you mean --overscan?",
         ),
-        ([*CALL, "--frobnicate"], "--frobnicate is no flag, expected one of clsplat render --help"),
+        ([*CALL, "--frobnicate"], "--frobnicate is not a flag, expected one of clsplat render --help"),
         # a wrong name of what is needed is said before what is missing
-        (["render", "model.ply", "--ouput", "x.png"], "--ouput is no flag, did you mean --output?"),
+        (["render", "model.ply", "--ouput", "x.png"], "--ouput is not a flag, did you mean --output?"),
         (
             ["train", "S", "-o", "R", "--densty.split-factor", "2"],
-            "--densty.split-factor is no flag, did you mean --density.split-factor?",
+            "--densty.split-factor is not a flag, did you mean --density.split-factor?",
         ),
-        (["rendr", "x"], "rendr is no verb, did you mean render?"),
-        (["vew", "x"], "vew is no verb, did you mean view?"),
-        (["Train", "x"], "Train is no verb, did you mean train?"),
+        (["rendr", "x"], "rendr is not a verb, did you mean render?"),
+        (["vew", "x"], "vew is not a verb, did you mean view?"),
+        (["Train", "x"], "Train is not a verb, did you mean train?"),
         (["nonsense", "x"], "Unrecognized options: nonsense, x"),
         ([*CALL, "--f-stop", "2,8"], f"Error parsing --f-stop: {NO_NUMBER}: '2,8'"),
         (["convert", "a.ply", "b.ply", "--scale", "1,2,1"], f"Error parsing --scale: {NO_NUMBER}: '1,2,1'"),
@@ -161,10 +161,10 @@ def test_one_scale_is_one_number(steps: str, found: str, tmp_path: Path, capsys:
     ("words", "message"),
     [
         ([*CALL, "--json"], "model.ply: no such"),
-        ([*CALL, "--json", "--shutter-angel", "1"], "--shutter-angel is no flag, did you mean --shutter-angle?"),
+        ([*CALL, "--json", "--shutter-angel", "1"], "--shutter-angel is not a flag, did you mean --shutter-angle?"),
         (["convert", "nowhere.ply", "b.ply", "--json"], "nowhere.ply: no such"),
         (["report", "nowhere", "--json"], "nowhere"),
-        (["view", "nowhere.ply", "--json"], "--json is no flag"),
+        (["view", "nowhere.ply", "--json"], "--json is not a flag"),
         (["eval", "--json", "--test-every"], "--test-every"),
     ],
 )

@@ -327,7 +327,7 @@ def test_the_plan(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     for part in (
         f"{WIDTH + 6}x{HEIGHT + 6} at -3,-3 of {WIDTH}x{HEIGHT}",
         "colour    sRGB to ACEScg",
-        "samples   3 frames for one, shutter from -0.25 to 0.25 frames, lens in focus at 4, 2x2 a pixel, box",
+        "samples   3 pictures per frame, shutter from -0.25 to 0.25 frames, lens in focus at 4, 2x2 samples per pixel",
     ):
         assert part in text
     plan = json.loads(ran(capsys, render_shot, shot, tmp_path / "new", f"{EVERYTHING} --dry-run --json").out)
@@ -406,7 +406,7 @@ def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Captu
         ("--shutter-open 0.1", "a.#.exr", "--shutter-open 0.1 --shutter-close None: expected two times"),
         ("--aperture 0.1", "a.#.exr", "--focus 0.0: expected the depth that is in focus"),
         ("--deep --supersample 2", "a.#.exr", "deep EXR: --supersample cannot filter deep samples"),
-        ("--deep --channels rgb,depth", "a.#.exr", "--deep: cannot hold depth, only colour, alpha, depths"),
+        ("--deep --channels rgb,depth", "a.#.exr", "--deep: deep EXR cannot hold depth besides its own depths"),
         ("--deep --parts several", "a.#.exr", "--deep and --parts several exclude each other"),
         ("--deep", "a.#.tif", "cannot hold deep samples, expected an .exr file"),
         ("--deep --background white", "a.#.exr", "--deep and --background exclude each other"),

@@ -305,7 +305,7 @@ def test_only_a_town_is_replaced_and_only_if_told(tmp_path: Path) -> None:
         ("--town 1x1 --seed=-1", "--seed -1: expected a whole number of at least 0"),
         ("--town 1x1 --iterations 5", "--iterations: has no effect with --town, which trains nothing"),
         ("--town 1x1 --device cpu", "--device: has no effect with --town, which trains nothing"),
-        ("--town-photos 10", "--town-photos: has an effect only with --town, expected it too, such as --town 2x2"),
+        ("--town-photos 10", "--town-photos: has an effect only with --town, expected --town too, such as --town 2x2"),
         ("--seed 1", "--seed: has an effect only with --town"),
         ("--overwrite", "--overwrite: has an effect only with --town"),
     ],

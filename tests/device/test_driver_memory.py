@@ -143,7 +143,7 @@ def test_a_failure_is_forgotten_when_what_failed_works(
     assert "probe.cl" in failed
     monkeypatch.setattr(driver_check, "examine", lambda *_: DriverReport())
     assert main(["selftest", "--device", str(index)]) == 0
-    assert f"The driver's kernel shape is still not used: {failed}; tried once more: " in capsys.readouterr().out
+    assert f"The kernel shape that failed stays disabled: {failed}; tried once more: " in capsys.readouterr().out
     assert driver_records.entries(device)[label].failed == failed
     standing("abort", ALWAYS)
     assert json.loads(printed(capsys, ["selftest", "--device", index, "--json"]).out)[0]["remembered"] == ""

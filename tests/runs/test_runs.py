@@ -47,14 +47,14 @@ def test_config_comes_back(tmp_path: Path) -> None:
     [
         (
             'clsplat = "1"\n[train]\niteration = 3\n',
-            "[train] has 'iteration', which is no setting there; did you mean 'iterations' in [train]?",
+            "[train] has 'iteration', which is not a setting there; did you mean 'iterations' in [train]?",
         ),
-        ('clsplat = "1"\n[train.density]\neach = 3\n', "[train.density] has 'each', which is no setting there"),
+        ('clsplat = "1"\n[train.density]\neach = 3\n', "[train.density] has 'each', which is not a setting there"),
         (
             'clsplat = "1"\n[train.rasterizer]\niterations = 3\n',
-            "[train.rasterizer] has 'iterations', which is no setting there; it belongs to [train]",
+            "[train.rasterizer] has 'iterations', which is not a setting there; it belongs to [train]",
         ),
-        ('clsplat = "1"\ntrian = 3\n', "has 'trian', which is no setting"),
+        ('clsplat = "1"\ntrian = 3\n', "has 'trian', which is not a setting"),
         ('clsplat = "1"\n[train]\niterations = "many"\n', "train.iterations is 'many', expected a whole number"),
         ('clsplat = "1"\n[train]\niterations = true\n', "train.iterations is True, expected a whole number"),
         ('clsplat = "1"\n[train]\nbackground = "red"\n', "expected one of black, white, random"),
@@ -151,7 +151,7 @@ def test_other_folders_are_not_taken(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years")
     (tmp_path / "config.toml").write_text("[tool]\nof = 'another program'\n")
     for overwrite in (False, True):
-        refuses(r"holds other files \(config\.toml\) and is no run", Run.create, tmp_path, CONFIG, overwrite=overwrite)
+        refuses(r"is not a run but has files \(config\.toml\)", Run.create, tmp_path, CONFIG, overwrite=overwrite)
     refuses("no run to resume", Run.create, tmp_path, CONFIG, resume=True)
     refuses("is a file", Run.create, tmp_path / "thesis.tex", CONFIG)
     assert (tmp_path / "thesis.tex").read_text() == "years"

@@ -232,9 +232,9 @@ RENDER = """def RenderSettings "Render"
 @pytest.mark.parametrize(
     ("flags", "settings", "message"),
     [
-        ("--width 64", "", "--stereo: frame 1 is 64x48 for the left eye and 64x32 for the right; "),
+        ("--width 64", "", "--stereo: frame 1 has the size 64x48 for the left, 64x32 for the right eye; "),
         ("--width 64 --region 0,30,8,8", "", "--region 0,30,8,8: ends at 8,38, beyond the frame's size 64,32"),
-        ("", RENDER, "--stereo: frame 1 has pixels of the aspect ratio 1.0 for the left eye and 1.5 for the right; "),
+        ("", RENDER, "--stereo: frame 1 has the pixel aspect ratio 1.0 for the left, 1.5 for the right eye; "),
     ],
 )
 def test_eyes_that_are_not_alike(

@@ -43,7 +43,7 @@ def test_it_is_so_where_the_scene_has_other_lenses(scene: Scene, default_device:
 
 DRAWN = {
     "antialiased": ("--antialiased", b"SplatRenderMode: mip", ("spz", "compressed.ply", "sog"), "antialiasing"),
-    "by_rays": ("--perspective rays", b"clsplat rays", ("compressed.ply",), "drawing along rays"),
+    "by_rays": ("--perspective rays", b"clsplat rays", ("compressed.ply",), "projection along rays"),
 }
 """By its field in a model: the flags, the comment in a PLY, formats that store it, and its name where one cannot."""
 

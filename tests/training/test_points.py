@@ -75,7 +75,7 @@ def test_a_cloud_that_changes_is_refused(scene: Path, tmp_path: Path, capsys: Ca
     assert main(["train", str(scene), "-o", str(run), "--points", str(cloud), *WORDS]) == 0
     hidden_model(60).save(cloud)
     capsys.readouterr()
-    assert "other points (50 then, 60 now)" in rejected(capsys, ["train", "-o", run, "--resume", "--iterations", "5"])
+    assert "other points (50 before, 60 now)" in rejected(capsys, ["train", "-o", run, "--resume", "--iterations", "5"])
 
 
 def test_colours_come_from_the_photographs(scene: Path, cloud: Path) -> None:

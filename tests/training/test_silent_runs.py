@@ -109,7 +109,7 @@ def test_a_checkpoint_under_another_name_is_passed_over(run: Path) -> None:
     latest = run / "checkpoints" / "step-0000003.npz"
     latest.rename(latest.with_name("step-0000900.npz"))
     with (
-        pytest.warns(UserWarning, match="it contains step 3, but its name says step"),
+        pytest.warns(UserWarning, match="the file contains step 3, but its name says step"),
         pytest.raises(InputError, match="no intact checkpoint"),
     ):
         Run.open(run).load_latest_checkpoint()

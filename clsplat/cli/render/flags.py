@@ -58,15 +58,16 @@ class RenderVerb(Verb):
     transform: Annotated[str | None, arg(metavar="FILE|STEPS|M00,M01,...")] = None
     """Place the model by a 4 x 4 matrix: rotation, uniform scale, translation. Give 16 numbers row by row, a file of
     them, or steps in their order such as 'rotate=0,90,0 scale=2 translate=1,0,0'. A JSON file can hold key frames or a
-    matrix a frame (docs/shot.md)."""
+    matrix for each frame (docs/shot.md)."""
     path: Annotated[Literal["turntable", "spiral", "through"] | None, arg(metavar="turntable|spiral|through")] = None
-    """Path made from the cameras, instead of the cameras themselves. turntable: around their common focus; spiral: two
-    such turns, rising and sinking; through: along the cameras in their order, smoothed. Frames count from 1.
-    Without --cameras, the path is made from the cameras of a run's photographs. For a model file it goes around the
-    whole model if that is an object, or around the most detailed part of a scene."""
+    """Path made from the cameras, instead of the cameras themselves. turntable: once around the point that they
+    look at; spiral: twice around it, rising and sinking; through: along the cameras in their order, smoothed. Frames
+    count from 1. Without --cameras, the path is made from the cameras of a run's photographs. For a model file it goes
+    around the whole model if that is an object, or around the most detailed part of a scene."""
     up: Annotated[str | None, arg(metavar="AXIS|X,Y,Z")] = None
     """Up direction of a path around a model, without --cameras: x, y, z, -x, -y, -z or three numbers. If not given: -y,
-    as in a COLMAP scene. With it the path goes around a run's model too. Write --up=-z if it begins with a minus."""
+    as in a COLMAP scene. With --up, the path goes around a run's model too. Write --up=-z if the value begins with a
+    minus."""
     count: OptionalInt = None
     """Number of frames of the path; 120 if not given."""
     frames: Annotated[str | None, arg(metavar="1-100,200-300:2,...")] = None
@@ -90,8 +91,8 @@ class RenderVerb(Verb):
     """Write alpha too, like --channels rgb,alpha, without a background. It is premultiplied in EXR and TIFF, straight
     in PNG."""
     exr: ExrDepth = DEFAULT_EXR_DEPTH
-    """Bits of the floats in EXR, 16 or 32, for colour, alpha and normals. Depths, positions and motion always have
-    32."""
+    """Type of colour, alpha and normals in EXR files: half (16 bits) or float (32 bits). Depths, positions and motion
+    are always float."""
     parts: Parts = "one"
     """one: all channels of an EXR file in one part; several: one part for colour with alpha, and one for each other
     channel."""
@@ -114,7 +115,7 @@ class RenderVerb(Verb):
     warp: Annotated[WarpConfig, arg(name="")] = field(default_factory=WarpConfig)
     pairs: Annotated[StereoConfig, arg(name="")] = field(default_factory=StereoConfig)
     deep: Flag = False
-    """Write deep EXR: colour, alpha and depth of each pixel, in slices of the scene. docs/pictures.md explains them."""
+    """Write deep EXR: colour, alpha and depth of each pixel, in slices by depth. docs/pictures.md explains them."""
     slices: Annotated[DeepConfig, arg(name="deep")] = field(default_factory=DeepConfig)
     holdout: Annotated[str | None, arg(metavar="PATTERN")] = None
     """Depth EXR or deep EXR of other elements, such as 'cg/depth.####.exr'. Everything behind their surfaces is left
@@ -155,7 +156,10 @@ class RenderVerb(Verb):
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
 
     def completed(self, given: Collection[str]) -> RenderVerb:
-        """Take the rasterizer's settings from the preset, or without one from the run, and the lenses from the run."""
+        """Return the arguments with the rasterizer's settings of --preset, or else of the run, and the run's lenses.
+
+        Flags that are `given` override these. Raises InputError.
+        """
         from clsplat.models.formats import model_path
         from clsplat.runs.run import Run, is_run
 
@@ -173,7 +177,7 @@ class RenderVerb(Verb):
 
     @property
     def is_video(self) -> bool:
-        """True if all frames go into one file."""
+        """True if the output is a video, one file with all frames."""
         from clsplat.images.frame_files import VIDEO_SUFFIXES
 
         return self.extension in VIDEO_SUFFIXES

@@ -9,7 +9,7 @@ MOST_NEEDED_FLAGS = (
     *("output", "cameras", "path", "frames", "width", "height", "channels", "colorspace"),
     *("shutter-angle", "skip-existing", "device", "dry-run"),
 )
-"""The twelve flags of the first group. The model is listed above them."""
+"""Flags that the first group of the help lists, below the model."""
 RENDER_GROUPS: Groups = (
     ("Needed most", ("RUN|MODEL", *MOST_NEEDED_FLAGS)),
     (

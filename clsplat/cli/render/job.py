@@ -44,9 +44,9 @@ class Job:
     """Models, frames and options of a call of `clsplat render`, ready to be rendered.
 
     tasks: a task for each frame.
-    spaces: colour spaces of the model and of the written pictures, by name.
+    spaces: names of the model's colour space and of the colour space of the written pictures.
     video: encoding of the video, with its frame rate.
-    mattes: objects of each Cryptomatte channel.
+    mattes: the objects of each Cryptomatte, by the name of its channel.
     """
 
     request: Request
@@ -59,7 +59,7 @@ class Job:
 
 
 def job_of(request: Request) -> Job:
-    """Read cameras and models, and check everything that can be checked without rendering.
+    """Read cameras and models, and return the job, after all checks that are possible without rendering.
 
     Raises InputError; writes nothing.
     """
@@ -105,21 +105,20 @@ def job_of(request: Request) -> Job:
 
 def _models(flags: RenderVerb) -> JobModels:
     """Load the model or models that MODEL names, placed by --transform. Raises InputError."""
-    wrong = f"--appearance {flags.appearance}: is for one run's model, but {flags.model}"
-    if flags.appearance is not None and is_layout(flags.model):
-        raise InputError(f"{wrong} is a shot of several")
-    if flags.appearance is not None and is_sequence(flags.model):
-        raise InputError(f"{wrong} has a file for each frame")
+    for has_several, what in ((is_layout, "is a shot of several models"), (is_sequence, "has a file for each frame")):
+        if flags.appearance is not None and has_several(flags.model):
+            raise InputError(f"--appearance {flags.appearance}: is for one run's model, but {flags.model} {what}")
     return load_job_models(flags.model, None if flags.transform is None else parse_transform(flags.transform))
 
 
 def _video(flags: RenderVerb, fps: float | None, path: Path, sizes: Collection[tuple[int, int]]) -> VideoConfig:
     """Return the video settings, with the shot's frame rate unless a flag sets another.
 
-    fps: the shot's frames a second; None if it gives no rate.
-    sizes: (width, height) of the pictures, of which a video needs a single one.
-    Raises InputError for a rate or sizes that no video has, and for a file that may not be replaced. With
-    --skip-existing a video that clsplat wrote may be replaced.
+    fps: the shot's frame rate in frames a second; None if the shot has no frame rate.
+    path: file of the video.
+    sizes: (width, height) of the pictures. A video needs pictures of a single size.
+    Raises InputError for a frame rate or sizes that a video cannot have, and for an existing file that may not be
+    replaced. With --skip-existing a video that clsplat wrote may be replaced.
     """
     if not flags.is_video:
         return flags.video
@@ -163,23 +162,23 @@ def _picture_sizes(tasks: Sequence[Task], pictures: PictureConfig, *, deep: bool
 
 
 def _check_pair(task: Task, left: Camera, right: Camera) -> None:
-    """Raise InputError if eyes in one EXR file differ in window size or pixel aspect ratio, which all parts share."""
-    advice = f"{task.path} holds both eyes, expected them alike, or a file for each: {{eye}} in -o"
-    sizes = [f"{frame.width}x{frame.height}" for frame in (left.window or left, right.window or right)]
-    if sizes[0] != sizes[1]:
-        what = f"is {sizes[0]} for the left eye and {sizes[1]}"
-        raise InputError(f"--stereo: frame {task.number} {what} for the right; {advice}")
-    # compare as float32, the precision in which EXR headers store the pixel aspect ratio
-    shapes = [str(np.float32(eye.fy / eye.fx)) for eye in (left, right)]
-    if task.optics is not None and shapes[0] != shapes[1]:
-        what = f"has pixels of the aspect ratio {shapes[0]} for the left eye and {shapes[1]}"
-        raise InputError(f"--stereo: frame {task.number} {what} for the right; {advice}")
+    """Raise InputError if eyes in one EXR file differ in window size or pixel aspect ratio: its parts share these."""
+    values = {"size": [f"{frame.width}x{frame.height}" for frame in (left.window or left, right.window or right)]}
+    if task.optics is not None:
+        # compare as float32, the precision in which EXR headers store the pixel aspect ratio
+        values["pixel aspect ratio"] = [str(np.float32(eye.fy / eye.fx)) for eye in (left, right)]
+    for what, (of_left, of_right) in values.items():
+        if of_left != of_right:
+            raise InputError(
+                f"--stereo: frame {task.number} has the {what} {of_left} for the left, {of_right} for the right eye; "
+                f"expected the same in {task.path}, which holds both; or write a file for each eye: {{eye}} in -o"
+            )
 
 
 def check_warps(tasks: Sequence[Task], pictures: PictureConfig) -> None:
     """Raise InputError for panoramas, which cannot be distorted, and for an STMap that does not cover the picture.
 
-    Warns if a part of the picture stays empty.
+    Warns if a part of a picture stays empty. pictures: settings with the distortion of --stmap or --distort.
     """
     flag = f"--stmap {pictures.warp.stmap}" if pictures.warp.stmap else "--distort"
     empty: dict[int, float] = {}
@@ -202,8 +201,8 @@ def check_warps(tasks: Sequence[Task], pictures: PictureConfig) -> None:
         number, part = max(empty.items(), key=lambda item: item[1])
         advice = "" if pictures.warp.stmap else "; --lenses native renders fisheyes without undistorted pictures"
         warn(
-            f"{flag}: {100 * part:.0f} % of frame {number} stays black and transparent: these pixels have no "
-            f"position in the undistorted picture, or one more than a frame's size outside it{advice}"
+            f"{flag}: {100 * part:.0f} % of frame {number} stays black and transparent: even extended by its own size "
+            f"on each side, the undistorted picture does not contain what these pixels show{advice}"
         )
 
 
@@ -287,7 +286,7 @@ def _plan_lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan])
 
 
 def _sizes(frames: Sequence[dict[str, Any]]) -> list[str]:
-    """Return the distinct picture sizes as texts, each with its place in the frame if the picture is a part of one."""
+    """Return the distinct picture sizes as texts. If a picture is a part of the frame, the text gives its position."""
     sizes = {(frame["width"], frame["height"], tuple(frame.get("window", ()))) for frame in frames}
     texts = []
     for width, height, window in sorted(sizes):
@@ -298,20 +297,20 @@ def _sizes(frames: Sequence[dict[str, Any]]) -> list[str]:
 
 def _samples(job: Job) -> str:
     sampling, framing = sampling_of(job.tasks[0], job.options.pictures), job.options.pictures.framing
-    words = [f"{sampling.samples} frames for one" if sampling.on else ""]
+    words = [f"{sampling.samples} pictures per frame" if sampling.on else ""]
     if sampling.moves:
         opens, closes = sampling.shutter
         words.append(f"shutter from {opens:g} to {closes:g} frames")
     words.append(f"lens in focus at {sampling.focus:g}" if sampling.has_lens else "")
-    words.append(
-        f"{framing.supersample}x{framing.supersample} a pixel, {framing.filter}" if framing.supersample > 1 else ""
-    )
+    if framing.supersample > 1:
+        words.append(f"{framing.supersample}x{framing.supersample} samples per pixel, {framing.filter} filter")
     return ", ".join(word for word in words if word)
 
 
 def write_frames(job: Job, renderers: Sequence[Any]) -> int:
     """Render and write all frames, with a renderer for each device or on a Dask cluster.
 
+    renderers: a renderer for each device; unused on a Dask cluster.
     --skip-existing leaves out frames whose files exist.
     Raises ClsplatError, and KeyboardInterrupt with the number of frames done.
     """

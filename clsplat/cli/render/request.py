@@ -54,10 +54,10 @@ class Request:
 def checked(flags: RenderVerb) -> Request:
     """Check the flags and return them as a request. Warns of flags without effect.
 
-    Raises InputError, and DeviceError for a device that is not there.
+    Raises InputError, and DeviceError for a device that does not exist.
     """
     if flags.cameras is None:
-        check_around(flags.path, among_own=True)  # a run's own cameras are read later
+        check_around(flags.path, among_own=True)  # assume that the run has cameras: they are read later
     channels = parse_channels(f"{flags.channels},alpha" if flags.alpha or flags.deep else flags.channels)
     check_format(flags.output, channels, video=True)
     flags.video.check()
@@ -121,13 +121,14 @@ def _check_deep(flags: RenderVerb, pictures: PictureConfig, channels: tuple[str,
     if flags.extension != ".exr":
         raise InputError(f"--deep: {flags.output} cannot hold deep samples, expected an .exr file")
     if over := [name for name in channels if name not in ("rgb", "alpha")]:
-        raise InputError(f"--deep: cannot hold {', '.join(over)}, only colour, alpha, depths; expected --channels rgb")
+        names = ", ".join(over)
+        raise InputError(f"--deep: deep EXR cannot hold {names} besides its own depths, expected --channels rgb")
     if flags.parts != "one":
         raise InputError("--deep and --parts several exclude each other: a deep file has one part")
 
 
 def bits_of(path: str, bits: int | None, channels: Collection[str]) -> int:
-    """Return the bits per channel for files of that name.
+    """Return the bits per channel of the file `path`, from --bits or else the default of its format.
 
     bits: value of --bits, or None for the format's default.
     Raises InputError if the format does not support the bits.

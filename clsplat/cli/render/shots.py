@@ -47,7 +47,7 @@ def shots_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[str,
 
 
 def _cameras_asked(flags: RenderVerb, models: Callable[[], JobModels]) -> dict[str, Shot]:
-    """Return the shot of --cameras or of --path for each eye, before a still camera is repeated for each frame."""
+    """Return the shot of --cameras or of --path by the eye's name. A still camera is a shot of a single frame."""
     pairs, size = flags.pairs, (flags.width, flags.height)
     paths = _stage_cameras(pairs, flags.cameras, flags.usd_camera) if pairs.of_stage else {}
     if flags.cameras is None:
@@ -105,7 +105,8 @@ def with_stage(
     """Return picture settings with a USD stage's data window, shutter and lens, and the stage settings not applied.
 
     source: the stage's file, for messages.
-    shot: the shot read from the stage. Its first frame gives the shutter and the lens.
+    shot: the shot read from the stage, with its data window.
+    tasks: the frames of the shot. The first gives the shutter and the lens.
     Raises InputError for a data window without a pixel.
     """
     unapplied = (*_lens_unapplied(pictures.sampling, tasks), *_pixel_aspect_unapplied(tasks[0]))
@@ -128,7 +129,7 @@ def _pixel_aspect_unapplied(task: Task) -> tuple[str, ...]:
     shape, kind = task.camera.fy / task.camera.fx, task.path.suffix.lower()
     if task.optics is None or kind == ".exr" or abs(shape - 1) < _STAGE_FLOAT32_TOLERANCE:
         return ()
-    return (f"pixelAspectRatio ({shape:g}) in {kind} files, whose pixels viewers show as squares",)
+    return (f"pixelAspectRatio ({shape:g}), because {kind} files cannot store it and viewers show square pixels",)
 
 
 def _framing(
@@ -146,8 +147,8 @@ def _framing(
         x, y, end_x, end_y = (max(math.ceil(edge - 0.5 - _PIXEL_CENTRE_TOLERANCE_PX), 0) for edge in edges)
         if x >= end_x or y >= end_y:
             raise InputError(
-                f"{source}: {window_named(window)[0]} holds no pixel of {width}x{height}, expected one; or give "
-                "--region"
+                f"{source}: {window_named(window)[0]} contains no pixel centre of the {width}x{height} frame, expected "
+                "at least one; give --region to render another part"
             )
         return replace(framing, region=f"{x},{y},{end_x - x},{end_y - y}")
     shares = (-left, -bottom, right - 1, top - 1)
