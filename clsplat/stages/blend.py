@@ -73,7 +73,7 @@ def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[De
 
 
 _MIN_STRIP_ITEMS = 32
-"""Number of work-items per tile from which sums over a tile's pixels are in the order of kernels/shared/strips.h."""
+"""Minimum number of work-items per tile with which kernels/shared/strips.h defines the order of sums over pixels."""
 _MIN_TILE_ITEMS = 8
 """Minimum number of work-items that share a tile: those of one row of a pixel block (kernels/shared/blocks.h). A tile
 that is not shared has one work-item."""

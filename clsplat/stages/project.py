@@ -109,8 +109,9 @@ def project(
     thinning: Thinning | None = None,
     chunks: ChunkList | ChunkNumbers | None = None,
 ) -> Projected:
-    """Project all Gaussians that thinning does not drop, and count their tiles (Kerbl et al. 2023, section 4).
+    """Project Gaussians to splats, and count the tiles that each splat reaches (Kerbl et al. 2023, section 4).
 
+    thinning: random dropout of Gaussians in a step of training; None projects all.
     chunks: the chunks whose Gaussians are projected and have rows in the result. None projects the whole model.
     """
     n = gaussians.count if chunks is None else chunks.rows
