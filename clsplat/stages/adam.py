@@ -67,7 +67,7 @@ def adam(
     (`columns.REFUSED`).
     """
     readback = readback or allocate(device, (len(READBACK),), np.uint32)
-    counts = readback.buffer  # as a plain buffer, so that the profile does not count its bytes: it is rarely written
+    counts = readback.buffer  # a plain buffer: the profile must not count readback's bytes, which are rarely written
     config = step.config
     beta1, beta2, epsilon = config.beta1, config.beta2, config.epsilon
     abreast = max(device.shape.lanes, 4)  # number of elements per work-item, ABREAST in adam.h

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches the kernels of a colour model, which removes a photograph's own colours, and appearance.cl, its update.
+"""Launches the kernels of colour models, which remove a photograph's own colours, and of their update (appearance.cl).
 
 To add a colour model, add a row to COLOUR_MODELS (config/colour_models.py), and a kernel file and a twin of that name.
 """

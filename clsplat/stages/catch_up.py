@@ -102,7 +102,7 @@ def catch_up(
         np.uint32(sh_width),
         *(config.beta1, config.beta2, config.epsilon),
         *(PARAMETER_GROUPS["means"].limit ** 2, PARAMETER_GROUPS["sh_dc"].limit ** 2),
-        readback.buffer,  # as a plain buffer, so that the profile does not count its bytes: it is rarely written
+        readback.buffer,  # a plain buffer: the profile must not count readback's bytes, which are rarely written
         *(arrays[group] for arrays in model for group in PARAMETER_GROUPS),
     )
     noted = (chunks.model_rows, chunks.numbers, np.uint32(step), readback.buffer, caught)

@@ -160,8 +160,9 @@ def channels(
     blended: Blended,
     held: Held | None = None,
 ) -> Channels:
-    """Blend a row of values per Gaussian into channels, with the weights that `blended` has from the same lists.
+    """Blend a row of values of each Gaussian into channels, with the same weights as the image in `blended`.
 
+    lists: the tile lists from which the image was blended.
     wanted: what the rows contain.
     rows: (n, wanted.floats), the values of each Gaussian, such as the result of `features`.
     held: surfaces of the holdout, if there is one.

@@ -379,7 +379,8 @@ def carried(
     *,
     densified: bool,
 ) -> DensityStatistics:
-    """Return the statistics after density control. Row j is row rows[j] of the source, or infinite with the bit FRESH.
+    """Return the statistics after density control. Row j is row rows[j] of the source, or infinite if rows[j] is
+    FRESH.
 
     rows: entries of a row list, on the device or on the host.
     source: arrays by name (`DensityStatistics.named`). Each array is removed from the dictionary as soon as it is

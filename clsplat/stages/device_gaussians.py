@@ -392,8 +392,9 @@ def upload_gaussians(device: Device, gaussians: Gaussians, sh: ShStorage | None 
 
 
 def host_gaussians(gaussians: Gaussians, rows: int, sh: ShStorage | None = None) -> HostGaussians:
-    """Wrap Gaussians on the host without a copy. They are streamed to the device, `rows` at a time.
+    """Wrap Gaussians on the host. They are streamed to the device, `rows` at a time.
 
+    An array is copied only if its dtype or layout has to change.
     sh: the SH storage, for a model that is only rendered.
     """
     sh = sh or ShStorage(gaussians.sh.shape[1])

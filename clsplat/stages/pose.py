@@ -16,7 +16,7 @@ point)."""
 
 
 def sums_of(work: Workspace, count: int, numbers: int = POSE_NUMBERS) -> DeviceArray:
-    """Return an array for the partial sums of `pose_rows` or `lens_rows`, of the gradient of a pose or lens.
+    """Return an array for partial sums of the gradient of a pose or lens, which `pose_rows` or `lens_rows` fills.
 
     It has a row of `numbers` sums for every POSE_ROWS of the `count` Gaussians.
     """
@@ -36,7 +36,8 @@ def pose_rows(
     """Compute the gradient with respect to a camera's pose, as a partial sum for every POSE_ROWS Gaussians.
 
     device: the device with the kernel switches of the camera model.
-    gaussians, gradients: all Gaussians of the model, or consecutive rows of it, and the gradients by these.
+    gaussians: all Gaussians of the model, or consecutive rows of it.
+    gradients: the gradients with respect to the parameters of these Gaussians.
     sums: (ceil(rows of the model / POSE_ROWS), 6), of which the rows of these Gaussians are filled.
     first_row: the model's row that is the first of `gaussians`, a multiple of POSE_ROWS.
     """

@@ -38,7 +38,7 @@ SCREEN_GRADIENT_BYTES = 8
 
 
 def gaussian_bytes(*, keeps_culled: bool) -> int:
-    """Return the bytes per Gaussian of `Projected`: a splat, a tile count, and `shown` with `keeps_culled`."""
+    """Return the bytes per Gaussian of `Projected`: splat, tile count and, if `keeps_culled`, an entry of `shown`."""
     return 4 * (len(SPLAT) + 1 + keeps_culled)
 
 
@@ -302,7 +302,7 @@ def project_step(
         *(config.beta1, config.beta2, config.epsilon),
         *numbers[weights:],
         *(PARAMETER_GROUPS["means"].limit ** 2, PARAMETER_GROUPS["sh_dc"].limit ** 2),
-        readback.buffer,  # as a plain buffer, so that the profile does not count its bytes: it is rarely written
+        readback.buffer,  # a plain buffer: the profile must not count readback's bytes, which are rarely written
         *(arrays[group] for arrays in model for group in PARAMETER_GROUPS),
         *projected.chunk_arguments,
     )
@@ -325,7 +325,7 @@ class _Build(NamedTuple):
 
 
 def _build(device: Device) -> _Build:
-    """Return how project_grad.cl is built: with one lane if Gaussians are evaluated along rays, like project.cl."""
+    """Return how project_grad.cl is built. For cameras that evaluate Gaussians along rays, it has one lane."""
     return _Build(1, {"LANES": 1}) if device.switched("RAYS") else _Build(device.shape.lanes, {})
 
 

@@ -31,7 +31,7 @@ def settle(
 
     model: parameters, first and second moments.
     last: (n,) uint32, the last step that each Gaussian took. For settled Gaussians it becomes `step`. With
-    `tile_counts` it becomes `step + 1`, because the Gaussians that a view shows take its step right after this call.
+    `tile_counts` it becomes `step + 1`, because visible Gaussians take step `step + 1` right after this call.
     missed: (MOST_MISSED + 1, groups, 3), the result of `MissedSteps.rounded` after step `step`.
     tile_counts: (n,) uint32, tile counts of the view of step `step + 1`. Only visible Gaussians, whose count is not 0,
     are settled. None settles all Gaussians.

@@ -89,7 +89,7 @@ def values_grad(
 ) -> None:
     """Fill every row of `gradients` from the gradients with respect to blended values and alpha.
 
-    of: the values that were blended, and the image with whose weights.
+    of: the blended values, and the image whose weights they have.
     first_slots: (n,), the first slot of each Gaussian.
     d_pixels: (height, width, depth), the gradient with respect to the blended values.
     d_alpha: (height, width), the gradient with respect to alpha; None means zero.
