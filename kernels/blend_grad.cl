@@ -129,7 +129,7 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
 #endif
 }
 
-// The gradient by a pixel's final transmittance: `background`, its part through colour, plus by_t, of the fourth plane.
+// Gradient with respect to the final transmittance: `background`, its part through colour, + by_t, the fourth plane.
 #ifdef ALPHA_GRADIENT
 #define AT_END(background) ((background) + by_t)
 #define NEAR_PLANE 4

@@ -61,7 +61,7 @@ static inline Double camera_row(__constant float *r, __constant float *r_low, fl
   camera_row(camera + CAMERA_R##index##0, camera + CAMERA_R##index##0_LOW, camera[CAMERA_T##index],                    \
              camera[CAMERA_T##index##_LOW], x, y, z)
 
-// The low part of ratio = x / z in two floats.
+// Returns the low part of x / z in two floats. ratio: x / z in one float, the high part.
 static inline floatL slope_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low) {
   return (fmaL(-ratio, z, x) + fmaL(-ratio, z_low, x_low)) / z;
 }
