@@ -252,7 +252,7 @@ class ChunkPool:
         return values.view(self.store.record).reshape(-1)
 
     def _groups(self, count: int) -> list[slice]:
-        """Split `count` chunks into parts that cross the bus one after the other (`residency.CROSSING_SHARE`)."""
+        """Return slices of `count` chunks, which cross the bus one after the other (`residency.CROSSING_SHARE`)."""
         most = min(max(self.slots // CROSSING_SHARE, 1), _MAX_CROSSING)
         return [slice(begin, begin + most) for begin in range(0, count, most)]
 

@@ -29,9 +29,9 @@ DUPLICATE_GAUSSIAN_BYTES = 3 * 4 + SORT_KEY_BYTES + 3 * 4
 """Bytes per Gaussian: its entries of `first_slots`, `gaussian_from_visible` and `depth_keys`, of the sort by depth, and
 of `gaussian_from_rank`, `rank_counts` and `offsets`."""
 BAND_GAUSSIAN_BYTES = 4
-"""Additional bytes per Gaussian if there are several bands: the number of its tiles in the current band."""
+"""Additional bytes per Gaussian if there are several bands: the number of the Gaussian's tiles in the band."""
 BAND_TILE_BYTES = 4
-"""Additional bytes per tile if there are several bands: the number of its pairs."""
+"""Additional bytes per tile if there are several bands: the number of the tile's pairs."""
 
 
 def pair_bytes(*, sorts_pairs: bool) -> int:
