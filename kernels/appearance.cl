@@ -26,9 +26,9 @@ __kernel void column_sums(const int stride, const int tiles_y, __global const fl
   columns[(size_t)stride * c + x] = sum;
 }
 
-// Takes a step of Adam on the entries of all photographs. Only the entries of `photograph` have a gradient; that of all
-// other entries is 0. columns, logs, start, begins, others, weights -> moved: the new logs before centring; first and
-// second change in place. The learning rate of mixes is `slow` times `rate`.
+// Takes a step of Adam on the entries of all photographs. Only the entries of `photograph` get a gradient from columns;
+// the loss's gradient with respect to all other entries is 0. columns, logs, start, begins, others, weights -> moved:
+// the new logs before centring; first and second change in place. The learning rate of mixes is `slow` times `rate`.
 __kernel void move_gains(const int count, const int entries, const int photograph, const int stride, const int at,
                          const float rate, const float slow, const float root, const float beta1, const float beta2,
                          const float epsilon, __global const uint *readback, __global const float *columns,
@@ -43,7 +43,7 @@ __kernel void move_gains(const int count, const int entries, const int photograp
   if (c < 3) g *= LN2;
   const int begin = begins[photograph], end = begins[photograph + 1];
   if (i / entries == photograph && end > begin) {
-    // apart: the sum over all pulled photographs of logs - start; told: the number of these photographs.
+    // apart: the sum of logs - start over the photographs whose gains are pulled; told: the number of these.
     float told = 0.0f, apart = 0.0f, pull = 0.0f;
     for (int k = 0; entries * k < count; ++k)
       if (begins[k + 1] > begins[k]) told += 1.0f, apart = added(apart, logs[entries * k + c] - start[entries * k + c]);

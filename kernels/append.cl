@@ -37,12 +37,13 @@ static inline void order_two(Pair *one, Pair *other) {
   *other = (Pair)(after ? a.x : b.x, after ? a.y : b.y);
 }
 
-// The index in local memory of a list's pair `number`. It permutes each 16 numbers, so that neighbouring items use
-// different banks of local memory at every step of the network. PLACE(a ^ b) is PLACE(a) ^ PLACE(b).
+// The index in local memory of a list's pair `number`. The indices within each run of 16 pairs are permuted, so that
+// neighbouring items use different banks of local memory in every step of the sorting network. PLACE(a ^ b) is PLACE(a)
+// ^ PLACE(b).
 #define PLACE(number) ((number) ^ ((number) >> 4 & 3) ^ ((number) >> 2 & 12))
 
 // Takes two steps of the sorting network over `pairs` (count) in local memory. The first step compares pairs that are
-// `step` apart. If `mirrored`, it compares pairs at equal distances from the two ends of a block of 2 step pairs. The
+// `step` apart. If `mirrored`, it compares pairs at equal distances from the two ends of a block of 2 * step pairs. The
 // second step compares pairs that are step / 2 apart. An item does both steps for four pairs in registers; these may
 // lie past `count`, up to the next power of two.
 //
@@ -67,8 +68,8 @@ static inline void order_steps(__local Pair *pairs, uint count, uint step, int m
   BARRIER_LOCAL();
 }
 
-// Takes one step of the network over `list` (count) in global memory. All comparisons leave the lesser pair first. So a
-// list needs no filler past its end: the filler would never move.
+// Takes one step of the sorting network over `list` (count) in global memory. Every comparison puts the lesser pair
+// first. So the list needs no filler up to a power of two: the filler would stay at the end.
 static inline void order_step_far(__global Pair *list, uint count, uint step, int mirrored) {
   for (uint k = get_local_id(0); 2 * k - (k & (step - 1)) + 1 < count; k += ITEMS) {
     const uint a = 2 * k - (k & (step - 1));
@@ -155,8 +156,9 @@ GROUP __kernel void count_tiles(const uint n, const int tiles_x, const int tiles
 // which each list begins; sums: their exclusive scan; ranges (tiles, 2); order (tiles): the tiles sorted by floor(log2)
 // of their lists' lengths, longest first, because these take longest to sort.
 //
-// readback gets the entries that compact_visible in duplicate.cl writes, with keys of 0, and in addition the length of
-// the longest list. A pass stops under the conditions that compact_visible names; a stopped pass has empty lists.
+// readback gets the same entries as from compact_visible in duplicate.cl, except that the two entries for keys are 0,
+// and in addition the length of the longest list. A pass stops under the conditions that the comment of compact_visible
+// names. A stopped pass has empty lists.
 GROUP __kernel void list_offsets(const uint tiles, const uint groups, const uint capacity, __global uint *counts,
                                  __global uint *sums, __global uint *ranges, __global uint *order,
                                  __global uint *readback) {

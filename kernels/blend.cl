@@ -150,8 +150,8 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
 
 #if ITEMS == 1
   int i = begin;
-  // Two Gaussians' reaches are loaded together before their use, so that no load waits for the blending of earlier
-  // cells.
+  // The cells that two Gaussians reach are computed together, before both are blended. So no load of a splat waits for
+  // the blending of earlier cells.
   Reach reach, second;
   for (; i < end && GOES_ON(open); ++i) {
     const int turn = (i - begin) & 1;
@@ -197,7 +197,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   const int zero = min(pixels[0].stop + 1, 0); // always 0, but unknown to the compiler: see exp2_by
   for (int block = ITEM; block < BLOCKS; block += ITEMS) open_in[block] = 0;
   BARRIER_LOCAL();
-  // Indices for the next batch, loaded early: loads of its splats need not wait for them.
+  // The indices for the next batch are loaded early, so that the loads of its splats need not wait for them.
   uint gaussian_of[FETCHES];
   if (begin < end) {
     FOR_FETCHES(fetch) { FETCH_INDEX(fetch, begin) }

@@ -58,7 +58,7 @@ typedef struct {
 
 #include "shared/behind.h"
 
-// Removes a pair from a cell's pixels. Returns its g and weight. uncapped: alpha before the cap, 0 where left out.
+// Undoes the blending of a pair in a cell's pixels. uncapped: its alpha before the cap, 0 in pixels without the pair.
 static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red, float c_green,
                              float c_blue NEAR_PARAMETER) {
 #if ITEMS == 1
@@ -129,7 +129,7 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
 #endif
 }
 
-// The gradient with respect to a pixel's final transmittance. background: its part by colour; by_t: by the alpha plane.
+// Gradient with respect to the final transmittance: `background`, its part through colour, + by_t, the fourth plane.
 #ifdef ALPHA_GRADIENT
 #define AT_END(background) ((background) + by_t)
 #define NEAR_PLANE 4
@@ -142,7 +142,7 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
 #include "shared/strips.h"
 #endif
 
-// ALPHA_IN defines for the i-th pair and a cell's pixels: u, v; power, the log2 of alpha; taken, the lanes that add it.
+// ALPHA_IN defines for pair i and a cell: (u, v); power: log2 of alpha; taken: the pixels to which the pair was added.
 #ifdef RAYS
 #define WHITENING_HERE                                                                                                 \
   float whitening[3];                                                                                                  \
@@ -400,7 +400,7 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
   BARRIER_LOCAL();
   ALL_CELLS(cell) atomic_max(lasts + OWN_BLOCK(cell), pixels.stop[cell]);
   BARRIER_LOCAL();
-  // Indices for the next batch, loaded early: loads of its splats need not wait for them.
+  // The indices for the next batch are loaded early, so that the loads of its splats need not wait for them.
   uint gaussian_of[FETCHES], slot_of[FETCHES];
   if (last > begin) {
     FOR_FETCHES(fetch) { FETCH_INDICES(fetch, last) }

@@ -32,7 +32,7 @@
 
 #define BLOCK 16         // number of steps between two checks for parameters that no longer change
 #define LEAST_BETA2 0.9f // least beta2 for which equation (193) of docs/gradients.md holds throughout a block of steps
-// A movement below this fraction of a parameter changes no bit of it: 2^-28, an eighth of the least half ulp.
+// 2^-28. A movement below this fraction of a parameter changes no bit of it, as half an ulp is 2^-25 of it or more.
 #define STILL 3.725290298e-9f
 
 // The missed steps of one array of a chunk. rates, roots: the array's columns of the table, from the first missed step

@@ -17,7 +17,7 @@
 #include "shared/prefetch.h"
 #include "shared/slices.h"
 
-// Writes the current slice and begins an empty one, in the lanes of `which`.
+// Writes the current slice of each pixel and begins an empty slice, in the lanes that are set in `which`.
 static inline void write_slices(Lanes *values, IntLanes *slices, intL which, __global float *planes, size_t plane,
                                 size_t stride) {
   IntLanes written;

@@ -14,7 +14,8 @@
 #include "shared/lanes.h"
 #include "shared/slices.h"
 
-// Writes the slice that reduces the light from `first` to `after`, and sets `colour` to zero for the next slice.
+// Writes the slice in which the transmittance falls from `first` to `after`, and sets `colour` to zero for the next
+// slice. to: the slice's address in the planes; plane: the distance of planes in floats.
 static inline void write_slice(__global float *to, size_t plane, float *colour, float first, float after, float depth) {
   for (int channel = 0; channel < 3; ++channel) {
     to[plane * (DEEP_RED + channel)] = colour[channel] / first;

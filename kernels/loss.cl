@@ -10,8 +10,8 @@
 //   items: blocks across x blocks down x channels. Blocks are numbered in this order.
 // Buffers: image, target (3, rows, stride): colour, padded to whole tiles with zeros. With PHOTOGRAPH the target is
 //     (height, width, 3), bytes or floats.
-//   partials: with ITEMS == 1 (groups, LOSS_RING, 3, field); otherwise (3 channels, strips of COLUMNS columns, height,
-//     3 derivatives, COLUMNS), so that addresses within a column differ by constants.
+//   partials: with ITEMS == 1 (groups, LOSS_RING rows, 3 derivatives, field floats); otherwise (3 channels, strips of
+//     COLUMNS columns, height, 3 derivatives, COLUMNS), so that addresses within a column differ by constants.
 //   -> gradient (3, rows, stride): 0 right of the image.
 //   sums (3, ...), of SSIM, of |image - target| and of its square: one sum per row of a block with ITEMS == 1,
 //     otherwise per block.

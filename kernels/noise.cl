@@ -19,8 +19,8 @@
 #define WORDS (HALVES / 2)    // number of random 32-bit words, each with two of these numbers
 #define SPREAD 1.86881232e-5f // 1 / sqrt(HALVES * (2^32 - 1) / 12), the inverse of the sum's standard deviation
 
-// The normally distributed number `index` of a row, equation (93) of docs/gradients.md. The sum is an integer below
-// 2^23, so the result is rounded only once.
+// The normally distributed random number with the given index, 0 to 2, for a row of the model: equation (93) of
+// docs/gradients.md. It is a scaled sum of uniform integers. The sum stays below 2^23, so only the scaling rounds.
 static inline float normal(uint row_word, uint index) {
   int sum = -(HALVES * 65535) / 2;
   for (uint k = 0; k < WORDS; ++k) {

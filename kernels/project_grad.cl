@@ -107,8 +107,8 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
 #define BLOCKS (ROWS / LANES)
 #define ROW_ALIGNED __attribute__((aligned(4 * ABREAST)))
 #define SH_FLOATS (3 * SH_HIGHER) // number of floats in a Gaussian's SH bands from degree 1 on
-// MODEL(EACH) calls EACH for each array of the model, with: number, name, floats per row, gradients, and Step's root
-// and limit2.
+// MODEL(EACH) calls the macro EACH for each array of the model, with the array's number, its name, floats per row,
+// gradients, and values of the fields root and limit2 of Step (shared/adam.h).
 #ifdef NO_SH_REST
 #define ARRAYS 5
 #define SH_REST(EACH)

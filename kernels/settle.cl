@@ -17,8 +17,8 @@
 #define FACTORS 3
 #define GROUPS 6
 
-// Takes the missed steps of a row of `width` floats. If a new parameter would be not finite or too large, the old one
-// stays. The row's next step of Adam then refuses and counts the element.
+// Takes the missed steps of a row of `width` floats. If a new parameter would not be finite, or would be too large, the
+// old one stays. The row's next step of Adam then refuses and counts the element.
 static inline void settle_row(const size_t row, const uint width, __global const float *factors, const float epsilon,
                               const float limit2, __global float *parameters, __global float *first,
                               __global float *second) {

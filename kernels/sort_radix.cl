@@ -120,7 +120,7 @@ GROUP __kernel void radix_sort(ELEMENTS(n), const uint base, const uint digit_bi
 #define TILE (RUN * ITEMS)
 #define GAPPED(i) ((i) + ((i) >> 5))
 
-// Sorts a tile stably by the four bits that start at bit `shift`.
+// Sorts a tile, a batch of TILE keys, stably by the four bits that start at bit `shift`.
 static inline void sort_tile(uint shift, __local uint *tile, __local uint *counters, __local uint *scratch) {
   const uint item = get_local_id(0);
   uint entries[RUN], ranks[RUN], words[WORDS], all;
@@ -158,7 +158,7 @@ static inline void sort_tile(uint shift, __local uint *tile, __local uint *count
   BARRIER_LOCAL();
 }
 
-// Moves a chunk's keys to their destinations, a tile at a time. Digits have at most 8 bits.
+// Moves a chunk's keys to their destinations, a tile (TILE keys) at a time. Digits have at most 8 bits.
 GROUP __kernel void radix_scatter(SCATTER) {
   FIND_ELEMENTS(n)
   __local uint tile[GAPPED(TILE)]; // digit << 16 | position in the tile
@@ -184,7 +184,8 @@ GROUP __kernel void radix_scatter(SCATTER) {
     }
     BARRIER_LOCAL();
     for (uint bits = 0; digits >> bits > 1; bits += 4) sort_tile(16 + bits, tile, counters, scratch);
-    // While a tile is written, places[digit] is reduced by the position in the tile of the digit's first key.
+    // While a tile of keys is written, places[digit] is the destination of the digit's first key in the tile, minus
+    // this key's position in the tile.
     for (uint i = item; i < count; i += ITEMS) {
       const uint digit = tile[GAPPED(i)] >> 16;
       if (i == 0 || tile[GAPPED(i - 1)] >> 16 != digit) places[digit] -= i;

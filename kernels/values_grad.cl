@@ -89,7 +89,8 @@ static inline floatL shade_of(__global const float *by_pixels, int depth, int ce
   return (shade[0] + shade[1]) + (shade[2] + shade[3]);
 }
 
-// Removes the i-th pair from the pixels of a cell, and adds the pixels' gradients to the pair's sums (FIELDS).
+// Undoes the blending of the i-th pair in the pixels of a cell, and adds the pixels' gradients to the pair's sums
+// (FIELDS).
 static inline void take_pair(Pixels *p, int i, floatL u, floatL v, float l11, float l12, float l22, float log2o,
                              __global const float *by_pixels, int depth, int first, int cell, __global const float *own,
                              floatL *sums) {

@@ -38,12 +38,12 @@ class AdamStep:
         return self.rates[group] / shrunk, root
 
     def corrections(self, updates: int) -> tuple[float, float]:
-        """The factors 1 - beta1^t and 1 / sqrt(1 - beta2^t) of the t-th update; `updates` is t."""
+        """Return 1 - beta1^t and 1 / sqrt(1 - beta2^t), where t is `updates`, the number of an update from 1."""
         return 1.0 - self.config.beta1**updates, (1.0 - self.config.beta2**updates) ** -0.5
 
     @property
     def scales(self) -> dict[str, float]:
-        """Step sizes, rate sqrt(1 - beta2^t) / (1 - beta1^t), of the groups that the step updates, by group."""
+        """Step size, rate sqrt(1 - beta2^t) / (1 - beta1^t), of each parameter group that the step updates, by name."""
         groups = [group for group in self.rates if group != "sh_rest" or self.updates_sh_rest]
         by_group = {group: self.corrected(group) for group in groups}
         return {group: rate / root for group, (rate, root) in by_group.items()}
@@ -62,15 +62,15 @@ def adam(
 ) -> None:
     """Update the parameters by Adam, and set the gradients to zero.
 
-    tile_counts: (n,) uint32, 0 for a Gaussian that is not visible in the view; needed for `OptimiserConfig.late`.
+    tile_counts: (n,) uint32, 0 for a Gaussian that the view does not show; needed if `OptimiserConfig.late` is set.
     readback: (READBACK_SIZE,) uint32. Its last four entries count the elements that were not updated, by reason
     (`columns.REFUSED`).
     """
     readback = readback or allocate(device, (len(READBACK),), np.uint32)
-    counts = readback.buffer  # a buffer, which the profile does not count: the kernel writes it only on a fault
+    counts = readback.buffer  # a plain buffer: the profile must not count readback's bytes, which are rarely written
     config = step.config
     beta1, beta2, epsilon = config.beta1, config.beta2, config.epsilon
-    abreast = max(device.shape.lanes, 4)  # elements per work-item: ABREAST in adam.h
+    abreast = max(device.shape.lanes, 4)  # number of elements per work-item, ABREAST in adam.h
     for group, about in PARAMETER_GROUPS.items():
         if group == "sh_rest" and not step.updates_sh_rest:
             continue

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches appearance.cl and a colour model's kernels, which remove a photograph's own colours and learn them by Adam.
+"""Launches the kernels of colour models, which remove a photograph's own colours, and of their update (appearance.cl).
 
-A new colour model is a row of COLOUR_MODELS (config/colour_models.py), a kernel file and its twin of the same name.
+To add a colour model, add a row to COLOUR_MODELS (config/colour_models.py), and a kernel file and a twin of that name.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON = 0.9, 0.999, 1e-15
 class PhotoLens:
     """Photograph and lens of a view, for the kernels.
 
-    photograph, lens: their rows in the arrays of colour entries (`Gains`).
+    photograph, lens: row of the photograph, and row of the lens, in the arrays of colour entries (`Gains`).
     centre: the principal point, as fractions of the image's width and height.
     flat: False for a panorama, which cannot have a vignette.
     """
@@ -49,8 +49,8 @@ class PhotoLens:
 class GainEntries:
     """Settings of `step_gains`, the update of colour entries by Adam.
 
-    first_row: row of the first entry in the column sums of `entry_gradient`.
-    mix_rate: learning rate of mixes, as a fraction of the rate of gains.
+    first_row: row of `entry_gradient`'s result that belongs to the first entry.
+    mix_rate: learning rate of colour mixes, divided by the learning rate of gains.
     centred: True if the mean of each entry over all rows is subtracted after a step.
     """
 
@@ -103,7 +103,7 @@ class Gains:
 
 
 def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[str, DeviceArray]:
-    """The arrays `begins`, `others` and `weights` of a sparse matrix; None gives a zero matrix."""
+    """Upload the arrays `begins`, `others` and `weights` of `Gains` for the sparse matrix `pull`; None means zero."""
     from scipy.sparse import csr_array
 
     matrix = csr_array((photographs, photographs), dtype=np.float32) if pull is None else pull
@@ -151,11 +151,12 @@ def entry_gradient(
     size: tuple[int, int],
     place: int = 0,
 ) -> DeviceArray:
-    """Column sums (model.sums, stride) of the gradient with respect to colour entries that are applied to the render
-    and are 0.
+    """Return the gradient with respect to colour entries, summed over each pixel column: (model.sums, stride).
 
-    The sum over the columns, multiplied by ln 2 for logarithms, is the gradient (equations (184) to (186) of
-    docs/gradients.md). place: index of the view in the batch; the result of each view is in an array of its own.
+    It is the gradient of the loss if the entries were applied to the render, at entries of 0. Its sum over the columns,
+    times ln 2 for logarithms, is given by equations (184) to (186) of docs/gradients.md.
+
+    place: index of the view in the batch; the result of each view is in an array of its own.
     """
     _, rows, stride = image.shape
     down = rows // TILE
@@ -182,10 +183,10 @@ def step_gains(
 ) -> None:
     """Update the colour entries `gains` in place by Adam.
 
-    photograph: row of `gains` that has a gradient, of a photograph or a lens.
-    columns: sums of its gradient over each pixel column, from `entry_gradient`.
+    photograph: the photograph or lens of the view, a row of `gains`. All other rows have a gradient of 0.
+    columns: the gradient of this row, summed over each pixel column (`entry_gradient`).
     step: the number of this update, from 1.
-    readback: counts of the step's pass (`READBACK`). Nothing changes if it has stopped (kernels/duplicate.cl).
+    readback: counts of the step's pass (`READBACK`). Nothing changes if the pass has stopped (kernels/duplicate.cl).
     """
     kernels, (photographs, width) = device.kernels("appearance", {"LANES": 1}), gains.logs.shape
     count = photographs * width

@@ -59,8 +59,9 @@ def append(
 
     With more pairs the pass stops (kernels/append.cl).
 
-    readback: (READBACK_SIZE,) uint32, the array that `project_step` gets too.
-    host: host memory for the copy of `readback`.
+    tiles: numbers of tiles across and down.
+    readback: (READBACK_SIZE,) uint32, filled with the counts of the pass. Pass the same array to `project_step`.
+    host: host memory, to which `readback` is copied.
     """
     (n,), number, items = projected.tile_counts.shape, tiles[0] * tiles[1], device.shape.items
     groups = -(-n // items)

@@ -31,10 +31,10 @@ def gradient_pair_bytes(fields: SlotFields) -> int:
 class ImageInputs:
     """Input of the stages that process pixels, in addition to the tile lists.
 
-    splats: (n, SPLAT), of `Projected`.
-    background: (3,).
-    width, height: pixels.
-    camera_array: the packed camera, for cameras that evaluate Gaussians along the rays of pixels.
+    splats: (n, SPLAT), the array `splats` of `stages.project.Projected`.
+    background: (3,), the background colour.
+    width, height: size of the image in pixels.
+    camera_array: the camera (`pack_camera`), for camera models that evaluate Gaussians along the rays of pixels.
     """
 
     splats: DeviceArray
@@ -73,7 +73,7 @@ def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[De
 
 
 _MIN_STRIP_ITEMS = 32
-"""Number of work-items per tile from which sums over a tile's pixels are in the order of kernels/shared/strips.h."""
+"""Minimum number of work-items per tile with which kernels/shared/strips.h defines the order of sums over pixels."""
 _MIN_TILE_ITEMS = 8
 """Minimum number of work-items that share a tile: those of one row of a pixel block (kernels/shared/blocks.h). A tile
 that is not shared has one work-item."""
@@ -113,10 +113,14 @@ def frame_items(device: Device, tiles: int) -> int:
 
 
 def items_for(tiles: int, units: int, items: int, most: int) -> int:
-    """Return the work-items of a group for `frame_items`, on a GPU: `items` times a power of two, at most `most`.
+    """Return the number of work-items that share a tile on a GPU, for `frame_items`.
 
-    tiles: number of tiles of the picture.
+    The result is `items` times a power of two: the largest of at most `most` that the compute units can use.
+
+    tiles: number of tiles of the frame.
     units: number of the GPU's compute units.
+    items: number of work-items that share a tile by the kernel shape.
+    most: maximum number of work-items in a group.
     """
     while 2 * items <= most and 2 * items * tiles <= _BUSY_ITEMS * units:
         items *= 2
@@ -133,11 +137,11 @@ def gradient_items(device: Device, tiles: int) -> int:
 
 
 def gradient_items_for(tiles: int, units: int, items: int, most: int) -> int:
-    """Return the work-items of a group for `gradient_items`, on a GPU.
+    """Return the number of work-items that share a tile on a GPU, for `gradient_items`.
 
-    tiles: number of tiles of the picture.
+    tiles: number of tiles of the frame.
     units: number of the GPU's compute units.
-    items: work-items of a group by the kernel shape.
+    items: number of work-items that share a tile by the kernel shape.
     most: maximum number of work-items in a group.
     """
     return TILE * TILE if tiles <= _GRADIENT_TILES * units and most >= TILE * TILE else items
@@ -223,7 +227,7 @@ def count_pairs(
     vector computes the alpha of all its lanes.
     """
     width, height = camera.width, camera.height
-    planes = _planes(work, width, height, kept=True)  # the arrays of `blend`, which get the same values
+    planes = _planes(work, width, height, kept=True)  # the arrays of `blend`; they keep their values
     counts = work.array("counts", (lists.band.tiles * tile_items(device), 2), np.uint32)
     arrays = (lists.ranges, lists.gaussian_from_sorted, splats, background, *planes, counts)
     launch_tiles(device, "blend", {"COUNT_PAIRS": True}, lists, -(-width // TILE), width, height, *arrays)
@@ -242,10 +246,14 @@ def blend_grad(
     *,
     fields: SlotFields = PLAIN_SLOTS,
 ) -> DeviceArray:
-    """Compute the partial gradients of all pairs, (pairs, fields.floats). The row of a pair is its slot.
+    """Return the gradients of each pair of a Gaussian and a tile, summed over the tile's pixels.
 
-    image_gradient: (3, rows, stride). An optional fourth plane is the gradient with respect to the transmittance.
-    If the fields include nearness, the last plane is the gradient with respect to nearness.
+    The result has the shape (pairs, fields.floats). The row of a pair is its slot.
+
+    image_gradient: (3, rows, stride), the loss's gradient with respect to the image. An optional fourth plane is the
+    gradient with respect to the transmittance. With `fields.nearness` the last plane is the gradient with respect to
+    nearness.
+    fields: the columns of the result, in addition to the gradients that every slot has.
     """
     rows, stride = blended.transmittance.shape
     pairs = lists.gaussian_from_sorted.shape[0]

@@ -17,9 +17,9 @@ BOUNDS_FLOATS = 7
 
 @stage("bounds")
 def bounds(device: Device, work: Workspace, gaussians: DeviceGaussians, chunks: ChunkList) -> Float32:
-    """Compute the bounds of these chunks, (chunks, BOUNDS_FLOATS), and wait for them.
+    """Compute the bounds of the chunks in a list, wait for them, and return them: (entries, BOUNDS_FLOATS).
 
-    An entry NO_CHUNK in the list has empty bounds: from infinity to -infinity.
+    An entry NO_CHUNK has empty bounds: from infinity to -infinity.
     """
     count = chunks.numbers.shape[0]
     items = 1 if device.shape.lanes > 1 or device.max_group < DEFAULT_GROUP_ITEMS else DEFAULT_GROUP_ITEMS

@@ -24,13 +24,13 @@ from clsplat.stages.device_gaussians import DeviceGaussians
 from clsplat.stages.project import CPU_STEP_ROWS, step_numbers
 
 _TABLE_NUMBERS = 2 + len(PARAMETER_GROUPS)
-"""Columns of a step table (`step_numbers`): two factors of Adam, then a learning rate for each parameter group."""
+"""Number of columns of a step table (`step_numbers`): two factors of Adam, then a rate for each parameter group."""
 _ABREAST = 4
-"""Elements that a work-item updates at once in kernel shapes of one lane (`kernels/shared/adam.h`)."""
+"""Number of elements that a work-item updates at once in kernel shapes of one lane (`kernels/shared/adam.h`)."""
 
 
 def step_table(steps: Iterable[AdamStep]) -> Float32:
-    """Table (steps, _TABLE_NUMBERS) by which `catch_up` takes consecutive steps of Adam."""
+    """Return the table (steps, _TABLE_NUMBERS) for `catch_up`: for each step, the factors of Adam and the rates."""
     return np.array([step_numbers(step, NO_EXPLORATION) for step in steps], np.float32).reshape(-1, _TABLE_NUMBERS)
 
 
@@ -38,7 +38,7 @@ def step_table(steps: Iterable[AdamStep]) -> Float32:
 class StepTable:
     """A table of consecutive steps of Adam on the device.
 
-    numbers: (steps, _TABLE_NUMBERS), a `step_table`.
+    numbers: (steps, _TABLE_NUMBERS), the result of `step_table`.
     first_step: the number of the step in row 0.
     """
 
@@ -63,15 +63,15 @@ def catch_up(
     table: StepTable,
     readback: DeviceArray,
 ) -> None:
-    """Take the steps of Adam that these chunks missed, up to step `step`, with gradients of zero.
+    """Take the steps of Adam that the listed chunks missed, up to step `step`, with gradients of zero.
 
-    The bits are those of steps that update all rows of the model. Nothing changes if `readback` says that the step's
-    pass has stopped.
+    The model has the same bits as if each step had updated all of its rows. Nothing changes if `readback` says that the
+    step's pass has stopped.
 
     model: parameters, first and second moments of the whole model.
-    last: (entries of chunks,) uint32, the last step that updated each chunk with its gradients.
+    last: (k,) uint32, for each of the k entries of `chunks` the last step that updated the chunk with its gradients.
     caught: (chunks of the model,) uint32, the step up to which each chunk has caught up. The call writes `step` for
-    these chunks, so that a second call for the same step changes nothing.
+    the listed chunks, so that a second call for the same step changes nothing.
     table: must contain all missed steps.
     readback: (READBACK_SIZE,) uint32. Its last four entries count the refused updates; an element counts once for each
         step that refuses it.
@@ -102,7 +102,7 @@ def catch_up(
         np.uint32(sh_width),
         *(config.beta1, config.beta2, config.epsilon),
         *(PARAMETER_GROUPS["means"].limit ** 2, PARAMETER_GROUPS["sh_dc"].limit ** 2),
-        readback.buffer,  # a buffer, which the profile does not count: the kernel writes it only on a fault
+        readback.buffer,  # a plain buffer: the profile must not count readback's bytes, which are rarely written
         *(arrays[group] for arrays in model for group in PARAMETER_GROUPS),
     )
     noted = (chunks.model_rows, chunks.numbers, np.uint32(step), readback.buffer, caught)

@@ -38,7 +38,7 @@ class Features:
 
     @classmethod
     def of(cls, wanted: Iterable[str]) -> Features:
-        """Depth and the `wanted` features. Raises ValueError for an unknown name."""
+        """Make `Features` of depth and of the features named in `wanted`. Raises ValueError for an unknown name."""
         kept = {"depth", *wanted}
         if unknown := kept - FEATURE_WIDTHS.keys():
             raise ValueError(f"no such features: {', '.join(sorted(unknown))}; expected {', '.join(FEATURE_WIDTHS)}")
@@ -57,13 +57,13 @@ class Features:
 
     @property
     def defines(self) -> dict[str, object]:
-        """Defines for features.cl and channels.cl."""
+        """Macros that features.cl and channels.cl are compiled with: the size of a row and the features' offsets."""
         return {"FEATURES": self.floats, **{f"FEATURE_{name.upper()}": at for name, at in self.offsets.items()}}
 
     def named(self, means: NDArray[Any], whole: NDArray[Any]) -> dict[str, NDArray[Any]]:
         """Return channels by name, (H, W) or (H, W, floats).
 
-        means, whole: the planes of `Channels` on the host, with the plane axis last.
+        means, whole: the arrays of `Channels`, copied to the host and transposed to (H, W, planes).
         """
         planes = {name: means[:, :, at : at + FEATURE_WIDTHS[name]] for name, at in self.offsets.items()}
         planes = {name: plane if plane.shape[2] > 1 else plane[:, :, 0] for name, plane in planes.items()}
@@ -73,13 +73,13 @@ class Features:
 
 @dataclass(frozen=True)
 class Floats:
-    """Rows of `floats` arbitrary values per Gaussian, which are blended like features."""
+    """Arbitrary values that are blended like features: each Gaussian has a row of `floats` numbers."""
 
     floats: int
 
     @property
     def defines(self) -> dict[str, object]:
-        """Defines for channels.cl."""
+        """Macros that channels.cl is compiled with: the size of a Gaussian's row."""
         return {"FEATURES": self.floats}
 
 
@@ -87,8 +87,8 @@ class Floats:
 class Channels:
     """Channels of a frame, as planes padded to whole tiles. `Features.named` splits them into channels by name.
 
-    means: (floats + 2, rows, stride), the features, then the planes of DEPTH_PLANES.
-    whole: (2, rows, stride), the planes of WHOLE_NUMBER_PLANES.
+    means: (floats + 2, rows, stride), the blended features, then the planes of DEPTH_PLANES.
+    whole: (2, rows, stride) int32, the planes of WHOLE_NUMBER_PLANES.
     """
 
     means: DeviceArray
@@ -121,7 +121,7 @@ def features(
     projected: Projected,
     motion: Motion,
 ) -> DeviceArray:
-    """Compute the features of each visible Gaussian, (n, wanted.floats)."""
+    """Compute the features (n, wanted.floats) of each visible Gaussian. Other rows are left unwritten."""
     rows = work.array("features", (gaussians.count, wanted.floats))
     after, before = motion.after, motion.after if motion.before is None else motion.before
     moments = (motion.moved, motion.earlier)
@@ -160,8 +160,11 @@ def channels(
     blended: Blended,
     held: Held | None = None,
 ) -> Channels:
-    """Blend the features with the weights of `blended`, which must come from the same lists.
+    """Blend a row of values of each Gaussian into channels, with the same weights as the image in `blended`.
 
+    lists: the tile lists from which the image was blended.
+    wanted: what the rows contain.
+    rows: (n, wanted.floats), the values of each Gaussian, such as the result of `features`.
     held: surfaces of the holdout, if there is one.
     """
     plane_rows, stride = blended.stops.shape

@@ -16,7 +16,7 @@ from clsplat.layouts.columns import CHUNK_ROWS, NO_CHUNK
 
 @dataclass(frozen=True, eq=False)
 class ChunkList:
-    """Chunks whose rows a launch runs over (`kernels/shared/chunks.h`). In a pool, the slots that hold the chunks.
+    """List of the chunks whose rows a launch runs over (`kernels/shared/chunks.h`); for a pool, of the chunks' slots.
 
     numbers: uint32, numbers of the chunks in rising order, or their slots in the same order; then NO_CHUNK as padding.
     model_rows: number of rows of the model, or of all slots of the pool.
@@ -34,18 +34,19 @@ class ChunkList:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """Key for command buffers: everything that launches over these chunks depend on, except the chunks' numbers."""
+        """Key for command buffers: all that a launch over these chunks depends on, except the chunks' numbers."""
         first = None if self.first_rows is None else self.first_rows.buffer
         return self.numbers.buffer, self.numbers.shape, self.model_rows, first
 
     @property
     def arguments(self) -> tuple[DeviceArray, int]:
-        """Kernel arguments for CHUNK_PARAMETERS of kernels/shared/chunks.h."""
+        """Arguments for the kernel parameters CHUNK_PARAMETERS (kernels/shared/chunks.h)."""
         return self.numbers, self.model_rows
 
 
 def padded_chunks(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Pad numbers of chunks with NO_CHUNK to one of few lengths, so that arrays and command buffers are reused."""
+    """Pad numbers of chunks with NO_CHUNK. There are only a few padded lengths, so that arrays and command buffers can
+    be reused."""
     padded = np.full(listed_chunks(len(numbers)), NO_CHUNK, np.uint32)
     padded[: len(numbers)] = numbers
     return padded
@@ -78,7 +79,7 @@ def exact_chunks(
     model_rows: int,
     first_rows: NDArray[np.integer[Any]],
 ) -> ChunkList:
-    """Upload a list of chunks without padding, and the chunks' first rows."""
+    """Upload a list of chunks without padding to the workspace's array `name`, and the chunks' first rows."""
     sent = []
     for array, values in ((name, numbers), (f"{name}_rows", first_rows)):
         sent.append(work.array(array, values.shape, np.uint32))

@@ -26,7 +26,7 @@ from clsplat.layouts.columns import CHUNK_ROWS
 INVISIBLE_LOGIT = -1e9
 """Opacity logit of padding rows, which no view shows. Its square is finite, because `adam` refuses other values."""
 _VECTOR = 4
-"""Words of 4 bytes that a work-item of the kernel copies."""
+"""Number of words of 4 bytes that a work-item of chunk_records.cl copies."""
 _MAX_CROSSING = 32
 """Maximum number of records that cross the bus at a time. More are not faster."""
 
@@ -50,7 +50,7 @@ def copy_chunks(
     records: (k, words of a record) uint32.
     record: type of a record (`chunks.store.record_type`).
     arrays: the pool's arrays by field, (slots x CHUNK_ROWS, ...) float32.
-    to_records: True to copy from the arrays to the records.
+    to_records: True to copy from the arrays to the records, False to copy from the records to the arrays.
     """
     kernel = device.kernels("chunk_records", {"TO_RECORDS": True} if to_records else {}).copy_chunks
     for name in record.names or ():
@@ -67,8 +67,8 @@ class ChunkPool:
     store: records of all chunks. Until `write_back`, chunks on the device may be newer than their records.
     arrays: arrays on the device by field, with CHUNK_ROWS rows for each slot.
     caught: (slots,) uint32, the last step up to which the chunk in each slot has been caught up (`stages.catch_up`).
-    cull: function that returns the chunks that a camera may show; None if that is not known.
-    before_view: function that is called before the chunks of a step's view are fetched, with their number. It may
+    cull: function that returns the chunks that a camera may show; None if no such function is available.
+    before_view: function that is called with the number of chunks of a step's view, before these are fetched. It may
         resize the pool.
     """
 
@@ -125,9 +125,10 @@ class ChunkPool:
     def place(self, numbers: NDArray[np.integer[Any]], *, changes: bool) -> NDArray[np.uint32]:
         """Fetch chunks that are not on the device yet. Returns the slot of each chunk.
 
-        changes: True if the device will change them.
-        Raises ValueError for more chunks than slots, WriteError, and ScratchError. An error changes no chunk, neither
-        on the device nor in the store.
+        changes: True if the device will change the chunks.
+
+        Raises ValueError for more chunks than slots, WriteError, and ScratchError. After an error all chunks are
+        unchanged, on the device and in the store.
         """
         moves = self._residency.plan(numbers)
         if len(moves.fetched):
@@ -143,10 +144,10 @@ class ChunkPool:
         return moves.slots
 
     def read_ahead(self, camera: Camera) -> None:
-        """Begin to read the chunks that a camera may show and that are not on the device from a scratch file.
+        """Begin to read, from a scratch file, the chunks that a camera may show and that are not on the device.
 
-        If no chunk has crossed the bus since the last call, nothing is read: the chunks of all views are probably on
-        the device, and finding those in view would take time for nothing.
+        If no chunk has crossed the bus since the last call, nothing is read: the chunks of all views are then probably
+        on the device, and culling would take time for nothing.
         """
         if self.moved_bytes > self._moved_before and self.cull is not None and self.store.path is not None:
             numbers = self.cull(camera)
@@ -154,10 +155,9 @@ class ChunkPool:
         self._moved_before = self.moved_bytes
 
     def place_rows(self, start: int, stop: int) -> None:
-        """Copy the rows [start, stop) of the model to the first rows of the pool, wherever chunks begin and end.
+        """Copy the rows [start, stop) of the model to the first rows of the pool. They need not be whole chunks.
 
-        The slots then have no whole chunks, so `keep_rows` has to write changes back. Raises WriteError and
-        ScratchError.
+        So only `keep_rows` can write changes of these rows back. Raises WriteError and ScratchError.
         """
         self.release()
         for begin, end, slots in self._row_groups(start, stop):
@@ -169,8 +169,8 @@ class ChunkPool:
             self.store.set_records(begin, end, self._from_slots(slots))
 
     def _row_groups(self, start: int, stop: int) -> Iterator[tuple[int, int, NDArray[np.uint32]]]:
-        """Split rows into parts that cross the bus one after the other. Yields begin and end of a part, and its
-        slots."""
+        """Split the rows [start, stop) into parts that cross the bus one after the other. Yields the first row of a
+        part, the end of its rows, and its slots in the pool."""
         slots = np.arange(chunks_of(stop - start), dtype=np.uint32)
         for some in self._groups(len(slots)):
             begin = start + CHUNK_ROWS * some.start
@@ -224,8 +224,8 @@ class ChunkPool:
             self._to_slots(slots[some], values)
 
     def _close(self, numbers: NDArray[np.int64], records: NDArray[Any]) -> None:
-        """Fill the rows past the end of each chunk with copies of its last row. The opacity of these copies is so low
-        that no view shows them, and their moments are 0, so that no step moves them."""
+        """Pad the records of chunks to CHUNK_ROWS rows, by copies of each chunk's last row. The copies' opacity is
+        so low that no view shows them, and their moments are 0, so that no step moves them."""
         lengths = self.store.lengths(numbers)
         for place in np.flatnonzero(lengths < CHUNK_ROWS).tolist():
             rows = int(lengths[place])
@@ -252,7 +252,7 @@ class ChunkPool:
         return values.view(self.store.record).reshape(-1)
 
     def _groups(self, count: int) -> list[slice]:
-        """Split `count` chunks into parts that cross the bus one after the other (`residency.CROSSING_SHARE`)."""
+        """Return slices of `count` chunks, which cross the bus one after the other (`residency.CROSSING_SHARE`)."""
         most = min(max(self.slots // CROSSING_SHARE, 1), _MAX_CROSSING)
         return [slice(begin, begin + most) for begin in range(0, count, most)]
 
@@ -265,7 +265,7 @@ class ChunkPool:
 
 @dataclass(frozen=True, eq=False)
 class StoredArray:
-    """A field of a streamed model, with the interface of a DeviceArray."""
+    """An array of a streamed model, such as "parameters/means", with the interface of a DeviceArray."""
 
     pool: ChunkPool
     field: str
@@ -276,15 +276,15 @@ class StoredArray:
 
     @property
     def in_pool(self) -> DeviceArray:
-        """The field's array in the pool."""
+        """The array of the pool, with CHUNK_ROWS rows for each slot."""
         return self.pool.arrays[self.field]
 
     def get(self) -> NDArray[np.float32]:
-        """Return a copy of all rows."""
+        """Return a copy of all rows of the array."""
         return self.get_rows(0, self.pool.store.count)
 
     def set(self, values: NDArray[np.float32]) -> None:
-        """Replace all rows."""
+        """Replace all rows of the array by `values`."""
         self.set_rows(0, values)
 
     def get_rows(self, start: int, stop: int) -> NDArray[np.float32]:
@@ -298,17 +298,17 @@ class StoredArray:
         self.pool.store.set_rows(self.field, start, values)
 
     def get_at(self, places: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
-        """Return a copy of rows. places: (k,), their indices."""
+        """Return a copy (k, ...) of the rows with the indices `places` (k,)."""
         self.pool.write_back()
         return self.pool.store.get_at(self.field, places)
 
     def set_at(self, places: NDArray[np.integer[Any]], values: NDArray[np.float32]) -> None:
-        """Replace rows. places: (k,), their indices."""
+        """Replace the rows with the indices `places` (k,) by `values` (k, ...)."""
         self.pool.release()
         self.pool.store.set_at(self.field, places, values)
 
     def change(self, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> None:
-        """Apply a function to the rows, chunk by chunk."""
+        """Replace the rows of each chunk by the result of the function `change` for them."""
         self.pool.release()
         self.pool.store.change(self.field, change)
 

@@ -25,10 +25,10 @@ def deep(
     inputs: ImageInputs,
     blended: Blended,
 ) -> DeviceArray:
-    """Slices (bins, DEEP_FLOATS, rows, stride) of the frame, filled for the tiles in the lists.
+    """Return the slices of a frame, (bins, DEEP_FLOATS, rows, stride). Only the tiles in `lists` are filled.
 
     bins: maximum number of slices per pixel.
-    blended: the frame, in which these tiles must have been blended.
+    blended: the frame, in which the tiles of `lists` must have been blended before.
     """
     plane_rows, stride = blended.stops.shape
     planes = work.array("deep", (bins, DEEP_FLOATS, plane_rows, stride), kept=lists.band.first > 0)

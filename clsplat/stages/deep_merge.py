@@ -14,16 +14,16 @@ from clsplat.stages.deep import DEEP_FLOATS
 
 
 def merge_bytes(pictures: int, bins: int) -> int:
-    """Bytes per pixel for a merge of deep pictures: pictures, weights, the order of all slices, and the result."""
+    """Return the bytes per pixel for a merge of deep pictures: pictures, weights, order of slices, result."""
     return pictures * (4 + bins * (4 * DEEP_FLOATS + 5)) + 4 * DEEP_FLOATS * bins
 
 
 @stage("deep_merge")
 def deep_merge(device: Device, work: Workspace, pictures: DeviceArray, weights: DeviceArray) -> DeviceArray:
-    """Merge deep pictures into one (bins, DEEP_FLOATS, pixels), an array of the workspace.
+    """Merge P deep pictures into one (bins, DEEP_FLOATS, pixels), an array of the workspace.
 
     pictures: (P, bins, DEEP_FLOATS, pixels), P at most DEEP_PICTURES.
-    weights: (P, pixels), not negative, with a sum near 1.
+    weights: (P, pixels), not negative; their sum over the pictures is close to 1 in each pixel.
     """
     count, bins, _, pixels = pictures.shape
     sources = work.array("deep_sources", (count * bins, pixels), np.uint8)

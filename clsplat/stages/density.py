@@ -38,27 +38,29 @@ KIND = "statistics"
 
 
 def statistics_names(*, contributions: bool) -> tuple[str, ...]:
-    """Return the names of the statistics of `DensityStatistics` that are kept with or without contributions."""
+    """Return the names of the arrays of `DensityStatistics`. contributions: include CONTRIBUTION_STATISTICS."""
     return ("gradient_sums", "seen", "radii", *(CONTRIBUTION_STATISTICS if contributions else ()))
 
 
 def gaussian_bytes(*, contributions: bool) -> int:
-    """Return the bytes of each Gaussian's statistics."""
+    """Return the number of bytes that a Gaussian's statistics take. contributions: include contributions."""
     return 4 * len(statistics_names(contributions=contributions))
 
 
 def initial_value(name: str) -> float:
-    """Return the value that a statistic starts from."""
+    """Return the value in new arrays of the statistic `name`: infinity for contributions, otherwise 0."""
     return np.inf if name in CONTRIBUTION_STATISTICS else 0.0
 
 
 def statistics_fields(*, contributions: bool) -> dict[str, tuple[int, ...]]:
-    """Return the fields of a store of chunks for the statistics."""
+    """Return the shape of a row of each statistic in a chunk's record, by name (such as "statistics/radii")."""
     return {f"{KIND}/{name}": () for name in statistics_names(contributions=contributions)}
 
 
 def new_values(*, densified: bool = False) -> NewValues:
-    """Return the values of moved rows in a store. Rows with the bit FRESH get zero moments and infinite statistics.
+    """Return the values in a store, after density control, that are not copied from old rows.
+
+    Rows with the bit FRESH get zero moments and infinite statistics.
 
     densified: True if all statistics except contributions start from zero in every row.
     """
@@ -97,18 +99,18 @@ class DensityStatistics:
 
     @classmethod
     def of(cls, arrays: Mapping[str, Any], *, of_slots: bool = False) -> DensityStatistics:
-        """Wrap arrays by name as statistics."""
+        """Make statistics of `arrays`, by the names of this class's attributes."""
         return cls(**arrays, of_slots=of_slots)
 
     @property
     def on_device(self) -> DensityStatistics:
-        """The statistics as arrays on the device, for kernels: of a streamed model, the arrays of its pool."""
+        """The statistics as arrays on the device, for kernels. For a streamed model they are the arrays of its pool."""
         if not isinstance(self.seen, StoredArray):
             return self
         return self.of({name: array.in_pool for name, array in self.named().items()}, of_slots=True)
 
     def rows(self, start: int, stop: int) -> DensityStatistics:
-        """Return statistics on the device of the Gaussians [start, stop). In a pool, these are in the first slots."""
+        """Return the statistics on the device of the Gaussians [start, stop), in a pool from its first slots."""
         start, stop = (0, stop - start) if self.of_slots else (start, stop)
         if (start, stop) == (0, self.seen.shape[0]):
             return self
@@ -116,7 +118,7 @@ class DensityStatistics:
         return self.of(arrays, of_slots=self.of_slots)
 
     def named(self) -> dict[str, Any]:
-        """Return the arrays by name."""
+        """Return the arrays that are not None, by name."""
         names = statistics_names(contributions=True)
         return {name: array for name in names if (array := getattr(self, name)) is not None}
 
@@ -125,7 +127,7 @@ class DensityStatistics:
         return {f"{KIND}/{name}": array for name, array in self.named().items()}
 
     def load(self, values: Mapping[str, Float32]) -> None:
-        """Set arrays by name. Arrays that are not in `values` stay as they are."""
+        """Set each array to the array of its name in `values`. Arrays without a name in `values` stay unchanged."""
         for name, array in self.named().items():
             if name in values:
                 array.set(values[name])
@@ -158,13 +160,13 @@ def new_statistics(device: Device, count: int, *, contributions: bool = False) -
 
 
 def pooled_statistics(pool: ChunkPool) -> DensityStatistics:
-    """Return the statistics that a pool's store has."""
+    """Return the statistics that a streamed model has in the store of its pool."""
     names = [name for name in statistics_names(contributions=True) if f"{KIND}/{name}" in pool.store.fields]
     return DensityStatistics.of({name: StoredArray(pool, f"{KIND}/{name}") for name in names})
 
 
 def statistics_numbers(camera: Camera) -> tuple[float, ...]:
-    """Return the numbers in launches of `add_statistics` that differ between cameras of the same size."""
+    """Return the kernel arguments of `add_statistics` that differ between cameras with images of the same size."""
     return (camera.fx,) if camera.model.along_rays else ()
 
 
@@ -176,9 +178,10 @@ def add_statistics(
     projected: Projected,
     screen: Screen,
 ) -> None:
-    """Add a view to the statistics. Gradients are with respect to means in NDC, because the paper's threshold is.
+    """Add a view to the statistics. The gradients are converted to NDC, because the paper's threshold is in NDC.
 
-    projected: splats of all rows of the statistics, or of the chunks that it lists.
+    projected: splats of the view, of all Gaussians or of those in the chunks `projected.chunks`.
+    screen: gradients of the same Gaussians with respect to their means on the image.
     """
     n = projected.tile_counts.shape[0]
     rays = camera.model.along_rays
@@ -194,9 +197,10 @@ def add_statistics(
 def add_contributions(
     device: Device, statistics: DensityStatistics, projected: Projected, contributions: DeviceArray, area: float
 ) -> None:
-    """Add the contributions (n,) of Gaussians to a view to the statistics of the current epoch.
+    """Add a view's contributions to the statistics of the current epoch.
 
-    projected: as for `add_statistics`.
+    projected: splats of the view, as for `add_statistics`.
+    contributions: (n,), the contribution of each Gaussian of `projected` to the view, in pixels.
     area: number of full-resolution pixels per pixel of a reduced image; contributions are multiplied by it.
     """
     n = projected.tile_counts.shape[0]
@@ -207,9 +211,9 @@ def add_contributions(
 
 @dataclass(frozen=True, eq=False)
 class DeviceRowList:
-    """The rows of a model after density control, listed on the device.
+    """Row list on the device: where each row of a model after density control is copied from.
 
-    rows: (m,) uint32, the source row of each row, with the bit FRESH set if the row is new.
+    rows: (m,) uint32, the old row that each row is copied from, with the bit FRESH set if the row is a new Gaussian.
     halves: number of halves of split Gaussians, which are the last rows: all first halves, then all second halves.
     """
 
@@ -222,17 +226,17 @@ class DeviceRowList:
         return self.rows.shape[0]
 
     def entries(self) -> NDArray[np.uint32]:
-        """Return the list on the host."""
+        """Return a copy of `rows` on the host."""
         entries: NDArray[np.uint32] = self.rows.get()
         return entries
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceMarker:
-    """Marks the Gaussians of a model by their statistics.
+    """Marks which Gaussians of a model are kept, cloned and split, by their statistics.
 
-    The results overwrite a frame's splats in `work`. So no frame may be in use then, and the results are valid only
-    until the next frame is rendered.
+    The results overwrite the splats of the last frame in `work`. So this frame must not be needed any more, and the
+    results are valid only until the next frame is rendered.
     """
 
     device: Device
@@ -241,21 +245,22 @@ class DeviceMarker:
     statistics: DensityStatistics
 
     def scores(self, rules: MarkRules) -> Float32:
-        """Return the mean gradient norms (n,) of the Gaussians that may be densified; negative for the others."""
+        """Return each Gaussian's mean gradient norm (n,), or a negative number if it may not be densified."""
         found = np.empty(self.parameters.count, np.float32)
         for start, stop in self._pieces():
             found[start:stop] = _scored(self.device, self, rules, start, stop).scores.get()
         return found
 
     def rows(self, rules: MarkRules) -> DeviceRowList | SourceList:
-        """List the rows of the model after the rules are applied; on the host if the model is streamed."""
+        """Return the row list that the rules give: the rows to keep, clone and split. It is on the host for a streamed
+        model."""
         if isinstance(self.parameters, DeviceGaussians):
             return _listed(self.device, self, rules, 0, self.parameters.count)
         pieces = (_listed(self.device, self, rules, *piece) for piece in self._pieces())
         return in_source_order(piece.entries() for piece in pieces)
 
     def _pieces(self) -> Iterator[tuple[int, int]]:
-        """Yield [start, stop) of rows that are marked together.
+        """Yield the ranges [start, stop) of rows that are marked together.
 
         A streamed model is marked in parts of the rows that are on the device at once. With a pool, a part has half as
         many rows as the pool, so that marks and statistics fit in the memory of the splats.
@@ -269,9 +274,11 @@ class DeviceMarker:
 
 
 class _Scratch:
-    """Arrays for marking `n` rows, in the memory of a frame's splats.
+    """Scratch arrays for marking `n` rows (kernels/density.cl), in the memory of a frame's splats.
 
-    scores (n), float32; marks (3n), places (3n) and rows (2n), uint32.
+    scores: (n,) float32, the results of density_scores.
+    marks, places: (3n,) uint32, the results of density_marks, and their prefix sums.
+    rows: (2n,) uint32, memory for the row list.
     """
 
     def __init__(self, marker: DeviceMarker, n: int) -> None:
@@ -285,9 +292,9 @@ class _Scratch:
         self._columns = dict(zip(_COLUMNS, words[4:], strict=True))
 
     def column(self, name: str, array: AnyArray, start: int) -> DeviceArray:
-        """Return the rows of an array from `start` on, on the device.
+        """Return the n rows of `array` from row `start` on, on the device.
 
-        Of an array on the host it is a copy, which the next call with this name overwrites.
+        For an array on the host the result is a copy, which the next call with the same `name` overwrites.
         """
         if isinstance(array, DeviceArray):
             return array.rows(start, start + self._n)
@@ -314,7 +321,7 @@ def _scored(device: Device, marker: DeviceMarker, rules: MarkRules, start: int, 
 
 @stage("density")
 def _listed(device: Device, marker: DeviceMarker, rules: MarkRules, start: int, stop: int) -> DeviceRowList:
-    """Mark and list the rows [start, stop). The next call overwrites the list."""
+    """Return the row list that the rules give for the old rows [start, stop). The next call overwrites it."""
     n, model, kernels = stop - start, marker.parameters, device.kernels("density")
     scratch, counts = _scored(device, marker, rules, start, stop), allocate(device, (2,), np.uint32)
     columns = [scratch.column(name, model[name], start) for name in ("log_scales", "opacity_logits")]
@@ -341,8 +348,10 @@ def try_gather(device: Device, count: int, source: AnyGaussians) -> None:
 def gather(
     device: Device, rows: DeviceArray | NDArray[np.uint32], source: AnyGaussians, *, renews: bool = False
 ) -> AnyGaussians:
-    """Return new arrays whose row j is row rows[j] of the source, on the device or on the host like the source.
+    """Copy the rows that a row list names. Row j of the result is row rows[j] of `source`.
 
+    rows: entries of a row list, with the bit FRESH in new rows. The list, source and result are all on the device, or
+        all on the host.
     renews: True sets rows with the bit FRESH to zero, for moments. False copies them too, for parameters.
     """
     count = rows.shape[0]
@@ -370,11 +379,13 @@ def carried(
     *,
     densified: bool,
 ) -> DensityStatistics:
-    """Return the statistics of moved rows: row j is row rows[j] of the source, or infinite if its bit FRESH is set.
+    """Return the statistics after density control. Row j is row rows[j] of the source, or infinite if rows[j] is
+    FRESH.
 
-    densified: True if all statistics except contributions start from zero.
-    source: arrays by name (`DensityStatistics.named`). Each is removed as soon as it is copied, so that only one array
-        is in memory twice.
+    rows: entries of a row list, on the device or on the host.
+    source: arrays by name (`DensityStatistics.named`). Each array is removed from the dictionary as soon as it is
+        copied, so that only one array is in memory twice.
+    densified: True if all statistics except contributions start from zero in every row.
     """
     arrays = {}
     for name in tuple(source):
@@ -405,7 +416,7 @@ def _on_device(work: Workspace, rows: DeviceArray | NDArray[np.uint32]) -> Itera
 
 
 def _gather_array(device: Device, rows: DeviceArray, source: DeviceArray, to: DeviceArray, fresh: float | None) -> None:
-    """Copy the rows `rows` of `source` to `to`. fresh: the value for FRESH rows; None copies them like the others."""
+    """Set row j of `to` to row rows[j] of `source`. fresh: the value of rows with the bit FRESH; None copies these."""
     count, width = rows.shape[0], int(np.prod(source.shape[1:]))
     kernel = device.kernels("density").gather_rows
     if width:
@@ -413,7 +424,7 @@ def _gather_array(device: Device, rows: DeviceArray, source: DeviceArray, to: De
 
 
 def widen(device: Device, source: AnyGaussians, coefficients: int) -> AnyGaussians:
-    """Return the model with more SH coefficients, which are zero, on the same device or host."""
+    """Return a copy of the model with `coefficients` SH coefficients per channel. The additional ones are zero."""
     rest = np.zeros(group_shapes(source.count, coefficients)["sh_rest"], np.float32)
     rest[:, : source.coefficients - 1] = source["sh_rest"].get()
     if isinstance(source, HostGaussians):

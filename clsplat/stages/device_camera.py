@@ -22,8 +22,8 @@ _ROTATION_FIELDS = tuple(tuple(f"R{row}{column}" for column in range(3)) for row
 
 
 def pack_camera(camera: Camera) -> NDArray[np.float32]:
-    """The camera's values as float32 in the order of `columns.CAMERA`. Fields that end in _LOW are rounding errors of
-    the others.
+    """Return the camera as float32 numbers in the order of `columns.CAMERA`, for kernels. A field NAME_LOW is the
+    rounding error of the field NAME.
 
     Raises InputError for a panorama of more than a full turn.
     """
@@ -37,7 +37,7 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
         "FY": camera.fy,
         "CX": camera.cx,
         "CY": camera.cy,
-        "NEAR": max(camera.near, 0.0),  # not behind the camera, where depth does not order points
+        "NEAR": max(camera.near, 0.0),  # sort keys, the bits of depths, order only positive depths
         "FAR": min(camera.far, FARTHEST_PLANE),
         "HAND": float(np.copysign(1.0, np.linalg.det(camera.rotation))),
         "XMIN": -camera.cx / camera.fx - window.clamp * half_w,
@@ -62,7 +62,7 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
 
 
 def padded_size(width: int, height: int) -> tuple[int, int]:
-    """Rows and stride of an image's planes in pixels, padded to whole tiles."""
+    """Return the number of rows and the stride of an image's planes, in pixels, padded to whole tiles."""
     return -(-height // TILE) * TILE, -(-width // TILE) * TILE
 
 

@@ -88,7 +88,7 @@ class HostArray:
         return self.values.copy()
 
     def set(self, values: NDArray[Any]) -> None:
-        """Copy the values of another array into this one."""
+        """Copy the array `values` into this one."""
         self.values[...] = values
 
     def get_rows(self, start: int, stop: int) -> NDArray[Any]:
@@ -106,7 +106,7 @@ class HostArray:
 
 @dataclass(frozen=True, eq=False)
 class SavedArray:
-    """A field of a checkpoint's chunks in a scratch file, with the reading part of a DeviceArray's interface."""
+    """An array of a checkpoint whose chunks are in a scratch file, with a DeviceArray's methods for reading."""
 
     store: ChunkStore
     field: str
@@ -116,7 +116,7 @@ class SavedArray:
         return self.store.count, *self.store.fields[self.field]
 
     def get(self) -> NDArray[np.float32]:
-        """Return a copy of all rows."""
+        """Return a copy of all rows of the array."""
         return self.get_rows(0, self.store.count)
 
     def get_rows(self, start: int, stop: int) -> NDArray[np.float32]:
@@ -146,12 +146,12 @@ class HostGaussians(_ByGroup[Any]):
 
     @property
     def in_pool(self) -> DeviceGaussians:
-        """The arrays of the pool, with the rows of all slots that it has now."""
+        """The pool's arrays of this model, with the rows of all slots that the pool has now."""
         assert self.pool is not None
         return self.first_in_pool(self.pool.rows)
 
     def first_in_pool(self, rows: int) -> DeviceGaussians:
-        """Return the first `rows` rows of the pool's arrays."""
+        """Return the first `rows` rows of the pool's arrays of this model."""
         assert self.pool is not None
         arrays = {name: self.pool.arrays[f"{self.kind}/{name}"].rows(0, rows) for name in self.arrays}
         return DeviceGaussians(rows, self.coefficients, arrays)
@@ -161,7 +161,7 @@ AnyGaussians = DeviceGaussians | HostGaussians
 AnyArray = DeviceArray | HostArray | StoredArray
 ReadableArray = AnyArray | SavedArray
 KINDS = ("parameters", "first", "second")
-"""Names of parameters, first and second moments in a checkpoint and in a store of chunks."""
+"""First parts of names, before "/", of parameters, first and second moments in checkpoints and stores of chunks."""
 
 
 def parts(
@@ -209,7 +209,8 @@ def _uploaded(work: Workspace, index: int, model: HostGaussians, start: int, sto
 
 
 def fields_of(coefficients: int) -> dict[str, tuple[int, ...]]:
-    """Return the fields of a store of chunks for parameters, first and second moments."""
+    """Return the shape of a row of each array in a chunk's record, by name (such as "first/means"), for the parameters
+    and their first and second moments. coefficients: number of SH coefficients per channel."""
     shapes = group_shapes(1, coefficients)
     return {f"{kind}/{name}": shape[1:] for kind in KINDS for name, shape in shapes.items()}
 
@@ -224,8 +225,8 @@ def chunk_parts(
     is requested.
 
     models: models in one pool.
-    changes: True if the device will change the models. The last chunks then come first, because the pass that only
-        reads, before it, has left them on the device.
+    changes: True if the device will change the models. The parts then come in reverse order: the previous pass, which
+        only reads, ends with the last chunks, so these are still on the device.
     """
     streamed = [model for model in models if isinstance(model, HostGaussians)]
     pool = streamed[0].pool
@@ -244,19 +245,20 @@ Models = Sequence["AnyGaussians | None"]
 
 
 def by_field(models: Models) -> dict[str, AnyArray]:
-    """Return the arrays of parameters and moments by their field names in a store, without moments that are None."""
+    """Return the arrays of parameters and moments by their names in a store (such as "first/means"). Moments that are
+    None are left out."""
     given = {kind: model for kind, model in zip(KINDS, models, strict=True) if model is not None}
     return {f"{kind}/{name}": model[name] for kind, model in given.items() for name in PARAMETER_GROUPS}
 
 
 @dataclass(frozen=True, eq=False)
 class CopiedRows:
-    """A copy of Gaussians that is made chunk by chunk.
+    """A copy of Gaussians, which `to_store` or `to_arrays` makes chunk by chunk.
 
-    arrays: arrays to copy from, by field. Either all of them are fields of one pool's store, or none of them is in a
+    arrays: arrays to copy from, by name (such as "first/means"). Either all are in one pool's store, or none is in a
         store.
-    rows: row j of the copy is row rows[j]; None copies all rows.
-    values: values of new rows, and of fields that are not among `arrays`.
+    rows: (m,), row j of the copy is row rows[j] of `arrays`; None copies all rows.
+    values: values of new rows, and of arrays that the copy has in addition to `arrays`.
     """
 
     arrays: Mapping[str, ReadableArray]
@@ -269,7 +271,7 @@ class CopiedRows:
             store.write(numbers, records)
 
     def to_arrays(self, arrays: Mapping[str, AnyArray]) -> None:
-        """Write the copy to arrays by field, on the device or in main memory. Raises ScratchError."""
+        """Write the copy to `arrays`, by name, on the device or in main memory. Raises ScratchError."""
         record = record_type({name: array.shape[1:] for name, array in arrays.items()})
         count = arrays["parameters/means"].shape[0]
         for numbers, records in self._records(record, even_starts(count)):
@@ -294,7 +296,7 @@ class CopiedRows:
 
 
 def _records(count: int, arrays: Mapping[str, ReadableArray], numbers: NDArray[np.int64]) -> NDArray[Any]:
-    """Return records of some chunks of `count` Gaussians, from arrays by field."""
+    """Return the records of the chunks `numbers` (k,), from the arrays of `count` Gaussians by name."""
     records = np.empty(len(numbers), record_type({name: array.shape[1:] for name, array in arrays.items()}))
     for place, first, length in runs(numbers):
         begin, end = CHUNK_ROWS * first, min(CHUNK_ROWS * (first + length), count)
@@ -307,7 +309,7 @@ def _records(count: int, arrays: Mapping[str, ReadableArray], numbers: NDArray[n
 
 
 def pooled(pool: ChunkPool, coefficients: int) -> tuple[HostGaussians, HostGaussians, HostGaussians]:
-    """Return parameters, first and second moments of a pool's store."""
+    """Return the parameters, first and second moments of the streamed model in a pool's store."""
 
     def of(kind: str) -> HostGaussians:
         arrays = {name: StoredArray(pool, f"{kind}/{name}") for name in PARAMETER_GROUPS}
@@ -317,7 +319,8 @@ def pooled(pool: ChunkPool, coefficients: int) -> tuple[HostGaussians, HostGauss
 
 
 def saved_models(store: ChunkStore) -> list[HostGaussians]:
-    """Return parameters, first and second moments of a checkpoint's store. Raises ValueError for other fields."""
+    """Return the parameters, first and second moments in a checkpoint's store. Raises ValueError if the store's records
+    have other arrays than `fields_of` returns."""
     coefficients = store.fields.get("parameters/sh_rest", (0,))[0] + 1
     if {name: shape for name, shape in store.fields.items() if name.split("/")[0] in KINDS} != fields_of(coefficients):
         raise ValueError("its chunks have other fields than this version's")
@@ -334,7 +337,7 @@ def saved_models(store: ChunkStore) -> list[HostGaussians]:
 
 
 def rows_at(array: AnyArray, places: NDArray[np.integer[Any]] | slice) -> NDArray[np.float32]:
-    """Return a copy of rows of an array. places: their indices (k,), or a slice."""
+    """Return a copy of the rows of `array` with the indices `places`, which are (k,) or a slice."""
     if isinstance(places, slice):
         return array.get_rows(places.start, places.stop)
     if isinstance(array, StoredArray):
@@ -344,7 +347,7 @@ def rows_at(array: AnyArray, places: NDArray[np.integer[Any]] | slice) -> NDArra
 
 
 def set_rows_at(array: AnyArray, places: NDArray[np.integer[Any]] | slice, values: NDArray[np.float32]) -> None:
-    """Replace rows of an array. places: their indices (k,), or a slice."""
+    """Replace the rows of `array` with the indices `places`, which are (k,) or a slice, by `values`."""
     if isinstance(places, slice):
         array.set_rows(places.start, values)
         return
@@ -357,7 +360,7 @@ def set_rows_at(array: AnyArray, places: NDArray[np.integer[Any]] | slice, value
 
 
 def change_rows(array: AnyArray, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> None:
-    """Apply a function to the rows of an array, to all at once or chunk by chunk."""
+    """Replace rows of an array by the result of the function `change` for them, all at once or chunk by chunk."""
     if isinstance(array, StoredArray):
         array.change(change)
     else:
@@ -365,7 +368,7 @@ def change_rows(array: AnyArray, change: Callable[[NDArray[np.float32]], NDArray
 
 
 def allocate_gaussians(device: Device, count: int, coefficients: int, *, zero: bool = False) -> DeviceGaussians:
-    """Allocate arrays for `count` Gaussians."""
+    """Allocate arrays for `count` Gaussians. zero: fill them with zeros; otherwise they are not initialised."""
     arrays = {name: allocate(device, shape, np.float32) for name, shape in group_shapes(count, coefficients).items()}
     if zero:
         for array in arrays.values():
@@ -389,10 +392,9 @@ def upload_gaussians(device: Device, gaussians: Gaussians, sh: ShStorage | None 
 
 
 def host_gaussians(gaussians: Gaussians, rows: int, sh: ShStorage | None = None) -> HostGaussians:
-    """Wrap Gaussians on the host, to be streamed through the device `rows` at a time.
+    """Wrap Gaussians on the host. They are streamed to the device, `rows` at a time.
 
-    The arrays are not copied.
-
+    An array is copied only if its dtype or layout has to change.
     sh: the SH storage, for a model that is only rendered.
     """
     sh = sh or ShStorage(gaussians.sh.shape[1])
@@ -401,8 +403,8 @@ def host_gaussians(gaussians: Gaussians, rows: int, sh: ShStorage | None = None)
 
 
 def host_model(arrays: Mapping[str, NDArray[Any]], kind: str) -> HostGaussians:
-    """Wrap the arrays of a checkpoint whose names begin with `kind`/. Raises ValueError for missing arrays and for a
-    wrong shape or dtype."""
+    """Return the Gaussians whose arrays in a checkpoint have names that begin with `kind`/. Raises ValueError for
+    missing arrays and for a wrong shape or dtype."""
     if missing := [group for group in PARAMETER_GROUPS if f"{kind}/{group}" not in arrays]:
         raise ValueError(f"has no {kind}/{missing[0]}")
     host = {group: arrays[f"{kind}/{group}"] for group in PARAMETER_GROUPS}
@@ -415,7 +417,7 @@ def host_model(arrays: Mapping[str, NDArray[Any]], kind: str) -> HostGaussians:
 
 
 def host_zeros(count: int, coefficients: int, rows: int) -> HostGaussians:
-    """Make arrays of zeros on the host: the initial moments of Adam."""
+    """Make zeros on the host, the initial moments of Adam, for `count` Gaussians. rows: as in `HostGaussians`."""
     shapes = group_shapes(count, coefficients)
     arrays = {name: HostArray(np.zeros(shape, np.float32)) for name, shape in shapes.items()}
     return HostGaussians(count, coefficients, arrays, rows)

@@ -29,14 +29,14 @@ DUPLICATE_GAUSSIAN_BYTES = 3 * 4 + SORT_KEY_BYTES + 3 * 4
 """Bytes per Gaussian: its entries of `first_slots`, `gaussian_from_visible` and `depth_keys`, of the sort by depth, and
 of `gaussian_from_rank`, `rank_counts` and `offsets`."""
 BAND_GAUSSIAN_BYTES = 4
-"""Additional bytes per Gaussian if there are several bands: the number of its tiles in the current band."""
+"""Additional bytes per Gaussian if there are several bands: the number of the Gaussian's tiles in the band."""
 BAND_TILE_BYTES = 4
-"""Additional bytes per tile if there are several bands: the number of its pairs."""
+"""Additional bytes per tile if there are several bands: the number of the tile's pairs."""
 
 
 def pair_bytes(*, sorts_pairs: bool) -> int:
-    """Bytes per pair: its tile, slot and Gaussian. If `sorts_pairs`, also tile, Gaussian and depth by slot, and a sort
-    of the pairs by depth."""
+    """Return the bytes per pair of its tile, slot and Gaussian. With `sorts_pairs` the bytes for `duplicate_and_sort`
+    are added: tile, Gaussian and depth by slot, and a sort of the pairs by depth."""
     return 12 + (12 + SORT_KEY_BYTES if sorts_pairs else 0)
 
 
@@ -76,10 +76,10 @@ class Totals:
     arriving: Callable[[], NDArray[Any]] | None = None
 
     def elements(self, most: int, name: str) -> Elements:
-        """The number of elements that a kernel processes: `most`. In a pass by capacity it is field `name` of READBACK
-        instead.
+        """Return the number of elements that a kernel processes, as the kernel's argument.
 
-        most: the number. In a pass by capacity, an upper bound of the number that the kernel reads from READBACK.
+        The number is `most`. In a pass by capacity the kernel reads the number from field `name` of READBACK, and
+        `most` is an upper bound of it.
         """
         return Elements(most, self.on_device, READBACK.index(name))
 
@@ -127,8 +127,8 @@ def count(
     Waits for the device.
 
     all_bits: assume that depths differ in all 32 bits.
-    readback: (READBACK_SIZE,) uint32, the array that the host reads. Its counts of elements that `adam` refused become
-    part of the result. None uses an array without these counts.
+    readback: (READBACK_SIZE,) uint32, filled with the counts. The numbers of elements that `adam` refused, which it
+    already contains, become part of the result. None uses an array without these numbers.
     """
     readback = readback or work.array("readback", (len(COUNTED),), np.uint32)
     first_slots, gaussian_from_visible, depth_keys = _compact(device, work, projected, readback)
@@ -159,8 +159,8 @@ def count_by_capacity(
 ) -> Counted:
     """Count like `count`, but without waiting. With more than `capacity` pairs the pass stops (kernels/duplicate.cl).
 
-    readback: (READBACK_SIZE,) uint32, the same array that `project_step` gets.
-    host: host memory for a copy of `readback`.
+    readback: (READBACK_SIZE,) uint32, filled with the counts. Pass the same array to `project_step`.
+    host: host memory, to which `readback` is copied.
 
     Depths are sorted by all 32 bits. On a GPU this takes no more passes than a sort by the bits that differ.
     """

@@ -54,7 +54,11 @@ def device_bytes(photographs: int, sizes: Sequence[tuple[int, int]]) -> int:
 def apply_grid(
     device: Device, work: Workspace, grids: Grids, photograph: int, image: DeviceArray, width: int, height: int
 ) -> DeviceArray:
-    """Apply a photograph's colour transforms to an image, width x height pixels. Returns planes (3, rows, stride)."""
+    """Apply the colour transforms of a photograph's grid to `image`, and return the new planes (3, rows, stride).
+
+    photograph: the photograph's index in `grids`.
+    width, height: size of the image in pixels, without padding.
+    """
     _, rows, stride = image.shape
     seen = work.array("appearance_seen", image.shape)
     sizes = (photograph, stride, rows * stride, *_spans(width, height))
@@ -76,9 +80,12 @@ def grid_gradient(
     weight: float,
     place: int = 0,
 ) -> DeviceArray:
-    """Replace the gradient with respect to the transformed image by the gradient with respect to the image.
+    """Compute the gradients with respect to a photograph's grid and, in place, with respect to the image.
 
-    Returns the gradient with respect to the photograph's grid, plus `weight` times the gradient of its total variation.
+    Returns the gradient with respect to the grid, plus `weight` times the gradient of the grid's total variation.
+
+    gradient: planes (3, rows, stride), the gradient with respect to the transformed image. It is overwritten by the
+    gradient with respect to `image`, the image before the transform.
     place: index of the view in the batch; the result of each view is in an array of its own.
     """
     _, rows, stride = image.shape
@@ -106,9 +113,11 @@ def step_grid(
     rate: float,
     readback: DeviceArray,
 ) -> None:
-    """Update the photograph's grid by Adam. visit: the number of this update of the grid, from 1.
+    """Update a photograph's grid by Adam. Nothing changes if the step's pass has stopped (kernels/duplicate.cl).
 
-    Nothing changes if the step's pass has stopped (kernels/duplicate.cl).
+    by_grid: the gradient with respect to the grid.
+    visit: the number of this update of the grid, from 1.
+    rate: learning rate.
     """
     kernel = device.kernels("grid", {"LANES": 1}).move_grid
     constants = (
@@ -124,6 +133,7 @@ def step_grid(
 
 @stage("appearance")
 def centre_grids(device: Device, grids: Grids, readback: DeviceArray) -> None:
-    """Shift the grids so that their mean is the identity. Nothing changes if the step's pass has stopped."""
+    """Shift all grids so that their mean over the photographs is the identity transform. Nothing changes if the step's
+    pass has stopped."""
     kernel = device.kernels("grid", {"LANES": 1}).centre_grids
     launch_items(device, kernel, GRID_FLOATS, grids.grids.shape[0], readback, grids.grids)

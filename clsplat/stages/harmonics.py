@@ -56,7 +56,7 @@ class Harmonics:
 
     @property
     def defines(self) -> dict[str, object]:
-        """Defines that harmonics.cl and harmonics_grad.cl share."""
+        """Macros that harmonics.cl and harmonics_grad.cl are both compiled with."""
         wanted = {
             "CAMERA": self.centre is not None,
             "MASKED": self.mask is not None,

@@ -18,7 +18,7 @@ from clsplat.stages.device_camera import padded_size
 from clsplat.stages.ranges import TileLists
 
 HELD_PIXEL_BYTES = 4 + 4 * len(HOLDOUT_SURFACE_FIELDS)
-"""Bytes that a pixel with one holdout surface takes."""
+"""Bytes on the device of a pixel with one holdout surface: its entry of `starts`, and the surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Held:
 
     @property
     def arguments(self) -> tuple[DeviceArray, DeviceArray]:
-        """The arguments of a kernel that omits everything behind the surfaces."""
+        """The arrays as arguments of a kernel that leaves out what is behind the surfaces (kernels/shared/held.h)."""
         return self.starts, self.surfaces
 
 

@@ -31,12 +31,13 @@ class _Blocks:
     """Blocks of pixels that groups of the loss kernel process.
 
     rows, columns: size of a block in pixels.
-    groups: the number of groups, if they share the blocks. If each block has a group of its own: a tuple of the numbers
-        of blocks across, of blocks down, and of channels.
-    field: floats that a row of one of the three partial derivatives takes; 0 in groups of several items.
-    partials, sums: lengths in floats of two arrays, the partial derivatives and the partial sums.
+    groups: number of groups. In groups of several items, which process one block each, it is a tuple: the numbers of
+        blocks across, of blocks down, and of channels.
+    field: number of floats in a row of one of SSIM's three partial derivatives; 0 in groups of several items.
+    partials: number of floats in the array of partial derivatives.
+    sums: number of floats in the array of the loss's partial sums.
 
-    The order in which the loss is summed depends on the columns of a block. No other result depends on the blocks.
+    The order in which the loss is summed depends on `columns`. No other result depends on the blocks.
     """
 
     rows: int
@@ -56,10 +57,11 @@ def _blocks(device: Device, height: int, stride: int) -> _Blocks:
         return _Blocks(rows, columns, (across, down, 3), 0, partials, sums)
     columns = -(-stride // (-(-stride // LOSS_COLUMNS) * TILE)) * TILE
     across = -(-stride // columns)
-    rows = max(-(-height * across // shape.chunks), _MIN_BLOCK_ROWS)  # at most three blocks per chunk
+    # A channel has about shape.chunks blocks, or fewer.
+    rows = max(-(-height * across // shape.chunks), _MIN_BLOCK_ROWS)
     blocks = 3 * -(-height // rows) * across
     groups = blocks if blocks < 3 * shape.chunks else shape.chunks
-    field = 16 * ((columns // 16 + 2) | 1)  # odd, as rows at power-of-two distances evict each other from a cache
+    field = 16 * ((columns // 16 + 2) | 1)  # odd: at power-of-two distances, rows evict each other from a cache
     return _Blocks(rows, columns, groups, field, partials=groups * LOSS_RING * 3 * field, sums=9 * height * across)
 
 
@@ -74,8 +76,8 @@ class Loss:
     """A loss and its gradient.
 
     gradient: (3, rows, stride), with an additional plane for each of the alpha and depth terms.
-    sums: (3, ...), partial sums of SSIM, of |x - y| and of (x - y)^2. With further terms the array has one axis, and
-    the partial sums of these terms follow.
+    sums: (3, ...), partial sums of SSIM, of |x - y| and of (x - y)^2, where x is the render and y the target. With
+    further terms the array has one axis, and the partial sums of these terms follow.
     samples: number of colour samples, three per pixel, that no mask excludes.
     masked: number of masked samples. The mean of SSIM still includes the windows around them.
     copy: function that waits for a copy of the sums to the host and returns it; None if no copy has been started.
@@ -91,11 +93,12 @@ class Loss:
     further: tuple[tuple[float, float, int], ...] = ()
 
     def fetched(self) -> Loss:
-        """Start to copy the sums to the host, so that `read` does not wait for later work."""
+        """Start a copy of the sums to the host, and return the loss with this copy. Its `read` does not wait for
+        launches that follow."""
         return self.copied(self.sums.begin_get())
 
     def copied(self, copy: Callable[[], NDArray[Any]]) -> Loss:
-        """The same loss, whose sums `read` takes from the function `copy`."""
+        """Return this loss with `copy`, the function from which `read` gets the sums."""
         return Loss(self.gradient, self.sums, self.samples, self.weight, copy, self.masked, self.further)
 
     def read(self) -> tuple[float, float]:
@@ -126,8 +129,9 @@ def loss(
     blended: Blended | None = None,
     terms: Sequence[LossTerm] = (),
 ) -> Loss:
-    """Compute (1 - weight) L1 + weight (1 - SSIM) of planes (3, rows, stride), whose padding must be zero.
+    """Compute (1 - weight) L1 + weight (1 - SSIM) of an image and its target.
 
+    image: planes (3, rows, stride), whose padding must be zero.
     target: planes like the image's; or a photograph (height, width, 3), uint8 or float32, if several items share a
     tile (`tile_items`).
     sums_index: index of the array for the loss's sums. A call's sums can be read until the next call with this index.

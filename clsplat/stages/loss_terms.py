@@ -25,8 +25,8 @@ sums, rounded up."""
 class Compared:
     """A render and its photograph, the inputs and outputs of a loss term.
 
-    target: planes (3 or 4, rows, stride) of the photograph; the fourth is its alpha. If no term reads alpha, this may
-    be the photograph itself, (height, width, 3).
+    target: planes (3 or 4, rows, stride) of the photograph; the fourth is its alpha. If no term reads alpha, `target`
+    may be the photograph itself, (height, width, 3).
     gradient: planes (3 + terms, rows, stride); each term writes its own plane.
     sums: all partial sums of the loss; each term writes `rows / TILE * stride` of them.
     pixels: number of pixels that no mask excludes.
@@ -61,7 +61,8 @@ class LossTerm:
         raise NotImplementedError
 
     def launch(self, compared: Compared, plane: int, first: int) -> None:
-        """Write plane number `plane` of the gradient, and the partial sums from index `first` on."""
+        """Launch the term's kernel, which writes the plane with index `plane` of `compared.gradient`, and the term's
+        partial sums to `compared.sums` from index `first` on."""
         raise NotImplementedError
 
 

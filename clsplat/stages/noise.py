@@ -22,14 +22,14 @@ NOISE_OPACITY_RANGE = 0.16
 
 
 def highest_logit(dead: float) -> float:
-    """Logit of the opacity above which no noise is added."""
+    """Return the logit of the opacity above which no noise is added. dead: `Exploration.dead`."""
     highest = dead + NOISE_OPACITY_RANGE
     return log(highest / (1 - highest)) if highest < 1 else inf
 
 
 def noise_numbers(explore: Exploration) -> tuple[float, ...]:
-    """Arguments of add_noise that change from step to step: the words of the random key, and the amount of noise. Empty
-    without noise."""
+    """Return the arguments of the kernel add_noise that change from step to step: the words of the random key, and the
+    amount of noise. The tuple is empty without noise."""
     return () if explore.amount == 0 else (*map(LaunchParameterWord, explore.key), LaunchParameter(explore.amount))
 
 
@@ -38,7 +38,8 @@ def noise(
 ) -> None:
     """Add a step's noise to the means. Nothing changes if `readback` says that the step's pass has stopped.
 
-    first_row: row in the model of the first of these Gaussians.
+    gaussians: all Gaussians of the model, or consecutive rows of it.
+    first_row: the model's row that is the first of `gaussians`.
     """
     if explore.amount != 0:
         _add_noise(device, explore, gaussians, first_row, readback)

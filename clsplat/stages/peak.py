@@ -91,7 +91,7 @@ def _pairs_per_second(
 
 
 def _copy_rate(device: Device, nbytes: int, repeat: int) -> float:
-    copied = max(device.shape.lanes, 4)  # elements per work-item: a GPU needs 16 bytes to keep memory busy
+    copied = max(device.shape.lanes, 4)  # elements per work-item: a GPU keeps its memory busy by loads of 16 bytes
     n = min(nbytes, device.max_allocation // 4, device.budget // 4) // 4 // copied * copied
     source, copy = allocate(device, (n,), np.float32), allocate(device, (n,), np.float32)
     source.fill(1.0)

@@ -13,8 +13,10 @@ from clsplat.stages.device_camera import padded_size
 
 @stage("pixels")
 def pixels_from_planes(device: Device, blended: Blended, pixels: DeviceArray, alpha: DeviceArray) -> None:
-    """Fill alpha (height, width), and of pixels (height, width, depth) the first three values, or all if depth is
-    less."""
+    """Copy the image of `blended` to pixels (height, width, depth), and its alpha to alpha (height, width).
+
+    Each pixel gets min(depth, 3) colour values. With a depth over 3, its other values are not written.
+    """
     height, width, depth = pixels.shape
     kernel, stride = device.kernels("pixels").pixels_from_planes, blended.transmittance.shape[1]
     planes = (blended.image, blended.transmittance)
@@ -25,9 +27,12 @@ def pixels_from_planes(device: Device, blended: Blended, pixels: DeviceArray, al
 def planes_from_pixels(
     device: Device, work: Workspace, d_pixels: DeviceArray, d_alpha: DeviceArray | None = None
 ) -> DeviceArray:
-    """Make the image gradient (3, rows, stride) for `blend_grad` from d_pixels (height, width, depth), depth 1 to 3.
+    """Return the image gradient (3, rows, stride) for `blend_grad`, from the gradient with respect to pixels.
 
-    d_alpha: (height, width); adds a fourth plane, the gradient with respect to the transmittance.
+    d_pixels: (height, width, depth), depth 1 to 3.
+    d_alpha: (height, width), the gradient with respect to alpha. With it the result has a fourth plane, the gradient
+    with respect to the transmittance.
+
     The padding of the planes is not written.
     """
     height, width, depth = d_pixels.shape

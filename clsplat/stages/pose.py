@@ -16,7 +16,7 @@ point)."""
 
 
 def sums_of(work: Workspace, count: int, numbers: int = POSE_NUMBERS) -> DeviceArray:
-    """An array for partial sums of the gradient of a pose or lens, which `pose_rows` or `lens_rows` fills.
+    """Return an array for partial sums of the gradient of a pose or lens, which `pose_rows` or `lens_rows` fills.
 
     It has a row of `numbers` sums for every POSE_ROWS of the `count` Gaussians.
     """
@@ -33,10 +33,13 @@ def pose_rows(
     sums: DeviceArray,
     first_row: int = 0,
 ) -> None:
-    """Sum the pose gradient of these Gaussians into `sums` (ceil(n / POSE_ROWS), 6).
+    """Compute the gradient with respect to a camera's pose, as a partial sum for every POSE_ROWS Gaussians.
 
     device: the device with the kernel switches of the camera model.
-    first_row: row in the model of the first of these Gaussians, a multiple of POSE_ROWS.
+    gaussians: all Gaussians of the model, or consecutive rows of it.
+    gradients: the gradients with respect to the parameters of these Gaussians.
+    sums: (ceil(rows of the model / POSE_ROWS), 6), of which the rows of these Gaussians are filled.
+    first_row: the model's row that is the first of `gaussians`, a multiple of POSE_ROWS.
     """
     launch_items(
         device,
@@ -57,7 +60,11 @@ def pose_rows(
 def lens_rows(
     device: Device, tile_counts: DeviceArray, by_lens: DeviceArray, sums: DeviceArray, first_row: int = 0
 ) -> None:
-    """Sum the lens gradients (n, LENS_NUMBERS) of these Gaussians (`project_grad`) into `sums`, like `pose_rows`."""
+    """Compute the gradient with respect to a camera's lens, as a partial sum for every POSE_ROWS Gaussians.
+
+    by_lens: (n, LENS_NUMBERS), the gradients of n Gaussians from `project_grad`.
+    sums, first_row: as in `pose_rows`, with LENS_NUMBERS columns.
+    """
     (n,) = tile_counts.shape
     kernel = device.kernels("pose", {"LANES": 1}).lens_rows
     launch_items(device, kernel, -(-n // POSE_ROWS), n, first_row // POSE_ROWS, tile_counts, by_lens, sums)
@@ -65,7 +72,7 @@ def lens_rows(
 
 @stage("pose")
 def sum_of(device: Device, work: Workspace, sums: DeviceArray) -> DeviceArray:
-    """Add the rows of partial sums (m, numbers) to one row (1, numbers).
+    """Sum the rows of partial sums (m, numbers) into one row (1, numbers).
 
     For a pose the row is the gradient with respect to the rotation and translation of `Camera.moved`; for a lens, with
     respect to ln fx, ln fy, cx and cy.

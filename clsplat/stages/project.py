@@ -38,7 +38,7 @@ SCREEN_GRADIENT_BYTES = 8
 
 
 def gaussian_bytes(*, keeps_culled: bool) -> int:
-    """Bytes per Gaussian of `Projected`: splat and tile count, and `shown` if culling is switched off."""
+    """Return the bytes per Gaussian of `Projected`: splat, tile count and, if `keeps_culled`, an entry of `shown`."""
     return 4 * (len(SPLAT) + 1 + keeps_culled)
 
 
@@ -60,15 +60,15 @@ class Projected:
 
     @property
     def chunk_defines(self) -> dict[str, object]:
-        """Defines of kernels that find a projected Gaussian in the model's arrays."""
+        """Macros for kernels that run over the projected Gaussians and read or write the model's arrays."""
         return {} if self.chunks is None else {"CHUNKS": True}
 
     @property
     def chunk_arguments(self) -> tuple[object, ...]:
         """Last arguments of kernels with `chunk_defines`: CHUNK_PARAMETERS of `kernels/shared/chunks.h`.
 
-        The list is passed as a buffer, not as an array, because the profile takes a kernel's last arrays for those that
-        the kernel updates.
+        The list of chunks is passed as a plain buffer, because the profile assumes that a kernel updates the arrays at
+        the end of its arguments.
         """
         return () if self.chunks is None else (self.chunks.numbers.buffer, self.chunks.model_rows)
 
@@ -81,7 +81,7 @@ class Projected:
 
 
 def thinning_numbers(thinning: Thinning | None) -> tuple[float, ...]:
-    """Arguments of `project` for dropout of Gaussians, which change from step to step; empty without dropout."""
+    """Return the kernel arguments for dropout of Gaussians, which change from step to step; empty without dropout."""
     if thinning is None:
         return ()
     return (*map(LaunchParameterWord, (*thinning.key, thinning.threshold)), LaunchParameter(thinning.factor))
@@ -109,8 +109,9 @@ def project(
     thinning: Thinning | None = None,
     chunks: ChunkList | ChunkNumbers | None = None,
 ) -> Projected:
-    """Project all Gaussians that thinning does not drop, and count their tiles (Kerbl et al. 2023, section 4).
+    """Project Gaussians to splats, and count the tiles that each splat reaches (Kerbl et al. 2023, section 4).
 
+    thinning: random dropout of Gaussians in a step of training; None projects all.
     chunks: the chunks whose Gaussians are projected and have rows in the result. None projects the whole model.
     """
     n = gaussians.count if chunks is None else chunks.rows
@@ -158,7 +159,7 @@ def project(
 
 @dataclass(frozen=True, eq=False)
 class Slots:
-    """Partial gradients of the pairs.
+    """Gradients of the pairs of a tile and a Gaussian, from `blend_grad`.
 
     values: (pairs, fields.floats), or (n, fields.floats) if already summed by Gaussian.
     first_slots: (n), the first slot of each Gaussian; None if `values` are already summed.
@@ -169,7 +170,7 @@ class Slots:
     fields: SlotFields = PLAIN_SLOTS
 
     def rows(self, start: int, stop: int) -> Slots:
-        """The slots of the Gaussians [start, stop)."""
+        """Return the slots of the Gaussians [start, stop)."""
         if self.first_slots is None:
             return replace(self, values=self.values.rows(start, stop))
         first_slots = self.first_slots.rows(start, stop)
@@ -196,8 +197,11 @@ def add_slots(
     slots: Slots,
     sums: DeviceArray | None,
 ) -> DeviceArray:
-    """Add the slots of one band to the sums per Gaussian, (n, floats), and return the sums. Bands must come in order;
-    for the first, `sums` is None."""
+    """Add the slots of a band's pairs to each Gaussian's sums (n, floats), and return the sums.
+
+    tile_counts: (n,), the number of tiles of the band that each Gaussian reaches.
+    sums: the result for the previous band. Call the function for the bands in order, first with None.
+    """
     (n,) = tile_counts.shape
     if sums is None:
         sums = work.array("slot_sums", (n, slots.values.shape[1]))
@@ -223,6 +227,8 @@ def project_grad(
 ) -> None:
     """Compute `gradients` and `screen` of the visible Gaussians from the slots of their pairs.
 
+    slots: the gradients of the pairs, or their sums.
+    gradients: filled with the gradients in the parameters' shapes; rows of invisible Gaussians are not written.
     sh_rest: also compute the gradient of the higher SH bands.
     explore: penalties on opacity and scale, whose gradients are added.
     by_lens: (n, 4), filled with each Gaussian's gradient with respect to the logs of the focal lengths and to the
@@ -248,8 +254,8 @@ def project_grad(
 
 
 def step_numbers(step: AdamStep, explore: Exploration) -> tuple[float, ...]:
-    """Arguments of `project_step` that change with the step: penalty weights, Adam's factors 1 / sqrt(1 - beta2^t) for
-    most groups and for sh_rest, and each group's learning rate over 1 - beta1^t."""
+    """Return the numbers that the kernel of `project_step` needs for a step: the penalty weights; 1 / sqrt(1 - beta2^t)
+    for most groups, then for sh_rest; and the learning rate / (1 - beta1^t) of each group."""
     rates, number, every = step.rates, step.number, step.config.sh_rest_every
     shrunk, root = of_rest, root_of_rest = step.corrections(number)
     if every > 1:
@@ -296,7 +302,7 @@ def project_step(
         *(config.beta1, config.beta2, config.epsilon),
         *numbers[weights:],
         *(PARAMETER_GROUPS["means"].limit ** 2, PARAMETER_GROUPS["sh_dc"].limit ** 2),
-        readback.buffer,  # a buffer, which the profile does not count: the kernel writes it only on a fault
+        readback.buffer,  # a plain buffer: the profile must not count readback's bytes, which are rarely written
         *(arrays[group] for arrays in model for group in PARAMETER_GROUPS),
         *projected.chunk_arguments,
     )
@@ -311,14 +317,15 @@ def project_step(
 
 
 class _Build(NamedTuple):
-    """Gaussians per work-item of the gradient's kernel, and the define LANES if the kernel shape has another number."""
+    """How project_grad.cl is built: the number of Gaussians per work-item, and the macro LANES if the kernel shape has
+    another number."""
 
     lanes: int
     defines: dict[str, object]
 
 
 def _build(device: Device) -> _Build:
-    """The build of the gradient. If Gaussians are evaluated along rays, it has one lane, as the projection has too."""
+    """Return how project_grad.cl is built. For cameras that evaluate Gaussians along rays, it has one lane."""
     return _Build(1, {"LANES": 1}) if device.switched("RAYS") else _Build(device.shape.lanes, {})
 
 
@@ -331,8 +338,7 @@ def _inputs(
     gaussians: DeviceGaussians, camera_array: DeviceArray, projected: Projected, slots: Slots
 ) -> tuple[object, ...]:
     """The arguments that `project_grad` and `project_step` share, after the number of rows."""
-    first_slots = (
-        slots.first_slots or projected.tile_counts
-    )  # a placeholder if the slots are already summed: then the kernel does not read first slots
+    # If the slots are already summed, the kernel does not read first_slots, and tile_counts is a placeholder.
+    first_slots = slots.first_slots or projected.tile_counts
     counts = (projected.tile_counts, first_slots, slots.values, projected.splats)
     return (gaussians.coefficients, camera_array, *counts)

@@ -46,6 +46,8 @@ def sampling_limits(
     resolve.
 
     See Yu et al. 2024, Mip-Splatting, section 5.1. A Gaussian that no camera sees gets -1e30.
+
+    cameras: the cameras of all photographs, from `upload_cameras`.
     """
     for start, stop, (part,) in parts(work, gaussians):
         for index, group in enumerate(cameras):
@@ -56,7 +58,7 @@ def sampling_limits(
 
 @stage("sampling", limit_scales=1)
 def limit_scales(device: Device, work: Workspace, gaussians: AnyGaussians, least: DeviceArray) -> None:
-    """Raise log scales below `least` (n,) to `least`."""
+    """Raise the log scales of each Gaussian to its number in `least` (n,), where they are lower."""
     kernel = device.kernels("sampling", {"LANES": 1}).limit_scales
     for start, stop, (part,) in parts(work, gaussians, keep=True):
         launch_items(device, kernel, part.count, part.count, least.rows(start, stop), part["log_scales"])

@@ -26,9 +26,9 @@ reads the counts of all groups before it."""
 class Elements:
     """The number of elements that a kernel processes: `most`, or counts[place] if `counts` is given.
 
-    most: number of elements for which launches are sized. counts[place] must not be larger.
-    counts, place: array on the device and index in it, from which the kernel reads the number
-    (kernels/shared/count.h).
+    most: number of elements for which launches are sized, at least counts[place].
+    counts: array on the device from which the kernel reads the number (kernels/shared/count.h).
+    place: index of the number in `counts`.
     """
 
     most: int
@@ -42,12 +42,12 @@ class Elements:
 
     @property
     def defines(self) -> dict[str, object]:
-        """The defines of kernels that take `arguments`."""
+        """Macros for the build of a kernel that takes `arguments`."""
         return {} if self.counts is None else {"BY_CAPACITY": True}
 
 
 def chunking(device: Device, n: int, items: int = 0) -> tuple[int, int]:
-    """The number of groups that share n elements, and the number of elements in the chunk of each group.
+    """Return the number of groups that share n elements, and the number of elements in each group's chunk.
 
     items: work-items of a group, if different from the kernel shape.
     """
@@ -70,7 +70,7 @@ def scan(
 ) -> None:
     """Compute out[i] = sum of values[:i] and total[0] = sum of values, in one launch if one group is enough, else two.
 
-    elements: the number of values to scan; None scans all.
+    elements: the number of values to scan, from the first on; None scans all.
     """
     elements = elements or Elements(values.shape[0])
     groups, chunk = chunking(device, elements.most)

@@ -25,15 +25,16 @@ def settle(
     readback: DeviceArray,
     tile_counts: DeviceArray | None = None,
 ) -> None:
-    """Settle Gaussians: take all steps that they missed, up to `step`.
+    """Settle Gaussians: take the steps of Adam that they missed, up to step number `step`.
 
     Nothing changes if `readback` says that the step's pass has stopped.
 
     model: parameters, first and second moments.
-    last: (n,) uint32, the last step that each Gaussian took.
+    last: (n,) uint32, the last step that each Gaussian took. For settled Gaussians it becomes `step`. With
+    `tile_counts` it becomes `step + 1`, because visible Gaussians take step `step + 1` right after this call.
     missed: (MOST_MISSED + 1, groups, 3), the result of `MissedSteps.rounded` after step `step`.
-    tile_counts: (n,) uint32, the tile counts of a view. Only Gaussians whose count is not 0, the visible ones, are
-    settled, and `step + 1` is written to `last` for them. None settles all Gaussians.
+    tile_counts: (n,) uint32, tile counts of the view of step `step + 1`. Only visible Gaussians, whose count is not 0,
+    are settled. None settles all Gaussians.
     """
     n, coefficients = model[0].count, model[0].coefficients
     visible = {} if tile_counts is None else {"VISIBLE": True}

@@ -39,11 +39,10 @@ def _widest_digit(device: Device, n: int) -> int:
 
 
 def scratch_bytes(device: Device, n: int) -> int:
-    """Upper bound of the scratch bytes of sorts and scans of up to `n` elements, sorted keys and positions excluded."""
+    """Return an upper bound of the scratch bytes of sorts and scans of `n` elements, apart from the results."""
     groups = max(chunking(device, n, device.shape.sort_items)[0], device.shape.chunks)
-    return (
-        4 * (1 << _widest_digit(device, n)) * (groups + 1) + 8 * groups
-    )  # histograms and totals, then the sums of scans
+    histograms_and_totals = 4 * (1 << _widest_digit(device, n)) * (groups + 1)
+    return histograms_and_totals + 8 * groups  # the sums of scans
 
 
 def radix_sort(
@@ -55,9 +54,11 @@ def radix_sort(
     base: int = 0,
     elements: Elements | None = None,
 ) -> tuple[DeviceArray, DeviceArray]:
-    """Sort by the lowest `bits` of the keys minus `base`. Returns sorted keys and their positions in the input, as
-    workspace arrays under `name`.
+    """Sort uint32 keys by radix sort. Returns the sorted keys and their positions in the input, workspace arrays whose
+    names begin with `name`.
 
+    bits: number of low bits by which the keys minus `base` are sorted.
+    base: not larger than any key.
     elements: the number of keys to sort; None sorts all.
 
     The sort makes as few passes as the widest digit allows, with digits of equal width.

@@ -46,7 +46,7 @@ class ScreenGaussians:
 
     @property
     def width(self) -> int:
-        """Values per Gaussian."""
+        """Number of values per Gaussian."""
         return self.values.shape[1]
 
 
@@ -103,8 +103,9 @@ def splats_grad(
     *,
     kept: int = SPLAT_VALUES,
 ) -> None:
-    """Fill every row of the gradients from the pairs' slots. Slots may include absolute gradients.
+    """Fill every row of `gradients` from the slots of the pairs.
 
+    slots: results of `blend_grad` or `values_grad`, with or without absolute gradients.
     kept: number of values, from the first on, whose gradients the slots hold.
     """
     assert slots.first_slots is not None, "expected slots of pairs, not their sums over bands"
@@ -133,7 +134,11 @@ def splats_grad(
 def add_values(
     device: Device, projected: Projected, slots: Slots, d_values: DeviceArray, first: int, count: int
 ) -> None:
-    """Sum each Gaussian's slots (pairs, count) into `count` columns of d_values (n, width), from column `first` on."""
+    """Sum the slots of each Gaussian into columns of d_values (n, width).
+
+    slots: (pairs, count), gradients with respect to `count` values.
+    first: the first of the `count` columns.
+    """
     n, width = d_values.shape
     kernel = device.kernels("splats_grad", {"LANES": 1, "VALUES": count}).add_values
     counts = (projected.tile_counts, slots.first_slots)

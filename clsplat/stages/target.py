@@ -30,7 +30,7 @@ def is_photograph(array: DeviceArray) -> bool:
 
 
 def sample_defines(photograph: DeviceArray) -> dict[str, object]:
-    """Defines of kernels that read a photograph by kernels/shared/photograph.h."""
+    """Macros for kernels that read `photograph` by kernels/shared/photograph.h."""
     return {"BYTES": True} if photograph.dtype == np.uint8 else {}
 
 
@@ -66,7 +66,7 @@ def target(
     render `blended` too; the gradient of blending skips them. An image on the host is uploaded as `on_device` does.
     """
     source = on_device(work, image)
-    device.under_way.append(source.buffer)  # a buffer may be host memory, which must exist until the kernel has run
+    device.under_way.append(source.buffer)  # it may be host memory, and must exist until the kernel has run
     height, width, channels = source.shape
     if not (in_planes or alpha) and is_photograph(source) and tile_items(device) > 1:
         return source

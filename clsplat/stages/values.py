@@ -33,21 +33,25 @@ def passes(first: int, depth: int, most: int) -> Iterator[tuple[int, int]]:
 
 
 def most_values(device: Device) -> int:
-    """Maximum number of values per pass of `values`."""
+    """Return the maximum number of values per pass of `values`."""
     items = tile_items(device)
     return MAX_VALUES_PER_PASS if items == 1 else min(max(_MAX_REGISTER_SUMS * items // (TILE * TILE), 2), 16)
 
 
 def most_gradients(device: Device) -> int:
-    """Maximum number of values per pass of `values_grad`."""
+    """Return the maximum number of values per pass of `values_grad`."""
     items = tile_items(device)
     return MAX_VALUES_PER_PASS if items == 1 else min(_MAX_LOCAL_SUMS // items, 16)
 
 
 @dataclass(frozen=True, eq=False)
 class ValuePass:
-    """Values (n, depth) of all Gaussians, the values' background (depth,), and the tile lists and results of the image
-    with whose weights the values are blended."""
+    """Values per Gaussian, and the image with whose weights they are blended.
+
+    lists, projected, blended: tile lists, splats and results of the image.
+    values: (n, depth), the values of all Gaussians.
+    background: (depth,), the value of each channel behind all Gaussians.
+    """
 
     lists: TileLists
     projected: Projected
@@ -83,10 +87,12 @@ def values_grad(
     *,
     fields: SlotFields = PLAIN_SLOTS,
 ) -> None:
-    """Fill every row of the gradients from d_pixels (height, width, depth) and d_alpha (height, width).
+    """Fill every row of `gradients` from the gradients with respect to blended values and alpha.
 
-    of: the values that were blended, with the results of the image whose weights they have.
+    of: the blended values, and the image whose weights they have.
     first_slots: (n,), the first slot of each Gaussian.
+    d_pixels: (height, width, depth), the gradient with respect to the blended values.
+    d_alpha: (height, width), the gradient with respect to alpha; None means zero.
     fields: fields of the slots; with absolute gradients if `gradients.absolute` is wanted.
     """
     height, width, depth = d_pixels.shape

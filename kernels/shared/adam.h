@@ -37,7 +37,8 @@ typedef struct {
   __global float *parameters, *first, *second;
 } Stepped;
 
-// Refuses the step of element i: sets its moments and counts the refusal by cause. p, g, m, v: the element's parameter,
+// Refuses the step of element i: counts the refusal by cause, and sets the first moment to 0. The second becomes
+// infinity, a mark of refusal, or 0 if only the old moments were not finite. p, g, m, v: the element's parameter,
 // gradient and moments before the step.
 static inline void refuse(size_t i, Step s, float p, float g, float m, float v, __global float *first,
                           __global float *second) {

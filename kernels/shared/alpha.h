@@ -17,8 +17,8 @@ static inline floatL whitened_u(float l11, float l12, floatL dx, floatL dy) {
   return fmaL((floatL)(l12), dy, l11 * dx);
 }
 
-// Adds g and its moments in (u, v) to the first fields of a slot's sums. by_u, by_v: what is added to the two
-// first-order moments.
+// Adds g = alpha * dL/dalpha and its moments in (u, v) to the first fields of a slot's sums. by_u, by_v: the values
+// that are added to the two first-order moments; g * u and g * v, except along rays.
 static inline void add_moments_by(floatS g, floatS u, floatS v, floatS by_u, floatS by_v, floatS *sums) {
   const floatS gu = g * u, gv = g * v;
   sums[SLOT_G] += g;
@@ -33,8 +33,8 @@ static inline void add_moments(floatS g, floatS u, floatS v, floatS *sums) {
   add_moments_by(g, u, v, g * u, g * v, sums);
 }
 
-// SPLAT_HERE defines a Gaussian's variables for a loop over cells. LOG2_ALPHA is log2 of the Gaussian's uncapped alpha
-// in the pixels of `cell`. With RAYS, RAY_TABLES defines the direction of each pixel.
+// SPLAT_HERE defines the variables of a Gaussian that LOG2_ALPHA reads. LOG2_ALPHA is log2 of the Gaussian's uncapped
+// alpha in the pixels of `cell`. With RAYS, RAY_TABLES defines the direction of each pixel.
 #ifdef RAYS
 #include "shared/camera.h"
 #include "shared/rays.h"

@@ -2,7 +2,8 @@
 // equation (48) in docs/gradients.md. A group of several items keeps D . B of equation (22), which takes fewer
 // instructions and is more precise.
 
-// BEHIND: the light behind all pairs. t: the final transmittance; at_end: the gradient with respect to t.
+// BEHIND: the light behind all pairs of a pixel, the background. t: the final transmittance; at_end: the gradient with
+// respect to t.
 #if ITEMS == 1
 #define BEHIND(t, at_end) ((t) * (at_end))
 #else
@@ -20,9 +21,10 @@ static inline float quotient(float t, float x) {
   return fma1(fma1(-near, x, t), inverse, near);
 }
 
-// Removes a pair from a pixel, and returns the pair's g and weight. *t: transmittance; *behind: D . B, the pixel's
-// gradient D times the light B behind the pair; difference: D . c - *behind, with the pair's colour c; uncapped: the
-// pair's alpha before the cap. If `uncapped` is 0, nothing changes.
+// Undoes the blending of a pair in a pixel, and returns the pair's g = alpha * dL/dalpha and blending weight. *t: the
+// transmittance, behind the pair before the call and in front of it afterwards; *behind: likewise D . B, the pixel's
+// gradient D times the light B behind; difference: D . c - *behind, with the pair's colour c; uncapped: the pair's
+// alpha before the cap. If `uncapped` is 0, nothing changes.
 static inline Share take_out_of(float *t, float *behind, float uncapped, float difference) {
   const float alpha = uncapped < ALPHA_MAX ? uncapped : ALPHA_MAX;
   const float before = quotient(*t, 1.0f - alpha), weight = alpha * before;

@@ -132,16 +132,16 @@ typedef struct {
 #endif
 } __attribute__((aligned(16))) Staged;
 
-// The index that blending keeps of a staged pair. With RAYS it is the Gaussian's index, because each pixel reads the
-// splat; otherwise it is the pair's index.
+// The index that is stored with a splat in local memory (Staged). With RAYS it is the Gaussian's index, because each
+// pixel reads the splat in global memory; otherwise it is the pair's index.
 #ifdef RAYS
 #define KEPT(gaussian, pair) (gaussian)
 #else
 #define KEPT(gaussian, pair) (pair)
 #endif
 
-// Copies a splat to *place in local memory. All loads are issued before a value is used, so that their latencies
-// overlap. Returns the blocks of the set `among` that the splat reaches.
+// Copies the splat of a Gaussian to *place in local memory. All loads are issued before a value is used, so that their
+// latencies overlap. Returns the blocks of the set `among` that the splat reaches.
 static inline uint stage(__local Staged *place, uint gaussian, uint kept, uint slot, uint among,
                          __global const float *splats, int tile_x, int tile_y) {
   __global const float4 *row = (__global const float4 *)splats + (size_t)(SPLAT_SIZE / 4) * gaussian;
@@ -213,7 +213,7 @@ static inline uint marked_from(__local const uint *marks, int begin) {
     count += popcount(marked);                                                                                         \
   }
 
-// Defines for a staged splat the variables that LOG2_ALPHA and the kernels use for a splat in global memory.
+// Defines the same variables for a splat `s` in local memory (Staged) as SPLAT_HERE for a splat in global memory.
 #define SPLAT_STAGED(s)                                                                                                \
   __global const float *splat = splats + (size_t)SPLAT_SIZE * s.kept;                                                  \
   const float mx = s.mx, my = s.my, l11 = s.l11, l12 = s.l12, l22 = s.l22, log2o = s.log2o;                            \

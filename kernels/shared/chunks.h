@@ -17,13 +17,14 @@ static inline long rows_ahead(__global const uint *chunks, uint row) {
   return (long)CHUNK_ROWS * ((long)chunks[place] - place);
 }
 
-// The end of the rows of a launch with `n` rows that the model has: n, or less if the model's last chunk is not full.
-// Returns `row` if the model has no row for it, as in padding by NO_CHUNK.
+// Returns the end of the rows that exist in the model, for a work-item that begins at `row` of a launch with `n` rows:
+// n, or less if the model's last chunk is not full. Returns `row` if no row exists, as in padding by NO_CHUNK. ahead:
+// the result of rows_ahead; model_rows: the number of rows of the model.
 static inline uint end_of_rows(uint row, uint n, long ahead, uint model_rows) {
   return row + ahead >= model_rows ? row : (uint)min((long)n, model_rows - ahead);
 }
 
-// Shifts the pointers to a model's arrays by `ahead` rows, so that rows of the launch index them.
+// Shifts the pointers to a model's arrays by `ahead` rows, so that they can be indexed by rows of the launch.
 #define MOVE_ROWS(ahead, prefix)                                                                                       \
   prefix##means += 3 * (ahead), prefix##quaternions += 4 * (ahead), prefix##log_scales += 3 * (ahead);                 \
   prefix##opacity_logits += (ahead), prefix##sh_dc += 3 * (ahead);                                                     \
@@ -34,7 +35,7 @@ static inline uint end_of_rows(uint row, uint n, long ahead, uint model_rows) {
 #define ROW_OF_MODEL(row) (row)
 #endif
 
-// The number of a row in the whole model, also of a row in a slot.
+// The number that a row of the launch has in the whole model, even if the kernel gets the slots of a pool.
 #ifdef FIRST_ROWS
 #define ROW_NUMBER(row) (first_rows[(row) / CHUNK_ROWS] + (row) % CHUNK_ROWS)
 #else

@@ -172,8 +172,8 @@ static inline void covariance2(float eps, Ellipse2 *p) {
 #define EWA_NUMBER2(name, index)                                                                                       \
   {(floatL)(camera[EWA_##name##0 + (index)]), (floatL)(camera[EWA_##name##0_LOW + (index)])}
 
-// Recomputes b1, b2 and c in the lanes of `which`, equation (57) of docs/gradients.md. It uses two floats up to the
-// last step in which terms cancel.
+// Recomputes b1, b2 and c of *p, the rows of J A and its minors, in the lanes of `which`: equation (57) of
+// docs/gradients.md. It uses two floats up to the last step in which terms cancel.
 static inline void refine2(const uint *row, __global const float *quaternions, __constant float *camera, intL which,
                            Ellipse2 *p) {
   Double r[9];

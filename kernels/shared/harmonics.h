@@ -58,8 +58,8 @@ static inline void band_4(floatL x, floatL y, floatL z, floatL *basis) {
   basis[24] = 0.6258357354491761f * (xx * (xx - 3.0f * yy) - yy * (3.0f * xx - yy));
 }
 
-// Adds to d (3) the part of this band: the sum over k of weight[k] times the gradient of basis[k] with respect to (x,
-// y, z).
+// Adds the part of the band of degree 4 to d (3): the sum of weight[k] times the gradient of basis[k] with respect to
+// (x, y, z), for k from 16 to 24.
 static inline void add_band_4_gradient(floatL x, floatL y, floatL z, const floatL *weight, floatL *d) {
   const float c0 = 2.5033429417967046f, c1 = 1.7701307697799304f, c2 = 0.9461746957575601f, c3 = 0.6690465435572892f;
   const float c4 = 0.10578554691520431f, c6 = 0.47308734787878004f, c8 = 0.6258357354491761f;

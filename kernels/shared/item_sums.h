@@ -5,7 +5,7 @@
 #define ADDENDS ITEMS
 #define ADDEND ITEM
 #endif
-// Number of items that exchange values and leave one sum per row.
+// Number of items that add up values by exchange, and then store one sum in each row of local memory.
 #define EXCHANGING (SUBGROUP < ADDENDS ? SUBGROUP : ADDENDS)
 #define PARTS (ADDENDS / EXCHANGING) // number of sums that local memory holds per row
 

@@ -237,7 +237,8 @@ static INLINE void differences(const Block block, const float l1_scale, const fl
     parts[part] = parts[SUMS + part] = 0.0f;
     RUN_OF_PART(block, part, block.stride)
     __local const float *in = near + (row * PARTS + run), *middle = near + (3 * FIELD + run);
-    // p0, q0: the middle pixels of this cell; then their differences from the middle pixels of the cells beside it.
+    // p0, q0: image and target in the middle pixel of this cell; the others: p0 and q0 minus the values in the middle
+    // pixels of the cells to the left and to the right.
     const float p0 = middle[REACH], q0 = middle[REACH + PARTS];
     const float p_left = p0 - middle[REACH - 1], q_left = q0 - middle[REACH - 1 + PARTS];
     const float p_right = p0 - middle[REACH + RUN], q_right = q0 - middle[REACH + RUN + PARTS];
@@ -273,8 +274,9 @@ static INLINE void differences(const Block block, const float l1_scale, const fl
   }
 }
 
-// Adds up the sums of all parts in a fixed order, for `fields` fields that are SUMS floats apart in `parts`. Stores the
-// total of a field at the field's index TOP. Before the next barrier, only the group's first item may read the total.
+// Adds up the sums of all parts of a block in a fixed order. `parts` has `fields` such sums for each part, in fields
+// that are SUMS floats apart. Stores the total of a field at the field's index TOP. Before the next barrier, only the
+// group's first item may read the total.
 #define TOP (PARTS + PARTS / 4 + PARTS / 16)
 static INLINE void add_parts(__local float *parts, const int fields) {
   UNROLL for (int count = PARTS / 4; count > 0; count /= 4) {

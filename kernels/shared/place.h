@@ -22,8 +22,8 @@ static inline void rotation_of(const floatL *q, floatL *r) {
   r[8] = 1.0f - 2.0f * (x * x + y * y);
 }
 
-// The rotation matrix in two floats, times the square of the returned length, equation (57) of docs/gradients.md.
-// length: that of the raw quaternion.
+// Sets r (9) to the rotation matrix in two floats, times the square of the returned length: equation (57) of
+// docs/gradients.md. length: the length of the raw quaternion.
 static inline floatL rotation2_of(const uint *row, __global const float *quaternions, floatL length, Double *r) {
   // The quaternion is scaled by a power of two, which is exact, so that the low parts of products are not denormal.
   const floatL size = AS_FLOATL(AS_INTL(length) & 0x7f800000);
@@ -61,7 +61,7 @@ static inline Double camera_row(__constant float *r, __constant float *r_low, fl
   camera_row(camera + CAMERA_R##index##0, camera + CAMERA_R##index##0_LOW, camera[CAMERA_T##index],                    \
              camera[CAMERA_T##index##_LOW], x, y, z)
 
-// The low part of ratio = x / z in two floats.
+// Returns the low part of x / z in two floats. ratio: x / z in one float, the high part.
 static inline floatL slope_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low) {
   return (fmaL(-ratio, z, x) + fmaL(-ratio, z_low, x_low)) / z;
 }

@@ -23,7 +23,8 @@
 #define SUBGROUPED
 #endif
 #include "shared/item_sums.h"
-// True if a sub-group has items of two teams. The two teams then run the same number of iterations.
+// True if a sub-group has items of two teams, which own different strips. The teams then run the same number of
+// iterations.
 #define ACROSS_TEAMS (SUBGROUP > BLOCK_ITEMS)
 #define ABREAST (ITEMS < SLOT_STRIDE ? ITEMS : SLOT_STRIDE) // number of items that write a slot together
 
@@ -51,8 +52,8 @@
 // Number of pairs for which `totals` has space, plus 1 so that the totals of a pair are in different banks.
 #define TOTALS (BATCH + 1)
 
-// Starts a lane's sums at -0. Because x + -0 is x for every x, a compiler can leave the first addition out; from 0 it
-// could not, because -0 + 0 is 0.
+// Starts a lane's sums at -0. Because x + -0 is x for every x, a compiler can leave the first addition out. With a
+// start of 0 it could not, because -0 + 0 is 0.
 #define BEGIN_SUMS(sums) FOR_FIELDS(field) sums[field] = -0.0f;
 
 // Computes those fields of a lane's sums that equal v times other fields, so that they are not added pixel by pixel.
@@ -96,8 +97,8 @@ static inline void leave_pixel(Share share, float u, float v, __local float *blo
 #endif
 }
 
-// Adds up what leave_pixel has stored for a pair that reaches these blocks, and stores the sums in the pair's first
-// rows. strip: the image's gradient in the lane's pixel of each block.
+// Adds up what leave_pixel has stored for a pair that reaches the blocks in the set `blocks`, and stores the sums in
+// the pair's first rows. strip: the image's gradient in the lane's pixel of each block.
 static inline void join_blocks(uint blocks, const Pixels *strip, float v, float l11, float l12, float l22,
                                __local float *pair_rows) {
   float sums[SLOT_STRIDE];
@@ -130,8 +131,8 @@ static inline void load_strip(__global const float *image_gradient, __global con
 }
 #endif
 
-// Loads the indices of the Gaussian and the slot for an item's fetch number `fetch`. The pairs of a batch run backwards
-// from index `batch` - 1.
+// Loads the indices of the Gaussian and the slot for the fetch of an item with the number `fetch`. The pairs of a batch
+// run backwards from index `batch` - 1.
 #define FETCH_INDICES(fetch, batch)                                                                                    \
   {                                                                                                                    \
     const int from = max((batch) - 1 - ITEM - fetch * ITEMS, begin);                                                   \

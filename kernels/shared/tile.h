@@ -55,7 +55,8 @@ static inline Ellipse ellipse_of(__global const float *splat, int tiles_x, int t
   return e;
 }
 
-// The tiles [*x0, *x1) of the box in tile row ty. A box that wraps has two parts, which are selected by `part`.
+// The tiles [*x0, *x1) of the box in tile row ty. A box that crosses the seam of a panorama has two parts, 0 and 1;
+// `part` selects one of them.
 #define SPANS 2
 static inline void tile_span(const Ellipse *e, int ty, int part, int tiles_x, int *x0, int *x1) {
   const int wraps = e->tile_x0 > e->tile_x1;

@@ -10,15 +10,15 @@
 #endif
 #define CHUNK (TILE * TILE / ITEMS) // number of pixels of a chunk
 #define ROW_CHUNKS (TILE / CHUNK)
-// Number of blocks that a chunk lies in; CHUNK_BLOCK is the first.
+// CHUNK_BLOCKS: number of blocks (blocks.h) that a chunk's pixels are in. CHUNK_BLOCK: the first of these blocks.
 #define CHUNK_BLOCKS (CHUNK < BLOCK_W ? 1 : CHUNK / BLOCK_W)
 #define CHUNK_BLOCK(chunk) ((chunk) / ROW_CHUNKS / BLOCK_H * BLOCK_COLUMNS + (chunk) % ROW_CHUNKS * CHUNK / BLOCK_W)
 
-// The index of pixel (x, y) in Passing and Fixed: items at adjacent chunks read adjacent elements.
+// The index of pixel (x, y) in the arrays of Passing and of Fixed. Items at adjacent chunks read adjacent elements.
 #define PLACE(x, y) ((x) % CHUNK * ITEMS + (y) * ROW_CHUNKS + (x) / CHUNK)
 
-// A pixel in local memory. Passing: the transmittance and `behind`, which change. Fixed: the image's gradient, and the
-// bits of the pixel's entry of `stops`.
+// A pixel in local memory. Passing has the values that change, the transmittance and the light behind (behind.h). Fixed
+// has the image's gradient, and the bits of the pixel's entry of `stops`.
 typedef float2 Passing;
 typedef float4 Fixed;
 
@@ -45,7 +45,7 @@ typedef struct {
 #define NEAR_PIXELS_PARAMETER
 #endif
 
-// Removes the walker's pair from the pixels of a chunk, and adds the pixels' gradients to the pair's sums
+// Undoes the blending of *w's pair in the pixels of a chunk, and adds the pixels' gradients to the pair's sums
 // (SLOT_STRIDE). Pixels to which the pair was not added are processed with alpha 0, without a branch. Of 32 items, one
 // nearly always has a pixel to which its pair was added, so branches would only serialise the pixels of a chunk.
 static inline void take_chunk(const Walker *w, int chunk, __local Passing *passing, __local const Fixed *fixed,

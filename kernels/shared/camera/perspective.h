@@ -28,8 +28,8 @@ static inline void jacobian_row(floatL x, floatL z, float focal, float low, floa
 // J, equation (52) of docs/gradients.md. Where x/z or y/z is clamped, J depends only on z. at: the mean; limited: rx,
 // ry; jx, jy: as in equation (4) of docs/gradients.md; d_mx, d_my: the gradient with respect to the image position;
 // by_j02, by_j12: the gradient with respect to J's last column, divided by -jx and -jy; d_size: the gradient with
-// respect to the log of the size. Also sets beyond (2), the part of equation (145) of docs/gradients.md for a clamped
-// x/z or y/z, whose limit is a fixed image position.
+// respect to the log of the ellipse's size. Also sets beyond (2), the part of equation (145) of docs/gradients.md for a
+// clamped x/z or y/z, whose limit is a fixed image position.
 static inline void mean_gradient(const floatL *at, const floatL *limited, floatL jx, floatL jy, floatL d_mx,
                                  floatL d_my, floatL by_j02, floatL by_j12, floatL d_size, floatL *d, floatL *beyond) {
   const floatL z = at[2], rx = at[0] / z, ry = at[1] / z;
