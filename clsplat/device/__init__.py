@@ -3,8 +3,8 @@
 
 import os
 
-# This variable switches off pyopencl's own cache of builds, and is read at the import. Drivers already cache builds by
-# the whole source text. pyopencl's cache needs a writable home folder, and some drivers fail to load its binaries.
+# PYOPENCL_NO_CACHE switches off pyopencl's own cache of builds; pyopencl reads it at its import. Most drivers have a
+# cache. pyopencl's cache needs a writable home folder, and some drivers fail to load binaries from it.
 os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
 
 from clsplat.device.drivers import quirks
@@ -14,7 +14,7 @@ from clsplat.process import undisturbed
 quirks.make_cache_folder()
 quirks.pin_threads()
 quirks.offer_packaged()
-with undisturbed():  # an exception in a signal handler during the import would abort the process
+with undisturbed():  # a signal handler that raises during this import would abort the process
     import pyopencl as cl
 
 __all__ = ["cl"]

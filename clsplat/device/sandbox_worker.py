@@ -20,7 +20,7 @@ from clsplat.errors import DriverError, KernelBuildError
 
 
 def _given(context: cl.Context, queue: cl.CommandQueue, kind: str, value: Any) -> Any:
-    """Make the kernel argument that `sandbox._described` encoded. A buffer is filled with zeros."""
+    """Make the kernel argument that `sandbox._described` encoded as `kind` and `value`. Buffers are filled with 0."""
     if kind == "local":
         return cl.LocalMemory(value)
     if kind != "buffer":
@@ -41,7 +41,7 @@ class _Stage:
     def answer(self, message: dict[str, Any]) -> dict[str, Any]:
         """Build the kernel file that a message names, and launch a kernel if the message asks for it.
 
-        Returns the answer that `sandbox.KernelTrials` expects: `salt`, or the reason why the trial failed.
+        Returns the answer to `sandbox.KernelTrials`: the build's `salt`, or the reason why the trial failed.
         """
         text = message["build"]
         variant = Variant(text["stem"], text["source"], tuple(text["options"]))
