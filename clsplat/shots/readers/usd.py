@@ -29,12 +29,12 @@ WORLD_UNITS_PER_APERTURE_UNIT = 0.1
 """World units per unit of apertures and focal lengths, in USD."""
 
 SUPPORTED_PROJECTIONS = names_of("usd")
-"""Accepted projections of a camera. Others are lenses with distortion, which are refused."""
+"""Values that are accepted in a camera's attributes of projection. Other values mean lenses with distortion."""
 
 
 def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), prim: str | None = None) -> Shot:
-    """Read the frames of a stage's camera, from the stage's start to its end time code. If the stage has none, they go
-    from the first time sample to the last.
+    """Read the frames of a stage's camera, one for each whole time code from startTimeCode to endTimeCode. If the stage
+    has neither, the frames go from the camera's first time sample to the last.
 
     The frame rate is the stage's timeCodesPerSecond; USD uses framesPerSecond if only that is authored. Each
     frame has the shutter and the lens of its time code. `Shot.moment` gives the camera at any time, with USD's own
@@ -56,7 +56,7 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
     """Read cameras like `read_usd`, from a file that is known not to crash USD's library."""
     from pxr import UsdGeom, UsdUtils
 
-    # captures the messages that USD would print: an unresolved layer may not concern the camera
+    # captures the messages that USD would print, as on a missing layer, which may not concern the camera
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
     stage = open_stage(path, path)
     with readable(path):
@@ -94,7 +94,10 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
 
 
 def _unapplied(camera: Any, codes: list[int]) -> tuple[str, ...]:
-    """Names and first values of authored camera attributes that would change a frame but are not applied."""
+    """Return names and first values of the camera's authored attributes that would change a frame but are not applied.
+
+    codes: time codes of the frames.
+    """
     from pxr import UsdGeom
 
     usual: dict[str, object] = {"exposure": 0.0, "exposure:iso": 100.0}
@@ -135,7 +138,7 @@ def _optics(where: str, camera: Any, code: int, settings: Settings, metres: floa
 
 
 def _authored(prim: Any, name: str, usual: Any, codes: list[int]) -> str:
-    """Name and value of an attribute if it is authored with another value than `usual`, else ''."""
+    """Return the name and first value of an attribute that is authored and differs from `usual`; otherwise ''."""
     attribute = prim.GetAttribute(name)
     if not attribute or not attribute.HasAuthoredValue():
         return ""
@@ -172,10 +175,10 @@ def _moved(camera: Any) -> Iterator[Any]:
 
 
 def _time_codes(where: str, stage: Any, camera: Any) -> tuple[list[int], tuple[float, ...]]:
-    """Whole time codes to render, and the times of all values of the camera or of an ancestor's transform.
+    """Return the whole time codes to render, and all times at which the camera or an ancestor's transform has a value.
 
-    The codes are the stage's range. If it has none, they go from the first time that has a value to the last. All
-    values are read once, to find those that USD cannot read.
+    The time codes are the stage's range. If it has none, they go from the first time with a value to the last. Each
+    value is read once, so that an error is raised now if USD cannot read it.
     """
     attributes = camera.GetPrim().GetAttributes()
     ops = [op for moved in _moved(camera) for op in moved.GetOrderedXformOps()]
@@ -200,7 +203,7 @@ def _number(where: str, attribute: Any, code: float) -> float:
 
 
 def _aperture(where: str, camera: Any, code: float) -> tuple[float, float]:
-    """Width and height of the camera's aperture."""
+    """Return the width and height of the camera's aperture at a time code, in USD's unit of apertures."""
     horizontal = _number(where, camera.GetHorizontalApertureAttr(), code)
     vertical = _number(where, camera.GetVerticalApertureAttr(), code)
     if not (horizontal > 0 and vertical > 0):
