@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OpenCL devices, their memory, the kernels built for them, and launches; nothing here knows of Gaussians."""
+"""OpenCL devices and drivers, device memory, kernel builds and launches. No module here depends on Gaussians."""
 
 import os
 

@@ -168,8 +168,8 @@ class DeviceArray:
             self.device.under_way.clear()
 
     def _copied(self, work: str, *ends: Any, **how: Any) -> cl.Event:
-        """Put a copy on the queue, and return its event. Raises DriverError or CapacityError if it or an earlier kernel
-        fails.
+        """Put a copy on the queue, and return its event. Raises DriverError or CapacityError if the copy or an earlier
+        kernel fails.
 
         work: what the copy does, for the message of an error.
         ends, how: arguments of `cl.enqueue_copy` after the queue.
@@ -211,8 +211,8 @@ def _poison() -> NDArray[np.uint32] | None:
 
 
 def _fill_bytes(device: Device, buffer: cl.Buffer, word: NDArray[np.uint32], nbytes: int) -> None:
-    """Fill the first `nbytes` bytes of a buffer with the 32-bit `word`. The bytes after the last whole word
-    get its lowest byte."""
+    """Fill the first `nbytes` bytes of a buffer with the 32-bit `word`. The bytes after the last whole
+    word get its lowest byte."""
     whole = nbytes // 4 * 4
     if whole:
         cl.enqueue_fill_buffer(device.queue, buffer, word, 0, whole)

@@ -117,7 +117,7 @@ class CommandBuffer:
         for index, value in enumerate(values):
             own.set_arg(index, typed(value))
             if isinstance(value, (LaunchParameter, LaunchParameterWord)):
-                set_bytes = getattr(own, "_set_arg_buf", own.set_arg)  # faster than set_arg: no type checks
+                set_bytes = getattr(own, "_set_arg_buf", own.set_arg)  # faster than set_arg, as it does not check types
                 self.anew.append((set_bytes, index))
                 self._numbers.append(value)
                 description.append(None)

@@ -125,7 +125,7 @@ class Device:
 
         registers: maximum registers per work-item, if the driver has an option for it; 0 for no limit.
         """
-        if self._why_another:  # shown only now, because the self-test chooses a shape after it opens the device
+        if self._why_another:  # not before, as the self-test chooses a shape after it opens the device
             tell_once(self._why_another)
         if self._switches:
             text = kernel_source(stem)

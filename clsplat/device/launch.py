@@ -26,7 +26,7 @@ _RECOMPILED_SIZE_ITEMS = 1 << 16
 
 @contextmanager
 def only_tried(device: Device) -> Iterator[None]:
-    """Inside the block, a launch runs nothing on the device. It tries its kernel in the sandbox unless that was done.
+    """Inside the block, a launch runs nothing on the device. A kernel that had no trial is tried in the sandbox.
 
     So if a driver fails in a trial, no array has been changed yet.
     """
@@ -48,7 +48,7 @@ def _values(arguments: tuple[Any, ...]) -> list[Any]:
 
 
 def _type(value: Any) -> Any:
-    """Return the NumPy type as which pyopencl passes a scalar argument to a kernel; None for other arguments."""
+    """Return the NumPy type to which pyopencl converts a scalar argument of a kernel; None for other arguments."""
     if isinstance(value, int):
         return np.uint32
     if isinstance(value, float):
@@ -61,7 +61,7 @@ def form_of(device: Device, size: tuple[int, ...], local: tuple[int, ...] | None
 
     It is "" unless the driver compiles a kernel again for other launch sizes. Then launches of 65,536 work-items or
     more along an axis have trials of their own, and so do those whose groups the driver chooses (`local` is None).
-    Given group sizes share a trial, because otherwise each width of an image would need one.
+    Launches with a given group size share a trial, because otherwise each width of an image would need its own.
     """
     if not device.compiles_by_size:
         return ""

@@ -16,7 +16,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 TRANSFERS_STAGE = "transfers"
-"""Name under which work outside all stages is recorded: copies of the camera and the background."""
+"""Name under which work outside all stages is recorded, such as copies of the camera and the background."""
 
 
 @dataclass

@@ -257,7 +257,7 @@ class Colours:
         light = np.array([[[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0], [4, -1, 2], [0.2, 0.01, 0.5]]], np.float32)
         colours = self._converted(light, source, target)
         matrix, sums = colours[0, :3], colours[0, 3:]
-        # the tolerance is small compared with values of up to 4
+        # the tolerance is small compared with the tested values of up to 4
         linear = np.allclose(light[0, 3:] @ matrix, sums, rtol=1e-5, atol=1e-5)
         return matrix if linear else None
 

@@ -36,7 +36,7 @@ def deep_data(scratch: Path, counts: NDArray[np.int32], columns: dict[str, NDArr
 
     scratch: path of the scratch file to write and read.
     counts (H, W): number of samples of each pixel.
-    columns: values (samples,) of each channel by name, as half or float, by row, by pixel, then front to back.
+    columns: values (samples,) by channel name, half or float, ordered by row, then by pixel, then front to back.
     Raises ClsplatError if OpenImageIO cannot read the scratch file.
     """
     _write(scratch, counts, columns)

@@ -234,7 +234,7 @@ def is_whole(
             )
             if (spec.width, spec.height, spec.deep) != (width, height, deep):
                 return False
-            if sorted(spec.channelnames) != sorted(names):  # OpenImageIO reorders the channels of an EXR
+            if sorted(spec.channelnames) != sorted(names):  # sorted, as OpenImageIO reorders them
                 return False
             if any(attribute_of(spec, key) not in (None, value) for key, value in (attributes or {}).items()):
                 return False

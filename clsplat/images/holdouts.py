@@ -142,7 +142,10 @@ def _surfaces(
 
 
 def _rows(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Float32:
-    """Return HOLDOUT_SURFACE_FIELDS of each surface. An opaque surface's back depth is set to its front depth."""
+    """Return HOLDOUT_SURFACE_FIELDS (S, 4) from front depths, back depths and alpha, each (S,).
+
+    The back depth of an opaque surface is set to its front depth.
+    """
     rows = np.zeros((len(begin), len(HOLDOUT_SURFACE_FIELDS)), np.float32)
     rows[:, 0], rows[:, 2] = begin, 1 - alpha
     rows[:, 1] = np.where((alpha < 1) & (end > begin), end, begin)

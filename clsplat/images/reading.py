@@ -266,7 +266,7 @@ def open_image(path: Path) -> Any:
         known = file.read(8).startswith(IMAGE_SIGNATURES)
     if size > MAX_IMAGE_FILE_BYTES or (size > MAX_UNSIGNED_IMAGE_BYTES and not known):
         raise InputError(
-            f"{path}: has {size} bytes, expected a picture of at most {MAX_IMAGE_FILE_BYTES} bytes in a usual format"
+            f"{path}: has {size} bytes, expected a picture in a known format, of at most {MAX_IMAGE_FILE_BYTES} bytes"
         )
     source = oiio.ImageInput.open(native_name(path), hints)
     if source is None:

@@ -215,7 +215,7 @@ def _frame_of(planes: tuple[NDArray[np.uint16], ...], form: str) -> Any:
         lines = np.zeros((values.shape[0], plane.line_size // 2), np.uint16)
         lines[:, : values.shape[1]] = values
         plane.update(lines)
-    # 1 means Rec.709, as a range limited. The ProRes encoder reads these, and writes them to each frame's header.
+    # The code 1 means Rec.709, in color_range limited range. The ProRes encoder writes these to each frame's header.
     frame.colorspace = frame.color_primaries = frame.color_trc = frame.color_range = 1
     return frame
 
@@ -293,7 +293,7 @@ class VideoWriter:
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, form
         context = self._stream.codec_context
         context.time_base = 1 / rate
-        # 1 means Rec.709 (its transfer function is close to sRGB's), and as a range limited.
+        # The code 1 means Rec.709 (its transfer function is close to sRGB's), in color_range limited range.
         context.colorspace = context.color_primaries = context.color_trc = 1
         context.color_range = 1
 

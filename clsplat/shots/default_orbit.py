@@ -22,7 +22,7 @@ from clsplat.shots.viewpoints import COLMAP_UP, extent_of, look_at
 DEFAULT_ORBIT_SIZE_PX = (1280, 720)
 """Default width and height of pictures, in pixels."""
 ORBIT_FOV_RADIANS = math.radians(40.0)
-"""Field of view of the shorter side, in radians."""
+"""Field of view across a picture's shorter side, in radians."""
 SUBJECT_SAMPLE_SIZE = 100_000
 """Number of Gaussians that are sampled to locate a model. A larger sample moves its centre by less than a pixel."""
 MIN_GAUSSIANS_FOR_STRAYS = 100
@@ -101,7 +101,7 @@ def cameras_around(
 
 
 def among(own: Sequence[Camera], size: tuple[int | None, int | None] = (None, None)) -> list[Camera]:
-    """Return pinhole cameras at the photographs' cameras `own`, for a path among them.
+    """Return pinhole cameras with the poses of the photographs' cameras `own`, for a path among them.
 
     Cameras far from the others are left out. Cameras that are not perspective get the default field of view.
 

@@ -98,7 +98,7 @@ def has_number(pattern: str) -> bool:
 
 
 def numbered_files(pattern: str) -> dict[int, Path]:
-    """Find the files that match a pattern such as `model.####.ply`. Return their paths by frame number, in its order.
+    """Find the files of a pattern such as `model.####.ply`. Return their paths, keyed and sorted by frame number.
 
     If the pattern has several fields, such as one for a folder and one for the file, they stand for the same number.
     Raises InputError for an unknown field.

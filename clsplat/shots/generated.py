@@ -67,11 +67,12 @@ def _ring(cameras: Sequence[Camera]) -> _Ring:
 
 
 def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A closed path of `frames` cameras around the scene cameras' focus point, with the first camera's intrinsics.
+    """A closed path of `frames` cameras around the point that the scene's cameras look at, their focus point.
 
     The path keeps the cameras' median distance and height, and begins near the first camera. If the cameras surround
     the focus point, the path makes one full turn. If they leave a wide gap, it swings back and forth over the arc that
-    they cover, since no camera has seen the rest. Raises ValueError for no cameras or no frames.
+    they cover, since no camera has seen the rest. Intrinsics are the first camera's. Raises ValueError for no cameras
+    or no frames.
     """
     _check("turntable", cameras, frames)
     ring = _ring(cameras)
@@ -96,8 +97,8 @@ MAX_SPIRAL_ELEVATION_RADIANS = np.deg2rad(85.0)
 """Largest elevation of a spiral, in radians. A level camera that looks straight up or down has no defined right
 axis."""
 SMOOTHING_NEIGHBOURS = 3
-"""Number of neighbours on each side of a camera from which `through` smooths it, to remove the jitter of hand-held
-photographs."""
+"""Number of cameras on each side of a camera from which `through` computes its smoothed pose. This removes the jitter
+of hand-held photographs."""
 
 
 def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:

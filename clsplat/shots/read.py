@@ -240,7 +240,7 @@ def _read_json(path: Path, size: tuple[int | None, int | None], lenses: Lenses) 
 
 
 def _parsed(path: Path) -> dict[str, Any] | list[Any]:
-    """The JSON object or list in a file. Raises InputError."""
+    """Read the JSON object or list in a file of cameras. Raises InputError."""
     try:
         document = parse_json(read_document(path, "a file of cameras"), once=True)
     except ValueError as error:

@@ -84,7 +84,7 @@ def driver_key(device: cl.Device) -> str:
 
 
 def _entry(value: object) -> Entry:
-    """Parse an entry of the file. A value that clsplat never writes gives an empty entry."""
+    """Parse an entry of the file of driver records. A value that clsplat never writes gives an empty entry."""
     given = value if isinstance(value, dict) else {}
     stages, kernels, failed = given.get("stages", []), given.get("kernels", {}), given.get("failed", "")
     trial = given.get("trial", {})
@@ -98,7 +98,7 @@ def _entry(value: object) -> Entry:
 _RECORDS_LOCK = threading.Lock()
 """Lock for `_unwritten`, because several devices may be used at the same time, each in a thread of its own."""
 _unwritten: dict[Path, list[tuple[str, str, Entry]]] = {}
-"""Entries that are still to be added to a file of records, by its path: driver key, shape label and entry of each."""
+"""Entries that are not written yet, by the path of the file of records: driver key, shape label and entry of each."""
 
 
 def _read() -> dict[str, Any]:

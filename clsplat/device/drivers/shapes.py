@@ -135,10 +135,10 @@ def asked_shape() -> str:
     text = os.environ.get("CLSPLAT_SHAPE", "")
     if text and _parsed(text, Shape(1, 1, 1)) is None:
         raise DeviceError(
-            f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; lanes are 1, 4, 8 or 16; with "
-            f"{' or '.join(f'{lanes}x{items}' for lanes, items in BY_GAUSSIAN_SHAPES)}, suffix g selects a gradient by "
-            "Gaussian; with "
-            f"{', '.join(f'{lanes}x{items}' for lanes, items in SUBGROUP_SHAPES)}, suffix s selects sub-groups"
+            f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; with 1, 4, 8 or 16 lanes; "
+            f"{' or '.join(f'{lanes}x{items}' for lanes, items in BY_GAUSSIAN_SHAPES)} may end in g (in the gradient, "
+            "a work-item has a Gaussian), and "
+            f"{', '.join(f'{lanes}x{items}' for lanes, items in SUBGROUP_SHAPES)} in s (with sub-groups)"
         )
     return text
 

@@ -168,7 +168,7 @@ class WorkerProcess:
         self._errors.extend(line.strip() for line in self._process.stderr)
 
     def send(self, message: object) -> None:
-        """Send a message as a line of JSON. If the process has ended, nothing is sent, and `receive` raises it."""
+        """Send a message as a line of JSON. If the process has ended, the next `receive` raises the error."""
         assert self._process.stdin is not None
         with suppress(OSError):
             self._process.stdin.write(json.dumps(message) + "\n")

@@ -20,7 +20,7 @@ from clsplat.shots.shot import Shot, numbered, whole_frames
 
 CAMERAS_VERSION_KEY, CAMERAS_VERSION = "clsplat_cameras", 1
 FOCAL_PROPERTIES = ("fx", "fy", "fov_x", "fov_y", "pixel_size")
-"""Properties that set the focal length."""
+"""Properties of a camera file or of a key that set the focal length."""
 LENS_PROPERTIES = (*FOCAL_PROPERTIES, "cx", "cy", "shift", "roll")
 CAMERA_FILE_PROPERTIES = (
     CAMERAS_VERSION_KEY,
@@ -55,7 +55,7 @@ def read_keyed(path: Path, document: dict[str, Any]) -> Shot:
         )
     _known(str(path), document, CAMERA_FILE_PROPERTIES)
     if not (entries := objects(document, "keys")):
-        raise InputError(f"{path}: has no keys, expected 'keys' to be a list of at least one")
+        raise InputError(f"{path}: has no keys, expected 'keys' to be a list of at least one object")
     whole = Keys(path, None, {}, document)
     fps, first, loop = whole.number("fps"), whole.require("first_frame", 1.0), whole.number("loop_frames")
     if fps is not None and fps <= 0:

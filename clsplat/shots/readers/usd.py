@@ -85,7 +85,7 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
         )
     lost = () if known or not asked else (f"camera ({asked}, which does not exist)",)
     unapplied = (*_unapplied(camera, codes), *settings.unapplied, *lost)
-    # cut the line's end, where USD prints the stage's address in memory
+    # cut off the end of each line, where USD prints the stage's address in memory
     lines = [message.commentary.split(" (instantiating")[0] for message in diagnostics.TakeUncoalescedDiagnostics()]
     warnings = tuple(f"{path}: USD says: {' '.join(line.split())}" for line in lines[:3])
     moved = [time for source in _moved(camera) for time in source.GetTimeSamples()]
@@ -164,7 +164,7 @@ def _find(path: Path, cameras: list[Any], prim: str | None) -> Any:
 
 
 def _moved(camera: Any) -> Iterator[Any]:
-    """Yield the camera and those of its ancestors that can have a transform."""
+    """Yield the camera and each of its ancestors that can have a transform."""
     from pxr import UsdGeom
 
     prim = camera.GetPrim()
