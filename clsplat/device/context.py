@@ -38,7 +38,7 @@ or fails."""
 def all_devices() -> list[cl.Device]:
     """Return all visible OpenCL devices in order of their index. Raises DeviceError in a forked process (`forks`)."""
     forks.claim()
-    with undisturbed():  # otherwise Ctrl-C would reach compilers and linkers that the driver starts
+    with undisturbed():  # keeps Ctrl-C from compilers and linkers that the driver starts
         devices = _visible()
     for device in devices:
         name_processor(device)
@@ -125,7 +125,7 @@ class Device:
 
         registers: maximum registers per work-item, if the driver has an option for it; 0 for no limit.
         """
-        if self._why_another:  # not before, as the self-test chooses a shape after it opens the device
+        if self._why_another:  # not shown when the device is opened, as the self-test may then change the shape
             tell_once(self._why_another)
         if self._switches:
             text = kernel_source(stem)
@@ -136,7 +136,7 @@ class Device:
         kernels = self._kernels.get(key)
         if kernels is None:
             if not self._fma:
-                self._fma.append(self._probe_fma())  # appended in place, as copies of a device share the list
+                self._fma.append(self._probe_fma())  # changed in place, as copies of this device share the list
             kernels = self._kernels[key] = self._built(stem, {**self._fma[0], **defines}, registers)
         return kernels
 
@@ -336,7 +336,7 @@ class Device:
             except (KernelBuildError, DriverError):
                 continue
             if np.array_equal(got, wanted):
-                self._subgroups.append(defines)  # appended in place, as copies of a device share the list
+                self._subgroups.append(defines)  # changed in place, as copies of this device share the list
                 return defines
         raise DeviceError(
             f"{title(self.cl_device)}: the work-items of a sub-group got wrong values from each other; choose a shape "

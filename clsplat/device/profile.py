@@ -164,5 +164,5 @@ def stage(name: str, **updated: int) -> Callable[[Callable[Concatenate[D, P], R]
 def _milliseconds(event: Any) -> float:
     try:
         return 1e-6 * float(event.profile.end - event.profile.start)
-    except cl.Error:  # the queue was made without profiling
+    except cl.Error:  # OpenCL has no times for a queue made without profiling
         return 0.0

@@ -177,10 +177,10 @@ class KernelTrials:
         elif trouble := answer.get("trouble"):
             trial = {**asked, "name": name, "build": {"stem": variant.stem, "options": variant.options}}
             error = self.fail(variant, kernel, trouble, trial, lasting=answer.get("lasting", True))
-            self._failed[name] = str(error)  # so that this process does not repeat the trial
+            self._failed[name] = str(error)  # kept, so that this process does not repeat the trial
             raise error
         self.known[name] = str(answer.get("salt", ""))
-        if "salt" in answer:  # without a salt the compiler has refused the text, as it will in this process
+        if "salt" in answer:  # no salt means that the compiler has refused the text, as it will in this process
             driver_records.remember(self._device, self._shape, kernels={name: self.known[name]})
 
     def fail(
@@ -199,7 +199,7 @@ class KernelTrials:
         trial: the failed trial (`driver_records.Entry`), if there was one.
         lasting: True also records the failure, so that the driver is not used in this shape again.
         """
-        advice = f"CLSPLAT_DEVICE selects another device, {TRUST_DRIVER_VARIABLE}=1 skips this test"
+        advice = f"CLSPLAT_DEVICE selects another device; {TRUST_DRIVER_VARIABLE}=1 skips this test"
         if lasting and not regardless():
             trial = trial or {"name": f"{variant.digest} {kernel}"}
             driver_records.remember(self._device, self._shape, failed=_text(variant, kernel, trouble), trial=trial)

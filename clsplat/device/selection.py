@@ -76,7 +76,7 @@ def select(selector: str | None) -> cl.Device:
     With None, CLSPLAT_DEVICE is the selector. If it is not set either, the result is the first GPU, or without a GPU
     the first device. Raises DeviceError.
     """
-    driver_timeout()  # raises InputError for an invalid environment variable now, not at the first kernel
+    driver_timeout()  # raises InputError if CLSPLAT_DRIVER_TIMEOUT is invalid, before the first kernel does
     devices = list(zip(all_devices(), list_devices(), strict=True))
     if not devices:
         raise no_device()
@@ -84,7 +84,7 @@ def select(selector: str | None) -> cl.Device:
     selector = selector or os.environ.get("CLSPLAT_DEVICE") or None
     if selector is None:
         return next((device for device, info in devices if info.kind == "gpu"), devices[0][0])
-    wanted = selector.lower() if selector.strip() else None  # a blank would match any name
+    wanted = selector.lower() if selector.strip() else None  # a blank selector would match any name
     for device, info in devices:
         words = f"{info.name} {info.platform} {info.version}".lower()
         by_name = wanted is not None and (wanted == info.kind or wanted in words)
@@ -115,7 +115,7 @@ def _part_of(name: str) -> tuple[str, int | None]:
 
 @lru_cache(maxsize=8)
 def _divided(index: int, parts: int) -> list[cl.Device]:
-    """Divide the `index`-th device into equal parts by OpenCL's device fission. Return [] if that is not possible."""
+    """Divide the `index`-th device into `parts` equal parts, by OpenCL's device fission. Return [] if that fails."""
     device = all_devices()[index]
     try:
         units = device.max_compute_units // parts

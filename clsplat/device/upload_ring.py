@@ -15,7 +15,7 @@ from clsplat.device.context import Device
 from clsplat.errors import CapacityError
 
 UPLOAD_RING_SLOTS = 3
-"""Number of slots of a ring: one each for the array in use, the array that the next work uses, and the array being
+"""Number of slots of a ring: one each for the array in use, the array that is used next, and the array that is being
 uploaded."""
 
 

@@ -80,7 +80,7 @@ class FrameFileHeader:
 
 
 def camera_matrices(camera: Camera) -> dict[str, Float64]:
-    """Return OpenEXR's attributes worldToCamera and worldToNDC, for row vectors; none for a camera without image plane.
+    """Return OpenEXR's attributes worldToCamera and worldToNDC, for row vectors; {} for a camera without image plane.
 
     Camera space has x right, y up and z along the view, so it is left-handed. In NDC, (0, 0) is the upper left corner
     of the display window and (1, 1) the lower right. OpenEXR does not define z in NDC. Here z is 0 at the near plane
@@ -234,7 +234,7 @@ def is_whole(
             )
             if (spec.width, spec.height, spec.deep) != (width, height, deep):
                 return False
-            if sorted(spec.channelnames) != sorted(names):  # sorted, as OpenImageIO reorders them
+            if sorted(spec.channelnames) != sorted(names):  # sorted, as OpenImageIO reorders channels
                 return False
             if any(attribute_of(spec, key) not in (None, value) for key, value in (attributes or {}).items()):
                 return False

@@ -395,7 +395,7 @@ def _resampling(source: int, target: int) -> Any:
         low, high = edges[:-1], edges[1:]
         index = np.floor(low).astype(int) + np.arange(int(np.ceil(source / target)) + 1)[:, None]
         weights = np.clip(np.minimum(index + 1, high) - np.maximum(index, low), 0, None)
-        index = np.minimum(index, source - 1)  # the weight beyond the last pixel is 0
+        index = np.minimum(index, source - 1)  # indices beyond the last pixel have weight 0
         weights /= weights.sum(axis=0)
     rows = np.broadcast_to(np.arange(target), index.shape)
     matrix = sparse.coo_matrix((weights.ravel(), (rows.ravel(), index.ravel())), shape=(target, source))

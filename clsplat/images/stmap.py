@@ -77,7 +77,7 @@ class StMap:
         def line(row: np.ndarray) -> Float64:
             begin, end = (values[row[:, None], column[None, :]].astype(np.float64) for column in (left, right))
             mixed = begin + across * (end - begin)
-            return np.asarray(np.where(across == 0, begin, mixed))  # 0 times a non-finite neighbour would be NaN
+            return np.asarray(np.where(across == 0, begin, mixed))  # avoids 0 times a non-finite neighbour
 
         upper, lower = line(above), line(below)
         return np.asarray(np.where(down == 0, upper, upper + down * (lower - upper)))
@@ -142,7 +142,7 @@ def _oriented_share(values: Float32) -> float:
         told = np.isfinite(areas) & (sides > 0)
     if not told.any():
         return 0.0 if np.isfinite(corners).any() else 1.0
-    turned = areas[told] / sides[told]  # sine of the angle between the sides
+    turned = areas[told] / sides[told]  # sine of the angle between a cell's mapped sides
     return float(max((turned > _MIN_CELL_SINE).mean(), (turned < -_MIN_CELL_SINE).mean()))
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writing of videos frame by frame: .mp4 (H.264) or .mov (ProRes), with PyAV (`pip install 'clsplat[video]'`).
 
-`VideoConfig` and DEFAULT_VIDEO_FPS in `config.pictures` have the settings.
+The settings of a video are in `config.pictures`: `VideoConfig` and DEFAULT_VIDEO_FPS.
 """
 
 from __future__ import annotations

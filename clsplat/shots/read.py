@@ -149,7 +149,7 @@ def photographed(path: Path, size: tuple[int | None, int | None] = (None, None))
         )
     if wrong := [image.name for image in images if image.lens.is_panorama]:
         raise InputError(f"{path}: {examples(wrong)} are panoramas, which cannot be warped from a pinhole picture")
-    cameras_of(images)  # warns about implausible cameras
+    cameras_of(images)  # called for its warnings on implausible cameras
     return images
 
 

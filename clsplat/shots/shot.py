@@ -77,7 +77,7 @@ class Shot:
         )
 
     def only(self, text: str) -> Shot:
-        """The frames of the shot that `text`, such as 1-100:2, lists. Adds a warning if the shot lacks some of them.
+        """Return the shot with the frames that `text`, such as 1-100:2, lists. Adds a warning if some do not exist.
 
         Raises InputError for a text that `parse_frames` refuses, and if the shot has none of the listed frames.
         """
@@ -94,7 +94,7 @@ class Shot:
         return replace(self, frames=tuple(frame for frame in self.frames if frame.number in asked), warnings=warnings)
 
     def without_optics(self) -> Shot:
-        """The shot without the USD stage's shutter and lens, whose settings are added to `unapplied`."""
+        """Return the shot without the shutter and lens of a USD stage. Their settings are added to `unapplied`."""
         named = [name for frame in self.frames if frame.optics for name in frame.optics.named()]
         found = {name.partition(" ")[0]: name for name in reversed(named)}  # the first value of each setting
         frames = tuple(replace(frame, optics=frame.optics.still) if frame.optics else frame for frame in self.frames)

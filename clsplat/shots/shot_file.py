@@ -233,7 +233,7 @@ def read_layout(path: Path) -> tuple[PlacedModel, ...]:
         volumes = tuple(_volumes(reader))
         taken += [name, *(volume.name for volume in volumes)]
         if twice := next((each for each in taken if taken.count(each) > 1), None):
-            raise InputError(f"{reader.where}: has the matte '{twice}', a name that is used twice")
+            raise InputError(f"{reader.where}: has the matte '{twice}', a name that is used twice, expected unique names")
         models.append(PlacedModel(name, path.parent / _text(reader, "path"), _track(reader), volumes))
     return tuple(models)
 
@@ -336,7 +336,7 @@ def _known(where: str, values: dict[str, Any], names: tuple[str, ...]) -> None:
 
 
 def _track(reader: Keys) -> KeyedTrack:
-    """Read the track of a JSON object, from its own properties, which hold for all frames, and from its keys."""
+    """Read a model's properties over time from a JSON object: properties for all frames, 'keys' and 'matrices'."""
     interpolation = reader.frame.get("interpolation", "linear")
     if interpolation not in ("linear", "hold"):
         raise reader.wrong("interpolation", "linear or hold")

@@ -42,6 +42,7 @@ class StageTrack:
     """The `Track` of a prim in a USD stage: its world transform and visibility over time.
 
     where: prefix of error messages.
+    place: the prim's transforms and visibility in the stage.
     held: the stage. USD closes a stage when its last reference is gone, so the track keeps one.
     """
 

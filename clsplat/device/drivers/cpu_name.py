@@ -28,7 +28,8 @@ CPU_NAMES_BY_FEATURES = (
 )
 """Processor names of LLVM, the most capable first, and the features that each requires, named as in Linux."""
 DEVICE_RECORD_BYTES = 2048
-"""Bytes of PoCL's device record (`cl_device_id`) to search for the processor name. In PoCL 3.0 it is at byte 640."""
+"""Number of bytes of PoCL's device record (`cl_device_id`) that are searched for the processor name. In PoCL 3.0 the
+name is at byte 640."""
 _kept: dict[int, ctypes.Array[ctypes.c_char]] = {}
 """Processor names set by `name_processor`, by the address of the device record's pointer to the name. They are kept
 here because the driver reads them at every build."""

@@ -217,7 +217,7 @@ class WorkerProcess:
         for reader in self._readers:
             reader.join(timeout=5)
         assert self._process.stdin is not None
-        with suppress(OSError, ValueError):  # the process may have ended; two threads may close the pipe
+        with suppress(OSError, ValueError):  # the process may have ended, or another thread closed the pipe
             self._process.stdin.close()
 
 
@@ -233,7 +233,7 @@ def python_module(module: str, *words: str) -> list[str]:
     Unlike `python -m`, the command imports nothing from the current folder. Raises DriverError if Python does not know
     the path of its executable.
     """
-    if not sys.executable:  # another program may embed Python
+    if not sys.executable:  # so in a program that embeds Python
         raise DriverError(f"sys.executable is empty, {_NO_PYTHON_ADVICE}")
     root = str(Path(__file__).resolve().parents[3])
     code = (

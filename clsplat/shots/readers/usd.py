@@ -73,7 +73,7 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
 
         def moment(time: float) -> Camera:
             with readable(path):
-                prim = UsdGeom.Camera(stage.GetPrimAtPath(place))  # the reference to the stage keeps it open
+                prim = UsdGeom.Camera(stage.GetPrimAtPath(place))  # this reference to `stage` keeps it open
                 return _camera(f"{where} at {time:g}", prim, time, picture, settings)
 
         frames = numbered(map(moment, codes), codes[0], None if len(codes) == 1 or per_second <= 0 else per_second)
@@ -107,7 +107,10 @@ def _unapplied(camera: Any, codes: list[int]) -> tuple[str, ...]:
 
 
 def _optics(where: str, camera: Any, code: int, settings: Settings, metres: float, fps: float) -> Optics:
-    """Shutter and lens at a time code. Raises InputError for invalid values."""
+    """Return the camera's shutter and lens at the time code `code`. Raises InputError for invalid values.
+
+    metres: length of a world unit in metres. fps: frames per second, 0 if unknown.
+    """
     opens, closes = (
         _number(where, attribute, code) for attribute in (camera.GetShutterOpenAttr(), camera.GetShutterCloseAttr())
     )
