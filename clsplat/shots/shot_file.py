@@ -233,7 +233,7 @@ def read_layout(path: Path) -> tuple[PlacedModel, ...]:
         volumes = tuple(_volumes(reader))
         taken += [name, *(volume.name for volume in volumes)]
         if twice := next((each for each in taken if taken.count(each) > 1), None):
-            raise InputError(f"{reader.where}: has the matte '{twice}', a name that is used twice, expected unique names")
+            raise InputError(f"{reader.where}: has the matte '{twice}', a name that is used twice")
         models.append(PlacedModel(name, path.parent / _text(reader, "path"), _track(reader), volumes))
     return tuple(models)
 
