@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OpenCL devices, their memory, the kernels built for them, and launches; nothing here knows of Gaussians."""
+"""OpenCL devices and drivers, device memory, kernel builds and launches. No module here depends on Gaussians."""
 
 import os
 
-# This variable switches off pyopencl's own cache of builds, and is read at the import. Drivers already cache builds by
-# the whole source text. pyopencl's cache needs a writable home folder, and some drivers fail to load its binaries.
+# PYOPENCL_NO_CACHE switches off pyopencl's own cache of builds; pyopencl reads it at its import. Most drivers have a
+# cache. pyopencl's cache needs a writable home folder, and some drivers fail to load binaries from it.
 os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
 
 from clsplat.device.drivers import quirks
@@ -14,7 +14,7 @@ from clsplat.process import undisturbed
 quirks.make_cache_folder()
 quirks.pin_threads()
 quirks.offer_packaged()
-with undisturbed():  # an exception in a signal handler during the import would abort the process
+with undisturbed():  # a signal handler that raises during this import would abort the process
     import pyopencl as cl
 
 __all__ = ["cl"]

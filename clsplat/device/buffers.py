@@ -38,7 +38,7 @@ _begin_fill = getattr(_inner, "_enqueue_fill_buffer", cl.enqueue_fill_buffer)
 
 @dataclass(frozen=True, eq=False)
 class DeviceArray:
-    """A C-contiguous array on a device. `buffer` may be larger than the shape needs."""
+    """A C-contiguous array on a device, at the start of `buffer`, which may be larger than the array."""
 
     device: Device
     buffer: cl.Buffer
@@ -105,13 +105,13 @@ class DeviceArray:
             self.device.recorder.add(name, event, self.nbytes if nbytes is None else nbytes)
 
     def read_into(self, host: NDArray[Any]) -> None:
-        """Copy to a C-contiguous host array of the same shape, and wait for the device."""
+        """Copy this array to `host`, a C-contiguous array of the same shape and dtype, and wait for the device."""
         self._read(host, 0)
 
     def begin_get(self, into: NDArray[Any] | None = None) -> Callable[[], NDArray[Any]]:
         """Start a copy to the host, which runs after all work that is on the queue now.
 
-        into: host memory for the copy, of the same shape, for example from `pinned`.
+        into: host array of the same shape to copy to, for example from `pinned`; None allocates one.
         Returns a function that waits for this copy only and returns the host array.
         """
         host = np.empty(self.shape, self.dtype) if into is None else into
@@ -151,7 +151,7 @@ class DeviceArray:
         self._write(values, start)
 
     def _read(self, host: NDArray[Any], start: int) -> None:
-        """Fill a host array with the rows from `start` on, and wait for the device."""
+        """Copy the rows from `start` on to `host`, as many as it has rows, and wait for the device."""
         if host.size:
             self.device.calls.blocking_reads += 1
             event = self._copied(_READING, host, self.buffer, src_offset=self._at(start), is_blocking=True)
@@ -159,7 +159,7 @@ class DeviceArray:
             self.device.under_way.clear()  # the queue is in order, so that all earlier work is done
 
     def _write(self, values: NDArray[Any], start: int) -> None:
-        """Fill the rows from `start` on with the values of a host array, and wait for the device."""
+        """Copy the host array `values` to the rows from `start` on, and wait for the device."""
         if values.size:
             self.device.calls.blocking_writes += 1
             host = np.ascontiguousarray(values, self.dtype)
@@ -168,15 +168,19 @@ class DeviceArray:
             self.device.under_way.clear()
 
     def _copied(self, work: str, *ends: Any, **how: Any) -> cl.Event:
-        """Put a copy on the queue, and return its event. Raises DriverError or CapacityError if it or an earlier kernel
-        fails."""
+        """Put a copy on the queue, and return its event. Raises DriverError or CapacityError if the copy or an earlier
+        kernel fails.
+
+        work: what the copy does, for the message of an error.
+        ends, how: arguments of `cl.enqueue_copy` after the queue.
+        """
         try:
             return cl.enqueue_copy(self.device.queue, *ends, **how)
         except cl.Error as error:
             raise self.device.failed(work, error) from None
 
     def _at(self, row: int) -> int:
-        """The byte offset of a row. An array without dimensions has only row 0."""
+        """Return the byte offset of a row in the array. An array without dimensions has only row 0."""
         return row * (self.nbytes // self.shape[0]) if row else 0
 
     def rows(self, start: int, stop: int) -> DeviceArray:
@@ -188,7 +192,7 @@ class DeviceArray:
         return DeviceArray(self.device, buffer, (stop - start, *self.shape[1:]), self.dtype)
 
     def reshaped(self, *shape: int) -> DeviceArray:
-        """The same memory in another shape, which must not be larger."""
+        """Return an array of this shape in the same memory. It must not have more elements than this array."""
         return DeviceArray(self.device, self.buffer, shape, self.dtype)
 
 
@@ -196,7 +200,7 @@ _READING, _WRITING = "reading its memory", "writing to its memory"
 
 
 def _poison() -> NDArray[np.uint32] | None:
-    """The word to fill new memory with, or None to leave memory uninitialised. Raises InputError."""
+    """Return the 32-bit number that CLSPLAT_POISON fills new memory with; None if it is not set. Raises InputError."""
     value = os.environ.get("CLSPLAT_POISON", "")
     if value in ("", "0"):
         return None
@@ -207,7 +211,8 @@ def _poison() -> NDArray[np.uint32] | None:
 
 
 def _fill_bytes(device: Device, buffer: cl.Buffer, word: NDArray[np.uint32], nbytes: int) -> None:
-    """Fill the buffer's first `nbytes` with the word. Bytes after the last whole word get the word's lowest byte."""
+    """Fill the first `nbytes` bytes of a buffer with the 32-bit `word`. The bytes after the last whole
+    word get its lowest byte."""
     whole = nbytes // 4 * 4
     if whole:
         cl.enqueue_fill_buffer(device.queue, buffer, word, 0, whole)
@@ -216,11 +221,11 @@ def _fill_bytes(device: Device, buffer: cl.Buffer, word: NDArray[np.uint32], nby
 
 
 class _Buffer(cl.Buffer):  # type: ignore[misc]  # no types of its own
-    """An OpenCL buffer that can be weakly referenced. Through this the memory account learns when it is freed."""
+    """An OpenCL buffer that allows weak references, by which the memory account learns that it is freed."""
 
 
 def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity: int = 0) -> DeviceArray:
-    """Allocate a new array, in a buffer of at least `capacity` elements.
+    """Allocate an uninitialised array of this shape, in a buffer for at least `capacity` elements.
 
     Raises CapacityError if the buffer would exceed the device's limit for one buffer, the limit for all buffers
     together (`Device.memory`), or the device's free memory.
@@ -246,16 +251,16 @@ def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity:
 
 
 def upload(device: Device, values: NDArray[Any]) -> DeviceArray:
-    """Upload these values to a new array."""
+    """Allocate an array on the device and copy the host array `values` to it."""
     array = allocate(device, values.shape, values.dtype)
     array.set(values)
     return array
 
 
 def shared(device: Device, values: NDArray[Any]) -> DeviceArray:
-    """A device array over a C-contiguous host array, without a copy, for a device that shares the host's memory.
+    """Return a device array that uses the memory of `values`, a C-contiguous host array. Nothing is copied.
 
-    The host array must not change as long as the result exists.
+    The device must share the host's memory. `values` must not change as long as the result exists.
     """
     buffer = cl.Buffer(device.context, cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR, hostbuf=values)
     return DeviceArray(device, buffer, values.shape, values.dtype)
@@ -277,14 +282,14 @@ def from_host(device: Device, values: NDArray[Any]) -> DeviceArray:
 
 @dataclass(frozen=True, eq=False)
 class Hosted:
-    """An array that kernels write, and host memory for its values. On a device that shares the host's memory, both are
-    the same memory."""
+    """An array that kernels write, and a host array that `get` fills with its values. On a device that shares the
+    host's memory, both arrays are in the same memory."""
 
     array: DeviceArray
     _host: NDArray[Any]
 
     def get(self) -> NDArray[Any]:
-        """The host memory, not a copy; waits for the device. Valid until a kernel writes to the array again."""
+        """Wait for the device, and return the host array itself. It is valid until a kernel writes to `array` again."""
         if not self._host.size:
             return self._host
         if not self.array.device.shares_memory:
@@ -302,7 +307,7 @@ class Hosted:
 
 
 def hosted(device: Device, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> Hosted:
-    """Allocate an array that is read back to the host. Raises CapacityError like `allocate`."""
+    """Allocate an array of this shape on the device and on the host. Raises CapacityError like `allocate`."""
     kind = np.dtype(dtype)
     nbytes = prod(shape) * kind.itemsize
     if not device.shares_memory or not nbytes:
@@ -316,9 +321,9 @@ def hosted(device: Device, shape: tuple[int, ...], dtype: DTypeLike = np.float32
 
 
 def pinned(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Allocate pinned host memory, to which a device can copy asynchronously.
+    """Allocate a host array in pinned memory, from and to which a device can copy while the host works.
 
-    A copy to other memory may make the host wait, even if the call is non-blocking.
+    A copy from or to unpinned memory may make the host wait, even if the call is non-blocking.
     """
     nbytes = prod(shape) * np.dtype(dtype).itemsize
     buffer = cl.Buffer(device.context, cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR, nbytes)
@@ -328,16 +333,16 @@ def pinned(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[
 
 
 MAX_COMMAND_BUFFERS_PER_OBJECT = 256
-"""Maximum number of command buffers that a workspace keeps for one object: enough for photographs of a few sizes. At
-this number, all command buffers of the object are dropped."""
+"""Maximum number of command buffers that a workspace keeps for one object (`of` in `Workspace.replayed`): enough for
+photographs of a few sizes. When there are this many, the next one replaces them all."""
 
 
 class Workspace:
-    """Scratch arrays by name.
+    """Scratch arrays on a device by name, and command buffers that use them.
 
     A call of `array` with a name reuses the buffer of the last call with this name. A buffer that is too small is
-    replaced by one of 1.5 times the required size, or of exactly this size if memory is `tight`. The workspace also
-    keeps command buffers that use its arrays. They are dropped when one of these arrays gets another buffer.
+    replaced by a buffer of 1.5 times the required size, or of exactly the required size if `tight` is True. Then all
+    command buffers are dropped.
     """
 
     def __init__(self, device: Device) -> None:
@@ -361,19 +366,17 @@ class Workspace:
         given: tuple[DeviceArray, ...] = (),
         before: Callable[[], None] | None = None,
     ) -> R:
-        """Return the result of `make`. From the second call with the same key on, a command buffer replays the commands
-        that `make` put on the queue.
+        """Return the result of `make`. The first call with a key calls `make` and records the commands that it puts on
+        the queue. Later calls with this key replay these commands and return the first call's result.
 
-        For the same key, `make` must always return the same result and put the same commands on the queue.
+        of: an object whose arrays `make` uses, in addition to the workspace's. When this object is deleted, its command
+        buffers are dropped.
+        key: all other inputs of `make`. For equal keys `make` must give the same result and the same commands.
+        numbers: inputs that may differ between calls: the `LaunchParameter` arguments of the kernels, in order.
+        given: arrays that may differ between calls with the same key, if their shapes and types are the same.
+        before: function to call before a replay, for work on the host that `make` does when it is called.
 
-        of: an object whose arrays `make` uses, in addition to the workspace's. When it is deleted, its command buffers
-        are dropped.
-        key: all other inputs of `make`, except `numbers` and `given`.
-        numbers: the values that `make` passes to kernels as `LaunchParameter`, in order.
-        given: arrays that `make` passes to kernels; for the same key, they may be others of the same shape and type.
-        before: function that is called before a replay; `make` does the same itself.
-
-        A nested call inside `make` only calls its own `make`, as the outer call records all commands.
+        If `make` itself calls `replayed`, the inner call records nothing, as the outer call records all commands.
         """
         device = self._device
         if self._poison is not None or self._use == "0" or device.command_buffers or not device.replays:
@@ -392,7 +395,7 @@ class Workspace:
             return result
         if known is not None:
             known[1].check(commands, numbers)
-            for read in known[1].reads:  # copy into the host memory of the result that is returned
+            for read in known[1].reads:  # copy to the host arrays of the first call's result, which is returned
                 read()
             return known[0]  # type: ignore[no-any-return]  # as above
         command_buffers = self._command_buffers.setdefault(of, {})
@@ -404,9 +407,9 @@ class Workspace:
     def array(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
     ) -> DeviceArray:
-        """The scratch array of this name. Its contents are undefined until they are written.
+        """Return the scratch array of this name. Its contents are undefined until they are written.
 
-        kept: True keeps the contents that the array had. The last call for this name must have had the same shape.
+        kept: True keeps the contents of the array. The last call for this name must have had the same shape.
         """
         latest = self._latest.get(name)
         if latest is not None and latest[0].shape == shape and latest[1] is dtype and self._poison is None:
@@ -421,7 +424,7 @@ class Workspace:
                 self._forget_command_buffers()
             held = self._arrays.pop(name, None)
             latest = self._latest.pop(name, None)
-            del held, latest  # frees the old buffer first: memory may not suffice for both
+            del held, latest  # frees the old buffer before the new one is allocated, as memory may not suffice for both
             held = self._arrays[name] = allocate(self._device, (elements,), kind, max(elements, spare))
         if self._poison is not None and not kept:
             _fill_bytes(self._device, held.buffer, self._poison, elements * kind.itemsize)
@@ -436,6 +439,6 @@ class Workspace:
         self._forget_command_buffers()
 
     def _forget_command_buffers(self) -> None:
-        """Drop all command buffers, including those being recorded."""
+        """Drop all command buffers. A command buffer that is being recorded will be dropped when it is complete."""
         self._command_buffers.clear()
         self._renewed += 1

@@ -2,8 +2,8 @@
 """Command buffers: launches, fills and copies, recorded once. A replay puts them on a device's queue again, without the
 Python code that prepared them.
 
-CLSPLAT_TAPES=0 disables replays. CLSPLAT_TAPES=check launches everything as usual and compares each launch with the
-recorded launch. An argument that differs is an error, unless it was passed as `LaunchParameter`.
+CLSPLAT_TAPES=0 disables replays. CLSPLAT_TAPES=check runs the Python code every time, and compares each launch with the
+recorded launch. If an argument differs that was not passed as `LaunchParameter`, AssertionError is raised.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class LaunchParameterWord(int):
 
 
 def asked() -> str:
-    """The value of TAPES_VARIABLE: 1 (the default), 0 or CHECK_TAPES. Raises InputError for other values."""
+    """Return the value of CLSPLAT_TAPES: "1" (the default), "0" or "check". Raises InputError for other values."""
     value = os.environ.get(TAPES_VARIABLE) or "1"
     if value not in ("0", "1", CHECK_TAPES):
         raise InputError(f"{TAPES_VARIABLE}={value}: expected 1, 0 or {CHECK_TAPES}")
@@ -44,14 +44,14 @@ def asked() -> str:
 
 
 def typed(value: Any) -> Any:
-    """A kernel argument with an explicit type: whole numbers become uint32, other numbers float32."""
+    """Return a kernel argument with an explicit type: an int as uint32, a float as float32, anything else unchanged."""
     if isinstance(value, int):
         return np.uint32(value)
     return np.float32(value) if isinstance(value, float) else value
 
 
 def described(value: Any) -> object:
-    """A form of a kernel argument for comparison. Two arguments have equal forms if the kernel gets the same value."""
+    """Return an object for comparison of kernel arguments, which is equal for two arguments of equal value."""
     value = typed(value)
     if isinstance(value, cl.MemoryObjectHolder):
         return value.int_ptr
@@ -62,10 +62,10 @@ class CommandBuffer:
     """Launches, fills and copies to the host, in order.
 
     entries: for each command a function that puts it on the queue, and its kernel if it is a launch.
-    calls: numbers of the recorded calls, by kind.
-    anew: setter and argument index of each launch parameter, which `set` gives a new value.
+    calls: how many commands of each kind were recorded.
+    anew: for each launch parameter, the function that sets an argument of its kernel, and the argument's index.
     reads: the functions of `entries` that copy to the host.
-    given: buffers of the recorded launches that a replay may exchange for others.
+    given: buffers in the recorded launches that a replay may replace by other buffers.
 
     Each launch has its own kernel object, in which the arguments that never change stay set. When a command buffer is
     dropped, its kernel objects are kept for later command buffers, because pyopencl takes at least 0.2 ms to make one.
@@ -81,22 +81,23 @@ class CommandBuffer:
         self._described: list[tuple[object, ...]] = []
         self._numbers: list[float] = []
         self._format, self._set = Struct("="), b""
-        """Struct layout of all launch parameters, and the bytes of their present values."""
+        """Struct format of the values of all launch parameters, and these values packed in it, as last set."""
         self._given = {buffer.int_ptr: number for number, buffer in enumerate(given)}
         self._places: list[tuple[Callable[[int, Any], None], int, int]] = []
-        """For each argument that is a given buffer: its setter, its argument index, the buffer's index in `given`."""
+        """For each argument that is one of the `given` buffers: the function that sets it, its index, and the buffer's
+        index in `given`."""
 
     def __del__(self) -> None:
         for kernel, own in self._owned:
             kernel.spare.append(own)
 
     def add_fill(self, fill: Callable[[], Any], *description: object) -> None:
-        """Append a fill of a buffer."""
+        """Append `fill`, which fills a buffer. description: the buffer, the value and the size, for `check`."""
         self.entries.append((None, fill))
         self._described.append(("a fill", *description))
 
     def add_read(self, read: Callable[[], Any], *description: object) -> None:
-        """Append a copy from the device to the host."""
+        """Append `read`, which copies a buffer to the host. description: the buffer and the size, for `check`."""
         self.entries.append((None, read))
         self.reads.append(read)
         self._described.append(("a copy to the host", *description))
@@ -109,14 +110,14 @@ class CommandBuffer:
         local: tuple[int, ...] | None,
         values: Sequence[Any],
     ) -> None:
-        """Append a launch that has just been made."""
+        """Append a launch that was just put on the queue, given its global size, group size and argument values."""
         own = kernel.spare.pop() if kernel.spare else cl.Kernel(kernel.program, kernel.name)
         self._owned.append((kernel, own))
         description: list[object] = []
         for index, value in enumerate(values):
             own.set_arg(index, typed(value))
             if isinstance(value, (LaunchParameter, LaunchParameterWord)):
-                set_bytes = getattr(own, "_set_arg_buf", own.set_arg)  # faster than set_arg: no type checks
+                set_bytes = getattr(own, "_set_arg_buf", own.set_arg)  # faster than set_arg, as it does not check types
                 self.anew.append((set_bytes, index))
                 self._numbers.append(value)
                 description.append(None)
@@ -129,10 +130,10 @@ class CommandBuffer:
         self._described.append((kernel.name, kernel.variant, size, local, *description))
 
     def set(self, numbers: Iterable[float], given: Sequence[cl.Buffer] = ()) -> None:
-        """Set the arguments that change for the next replay.
+        """Set the arguments that change from replay to replay, before a replay.
 
-        numbers: values of the launch parameters, in order of their launches.
-        given: buffers that replace the recorded `given`.
+        numbers: values of the launch parameters, in order of the recorded launches.
+        given: buffers in place of those that were `given` when the command buffer was made.
         """
         values, old = self._format.pack(*numbers), self._set
         if values != old:
@@ -144,23 +145,23 @@ class CommandBuffer:
             set_buffer(index, given[place])
 
     def check(self, fresh: CommandBuffer, numbers: Sequence[float]) -> None:
-        """Raise AssertionError if a replay with these numbers would differ from `fresh`, which was just recorded."""
-        assert len(self._described) == len(fresh._described), "a replay would have another number of commands"
+        """Raise AssertionError if a replay with these numbers would not repeat `fresh`, which was just recorded."""
+        assert len(self._described) == len(fresh._described), "a replay would have the wrong number of commands"
         for one, other in zip(self._described, fresh._described, strict=True):
-            assert len(one) == len(other), f"a replay of {one[0]} would have another number of arguments"
+            assert len(one) == len(other), f"{one[0]}: a replay would pass {len(one)} arguments, expected {len(other)}"
             differing = [place for place, pair in enumerate(zip(one, other, strict=True)) if pair[0] != pair[1]]
             assert not differing, (
-                f"a replay of {one[0]} would have other arguments: numbers {[p - 4 for p in differing]}"
+                f"{one[0]}: a replay would pass wrong values of the arguments with index {[p - 4 for p in differing]}"
             )
         given, made = ([described(number) for number in each] for each in (numbers, fresh._numbers))
         assert given == made, (
-            f"numbers given to a command buffer are {list(numbers)}, but the launches got {fresh._numbers}"
+            f"numbers: the replay was given {list(numbers)}, expected the launches' parameters {fresh._numbers}"
         )
 
     def is_all_of(self, calls: Calls) -> bool:
-        """End the recording. Returns False if a call was not recorded: a write, or a call for which the host waited.
+        """End the recording. Returns True if all calls were recorded: neither a write nor a blocking call was made.
 
-        calls: the numbers of calls on the queue since the recording began.
+        calls: counts of the calls on the queue since the recording began.
         """
         self.calls = calls
         self._format = Struct("=" + "".join("f" if isinstance(number, float) else "I" for number in self._numbers))

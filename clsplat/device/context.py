@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The list of visible OpenCL devices, and `Device`, an open device with its queue, kernel shape and kernels."""
+"""The list of visible OpenCL devices, and `Device`: an open device with its queue, kernel shape and kernels."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ or fails."""
 
 
 def all_devices() -> list[cl.Device]:
-    """All visible OpenCL devices, by index. Raises DeviceError in a forked process (`forks`)."""
+    """Return all visible OpenCL devices in order of their index. Raises DeviceError in a forked process (`forks`)."""
     forks.claim()
-    with undisturbed():  # otherwise Ctrl-C would reach compilers and linkers that the driver starts
+    with undisturbed():  # keeps Ctrl-C from compilers and linkers that the driver starts
         devices = _visible()
     for device in devices:
         name_processor(device)
@@ -62,11 +62,11 @@ def _visible() -> list[cl.Device]:
 class Device:
     """A device with its context, in-order queue, kernel shape and built kernels.
 
-    why: warning that another shape than the preferred one is used; shown at the first use of the device. Usually empty.
-    only_tries: True if launches are only tried in the sandbox (`launch.only_tried`).
-    waits: True if each launch waits for its kernel (SYNC_VARIABLE).
+    why: warning that the preferred shape failed and another is used, shown at the first use of the device; usually "".
+    only_tries: True while kernels run in the sandbox only, not on this device (`launch.only_tried`).
+    waits: True if the host waits for each kernel (SYNC_VARIABLE).
     shares_memory: True if the device uses the host's memory.
-    calls: the numbers of calls on its queue.
+    calls: counts of the calls on its queue.
     command_buffers: the command buffers that are being recorded.
     under_way: events and buffers that keep host arrays alive while the device may still read them.
     part: the whole device and the part's number, if this is a part of a device (`open_devices`); otherwise None.
@@ -121,11 +121,11 @@ class Device:
         return self._queue
 
     def kernels(self, stem: str, defines: Mapping[str, object] = {}, registers: int = 0) -> Kernels:
-        """The kernels of `stem`.cl for this device's shape and these defines, built at the first call.
+        """Return the kernels of `stem`.cl for this device's shape and these defines. The first call builds them.
 
         registers: maximum registers per work-item, if the driver has an option for it; 0 for no limit.
         """
-        if self._why_another:  # not shown when the device is opened: the self-test may choose another shape until now
+        if self._why_another:  # not shown when the device is opened, as the self-test may then change the shape
             tell_once(self._why_another)
         if self._switches:
             text = kernel_source(stem)
@@ -136,14 +136,14 @@ class Device:
         kernels = self._kernels.get(key)
         if kernels is None:
             if not self._fma:
-                self._fma.append(self._probe_fma())  # appended in place, as copies of a device share the list
+                self._fma.append(self._probe_fma())  # changed in place, as copies of this device share the list
             kernels = self._kernels[key] = self._built(stem, {**self._fma[0], **defines}, registers)
         return kernels
 
     def _built(self, stem: str, defines: Mapping[str, object], registers: int = 0) -> Kernels:
         given, text = {"LANES": self.shape.lanes, "ITEMS": self.shape.items, **defines}, text_of(stem)
         # Only defines that occur in the text are passed. A driver's cache is keyed by the options, so all shapes share
-        # the build of a file that does not depend on the shape.
+        # the cached build of a file that does not depend on the shape.
         named = {name: value for name, value in given.items() if name.partition("(")[0] in text}
         limit = register_limit(self.cl_device, registers) if registers else ""
         variant = variant_of(stem, named, f"{self._options} {limit}")
@@ -154,7 +154,7 @@ class Device:
     def with_shape(
         self, label: str = "", *, lanes: int | None = None, items: int | None = None, chunks: int | None = None
     ) -> Device:
-        """A copy of this device with another kernel shape, given by its label or by lanes, items and chunks."""
+        """Open this device again with another kernel shape, given by its label or by lanes, items and chunks."""
         shape = self.shape.relabelled(label) if label else self.shape
         if lanes or items or chunks:
             shape = Shape(lanes or shape.lanes, items or shape.items, chunks or shape.chunks)
@@ -163,29 +163,29 @@ class Device:
         return device
 
     def with_switches(self, switches: Mapping[str, object]) -> Device:
-        """A copy of this device, with the same queue, that adds these defines to kernels in whose text they occur."""
+        """Copy this device, with the same queue. The copy passes these defines to kernel files that contain them."""
         device = copy(self)
         device._switches = {**self._switches, **switches}  # noqa: SLF001  # a copy of our own class
         return device
 
     @property
     def is_another(self) -> bool:
-        """True if the device has its kernel shape because the driver failed in the preferred shape."""
+        """True if the driver failed in the preferred kernel shape, so that the device uses another one."""
         return bool(self._why_another)
 
     def switched(self, *names: str) -> bool:
-        """True if any of these defines was added by `with_switches`."""
+        """Return True if `with_switches` has set any of the defines `names`."""
         return any(name in self._switches for name in names)
 
     def with_memory_limit(self, limit: int | None) -> Device:
-        """A copy of this device, with the same queue and kernels, whose buffers may take at most `limit` bytes."""
+        """Copy this device, with the same queue and kernels. The copy's buffers may take at most `limit` bytes."""
         device = copy(self)
         device.memory = Memory(limit)
         return device
 
     @property
     def budget(self) -> int:
-        """Bytes that buffers may take: the limit if there is one, otherwise all of the device's memory."""
+        """Bytes that all buffers together may take: the memory limit, or without a limit all of the device's memory."""
         return self.memory.limit or int(self.cl_device.global_mem_size)
 
     @property
@@ -205,8 +205,10 @@ class Device:
         *,
         wait: bool = False,
     ) -> cl.Event:
-        """Put a kernel on the queue. Wait for it if `wait`, or if CLSPLAT_SYNC=1.
+        """Put a launch on the queue, and return its event. Wait for the kernel if `wait`, or if CLSPLAT_SYNC=1.
 
+        size, local: work-items in all and in a group, along each axis. With None the driver chooses the groups.
+        values: the kernel's arguments.
         Raises DriverError, and CapacityError if the device has no memory left for the kernel.
         """
         try:
@@ -214,7 +216,7 @@ class Device:
             self.calls.launches += 1
             if self.waits:
                 self._wait_for(event, kernel)
-            elif wait:  # so that a kernel that crashes is the last one that the log names
+            elif wait:  # waits here, so that the last kernel in the log is the one that crashed
                 self.queue.finish()
                 self.under_way.clear()
         except cl.Error as error:
@@ -229,10 +231,10 @@ class Device:
         return self.trials.error(kernel.variant, kernel.name, f"cannot be launched: {' '.join(str(error).split())}")
 
     def record(self, work: Callable[[], T], given: Sequence[cl.Buffer] = ()) -> tuple[T, CommandBuffer | None]:
-        """Run `work`. Returns its result, and a command buffer of the commands that `work` put on the queue; None if
-        these cannot be replayed.
+        """Run `work`. Return its result and a command buffer of the commands that it put on the queue, or None instead
+        of the command buffer if a replay of them is not possible.
 
-        given: buffers that a replay may exchange for others (`CommandBuffer`).
+        given: buffers that a replay may replace by other buffers (`CommandBuffer`).
         """
         commands, before = CommandBuffer(given), copy(self.calls)
         self.command_buffers.append(commands)
@@ -256,7 +258,7 @@ class Device:
 
     @property
     def replays(self) -> bool:
-        """True if command buffers may be replayed; False if each launch is waited for, profiled or only tried."""
+        """True if command buffers may be replayed: not with CLSPLAT_SYNC=1, in a profile or in `only_tried`."""
         return not (self.waits or self.recorder.on or self.only_tries)
 
     def _wait_for(self, event: cl.Event, kernel: Kernel) -> None:
@@ -281,22 +283,22 @@ class Device:
         self.under_way.clear()
 
     def failed(self, work: str, error: cl.Error) -> ClsplatError:
-        """The error to raise if a command other than a launch fails. An earlier kernel may be the cause, or a lost
-        device."""
+        """Return the error to raise if `work`, a command other than a launch, fails with `error`. The cause may be an
+        earlier kernel, or a device that was lost."""
         if isinstance(error, cl.MemoryError):
             return self.used_up(work)
         return DriverError(f"{title(self.cl_device)}: {work} failed ({' '.join(str(error).split())})")
 
     def used_up(self, work: str) -> CapacityError:
-        """The error to raise if the device has no memory left for `work`. Many drivers report this at the first use of
-        a buffer, not at its allocation."""
+        """Return the error to raise if the device has no memory left for `work`. Many drivers report this at the first
+        use of a buffer, not at its allocation."""
         used = amount(self.memory.used)
         return CapacityError(
             f"{self.name} has no memory left for {work}, with {used} in use: set --max-device-mem below {used}"
         )
 
     def timed(self, work: Callable[[], T]) -> tuple[T, float]:
-        """Run `work`, and return its result and milliseconds. The device is idle before and after."""
+        """Run `work`. Return its result and the milliseconds until the device has finished it."""
         self.finish()
         start = time.perf_counter()
         result = work()
@@ -304,11 +306,11 @@ class Device:
         return result, 1e3 * (time.perf_counter() - start)
 
     def _probe_fma(self) -> dict[str, object]:
-        """The define FMA_BY_CONTRACTION if the compiler fuses a*b + c in vectors, which is the fastest way to the bits
-        of fma. Otherwise no define.
+        """Return the define FMA_BY_CONTRACTION if the compiler fuses a*b + c in vectors; otherwise no define.
 
-        Without vectors the result is empty: Intel's runtime vectorises loops by itself, and then fuses only some of the
-        multiply-adds.
+        With this define, kernels write a*b + c instead of fma(a, b, c), which is faster and gives the same bits. A
+        shape without vectors never gets the define: Intel's runtime vectorises loops by itself, and then fuses only
+        some of the multiply-adds.
         """
         if self.shape.lanes == 1:
             return {}
@@ -318,7 +320,10 @@ class Device:
         return fused if np.all(results == np.float32(2.0**-24)) else {}
 
     def _with_subgroups(self) -> dict[str, object]:
-        """The first defines in `subgroup_ways` with which items exchange the right values. Raises DeviceError."""
+        """Return the first set of defines in `subgroup_ways` for which a probe kernel exchanges values in sub-groups.
+
+        Raises DeviceError if the values are wrong with every set.
+        """
         if self._subgroups:
             return self._subgroups[0]
         for defines in subgroup_ways(self.cl_device):
@@ -331,19 +336,20 @@ class Device:
             except (KernelBuildError, DriverError):
                 continue
             if np.array_equal(got, wanted):
-                self._subgroups.append(defines)  # appended in place, as copies of a device share the list
+                self._subgroups.append(defines)  # changed in place, as copies of this device share the list
                 return defines
         raise DeviceError(
-            f"{title(self.cl_device)}: items of a sub-group do not exchange the right values; choose a shape without "
-            f"sub-groups, such as CLSPLAT_SHAPE={self.shape.label.removesuffix('s')}"
+            f"{title(self.cl_device)}: the work-items of a sub-group got wrong values from each other; choose a shape "
+            f"without sub-groups, such as CLSPLAT_SHAPE={self.shape.label.removesuffix('s')}"
         )
 
     def _probed(
         self, kernel: Kernel, items: int, shape: int | tuple[int, ...], *numbers: object
     ) -> NDArray[np.float32]:
-        """Run a probe kernel in one group of `items` work-items, and return the array of this shape that it writes.
+        """Run a probe kernel in one group of `items` work-items, and return the array that it writes.
 
-        numbers: further arguments of the kernel.
+        shape: shape of this array, which is the kernel's first argument.
+        numbers: the kernel's further arguments.
         """
         results = np.empty(shape, np.float32)
         buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, results.nbytes)

@@ -25,8 +25,8 @@ _idle: list[NDArray[np.uint8]] = []
 
 
 def host_bytes(count: int) -> NDArray[np.uint8]:
-    """Uninitialised bytes (count,), aligned to HOST_ALIGNMENT_BYTES. They are freed with the last array that views
-    them."""
+    """Allocate an uninitialised array (count,), aligned to HOST_ALIGNMENT_BYTES. Its memory is freed with the last view
+    of it."""
     size = -(-count // HOST_ALIGNMENT_BYTES) * HOST_ALIGNMENT_BYTES
     if size < MIN_RECYCLED_BYTES:
         return _aligned(np.empty(size + HOST_ALIGNMENT_BYTES, np.uint8))[:count]
@@ -35,7 +35,7 @@ def host_bytes(count: int) -> NDArray[np.uint8]:
 
 
 def _found(size: int) -> NDArray[np.uint8] | None:
-    # A finalizer may call this function while this thread holds the lock. None makes the caller allocate new memory.
+    # A finalizer may call this function while this thread holds the lock. Then the caller allocates new memory.
     if not _lock.acquire(blocking=False):
         return None
     try:

@@ -21,14 +21,14 @@ DEFAULT_GROUP_ITEMS = 64
 the work over a CPU's processors."""
 _LOW_32_BITS = 0xFFFFFFFF
 _RECOMPILED_SIZE_ITEMS = 1 << 16
-"""PoCL compiles a kernel again if an axis has this number of items or more."""
+"""PoCL compiles a kernel again for launches with this number of work-items or more along an axis."""
 
 
 @contextmanager
 def only_tried(device: Device) -> Iterator[None]:
-    """Inside the block, launches only try the kernel in the sandbox, if that is necessary; nothing runs on the device.
+    """Inside the block, a launch runs nothing on the device. A kernel that had no trial is tried in the sandbox.
 
-    So no array has been changed yet if a driver fails in a trial.
+    So if a driver fails in a trial, no array has been changed yet.
     """
     device.only_tries = True
     try:
@@ -38,7 +38,7 @@ def only_tried(device: Device) -> Iterator[None]:
 
 
 def _values(arguments: tuple[Any, ...]) -> list[Any]:
-    """The arguments as OpenCL takes them: arrays become buffers, and whole numbers are cut to 32 bits."""
+    """Convert arguments for OpenCL: arrays to their buffers, whole numbers to their low 32 bits, others unchanged."""
     return [
         argument.buffer
         if (kind := type(argument)) is DeviceArray
@@ -48,7 +48,7 @@ def _values(arguments: tuple[Any, ...]) -> list[Any]:
 
 
 def _type(value: Any) -> Any:
-    """The NumPy type of a scalar kernel argument, for pyopencl; None for other arguments."""
+    """Return the NumPy type to which pyopencl converts a scalar argument of a kernel; None for other arguments."""
     if isinstance(value, int):
         return np.uint32
     if isinstance(value, float):
@@ -57,11 +57,11 @@ def _type(value: Any) -> Any:
 
 
 def form_of(device: Device, size: tuple[int, ...], local: tuple[int, ...] | None) -> str:
-    """Return the suffix that names the kind of a launch in the record of a kernel's sandbox trials; "" as a rule.
+    """Return the suffix that a kernel's name gets in the record of sandbox trials, for a launch of this size.
 
-    Drivers that compile a kernel anew for some launch sizes have one kind for many items, and one for group sizes that
-    the driver chooses. Each kind has its own trial. Launches whose group size is given have no kind for it, because
-    each width of an image would need one.
+    It is "" unless the driver compiles a kernel again for other launch sizes. Then launches of 65,536 work-items or
+    more along an axis have trials of their own, and so do those whose groups the driver chooses (`local` is None).
+    Launches with a given group size share a trial, because otherwise each width of an image would need its own.
     """
     if not device.compiles_by_size:
         return ""
@@ -114,7 +114,7 @@ def _enqueue(
 
 
 def launch_items(device: Device, kernel: Kernel, items: int, *arguments: Any) -> None:
-    """Launch `items` work-items, rounded up to whole groups. The kernel skips items in excess. 0 launches nothing."""
+    """Launch `items` work-items, rounded up to whole groups; the kernel must ignore the excess. 0 launches nothing."""
     if items > 0:
         size = -(-items // DEFAULT_GROUP_ITEMS) * DEFAULT_GROUP_ITEMS
         local = (DEFAULT_GROUP_ITEMS,) if device.max_group >= DEFAULT_GROUP_ITEMS else None
@@ -124,15 +124,17 @@ def launch_items(device: Device, kernel: Kernel, items: int, *arguments: Any) ->
 def launch_groups(
     device: Device, kernel: Kernel, groups: int | tuple[int, int, int], items: int, *arguments: Any
 ) -> None:
-    """Launch work-groups of `items` work-items. groups: number of groups, or numbers along the three axes of a grid. 0
-    launches nothing."""
+    """Launch work-groups of `items` work-items each.
+
+    groups: number of groups, or their numbers along the three axes of a grid. If one is 0, nothing is launched.
+    """
     first, *further = groups if isinstance(groups, tuple) else (groups,)
     if all((first, *further)):
         _enqueue(device, kernel, (first * items, *further), (items, *(1 for _ in further)), arguments)
 
 
 def launch_grid(device: Device, kernel: Kernel, size: tuple[int, ...], *arguments: Any) -> None:
-    """Launch a grid of work-items. If a side is 0, nothing is launched.
+    """Launch a grid with `size` work-items along each axis. If one of the sizes is 0, nothing is launched.
 
     On a CPU each row is a group; otherwise the driver might make the whole grid a single group.
     """

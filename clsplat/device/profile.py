@@ -16,7 +16,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 TRANSFERS_STAGE = "transfers"
-"""Name under which work outside all stages is recorded: copies of the camera and the background."""
+"""Name under which work outside all stages is recorded, such as copies of the camera and the background."""
 
 
 @dataclass
@@ -53,12 +53,12 @@ class Calls:
     blocking_reads: int = 0
 
     def since(self, earlier: Calls) -> Calls:
-        """The difference from an earlier copy of the counts."""
+        """Return the numbers of calls since `earlier`, a copy of the counts."""
         return Calls(*(now - then for now, then in zip(astuple(self), astuple(earlier), strict=True)))
 
     @property
     def total(self) -> int:
-        """The sum of all counts."""
+        """Number of all calls together."""
         return sum(astuple(self))
 
     def add(self, more: Calls) -> None:
@@ -100,7 +100,7 @@ class Recorder:
             self.on, self._stages, self._events = False, {}, []
 
     def add(self, name: str, event: Any, nbytes: int) -> None:
-        """Record a launch or transfer. Call this only while `on` is True."""
+        """Record a launch or transfer by its name, OpenCL event and bytes. Call this only while `on` is True."""
         stage = self._stack[0] if self._stack else TRANSFERS_STAGE
         record = self._stages.setdefault(stage, StageRecord())
         record.launches += 1
@@ -136,13 +136,14 @@ D = TypeVar("D", bound=Recorded)
 
 
 UPDATED_ARRAYS_BY_KERNEL: dict[str, int] = {}
-"""Number of arrays that a kernel both reads and writes, by the kernel's name. They are its last array arguments."""
+"""Number of arrays that a kernel both reads and writes, by the kernel's name. They are its last array arguments, and
+their bytes count twice."""
 
 
 def stage(name: str, **updated: int) -> Callable[[Callable[Concatenate[D, P], R]], Callable[Concatenate[D, P], R]]:
     """Mark a function as a stage of the pipeline; its first argument is the device.
 
-    updated: entries of `UPDATED_ARRAYS_BY_KERNEL` for the kernels that the function launches.
+    updated: for kernels that the function launches, by name, the number of arrays that they both read and write.
     """
 
     def decorate(function: Callable[Concatenate[D, P], R]) -> Callable[Concatenate[D, P], R]:
@@ -163,5 +164,5 @@ def stage(name: str, **updated: int) -> Callable[[Callable[Concatenate[D, P], R]
 def _milliseconds(event: Any) -> float:
     try:
         return 1e-6 * float(event.profile.end - event.profile.start)
-    except cl.Error:  # a queue without profiling
+    except cl.Error:  # OpenCL has no times for a queue made without profiling
         return 0.0

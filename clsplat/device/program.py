@@ -24,7 +24,7 @@ from clsplat.errors import DriverError, InputError, KernelBuildError, examples
 
 @dataclass(frozen=True)
 class Variant:
-    """The text of a kernel file and its build options."""
+    """A kernel file's name (without .cl) and text, and the options to build it."""
 
     stem: str
     source: str
@@ -37,22 +37,22 @@ class Variant:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def anew(self, salt: str) -> Variant:
-        """The same kernels in a text that no driver has cached, because a cached build may have been aborted.
+        """Copy this variant, with a text that no driver has in its cache, as the cached build may be damaged.
 
-        salt: random hexadecimal digits, which become part of the text; empty leaves the text as it is. They are in a
-        typedef, not in a comment, because PoCL's cache is keyed by the preprocessor's output.
+        salt: random hexadecimal digits, added to the text in the name of a typedef; "" adds nothing. A comment would
+        not do, because PoCL's cache is keyed by the preprocessor's output.
         """
         return replace(self, source=f"{self.source}typedef int anew_{salt};\n") if salt else self
 
 
 def variant_of(stem: str, defines: Mapping[str, object], options: str) -> Variant:
-    """The variant of `stem`.cl with these defines. Raises InputError if CLSPLAT_BREAK_KERNEL is invalid."""
+    """Return the variant of `stem`.cl with these defines and options. Raises InputError like `text_of`."""
     flags = [f"-D{name}" if value is True else f"-D{name}={value}" for name, value in sorted(defines.items())]
     return Variant(stem, text_of(stem), (*flags, *options.split()))
 
 
 def text_of(stem: str) -> str:
-    """The source of a kernel file, modified by CLSPLAT_BREAK_KERNEL if set. Raises InputError if that is invalid."""
+    """Return the source of `stem`.cl, modified as CLSPLAT_BREAK_KERNEL says. Raises InputError if that is invalid."""
     source = kernel_source(stem)
     wanted = os.environ.get(BREAK_KERNEL_VARIABLE)
     if not wanted:
@@ -60,7 +60,7 @@ def text_of(stem: str) -> str:
     where, _, change = wanted.partition(":")
     old, arrow, new = (part.strip() for part in change.partition("=>"))
     if not (where and old and arrow):
-        raise InputError(f"{BREAK_KERNEL_VARIABLE}={wanted}: expected STEM: WORDS => WORDS")
+        raise InputError(f"{BREAK_KERNEL_VARIABLE}={wanted}: expected STEM: OLD => NEW")
     stems = sorted(path.stem for path in kernel_root().glob("*.cl"))
     if where.strip() not in stems:
         raise InputError(
@@ -118,9 +118,9 @@ def _compiled(context: cl.Context, device: cl.Device, variant: Variant) -> cl.Pr
 class Kernel:
     """A built kernel.
 
-    cl_kernel: pyopencl's kernel. Before the first launch it is given the types of the scalar arguments. Without the
-        types, each scalar costs 10 microseconds per launch.
-    tried: the kinds of launch (`launch.form_of`) that the sandbox has tried.
+    cl_kernel: pyopencl's kernel. The first launch sets the types of its scalar arguments, because without them each
+        scalar costs 10 microseconds per launch.
+    tried: the kinds of launch (suffixes from `launch.form_of`) that the sandbox has tried.
     spare: kernel objects of dropped command buffers, for new command buffers.
     """
 

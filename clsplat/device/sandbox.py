@@ -54,8 +54,8 @@ class _Process:
     def ask(self, trial: Mapping[str, Any]) -> dict[str, Any]:
         """Run a trial and return its outcome, as `sandbox_worker` sends it.
 
-        If the process ends without an answer, `lasting` in the outcome says whether the driver is to blame. A crash
-        counts only if a second try crashes too, as another program may have killed the driver's linker.
+        If the process ends without an answer, `lasting` in the outcome is True if the driver is the cause. After a
+        crash the trial is repeated once, as another program may have killed the driver's linker.
         Raises TrialInterrupted, and DriverError if the process cannot be started.
         """
         try:
@@ -107,10 +107,10 @@ def _process(index: int) -> _Process:
 
 
 class KernelTrials:
-    """The trials of a driver in one kernel shape, and the kernels that passed.
+    """The trials of a driver in one kernel shape, and the names of the builds and launches that passed.
 
-    No sandbox is used in a worker process that tests a driver, such as `clsplat.selftest.worker`. There `say`, if set,
-    is called with the name of each kernel before its first use.
+    A worker process that tests a driver, such as `clsplat.selftest.worker`, uses no sandbox. In it, the function `say`,
+    if set, is called with the name of each kernel before the kernel's first use.
     """
 
     def __init__(self, device: cl.Device, index: int, shape: str) -> None:
@@ -120,14 +120,14 @@ class KernelTrials:
 
     @cached_property
     def known(self) -> dict[str, str]:
-        """The builds and launches that passed, by name, each with the salt (`Variant.anew`) that its text needs.
+        """Names of the builds and launches that passed, each with the salt (`Variant.anew`) of the build, usually "".
 
-        In a worker process: the builds and launches that have begun, without salts.
+        In a worker process that tests a driver: names of the builds and launches that have begun.
         """
         return {} if regardless() else dict(driver_records.entry(self._device, self._shape).kernels)
 
     def build(self, variant: Variant) -> Variant:
-        """Try the build of a kernel file, and return the variant to build. Raises DriverError."""
+        """Try the build of a kernel file. Return the variant that this process should build. Raises DriverError."""
         self._try(variant, "", variant.digest)
         return variant.anew(self.known[variant.digest])
 
@@ -139,18 +139,25 @@ class KernelTrials:
         arguments: Sequence[Any],
         form: str = "",
     ) -> None:
-        """Try a launch of the kernel. form: the kind of launch (`launch.form_of`). Raises DriverError."""
+        """Try a launch of the kernel with arguments of these sizes and values. Raises DriverError.
+
+        form: the kind of launch, a suffix from `launch.form_of`.
+        """
         given = [_described(argument) for argument in arguments]
         if regardless() or sum(value for kind, value in given if kind == "buffer") <= MAX_TRIAL_BYTES:
             launch = {"kernel": kernel.name, "size": _few(size, local), "local": local, "arguments": given}
             self._try(kernel.variant, kernel.name, f"{kernel.variant.digest} {kernel.name}{form}", {"launch": launch})
 
     def built(self, variant: Variant, salt: str) -> None:
-        """Record the salt (`Variant.anew`) that the build in this process needed."""
+        """Note the salt (`Variant.anew`) that the build of `variant` in this process needed, usually ""."""
         self.known[variant.digest] = salt or self.known[variant.digest]
 
     def _try(self, variant: Variant, kernel: str, name: str, asked: Mapping[str, Any] = {}) -> None:
-        """Try a build, or the launch in `asked`, in the sandbox, unless a trial of this name has passed before."""
+        """Try a build, or the launch that `asked` describes, in the sandbox. Do nothing if it has passed before.
+
+        kernel: name of the launched kernel; "" for a build.
+        name: name of the build or launch in the driver record.
+        """
         if regardless():
             self.known.setdefault(name, "")
             if self.say is not None:
@@ -162,7 +169,7 @@ class KernelTrials:
             raise DriverError(self._failed[name])
         text = variant.anew(self.known.get(variant.digest, ""))
         answer = _process(self._index).ask({"build": asdict(text), **asked})
-        if answer.get("memory"):  # not the driver's fault: this process goes on as if the trial had passed
+        if answer.get("memory"):  # the driver has not failed, so this process goes on as if the trial had passed
             driver_records.tell_once(
                 f"{self._device.name.strip()}: not enough memory to try every kernel in a separate process before its "
                 "first use, so kernels are used without this trial"
@@ -170,10 +177,10 @@ class KernelTrials:
         elif trouble := answer.get("trouble"):
             trial = {**asked, "name": name, "build": {"stem": variant.stem, "options": variant.options}}
             error = self.fail(variant, kernel, trouble, trial, lasting=answer.get("lasting", True))
-            self._failed[name] = str(error)  # so that this process does not repeat the trial
+            self._failed[name] = str(error)  # kept, so that this process does not repeat the trial
             raise error
         self.known[name] = str(answer.get("salt", ""))
-        if "salt" in answer:  # there is no salt if the compiler refuses the text; this process gets the same error
+        if "salt" in answer:  # no salt means that the compiler has refused the text, as it will in this process
             driver_records.remember(self._device, self._shape, kernels={name: self.known[name]})
 
     def fail(
@@ -185,20 +192,22 @@ class KernelTrials:
         *,
         lasting: bool = True,
     ) -> DriverError:
-        """The error to raise for a failure of the driver.
+        """Return the error to raise if the driver fails in a kernel file or in a kernel.
+
+        trouble: the failure, as a predicate of a sentence.
 
         trial: the failed trial (`driver_records.Entry`), if there was one.
-        lasting: also record the failure, so that the driver is not used in this shape again.
+        lasting: True also records the failure, so that the driver is not used in this shape again.
         """
-        advice = f"CLSPLAT_DEVICE selects another device, {TRUST_DRIVER_VARIABLE}=1 ignores this"
+        advice = f"CLSPLAT_DEVICE selects another device; {TRUST_DRIVER_VARIABLE}=1 skips this test"
         if lasting and not regardless():
             trial = trial or {"name": f"{variant.digest} {kernel}"}
             driver_records.remember(self._device, self._shape, failed=_text(variant, kernel, trouble), trial=trial)
-            advice = f"the next process uses another shape if one works; {advice}"
+            advice = f"the next process uses another kernel shape if one works; {advice}"
         return self.error(variant, kernel, f"{trouble}; {advice}")
 
     def error(self, variant: Variant, kernel: str, trouble: str) -> DriverError:
-        """The error to raise for a problem with a kernel file, or with a kernel in it."""
+        """Return the error to raise for `trouble`, a predicate of a sentence about a kernel file or a kernel in it."""
         text = _text(variant, kernel, trouble)
         return DriverError(f"{title(self._device)}, kernels in the shape {self._shape}: {text}")
 
@@ -210,7 +219,8 @@ def _text(variant: Variant, kernel: str, trouble: str) -> str:
 def again(index: int, trial: Mapping[str, Any]) -> str:
     """Repeat a failed trial (`driver_records.Entry.trial`) on the `index`-th device.
 
-    Returns the failure in words, or an empty string. A trial that clsplat did not record may raise any exception.
+    Returns the failure as a predicate of a sentence, or "" if the trial passes. Any exception may be raised for a
+    `trial` that clsplat has not recorded.
     """
     build = trial["build"]
     variant = Variant(build["stem"], text_of(build["stem"]), tuple(build["options"]))
@@ -219,13 +229,13 @@ def again(index: int, trial: Mapping[str, Any]) -> str:
 
 
 def _few(size: tuple[int, ...], local: tuple[int, ...] | None) -> list[int]:
-    """Work-items along each axis of the launch to try: at most MAX_TRIAL_ITEMS, in whole groups."""
+    """Limit the work-items `size` of a launch along each axis to MAX_TRIAL_ITEMS, in whole groups of `local`."""
     groups = local or tuple(1 for _ in size)
     return [min(n, max(MAX_TRIAL_ITEMS // group, 1) * group) for n, group in zip(size, groups, strict=True)]
 
 
 def _described(argument: Any) -> tuple[str, Any]:
-    """A launch argument as JSON: its kind, and its bytes or value."""
+    """Encode a launch argument for JSON: "buffer" or "local" and its bytes, or a scalar's dtype and value."""
     if isinstance(argument, cl.LocalMemory):
         return "local", argument.size
     if isinstance(argument, cl.MemoryObject):

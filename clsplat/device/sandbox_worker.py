@@ -20,7 +20,7 @@ from clsplat.errors import DriverError, KernelBuildError
 
 
 def _given(context: cl.Context, queue: cl.CommandQueue, kind: str, value: Any) -> Any:
-    """Make the kernel argument that `sandbox._described` encoded. A buffer is filled with zeros."""
+    """Make the kernel argument that `sandbox._described` encoded as `kind` and `value`. Buffers are filled with 0."""
     if kind == "local":
         return cl.LocalMemory(value)
     if kind != "buffer":
@@ -30,7 +30,7 @@ def _given(context: cl.Context, queue: cl.CommandQueue, kind: str, value: Any) -
     return buffer
 
 
-class _Stage:
+class _TrialDevice:
     """The device on which the worker tries kernels, with a queue and the kernels built so far."""
 
     def __init__(self, device: cl.Device) -> None:
@@ -41,7 +41,7 @@ class _Stage:
     def answer(self, message: dict[str, Any]) -> dict[str, Any]:
         """Build the kernel file that a message names, and launch a kernel if the message asks for it.
 
-        Returns the answer that `sandbox.KernelTrials` expects: `salt`, or the reason why the trial failed.
+        Returns the answer to `sandbox.KernelTrials`: the build's `salt`, or the reason why the trial failed.
         """
         text = message["build"]
         variant = Variant(text["stem"], text["source"], tuple(text["options"]))
@@ -74,12 +74,12 @@ class _Stage:
 def _serve(index: int) -> None:
     """Answer the parent's messages until its pipe is closed. If a driver hangs, this process ends after 1.5 times the
     message's time limit, with a traceback."""
-    stage = None
+    device = None
     for line in sys.stdin:
         message = json.loads(line)
         faulthandler.dump_traceback_later(1.5 * message["seconds"], exit=True)
-        stage = stage or _Stage(all_devices()[index])
-        answer = stage.answer(message)
+        device = device or _TrialDevice(all_devices()[index])
+        answer = device.answer(message)
         faulthandler.cancel_dump_traceback_later()
         tell(**answer)
 

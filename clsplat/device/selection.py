@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The list of OpenCL devices, their selection by --device or CLSPLAT_DEVICE, and their opening, once each."""
+"""The list of OpenCL devices; functions that select them by --device or CLSPLAT_DEVICE, and open each only once."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class DeviceInfo:
 
 
 def list_devices() -> list[DeviceInfo]:
-    """Every visible OpenCL device, GPUs and CPUs, in the order of their index.
+    """Describe every visible OpenCL device, in the order of their index, as `clsplat devices` lists them.
 
     Raises DeviceError if CLSPLAT_SHAPE or CLSPLAT_PRETEND is invalid for every device.
     """
@@ -54,7 +54,7 @@ def list_devices() -> list[DeviceInfo]:
 
 
 def limits(device: cl.Device) -> dict[str, object]:
-    """The device's limits on kernel launches, for a bug report."""
+    """Return the values of OpenCL device queries, by name, that a bug report needs: versions and limits."""
     names = (
         *("driver_version", "opencl_c_version", "extensions", "max_clock_frequency", "max_compute_units"),
         *("max_work_group_size", "local_mem_size", "max_constant_buffer_size", "max_mem_alloc_size", "global_mem_size"),
@@ -71,11 +71,12 @@ def limits(device: cl.Device) -> dict[str, object]:
 
 
 def select(selector: str | None) -> cl.Device:
-    """The device for a selector: an index, `cpu`, `gpu`, or part of a device's name, platform or version.
+    """Return the first device that `selector` names: an index, `cpu`, `gpu`, or part of a name, platform or version.
 
-    None selects by `CLSPLAT_DEVICE` if set, else the first GPU, else the first device. Raises DeviceError.
+    With None, CLSPLAT_DEVICE is the selector. If it is not set either, the result is the first GPU, or without a GPU
+    the first device. Raises DeviceError.
     """
-    driver_timeout()  # raises InputError for an invalid environment variable now, not at the first kernel
+    driver_timeout()  # raises InputError if CLSPLAT_DRIVER_TIMEOUT is invalid, before the first kernel does
     devices = list(zip(all_devices(), list_devices(), strict=True))
     if not devices:
         raise no_device()
@@ -83,7 +84,7 @@ def select(selector: str | None) -> cl.Device:
     selector = selector or os.environ.get("CLSPLAT_DEVICE") or None
     if selector is None:
         return next((device for device, info in devices if info.kind == "gpu"), devices[0][0])
-    wanted = selector.lower() if selector.strip() else None  # a blank would match any name
+    wanted = selector.lower() if selector.strip() else None  # a blank selector would match any name
     for device, info in devices:
         words = f"{info.name} {info.platform} {info.version}".lower()
         by_name = wanted is not None and (wanted == info.kind or wanted in words)
@@ -94,13 +95,13 @@ def select(selector: str | None) -> cl.Device:
 
 
 def find_device(selector: str | None) -> DeviceInfo:
-    """The entry of the device that `selector` names (see `select`). Raises DeviceError."""
+    """Describe the device that `selector` names (see `select`). Raises DeviceError."""
     chosen = select(selector)
     return list_devices()[all_devices().index(chosen)]
 
 
 def _names(selector: str | None) -> list[str]:
-    """The selectors in a list that is separated by commas. Raises DeviceError if `selector` is not text."""
+    """Split a list of selectors at its commas. Raises DeviceError if `selector` is not text."""
     if not isinstance(selector, str | None):
         raise DeviceError(f"device is {selector!r}, expected text, such as '0', 'gpu' or a part of a name")
     return device_names(selector)
@@ -114,7 +115,7 @@ def _part_of(name: str) -> tuple[str, int | None]:
 
 @lru_cache(maxsize=8)
 def _divided(index: int, parts: int) -> list[cl.Device]:
-    """Equal parts of the `index`-th device, by OpenCL's device fission; empty if it cannot be divided equally."""
+    """Divide the `index`-th device into `parts` equal parts, by OpenCL's device fission. Return [] if that fails."""
     device = all_devices()[index]
     try:
         units = device.max_compute_units // parts
@@ -148,7 +149,7 @@ def open_devices(
     """Open the devices of a list of selectors (see `select`), separated by commas.
 
     NAME/K selects part K of a device, counted from 0. OpenCL divides the device into max(2, largest K + 1) equal parts.
-    Without a limit, repeated calls return the same object for the same device.
+    Without `memory_limit`, repeated calls return the same object for the same device.
 
     memory_limit: maximum bytes of all buffers of each returned device.
     profile: True makes queues that record timings.

@@ -15,7 +15,7 @@ from clsplat.device.context import Device
 from clsplat.errors import CapacityError
 
 UPLOAD_RING_SLOTS = 3
-"""Number of slots of a ring: one each for the array in use, the array that the next work uses, and the array being
+"""Number of slots of a ring: one each for the array in use, the array that is used next, and the array that is being
 uploaded."""
 
 
@@ -26,7 +26,7 @@ class _Slot:
     key: the caller's key of the uploaded array (`UploadRing.begin`).
     held: the uploaded array, in the memory of `array`.
     arrived: event of the copy to the device.
-    used: event of the last launch that uses the uploaded array.
+    used: event after the last launch that uses the uploaded array; None if it has not been put on the queue yet.
     """
 
     array: DeviceArray
@@ -38,8 +38,8 @@ class _Slot:
 
 
 class UploadRing:
-    """A ring of UPLOAD_RING_SLOTS arrays, at most `nbytes` bytes each, that are uploaded before the device needs them.
-    Raises CapacityError if there is not enough memory."""
+    """Device memory for UPLOAD_RING_SLOTS arrays of at most `nbytes` bytes each, which are uploaded before kernels need
+    them. A new array replaces the least recently used one. Raises CapacityError if there is not enough memory."""
 
     def __init__(self, device: Device, nbytes: int) -> None:
         self._device, self.nbytes = device, nbytes
@@ -48,13 +48,15 @@ class UploadRing:
             self._queue = cl.CommandQueue(device.context, device.cl_device)
             hosts = [pinned(device, (nbytes,), np.uint8) for _ in range(UPLOAD_RING_SLOTS)]
         except cl.Error as error:
-            raise CapacityError(f"{device.name}: no room for a second queue or pinned memory ({error})") from None
+            raise CapacityError(f"{device.name}: no second queue or pinned memory available ({error})") from None
         self._slots = [_Slot(*pair) for pair in zip(arrays, hosts, strict=True)]
         """The slots, in order of their last use; the least recently used is first."""
 
     def begin(self, key: object, values: NDArray[Any]) -> None:
-        """Start to upload an array, which `take` returns by its key. Arrays that are too large or already in the ring
-        are skipped."""
+        """Start to upload the host array `values`. `take` returns it by its key.
+
+        Does nothing if the array is larger than a slot, or an array with this key is in the ring.
+        """
         if values.nbytes > self.nbytes or any(slot.key == key for slot in self._slots):
             return
         done = cl.enqueue_marker(self._device.queue)
@@ -65,7 +67,7 @@ class UploadRing:
         slot = self._slots[0]
         self._touch(slot)
         if slot.arrived is not None:
-            slot.arrived.wait()  # until the slot's last upload no longer reads the pinned memory
+            slot.arrived.wait()  # the earlier upload from this pinned memory may not be complete
         host = slot.host[: values.nbytes].view(values.dtype).reshape(values.shape)
         host[...] = values
         slot.held, slot.key = DeviceArray(self._device, slot.array.buffer, values.shape, values.dtype), key
@@ -76,7 +78,7 @@ class UploadRing:
         self._device.calls.writes += 1
 
     def take(self, key: object) -> DeviceArray | None:
-        """The uploaded array with this key, for later launches; None if it was not uploaded.
+        """Return the uploaded array with this key, for later launches; None if it is not in the ring.
 
         The array is valid until UPLOAD_RING_SLOTS - 1 other arrays have been uploaded or taken.
         """
@@ -94,5 +96,5 @@ class UploadRing:
 
     @property
     def taken(self) -> int:
-        """Bytes of device memory that the ring occupies."""
+        """Bytes of device memory that the ring's arrays take."""
         return UPLOAD_RING_SLOTS * self.nbytes

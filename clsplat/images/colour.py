@@ -120,8 +120,9 @@ def displayed(rgb: NDArray[Any], space: str) -> Float32:
 
 @lru_cache(maxsize=8)
 def _to_srgb(space: str, source: str) -> Colours:
-    """Return the conversion from a model's colour space to sRGB. It is cached, because a viewer shows many images.
+    """Return the `Colours` of a model whose output is sRGB. They are cached, because a viewer shows many images.
 
+    space: the model's colour space.
     source: OpenColorIO configuration; "" for the built-in one.
     """
     return Colours(ColourConfig(colorspace=SRGB, ocio_config=source), space)
@@ -139,7 +140,7 @@ class Colours:
     def __init__(self, config: ColourConfig | None = None, recorded: str = SRGB) -> None:
         """Load the OpenColorIO configuration and look up the spaces.
 
-        recorded: the model's colour space from `recorded_space`, unless `config` names another.
+        recorded: the model's colour space, from `recorded_space`. `config.model_colorspace` overrides it.
         Raises InputError if the configuration does not load or lacks a space. The message lists similar names.
         """
         config = config or ColourConfig()
@@ -209,12 +210,12 @@ class Colours:
         return str(resolved)
 
     def _ocio_name(self, space: str) -> str:
-        """Return the space's name in the configuration. Raises InputError if it lacks linear Rec.709."""
+        """Return the name that a space has in the OpenColorIO configuration. Raises InputError if it has none."""
         for name in _SPACE_ALIASES.get(space, (space,)):
             if self._config.getColorSpaceIndex(self._config.resolve(name)) >= 0:
                 return str(self._config.resolve(name))
         raise InputError(
-            f"{self._source}: has none of {', '.join(_SPACE_ALIASES[space])}, expected one of them for conversions"
+            f"{self._source}: lacks a colour space for conversions, expected one of {', '.join(_SPACE_ALIASES[space])}"
         )
 
     def convert(self, rgb: Float32, alpha: Float32 | None, source: str, target: str) -> Float32:
@@ -243,7 +244,8 @@ class Colours:
             self._matrices[names] = self._matrix(*names) if linear else None
         if (matrix := self._matrices[names]) is None:
             return self._converted(rgb, names[0], names[1])
-        red, green, blue = (rgb[:, :, index, None] for index in range(3))  # BLAS would vary the order of the sum
+        # not a matrix product, as BLAS would vary the order of the sum
+        red, green, blue = (rgb[:, :, index, None] for index in range(3))
         return np.asarray(red * matrix[0] + green * matrix[1] + blue * matrix[2], np.float32)
 
     def _matrix(self, source: str, target: str) -> Float32 | None:
@@ -255,7 +257,7 @@ class Colours:
         light = np.array([[[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0], [4, -1, 2], [0.2, 0.01, 0.5]]], np.float32)
         colours = self._converted(light, source, target)
         matrix, sums = colours[0, :3], colours[0, 3:]
-        # the tolerance is small compared with values of up to 4
+        # the tolerance is small compared with the tested values of up to 4
         linear = np.allclose(light[0, 3:] @ matrix, sums, rtol=1e-5, atol=1e-5)
         return matrix if linear else None
 
@@ -281,9 +283,13 @@ def configuration_digest(source: str) -> str:
 
 @lru_cache(maxsize=8)
 def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG001  # `changed` is a key of the cache
-    """Return glob patterns of the files that a configuration's FileTransforms name, in its search_path's folders.
+    """Return glob patterns for the files that the FileTransforms in an OpenColorIO configuration may read.
 
-    Environment variables in the names become "*".
+    There is a pattern for each file name in each folder of the configuration's search_path, with "*" in place of
+    environment variables.
+
+    source: path of the configuration.
+    changed: time of its last change.
     """
     text = Path(source).read_text("utf-8", "replace")
     listed = re.search(r"^search_path:([^\n]*(?:\n[ \t]*- [^\n]*)*)", text, re.MULTILINE)

@@ -45,7 +45,7 @@ def id_bits(name: str) -> int:
 
 
 def header_of(layer: str, names: Sequence[str]) -> dict[str, str]:
-    """Return a layer's header attributes: name, hash and conversion of ids, and the manifest, with each name's id."""
+    """Return a Cryptomatte layer's EXR attributes: its name, how ids are made, and each object's id by name."""
     key = f"cryptomatte/{murmur3(layer.encode()):08x}"[: len("cryptomatte/") + 7]
     manifest = json.dumps({name: f"{id_bits(name):08x}" for name in names}, separators=(",", ":"))
     return {
@@ -57,9 +57,12 @@ def header_of(layer: str, names: Sequence[str]) -> dict[str, str]:
 
 
 def ranked(coverage: Float32, names: Sequence[str]) -> Float32:
-    """Return ids and coverages (H, W, 4 CRYPTOMATTE_LAYERS) of the objects that cover most of a pixel, largest first.
+    """Return ids and coverages (H, W, 4 CRYPTOMATTE_LAYERS) of the objects that cover most of each pixel.
 
-    coverage: (H, W, objects). Equal coverages keep the order of `names`. Unused entries are 0.
+    They alternate along the last axis, from the largest coverage to the smallest; unused entries are 0. Objects with
+    equal coverage are in the order of `names`.
+
+    coverage: (H, W, objects), the fraction of each pixel that each object covers.
     """
     kept = min(2 * CRYPTOMATTE_LAYERS, len(names))
     ids = np.array([id_bits(name) for name in names], np.uint32).view(np.float32)

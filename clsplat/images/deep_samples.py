@@ -27,7 +27,7 @@ _EXR_PIXEL_TYPES = {2: 1, 4: 2}
 
 
 def samples_bytes(pixels: int, most: int) -> int:
-    """Return an upper bound in bytes of `deep_data`'s scratch file, for at most `most` samples per pixel."""
+    """Return an upper bound in bytes of `deep_data`'s scratch file, for at most `most` samples in each pixel."""
     return pixels * (4 + 24 * most) + 40 * pixels + (1 << 12)
 
 
@@ -36,7 +36,7 @@ def deep_data(scratch: Path, counts: NDArray[np.int32], columns: dict[str, NDArr
 
     scratch: path of the scratch file to write and read.
     counts (H, W): number of samples of each pixel.
-    columns: half or float values (samples,) of each channel, ordered by row, by pixel, then front to back.
+    columns: values (samples,) by channel name, half or float, ordered by row, then by pixel, then front to back.
     Raises ClsplatError if OpenImageIO cannot read the scratch file.
     """
     _write(scratch, counts, columns)

@@ -73,5 +73,5 @@ def _numpy(path: Path) -> Any:
         raise InputError(f"{path}: cannot be read as NPY: {one_line(str(error))}; expected {DEPTH_MAP_KINDS}") from None
     array = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
     if array.ndim != 2 or array.dtype.kind not in "fiu" or not 0 < array.size <= MAX_IMAGE_PIXELS:
-        raise InputError(f"{path}: is {array.dtype} of shape {array.shape}, expected numbers (height, width)")
+        raise InputError(f"{path}: is {array.dtype} of shape {array.shape}, expected an array (height, width)")
     return array

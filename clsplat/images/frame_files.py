@@ -80,7 +80,7 @@ class FrameFileHeader:
 
 
 def camera_matrices(camera: Camera) -> dict[str, Float64]:
-    """Return OpenEXR's attributes worldToCamera and worldToNDC, for row vectors; none for a camera without image plane.
+    """Return OpenEXR's attributes worldToCamera and worldToNDC, for row vectors; {} for a camera without image plane.
 
     Camera space has x right, y up and z along the view, so it is left-handed. In NDC, (0, 0) is the upper left corner
     of the display window and (1, 1) the lower right. OpenEXR does not define z in NDC. Here z is 0 at the near plane
@@ -117,7 +117,7 @@ def parse_channels(text: str) -> tuple[str, ...]:
 
 
 def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> None:
-    """Raise InputError if a file with this name cannot hold the channels. video: accept names of videos too."""
+    """Raise InputError if a file with this name cannot hold the channels. video: True allows videos too."""
     extension, known = Path(path).suffix.lower(), (*FRAME_SUFFIXES, *VIDEO_SUFFIXES) if video else FRAME_SUFFIXES
     if extension not in known:
         raise InputError(f"{path}: has the extension {extension or 'none'!r}, expected one of {', '.join(known)}")
@@ -148,6 +148,7 @@ def write_channels(
 
     channels: arrays (H, W) or (H, W, C) by channel name. rgb is over black, so it is premultiplied by alpha. In an EXR
       part of integers, the id -1, for no Gaussian, becomes 4294967295.
+    encoding, header: None for the defaults.
     Raises InputError and ClsplatError like `writing.write_image`.
     """
     write_views(path, [(channels, header or FrameFileHeader())], encoding)
@@ -176,9 +177,10 @@ def encoded(
     *,
     several: bool = False,
 ) -> list[tuple[NDArray[Any], Any]]:
-    """Return pixels and OpenImageIO specification of each part of a file, for one view.
+    """Encode one view of a frame: return the pixels and OpenImageIO's specification of each part of the file.
 
-    several: True if the file has several views, so that the names of parts include the view.
+    extension: of the file, with the dot. A file that is not an EXR has only one part.
+    several: True if the file has several views. Then the name of each part includes the view's name.
     """
     channels = {name: channels[name] for name in WRITABLE_CHANNELS if name in channels}
     if extension != ".exr":
@@ -203,8 +205,8 @@ def is_whole(
 ) -> bool:
     """Return True if the file is complete and holds these channels as `write_channels` writes them.
 
-    The image must have this size and a last row that decodes. Attributes must have these values or be absent. If the
-    file contains a disk block of zeros, every row must decode.
+    The image must have this size and a last row that decodes. If the file contains a disk block of zeros, every row
+    must decode. Each of `attributes` must have its value in the file's header or be absent.
 
     deep: expect a deep image, whose channels are DEEP_CHANNELS.
     views: number of views; each must have these channels.
@@ -232,7 +234,7 @@ def is_whole(
             )
             if (spec.width, spec.height, spec.deep) != (width, height, deep):
                 return False
-            if sorted(spec.channelnames) != sorted(names):  # OpenImageIO reorders the channels of an EXR
+            if sorted(spec.channelnames) != sorted(names):  # sorted, as OpenImageIO reorders channels
                 return False
             if any(attribute_of(spec, key) not in (None, value) for key, value in (attributes or {}).items()):
                 return False
@@ -280,7 +282,7 @@ def _exr_part(
         for name, plane in zip(names, planes, strict=True):
             _check_floats(name, plane)
             for channel in range(plane.shape[2]):
-                if formats[at] == oiio.HALF:  # larger values would become infinite
+                if formats[at] == oiio.HALF:  # clipped, because larger values would become infinite
                     np.clip(plane[:, :, channel], -MAX_HALF_FLOAT, MAX_HALF_FLOAT, out=pixels[:, :, at])
                 else:
                     pixels[:, :, at] = plane[:, :, channel]
@@ -320,7 +322,7 @@ def _picture(
         spec.attribute("oiio:BitsPerSample", bits)
         spec.attribute("oiio:Endian", "big")
     if extension == ".png":
-        if not header.is_srgb:  # by default OpenImageIO would write the chunks sRGB, gAMA and cHRM
+        if not header.is_srgb:  # keeps OpenImageIO from writing the chunks sRGB, gAMA and cHRM
             spec.attribute("oiio:ColorSpace", "unknown")
         spec.attribute("oiio:UnassociatedAlpha", 1)
         spec.attribute("png:compressionLevel", _PNG_LEVEL)
@@ -331,7 +333,7 @@ def _picture(
 
 
 def deep_spec(width: int, height: int, encoding: Encoding, header: FrameFileHeader) -> Any:
-    """Return OpenImageIO's specification of a deep EXR, with colours of the encoding's depth and depths as floats."""
+    """Return OpenImageIO's specification of a deep EXR: colours in `encoding.depth`, half or float; depths in float."""
     spec = _exr_spec((height, width, len(DEEP_CHANNELS)), DEEP_CHANNELS, [oiio.FLOAT], header)
     spec.deep = True
     spec.channelformats = (oiio.TypeDesc(encoding.depth),) * 4 + (oiio.TypeDesc("float"),) * 2
@@ -379,18 +381,15 @@ def _spec(shape: tuple[int, ...], names: Sequence[str], kind: Any, header: Frame
 
 
 def record_text(attributes: Mapping[str, Any]) -> str:
-    """Return the provenance record, a text with the digests of model and settings; '' if one of them is missing.
-
-    It is for file formats without custom attributes.
-
-    attributes: attributes of a frame's header.
+    """Return the provenance record for file formats without custom attributes: a text with the digests of model and
+    settings. It is '' if `attributes`, those of a frame's header, lack one of the digests.
     """
     model, settings = attributes.get(MODEL_DIGEST_ATTRIBUTE), attributes.get(SETTINGS_DIGEST_ATTRIBUTE)
     return f"clsplat model {model} settings {settings}" if model and settings else ""
 
 
 def parse_record(text: object) -> dict[str, str]:
-    """Return the digest attributes in a provenance record from `record_text`; none for any other text."""
+    """Return the digests in a provenance record from `record_text`, as attributes by name; {} for any other text."""
     match = _RECORD_PATTERN.search(str(text or ""))
     return {MODEL_DIGEST_ATTRIBUTE: match[1], SETTINGS_DIGEST_ATTRIBUTE: match[2]} if match else {}
 

@@ -38,7 +38,7 @@ class Surfaces:
         return int(np.ceil(self.counts.mean(axis=1).max(initial=0)))
 
     def taken(self, across: NDArray[np.int64], down: NDArray[np.int64]) -> Surfaces:
-        """Resample: pixel (x, y) of the result gets the surfaces of pixel (across[x], down[y]); none if outside."""
+        """Resample: pixel (x, y) of the result gets the surfaces of pixel (across[x], down[y]), if it exists."""
         height, width = self.counts.shape
         if np.array_equal(across, np.arange(width)) and np.array_equal(down, np.arange(height)):
             return self
@@ -50,7 +50,7 @@ class Surfaces:
         return Surfaces(counts, self.rows[np.repeat(first, flat) + np.arange(flat.sum())])
 
     def scaled(self, factors: Float32) -> Surfaces:
-        """Multiply the depths of each pixel by the pixel's factor in `factors` (H, W)."""
+        """Return a copy in which the depths of each pixel are multiplied by the pixel's factor in `factors` (H, W)."""
         by = np.repeat(factors.ravel(), self.counts.ravel())[:, None]
         return Surfaces(self.counts, (self.rows * np.concatenate([by, by, by**0, 1 / by], axis=1)).astype(np.float32))
 
@@ -60,7 +60,7 @@ class Holdout:
     """Surfaces of CG elements that hold out the model in a frame.
 
     surfaces: surfaces in the file's data window.
-    x, y: first pixel of the data window, in the frame.
+    x, y: position of the data window's first pixel in the frame.
     size: width and height of the frame.
     """
 
@@ -73,6 +73,7 @@ class Holdout:
 def check_holdout(path: Path, size: tuple[int, int], channel: str = "") -> bool:
     """Check the header of a holdout file. Return True if the file's depths are half floats.
 
+    channel: name of the depth channel; "" for Z.
     Raises InputError if the file cannot be a holdout of a frame of this size (width, height).
     """
     with _part(path, size, channel) as (source, _, places):
@@ -116,7 +117,7 @@ def read_holdout(path: Path, size: tuple[int, int], channel: str = "", *, invers
 def surfaces_of(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Surfaces:
     """Return surfaces from front depths, back depths and alpha, each (H, W, count).
 
-    Entries with a front depth of 0 or infinity, or an alpha of 0, are no surfaces.
+    Entries with a front depth of 0 or infinity, or an alpha of 0, are left out.
     """
     counts = np.full(begin.shape[0] * begin.shape[1], begin.shape[2])
     return _surfaces(begin.ravel(), end.ravel(), alpha.ravel(), counts, begin.shape[:2])
@@ -125,9 +126,9 @@ def surfaces_of(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> 
 def _surfaces(
     begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any], counts: NDArray[np.int64], shape: tuple[int, ...]
 ) -> Surfaces:
-    """Return surfaces from front depths, back depths and alpha (S,), ordered by pixel of an image of `shape` (H, W).
+    """Return surfaces like `surfaces_of`, from values (S,) of an image of `shape` (H, W), ordered by pixel.
 
-    counts: (H W,), number of values of each pixel.
+    counts: (H W,), number of the values that belong to each pixel.
     """
     alpha = np.clip(alpha, 0, 1)
     shown = (begin > 0) & (begin < np.inf) & (alpha > 0)
@@ -141,7 +142,10 @@ def _surfaces(
 
 
 def _rows(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Float32:
-    """Return HOLDOUT_SURFACE_FIELDS of each surface. An opaque surface's back depth is set to its front depth."""
+    """Return HOLDOUT_SURFACE_FIELDS (S, 4) from front depths, back depths and alpha, each (S,).
+
+    The back depth of an opaque surface is set to its front depth.
+    """
     rows = np.zeros((len(begin), len(HOLDOUT_SURFACE_FIELDS)), np.float32)
     rows[:, 0], rows[:, 2] = begin, 1 - alpha
     rows[:, 1] = np.where((alpha < 1) & (end > begin), end, begin)
@@ -153,7 +157,12 @@ def _rows(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Float3
 
 @contextmanager
 def _part(path: Path, size: tuple[int, int], channel: str) -> Iterator[tuple[Any, int, list[int | None]]]:
-    """Yield OpenImageIO's input, the part with the depths, and the channel indices of depths, alpha and back depths."""
+    """Open a holdout file. Yield OpenImageIO's input, the number of the part that contains the depth channel, and the
+    indices of the channels of front depths, alpha and back depths. An index is None if the file lacks the channel.
+
+    size: width and height of the frame.
+    channel: name of the depth channel; "" for Z.
+    """
     if not is_file(path):
         raise InputError(f"{path}: no such holdout file, expected a depth or deep EXR for each rendered frame")
     source = open_image(path)

@@ -34,9 +34,10 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_IMAGE_PIXELS = 1 << 28
 """Largest number of pixels of an image that is read."""
 MAX_UNCHECKED_CHANNEL_VALUES, MAX_CHANNEL_VALUES_PER_BYTE = 48 << 20, 4096
-"""Limits of the values (pixels times channels) to which a file may decode: in all, and for each byte of the file.
+"""Limits of the values (pixels times channels) that an image may have: a number for all files, and a number for each
+byte of the file. The larger of the two limits applies.
 
-The larger of the two limits applies. No real image has more per byte, as deflate expands a byte to at most 1032 bytes.
+No real image has more values per byte, as deflate expands a byte to at most 1032 bytes.
 """
 _DECODE_CHECK_ROWS = 64
 """Number of rows that `decodes` reads at a time."""
@@ -118,7 +119,7 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
     paths: list[Path] = []
     seen: set[str] = set()
     for root, folders, files in os.walk(folder, followlinks=True, onerror=cannot_be_searched):
-        real = os.path.realpath(root)  # An inode would not do: some file systems of Windows give 0 for every folder.
+        real = os.path.realpath(root)  # not the inode, which is 0 for every folder on some file systems of Windows
         if real in seen:
             folders.clear()
             continue
@@ -133,7 +134,7 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
 
 
 def cannot_be_searched(error: OSError) -> None:
-    """Raise InputError for a folder that cannot be read: the `onerror` of `os.walk`, which would skip the folder."""
+    """Raise InputError for a folder that cannot be read. `os.walk` calls this instead of skipping the folder."""
     why = reason_of(error)
     raise InputError(f"{error.filename}: cannot be searched for pictures: {why}; make it readable or move it away")
 
@@ -234,13 +235,13 @@ def turned(image: NDArray[T], orientation: int) -> NDArray[T]:
 
 
 def channels_of(spec: Any) -> list[str]:
-    """Return the upper-case name of each channel, "" where the decoder's list of names is too short."""
+    """Return each channel's name in upper case; "" for channels that the decoder's list of names does not reach."""
     names = [name.upper() for name in spec.channelnames][: spec.nchannels]
     return names + [""] * (spec.nchannels - len(names))
 
 
 def alpha_of(spec: Any) -> int:
-    """Return the index of the alpha channel, -1 for none.
+    """Return the index of the alpha channel in OpenImageIO's specification of an image; -1 if there is none.
 
     The decoder's index may be too large (OpenImageIO gives 4 for a GIF of 4 channels) or point to a colour channel. In
     both cases the channel called A is used.
@@ -265,7 +266,7 @@ def open_image(path: Path) -> Any:
         known = file.read(8).startswith(IMAGE_SIGNATURES)
     if size > MAX_IMAGE_FILE_BYTES or (size > MAX_UNSIGNED_IMAGE_BYTES and not known):
         raise InputError(
-            f"{path}: has {size} bytes, expected a picture of at most {MAX_IMAGE_FILE_BYTES} bytes in a usual format"
+            f"{path}: has {size} bytes, expected a picture in a known format, of at most {MAX_IMAGE_FILE_BYTES} bytes"
         )
     source = oiio.ImageInput.open(native_name(path), hints)
     if source is None:
@@ -285,7 +286,7 @@ def open_image(path: Path) -> Any:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """Open a file as a context manager: OpenImageIO's input, or None if it is not an image. Errors are discarded."""
+    """Open a file, yield OpenImageIO's input, or None if it is not an image, and close it. Errors are discarded."""
     source = oiio.ImageInput.open(native_name(path))
     try:
         yield source
@@ -307,7 +308,7 @@ def decodes(source: Any, part: int, first: int) -> bool:
 
 
 def error_of(source: Any) -> str:
-    """Return OpenImageIO's message of the last error."""
+    """Return the message of the last error of `source`, OpenImageIO's input; '' if there was none."""
     try:
         return str(source.geterror())
     except UnicodeDecodeError:
@@ -377,8 +378,11 @@ def png_is_whole(path: Path) -> bool:
 
 
 def _resampling(source: int, target: int) -> Any:
-    """Return a sparse matrix (target, source) that resamples an axis; each row's weights sum to 1."""
-    from scipy import sparse  # Here, because the import takes a quarter of a second and most commands do not need it.
+    """Return a sparse matrix (target, source) that resamples an axis of `source` pixels to `target` pixels.
+
+    The weights in each row sum to 1.
+    """
+    from scipy import sparse  # imported here, as the import takes 0.25 s and few commands need it
 
     if target >= source:
         centres = (np.arange(target) + 0.5) * (source / target) - 0.5
@@ -391,7 +395,7 @@ def _resampling(source: int, target: int) -> Any:
         low, high = edges[:-1], edges[1:]
         index = np.floor(low).astype(int) + np.arange(int(np.ceil(source / target)) + 1)[:, None]
         weights = np.clip(np.minimum(index + 1, high) - np.maximum(index, low), 0, None)
-        index = np.minimum(index, source - 1)  # the weight beyond the last pixel is 0
+        index = np.minimum(index, source - 1)  # indices beyond the last pixel have weight 0
         weights /= weights.sum(axis=0)
     rows = np.broadcast_to(np.arange(target), index.shape)
     matrix = sparse.coo_matrix((weights.ravel(), (rows.ravel(), index.ravel())), shape=(target, source))

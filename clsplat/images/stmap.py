@@ -25,19 +25,20 @@ HALF_FLOAT_SIDE_LIMIT_PX = 2048
 
 
 _ORIENTATION_CELLS_PER_SIDE = 32
-"""Number of grid cells along each side of an image in the test that it is an STMap (`_oriented_share`)."""
+"""Number of grid cells along each side of an image in `_oriented_share`, which tests if the image is an STMap."""
 _MIN_CELL_SINE = 0.05
-"""A cell has an orientation if the sine of the angle between its mapped sides is at least this, in magnitude."""
+"""A grid cell counts as mirrored or not mirrored only if the angle between its mapped sides has a sine of at least this
+magnitude."""
 _MIN_ORIENTED_SHARE = 0.7
-"""Minimum fraction of cells with the same orientation in an STMap. In an ordinary picture it is about a half, and in a
-grey picture 0, because the mapped sides of its cells coincide."""
+"""Minimum result of `_oriented_share` for an STMap. For an ordinary picture the result is about a half, and for a grey
+picture 0, because the mapped sides of its cells coincide."""
 
 
 @dataclass(frozen=True, eq=False)
 class StMap:
     """STMap from a file.
 
-    values: (H, W, 2) float32, horizontal and vertical source position, as fractions.
+    values: (H, W, 2) float32, source position of each pixel, as fractions of the source's width and height.
     x, y: position of the map's first pixel in the frame; may be negative.
     width, height: size of the frame.
     digest: SHA-256 of the map's file.
@@ -76,7 +77,7 @@ class StMap:
         def line(row: np.ndarray) -> Float64:
             begin, end = (values[row[:, None], column[None, :]].astype(np.float64) for column in (left, right))
             mixed = begin + across * (end - begin)
-            return np.asarray(np.where(across == 0, begin, mixed))  # 0 times a non-finite neighbour would be NaN
+            return np.asarray(np.where(across == 0, begin, mixed))  # avoids 0 times a non-finite neighbour
 
         upper, lower = line(above), line(below)
         return np.asarray(np.where(down == 0, upper, upper + down * (lower - upper)))
@@ -91,7 +92,7 @@ def read_stmap(path: Path) -> StMap:
     try:
         changed = path.stat().st_mtime_ns
     except OSError:
-        changed = 0  # open_image reports the error
+        changed = 0  # the file cannot be found, which open_image reports
     return _read(path, changed)
 
 
@@ -111,10 +112,10 @@ def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # `changed` is a 
     if pixels is None:
         raise InputError(f"{path}: does not decode: {one_line(reason)}; expected an STMap")
     values = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)[:, :, channels]
-    if (share := _oriented_share(values)) < _MIN_ORIENTED_SHARE:
+    if _oriented_share(values) < _MIN_ORIENTED_SHARE:
         raise InputError(
-            f"{path}: looks like a picture: R and G have the same orientation in {100 * share:.0f} % of its cells, "
-            "expected an STMap, whose R and G are positions"
+            f"{path}: looks like a picture: as an STMap, it would mirror some cells of a grid and not others; expected "
+            "R and G that are positions in another image"
         )
     if "half" in kinds and max(spec.full_width, spec.full_height) >= HALF_FLOAT_SIDE_LIMIT_PX:
         warn(f"{path}: has half floats, too coarse for {spec.full_width}x{spec.full_height} pixels; write floats")
@@ -123,10 +124,12 @@ def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # `changed` is a 
 
 
 def _oriented_share(values: Float32) -> float:
-    """Return the fraction of a map's grid cells with the more common orientation, mirrored or not mirrored.
+    """Return the fraction of grid cells that an STMap mirrors, or that it does not mirror, whichever is larger.
 
-    Cells without finite and varying values are left out. The result is 1 for a map that is too small to judge or has no
-    finite values. It is 0 for a map whose positions lie on a line or in a point.
+    Cells whose values are not finite or do not vary are left out. The result is 1 for a map that is too small to judge
+    or has no finite values. It is 0 for a map whose positions lie on a line or in a point.
+
+    values: (H, W, 2), as in `StMap`.
     """
     rows, columns = (np.arange(0, side, max(side // _ORIENTATION_CELLS_PER_SIDE, 1)) for side in values.shape[:2])
     if len(rows) < _ORIENTATION_CELLS_PER_SIDE // 2 or len(columns) < _ORIENTATION_CELLS_PER_SIDE // 2:
@@ -139,7 +142,7 @@ def _oriented_share(values: Float32) -> float:
         told = np.isfinite(areas) & (sides > 0)
     if not told.any():
         return 0.0 if np.isfinite(corners).any() else 1.0
-    turned = areas[told] / sides[told]  # sine of the angle between the sides
+    turned = areas[told] / sides[told]  # sine of the angle between a cell's mapped sides
     return float(max((turned > _MIN_CELL_SINE).mean(), (turned < -_MIN_CELL_SINE).mean()))
 
 

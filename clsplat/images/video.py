@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writing of videos frame by frame: .mp4 (H.264) or .mov (ProRes), with PyAV (`pip install 'clsplat[video]'`).
 
-`VideoConfig` and DEFAULT_VIDEO_FPS in `config.pictures` have the settings.
+The settings of a video are in `config.pictures`: `VideoConfig` and DEFAULT_VIDEO_FPS.
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ def video_missing() -> str:
 
 
 MBTREE_MIN_SIDE_PX = 128
-"""Shorter side in pixels below which x264's macroblock tree (mbtree) is off, for the same bytes in every encoding.
+"""x264's macroblock tree (mbtree) is switched off for videos whose shorter side is below this number of pixels.
 
-With the tree on a busy machine, up to 102 of 250 encodings of a 48x40 video had other bytes, and none of 225 of a
-320x240 video. In a larger video the tree saves a quarter of the bytes.
+With the tree, the bytes of small videos vary: on a busy machine, up to 102 of 250 encodings of a 48x40 video differed,
+but none of 225 of a 320x240 video. In a larger video the tree saves a quarter of the bytes.
 """
 
 
 MAX_VIDEO_SIDE_PX = 16384
 """Largest side of a video in pixels: x264's MAX_RESOLUTION."""
 MAX_VIDEO_MEGAPIXELS = 260
-"""Largest frame of a video, for messages: FFmpeg (av_image_check_size) requires 8 (width + 128) (height + 128) < 2^31.
-"""
+"""Largest frame of a video in megapixels, as error messages give it. FFmpeg's exact limit (av_image_check_size) is
+8 (width + 128) (height + 128) < 2^31."""
 
 
 def video_record(path: Path, frames: int | None = None) -> dict[str, str]:
@@ -91,19 +91,18 @@ def check_video(path: Path) -> None:
 
 
 def check_codec(path: str, config: VideoConfig, channels: Collection[str]) -> None:
-    """Raise InputError for settings of another codec than the video's, and for alpha that its codec cannot hold.
-
-    path: the video; its extension gives the codec.
+    """Raise InputError if `config` has settings of a codec that the video does not use, or if `channels` contain alpha
+    and the video's codec cannot hold it. The extension of `path` determines the codec: .mp4 is H.264, .mov is ProRes.
     """
     usual = VideoConfig()
     if Path(path).suffix.lower() == ".mp4":
         if config.prores != usual.prores:
-            raise InputError(f"--video.prores {config.prores}: is for ProRes, expected the name of a .mov, not {path}")
+            raise InputError(f"--video.prores {config.prores}: applies to ProRes only, expected a .mov, not {path}")
         return
     for name in ("crf", "preset"):
         if getattr(config, name) != getattr(usual, name):
             value = getattr(config, name)
-            raise InputError(f"--video.{name} {value}: is for H.264, expected the name of an .mp4, not {path}")
+            raise InputError(f"--video.{name} {value}: applies to H.264 only, expected an .mp4, not {path}")
     if "alpha" in channels and config.prores != "4444":
         raise InputError(f"{path}: ProRes {config.prores} cannot hold alpha, expected --video.prores 4444")
 
@@ -173,12 +172,12 @@ def _left_sited(chroma: NDArray[Any]) -> NDArray[Any]:
 
 
 def planes_of(path: Path, image: NDArray[Any], alpha: NDArray[Any] | None, prores: ProRes) -> VideoPlanes:
-    """Convert a frame to the planes of the codec that the extension of the video `path` gives."""
+    """Convert a frame to planes: by `prores_planes` if the video's `path` ends in .mov, else by `frame_planes`."""
     return prores_planes(image, alpha, prores) if path.suffix.lower() == ".mov" else frame_planes(image)
 
 
 def rate_of(fps: float) -> Fraction:
-    """Return the frame rate for a file as a fraction. Rounded NTSC rates become exact: 23.976 becomes 24000/1001."""
+    """Convert a frame rate to a fraction for a video file. Rounded NTSC rates become exact: 23.976 is 24000/1001."""
     whole = round(fps * 1.001)
     ntsc = Fraction(1000 * whole, 1001)
     near = 5e-3 if whole % 24 == 0 or whole % 30 == 0 else 1e-4
@@ -207,7 +206,7 @@ def video_writer(path: Path, config: VideoConfig | None = None, comment: str = "
 
 
 def _frame_of(planes: tuple[NDArray[np.uint16], ...], form: str) -> Any:
-    """Return a PyAV frame from 16-bit planes. form: FFmpeg's name of the frame's pixel format."""
+    """Return a PyAV frame with these planes, luma first. form: FFmpeg's name of the frame's pixel format."""
     import av
 
     height, width = planes[0].shape
@@ -216,7 +215,7 @@ def _frame_of(planes: tuple[NDArray[np.uint16], ...], form: str) -> Any:
         lines = np.zeros((values.shape[0], plane.line_size // 2), np.uint16)
         lines[:, : values.shape[1]] = values
         plane.update(lines)
-    # 1 is Rec.709, and limited range. ProRes stores these in each frame's header; the encoder reads them here.
+    # The code 1 means Rec.709, in color_range limited range. The ProRes encoder writes these to each frame's header.
     frame.colorspace = frame.color_primaries = frame.color_trc = frame.color_range = 1
     return frame
 
@@ -242,7 +241,7 @@ class VideoWriter:
         self.frames = 0
 
     def add(self, planes: VideoPlanes) -> None:
-        """Append a frame from `planes_of`. All frames must have the same size and kind.
+        """Append a frame, given its planes from `planes_of`. All frames must have the same size and planes.
 
         Raises ClsplatError if writing fails, ValueError for a frame of another size.
         """
@@ -294,7 +293,7 @@ class VideoWriter:
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, form
         context = self._stream.codec_context
         context.time_base = 1 / rate
-        # 1 is Rec.709 (its transfer function is close to sRGB's), and limited range.
+        # The code 1 means Rec.709 (its transfer function is close to sRGB's), in color_range limited range.
         context.colorspace = context.color_primaries = context.color_trc = 1
         context.color_range = 1
 
@@ -324,5 +323,5 @@ class VideoWriter:
     def close(self) -> None:
         """Close the file, complete or not."""
         if self._container is not None:
-            with suppress(Exception):  # After a failure, an error in closing would hide the error that caused it.
+            with suppress(Exception):  # an error here would hide an earlier error, which is the cause
                 self._container.close()

@@ -20,7 +20,7 @@ from clsplat.images.alpha import associate
 from clsplat.images.reading import decodes, one_line, opened, png_is_whole
 
 CHANNEL_NAMES_BY_COUNT = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
-"""Names of the channels of an image in a file, keyed by their number."""
+"""Names of an image's channels in a file, by the number of channels."""
 
 
 def write_image(path: Path, image: NDArray[Any]) -> None:
@@ -65,7 +65,8 @@ def steps_of(planes: Sequence[NDArray[Any]], bits: int) -> NDArray[Any]:
     """
     height, width = planes[0].shape[:2]
     whole = np.empty((height, width, sum(plane.shape[2] for plane in planes)), np.uint8 if bits == 8 else np.uint16)
-    scratch = np.empty((height, width), np.float32 if bits == 8 else np.float64)  # float32 would round 16 bits twice
+    # float64, because float32 would round 16-bit values twice
+    scratch = np.empty((height, width), np.float32 if bits == 8 else np.float64)
     most = scratch.dtype.type(2**bits - 1)
     channels = (plane[:, :, channel] for plane in planes for channel in range(plane.shape[2]))
     for at, channel in enumerate(channels):
@@ -138,10 +139,11 @@ def _write(
     """Write an image file with parts of these specifications, atomically, and check that it is complete.
 
     kind: the file's extension without the dot.
-    steps: function that writes pixels to OpenImageIO's open file, and yields True for each call that succeeds.
+    steps: generator function of OpenImageIO's open file and the file's name. It writes the pixels in several calls, and
+    yields after each whether it succeeded.
     reasons: messages of calls that failed in another thread.
     """
-    # For JPEG, disk space is checked before: libjpeg ends the process if it cannot write.
+    # Before a JPEG is written, disk space is checked, because libjpeg ends the process if it cannot write.
     most = jpeg_room(specs[0]) if kind in ("jpg", "jpeg") else 0
     with atomic_name(path) as temporary:
         file: Any = oiio.ImageOutput.create(kind)

@@ -22,7 +22,7 @@ from clsplat.shots.viewpoints import COLMAP_UP, extent_of, look_at
 DEFAULT_ORBIT_SIZE_PX = (1280, 720)
 """Default width and height of pictures, in pixels."""
 ORBIT_FOV_RADIANS = math.radians(40.0)
-"""Field of view of the shorter side, in radians."""
+"""Field of view across a picture's shorter side, in radians."""
 SUBJECT_SAMPLE_SIZE = 100_000
 """Number of Gaussians that are sampled to locate a model. A larger sample moves its centre by less than a pixel."""
 MIN_GAUSSIANS_FOR_STRAYS = 100
@@ -30,7 +30,7 @@ MIN_GAUSSIANS_FOR_STRAYS = 100
 BALL_SHRINK_FACTOR = 0.9
 """Ratio of successive ball radii in the search for the most detailed region."""
 REGION_DETAIL_FRACTION = 0.35
-"""Largest fraction of a model's detail that its most detailed region may hold."""
+"""Largest fraction of a model's detail (the sum of opacity over size) that is in its most detailed region."""
 MAX_SCENE_REGION_RADIUS_RATIO = 0.2
 """A model is a scene around an object if the radius of its most detailed region is at most this fraction of the model's
 radius. Measured fractions are 0.3 or more for a single object, and 0.05 for a room with a table in the middle."""
@@ -49,7 +49,7 @@ CAMERAS_PER_RING = 24
 
 
 def parse_up(text: str) -> tuple[float, float, float]:
-    """Unit vector for an axis such as `x` or `-y`, or for three numbers separated by commas. Raises InputError."""
+    """Parse --up, an axis such as `x` or `-y` or three numbers with commas. Return a unit vector. Raises InputError."""
     expected = InputError(f"--up {text[:80]}: expected x, y, z, -x, -y, -z or three numbers with commas, not all 0")
     name, sign = text.strip().removeprefix("-"), -1.0 if text.strip().startswith("-") else 1.0
     if name in ("x", "y", "z"):
@@ -61,7 +61,7 @@ def parse_up(text: str) -> tuple[float, float, float]:
     most = max(abs(x), abs(y), abs(z))
     if not (0 < most < math.inf and math.isfinite(x + y + z)):
         raise expected
-    x, y, z = x / most, y / most, z / most  # so that the squares neither overflow nor underflow
+    x, y, z = x / most, y / most, z / most  # scaled, so that the squares neither overflow nor underflow
     length = math.hypot(x, y, z)
     return x / length, y / length, z / length
 
@@ -101,11 +101,12 @@ def cameras_around(
 
 
 def among(own: Sequence[Camera], size: tuple[int | None, int | None] = (None, None)) -> list[Camera]:
-    """The photographs' own cameras as pinholes, without those far from the others, for a path among them.
+    """Return pinhole cameras with the poses of the photographs' cameras `own`, for a path among them.
+
+    Cameras far from the others are left out. Cameras that are not perspective get the default field of view.
 
     size: width and height in pixels. If both are given, the field of view is the largest that the photographs cover.
       Otherwise the pictures keep the photographs' aspect ratio.
-    Cameras that are not perspective are replaced by pinholes with the default field of view.
     """
     far = stray_cameras(own)
     return [_pinhole(camera, size) for camera, stray in zip(own, far, strict=True) if not stray]
@@ -148,7 +149,8 @@ def _size(size: tuple[int | None, int | None]) -> tuple[int, int]:
 
 
 def _subject(gaussians: Gaussians) -> tuple[Float64, float]:
-    """Centre (3,) in the world and radius of a scene's most detailed region, or of an object without its outliers.
+    """Return the centre (3,) in the world and the radius of the model's part that an orbit shows: the most detailed
+    region of a scene, or an object without its outliers.
 
     A ball shrinks towards the greatest detail, measured as opacity over size (mean shift, Fukunaga and Hostetler 1975),
     until it holds at most REGION_DETAIL_FRACTION of the detail.
@@ -170,7 +172,7 @@ def _subject(gaussians: Gaussians) -> tuple[Float64, float]:
     wanted = REGION_DETAIL_FRACTION * detail.sum()
     while (inside := np.linalg.norm(means - centre, axis=1) <= radius).any() and detail[inside].sum() > wanted:
         centre, radius = np.average(means[inside], axis=0, weights=detail[inside]), BALL_SHRINK_FACTOR * radius
-        if radius <= MAX_SCENE_REGION_RADIUS_RATIO * whole / 100:  # all detail is in one place
+        if radius <= MAX_SCENE_REGION_RADIUS_RATIO * whole / 100:  # stops, as all detail is in one place
             break
     if radius > MAX_SCENE_REGION_RADIUS_RATIO * whole:
         return middle + gaussians.origin, whole

@@ -19,16 +19,16 @@ FRAME_FIELD_PATTERN = re.compile(
     r"|\$F(?P<houdini>\d+)?(?!\w)|<F(?P<angled>\d+)?>",
     re.ASCII,
 )
-"""Pattern of a field for a frame's number or name in a file name, in the notations of renderers and compositors."""
+"""Pattern of a field in a file name, such as #### or {name}, that stands for a frame's number or name."""
 
 KNOWN_FRAME_FIELDS = "{name}, {frame}, ####, @@@@, %04d, $F4 or <F4>"
 UNKNOWN_FIELD_PATTERN = re.compile(r"%[-+ ]?\d*\.?\d*[diouxXeEfgGcsV]|[{}][^{}]*\}?|\$F\w*|<\w*>")
-"""Pattern of text that looks like a field but is not a known one."""
+"""Pattern of text in a file name that looks like a field but does not match FRAME_FIELD_PATTERN."""
 
 
 def parse_frames(text: str) -> list[int]:
-    """Frame numbers of a list such as 1-100, 1-100:2, 1-100x2, 10-1 or 7,12,30-40, without duplicates, in increasing
-    order.
+    """Parse a list of frames such as 1-100, 1-100:2, 1-100x2, 10-1 or 7,12,30-40. Return the frame numbers without
+    duplicates, in increasing order.
 
     A step counts from the start of its range and must be at least 1. Negative numbers are allowed: -5--1 is five
     frames. Raises InputError for any other text.
@@ -38,7 +38,7 @@ def parse_frames(text: str) -> list[int]:
         match = FRAME_RANGE_PATTERN.fullmatch(word.strip())
         if match is None:
             raise InputError(
-                f"--frames {text}: {word.strip()!r} is no frame or range, expected for example 1-100:2 or 7,12"
+                f"--frames {text}: {word.strip()!r} is not a frame or a range, expected for example 1-100:2 or 7,12"
             )
         first = int(match[1])
         last, step = int(match[2] or first), int(match[3] or 1)
@@ -53,7 +53,7 @@ def parse_frames(text: str) -> list[int]:
 
 
 def ranges(frames: Sequence[int]) -> str:
-    """Short text for frame numbers in increasing order, such as 1-3,7. Only the first eight ranges are listed."""
+    """Write frame numbers in increasing order as text such as 1-3,7. Only the first eight ranges are listed."""
     runs: list[list[int]] = []
     for frame in frames:
         if runs and frame == runs[-1][1] + 1:
@@ -65,11 +65,11 @@ def ranges(frames: Sequence[int]) -> str:
 
 
 def path_of(pattern: str, frame: int, name: str) -> Path:
-    """The file of a frame. Raises InputError for a name that leads out of the output folder.
+    """Return the path of a frame's file: `pattern` with the frame's number and name in its fields.
 
     `####`, `@@@@`, `%04d`, `{frame:04}`, `$F4` and `<F4>` become the frame's number, padded to four digits. `%d`,
     `{frame}`, `$F` and `<F>` become the number without padding. `{name}` becomes the frame's name without extension,
-    including its folders.
+    including its folders. Raises InputError for a name that leads out of the output folder.
     """
 
     def fill(match: re.Match[str]) -> str:
@@ -78,7 +78,7 @@ def path_of(pattern: str, frame: int, name: str) -> Path:
         width = match["printed"] or match["padded"] or match["houdini"] or match["angled"]
         return f"{frame:0{int(width or len(match['digits'] or ''))}d}"
 
-    # a single pass, because a name may contain # or %
+    # all fields are replaced in one pass, because a name may contain # or %
     return Path(FRAME_FIELD_PATTERN.sub(fill, pattern))
 
 
@@ -88,20 +88,20 @@ def _stem(name: str) -> str:
     stem = str(PurePosixPath(name).with_suffix(""))
     for text in (name, stem):
         if trouble := name_trouble(text):
-            raise InputError(f"image name {name!r} {trouble}, expected one for a file in the output folder")
+            raise InputError(f"image name {name!r} {trouble}, expected the name of a file in the output folder")
     return stem
 
 
 def has_number(pattern: str) -> bool:
-    """True if a path has a field for a frame's number."""
+    """Return True if a file pattern has a field for a frame's number."""
     return any(match["word"] in (None, "frame") for match in FRAME_FIELD_PATTERN.finditer(pattern))
 
 
 def numbered_files(pattern: str) -> dict[int, Path]:
-    """Existing files that match a pattern such as `model.####.ply`, by frame number, in increasing order.
+    """Find the files of a pattern such as `model.####.ply`. Return their paths, keyed and sorted by frame number.
 
-    Several fields, such as one in the folder and one in the file name, stand for the same number. Raises InputError for
-    an unknown field.
+    If the pattern has several fields, such as one for a folder and one for the file, they stand for the same number.
+    Raises InputError for an unknown field.
     """
     check_pattern(pattern)
     pieces = FRAME_FIELD_PATTERN.sub("\0", pattern).split("\0")
@@ -123,22 +123,21 @@ def check_pattern(pattern: str) -> None:
 
 
 def output_paths(pattern: str, frames: Sequence[tuple[int, str]]) -> list[Path]:
-    """File paths of frames. frames: number and name of each frame.
+    """Return the path of each frame's file, from a file pattern and the number and name of each frame.
 
     Raises InputError if two frames share a file, a file would leave the folder, or the pattern is invalid.
     """
     check_pattern(pattern)
     if len(frames) > 1 and not FRAME_FIELD_PATTERN.search(pattern):
         raise InputError(
-            f"{pattern}: has no {{name}} in it, expected one to tell {len(frames)} cameras apart, or a frame number "
-            "such as ####"
+            f"{pattern}: names a single file for {len(frames)} frames, expected {{name}} or a frame number such as ####"
         )
     paths: list[Path] = []
     taken: dict[str, str] = {}
     for frame, name in frames:
         path = path_of(pattern, frame, name)
         if (key := identity(path)) in taken:
-            raise InputError(f"{path}: would be the file of both {taken[key]} and {name}")
+            raise InputError(f"{path}: would be the file of both {taken[key]} and {name}, expected a file for each")
         taken[key] = name
         paths.append(path)
     return paths

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Generated camera paths, turntable, spiral and through, of any number of frames, from a scene's own cameras."""
+"""Camera paths generated from a scene's cameras, with any number of frames: turntable, spiral and through."""
 
 from __future__ import annotations
 
@@ -67,11 +67,12 @@ def _ring(cameras: Sequence[Camera]) -> _Ring:
 
 
 def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A closed path of `frames` cameras around the scene cameras' focus point, with the first camera's intrinsics.
+    """A closed path of `frames` cameras around the point that the scene's cameras look at, their focus point.
 
     The path keeps the cameras' median distance and height, and begins near the first camera. If the cameras surround
     the focus point, the path makes one full turn. If they leave a wide gap, it swings back and forth over the arc that
-    they cover, since no camera has seen the rest. Raises ValueError for no cameras or no frames.
+    they cover, since no camera has seen the rest. Intrinsics are the first camera's. Raises ValueError for no cameras
+    or no frames.
     """
     _check("turntable", cameras, frames)
     ring = _ring(cameras)
@@ -82,7 +83,7 @@ def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     if 2 * np.pi - width <= MAX_AZIMUTH_GAP_RADIANS:
         angles = 2 * np.pi * time
     else:
-        # the phase puts the first frame at azimuth 0, that of the first camera
+        # the phase puts the first frame at azimuth 0, which is the first camera's azimuth
         middle, half = begin + width / 2, width / 2
         off = (-middle + np.pi) % (2 * np.pi) - np.pi
         phase = np.arcsin(np.clip(off / half, -1, 1)) if half > 1e-6 else 0.0
@@ -96,8 +97,8 @@ MAX_SPIRAL_ELEVATION_RADIANS = np.deg2rad(85.0)
 """Largest elevation of a spiral, in radians. A level camera that looks straight up or down has no defined right
 axis."""
 SMOOTHING_NEIGHBOURS = 3
-"""Number of neighbours on each side of a camera from which `through` smooths it, to remove the jitter of hand-held
-photographs."""
+"""Number of cameras on each side of a camera from which `through` computes its smoothed pose. This removes the jitter
+of hand-held photographs."""
 
 
 def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
@@ -162,7 +163,7 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 
 def _in_medians(lengths: Float64, rounding: float) -> Float64:
-    """Divide lengths (n,) by the median of those that exceed the rounding error `rounding`."""
+    """Divide lengths (n,) by the median of the lengths that exceed `rounding`, the largest rounding error."""
     clear = lengths[lengths > rounding]
     return lengths / np.median(clear) if len(clear) else np.zeros_like(lengths)
 
@@ -181,9 +182,9 @@ def _smoothed(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def parabola_weights(reach: int) -> Float64:
-    """Savitzky-Golay weights (2 reach + 1,) for evenly spaced values (1964).
+    """Return the weights (2 reach + 1,) of a Savitzky-Golay filter (1964) for evenly spaced values.
 
-    The weighted sum of the values is the value in the middle of the parabola that is fitted to them.
+    The sum of the weighted values is the middle value of the parabola that is fitted to them.
     """
     offsets = np.arange(-reach, reach + 1)
     scale = 3 / ((2 * reach + 3) * (2 * reach + 1) * (2 * reach - 1))

@@ -56,7 +56,7 @@ def interpolate(keys: Sequence[Key], frames: Sequence[float], *, loop: float | N
         [[key.roll, np.log(key.camera.fx), np.log(key.camera.fy), key.camera.cx, key.camera.cy] for key in keys]
     )
     if loop is not None:
-        # one period before and one after are enough, as a slope depends on at most two neighbours
+        # the keys are repeated for one period before and after, as a slope depends on at most two neighbours
         at = times[0] + np.mod(at - times[0], loop)
         closing = np.zeros(scalars.shape[1])
         closing[0] = 2 * np.pi * np.round((scalars[-1, 0] - scalars[0, 0]) / (2 * np.pi))
@@ -90,7 +90,7 @@ def interpolate(keys: Sequence[Key], frames: Sequence[float], *, loop: float | N
 
 
 def _moved(camera: Camera, values: Float64, rotation: Float64, position: Float64) -> Camera:
-    """The camera with another pose and lens. values: roll, logs of fx and fy, cx, cy."""
+    """Copy a camera with another pose and lens. values: roll (not used), logs of fx and fy, cx, cy. position: (3,)."""
     fx, fy = np.exp(values[1:3])
     return replace(
         camera,
@@ -104,7 +104,10 @@ def _moved(camera: Camera, values: Float64, rotation: Float64, position: Float64
 
 
 def tangents(times: Float64, slopes: Float64) -> Float64:
-    """Velocities (N, D) at the keys of a spline. times: (N,). slopes: mean velocities (N - 1, D) between the keys."""
+    """Return the velocities (N, D) of a spline at its N keys.
+
+    times: (N,), of the keys. slopes: (N - 1, D), the mean velocities from each key to the next.
+    """
     before, after = np.diff(times)[:-1, None], np.diff(times)[1:, None]
     result = np.concatenate([slopes[:1], slopes[-1:]])
     if len(slopes) > 1:
@@ -124,8 +127,10 @@ def tangents(times: Float64, slopes: Float64) -> Float64:
 
 
 def _positions(times: Float64, keys: Float64, at: Float64, segment: NDArray[np.intp]) -> Float64:
-    """Positions (F, 3) of the spline through `keys` (N, 3) at the times `at` (F,). segment: index (F,) of each time's
-    segment."""
+    """Return the positions (F, 3) at the times `at` (F,) on the spline through the positions `keys` (N, 3).
+
+    times: (N,), of the keys. segment: (F,), for each time in `at` the index of the key before it.
+    """
     chords, lengths = np.diff(keys, axis=0), np.diff(times)
     velocity = tangents(times, chords / lengths[:, None])
     h = lengths[segment][:, None]

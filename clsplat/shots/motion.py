@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras for motion vectors and motion blur: those of the next and previous frame, and while the shutter is open."""
+"""Cameras for motion vectors (one frame later or earlier) and for motion blur (while the shutter is open)."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class Moments:
         for time, camera in zip(rising, cameras, strict=True):
             if camera.projection != cameras[0].projection:
                 raise InputError(
-                    f"an open shutter: the camera is {cameras[0].projection} at {rising[0]:g} frames from the frame, "
-                    f"and {camera.projection} at {time:g}, expected one projection"
+                    f"motion blur: the camera is {cameras[0].projection} at {rising[0]:g} frames from the frame, and "
+                    f"{camera.projection} at {time:g}, expected one projection while the shutter is open"
                 )
         return cls(cameras[0], rising, np.array([_values(camera) for camera in cameras]))
 
@@ -68,11 +68,12 @@ def _values(camera: Camera) -> Float64:
 
 
 def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, sampling: SamplingConfig) -> Moments | None:
-    """Cameras while the shutter of the frame `number` is open; None if the shot has no `moment`, or the shutter is
-    (0, 0).
+    """Return the cameras while the shutter of the frame `number` is open.
 
-    The times are those at which the shutter opens, is half-way and closes, those of the frame's samples, and the times
-    in between at which the source has values.
+    Their times are the opening, middle and closing of the shutter, the times of the frame's samples, and the times in
+    between at which the shot's source has values. Returns None if the shot has no `moment`, or the shutter is (0, 0).
+
+    resize: function that adapts a camera to the size of the pictures.
     """
     if shot.moment is None or sampling.shutter == (0.0, 0.0):
         return None
@@ -87,8 +88,10 @@ def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, samplin
 def targets(
     shot: Shot, resize: Callable[[Camera], Camera], index: int, middle: float, *, motion: bool, backward: bool
 ) -> tuple[Camera | None, Camera | None]:
-    """Cameras of the next and the previous frame, which the motion channels point to; None unless requested.
+    """Return the cameras of the next and the previous frame, to which the motion vectors of a frame point.
 
+    motion, backward: True to return the next frame's camera, and the previous frame's; False to return None for it.
+    resize: function that adapts a camera to the size of the pictures.
     index: index of the frame in the shot.
     middle: middle of the shutter, in frames. For a shot that has `moment`, the cameras are one frame from this time.
     """
@@ -101,7 +104,7 @@ def targets(
 
 
 def _beside(shot: Shot, resize: Callable[[Camera], Camera], time: float, way: int) -> Camera:
-    """Camera one frame after a time (way 1) or before it (-1), for a shot that has `moment`.
+    """Return the camera one frame after a time (way 1) or one frame before it (-1), for a shot that has `moment`.
 
     Outside the shot, where its source has no values, the camera is extrapolated.
     """
@@ -142,7 +145,7 @@ def camera_before(shot: Shot, index: int) -> Camera:
 
 
 def continued(earlier: Camera, now: Camera) -> Camera:
-    """The camera after the rigid motion from `earlier` to `now` is applied once more."""
+    """Repeat a camera's motion: return the camera that follows `now` as `now` follows `earlier`."""
     turn = now.rotation @ earlier.rotation.T
     shift = now.translation - turn @ earlier.translation
     return replace(now, rotation=turn @ now.rotation, translation=turn @ now.translation + shift)
@@ -163,6 +166,7 @@ def stretches(
     interpolated while that frame's shutter is open, numbered relative to the frame. It is None for a shot of one frame,
     which does not move. The shot is extrapolated beyond its ends, as for motion channels.
 
+    resize: function that adapts a camera to the size of the pictures.
     opens, closes: times at which the shutter opens and closes, in frames relative to the frame.
     motion, backward: also cover the middle of the next frame's shutter, or of the previous frame's.
     Raises InputError if the pictures of two consecutive frames differ in size or projection, because no camera can be
@@ -178,8 +182,8 @@ def stretches(
         kinds = [f"{shown.width}x{shown.height} {shown.projection}" for shown in (before, camera)]
         if kinds[0] != kinds[1]:
             raise InputError(
-                f"an open shutter: frame {earlier} is {kinds[0]} and frame {number} {kinds[1]}, expected one size and "
-                "projection"
+                f"motion blur: frame {earlier} is {kinds[0]} and frame {number} {kinds[1]}, expected one size "
+                "and projection"
             )
     first, second = frames[0][1], resize(camera_after(shot, 0))
     for _ in range(ceil(max(-opens, 0)) + NEIGHBOUR_FRAMES):

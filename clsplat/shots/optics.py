@@ -41,7 +41,7 @@ class Optics:
 
     @property
     def still(self) -> Optics:
-        """The same settings with an instantaneous shutter, and a pinhole in place of the lens."""
+        """A copy of these settings without motion blur or depth of field: instantaneous shutter, pinhole lens."""
         return replace(self, shutter=(0.0, 0.0), f_stop=0.0)
 
     def named(self) -> Iterator[str]:
@@ -56,9 +56,12 @@ class Optics:
 
 
 def headers(camera: Camera, number: int, optics: Optics | None, sampling: SamplingConfig) -> dict[str, tuple[str, Any]]:
-    """OpenEXR standard attributes for a frame of a USD stage, by name, as (type, value). Empty for other frames.
+    """Return OpenEXR's standard attributes for a frame of a USD stage, by name, as (type, value).
 
     camera: camera of the whole frame.
+    number: the frame's number, from which the time code is computed.
+    optics: the frame's settings in the stage; None for a frame of another source, which gets no attributes.
+    sampling: the settings of shutter and lens with which the frame is rendered.
     Lens and sensor attributes are written for perspective cameras only: lengths in millimetres, focus distance in
     metres. The sensor size is the part of the sensor that the picture shows.
     """
@@ -89,9 +92,9 @@ def headers(camera: Camera, number: int, optics: Optics | None, sampling: Sampli
 
 
 def time_code(number: int, rate: Fraction) -> int | None:
-    """SMPTE time code of a frame as packed bits, non-drop-frame, with frame 0 at 00:00:00:00.
+    """Return the SMPTE time code of a frame as packed bits, non-drop-frame, with frame 0 at 00:00:00:00.
 
-    None before frame 0, above 30 frames per second, and at a rate that is not close to a whole number.
+    Returns None for a frame before 0, and for a rate above 30 frames per second or not close to a whole number.
     """
     whole = round(rate)
     if number < 0 or not 1 <= whole <= MAX_TIME_CODE_FPS or abs(float(rate) - whole) > whole / 500:
@@ -100,6 +103,6 @@ def time_code(number: int, rate: Fraction) -> int | None:
     minutes, second = divmod(seconds, 60)
     hours, minute = divmod(minutes, 60)
     code = 0
-    for value in (hours % 24, minute, second, frame):  # two binary-coded decimal digits each
+    for value in (hours % 24, minute, second, frame):  # each takes two binary-coded decimal digits
         code = code << 8 | value // 10 << 4 | value % 10
     return code

@@ -51,7 +51,7 @@ def read_shot(
     """Read the frames of any camera file, whose format is recognised from its content. docs/cameras.md describes the
     formats.
 
-    size: requested width and height, for formats without their own (USD; transforms.json without its pictures).
+    size: requested width and height, for files that do not give a size (USD; transforms.json without its pictures).
     usd_camera: path or name of the camera to use in a USD stage.
     lenses: how lenses of photographs are treated, as in `load_scene`.
     Raises InputError, naming the file, if it is missing, of an unknown kind, damaged or without frames.
@@ -61,7 +61,7 @@ def read_shot(
         raise InputError(f"{path}: no such folder or file, expected {EXPECTED_CAMERA_SOURCES}")
     is_usd = path.suffix.lower() in USD_SUFFIXES
     if usd_camera is not None and not is_usd:
-        raise InputError(f"--usd-camera {usd_camera}: {path} is no USD stage, expected this flag with a stage only")
+        raise InputError(f"--usd-camera {usd_camera}: {path} is not a USD stage, expected this flag with USD only")
     if path.is_dir():
         return _read_folder(path, size, lenses)
     if is_usd:
@@ -114,7 +114,10 @@ def choose_shot(
 
 
 def _without_strays(frames: Sequence[Frame], source: Path) -> tuple[list[Camera], tuple[str, ...]]:
-    """Cameras of the frames without outliers, and a warning that names the outliers. source: file for the warning."""
+    """Return the cameras of the frames without outliers, and a warning that names the outliers.
+
+    source: file or folder of the cameras, for the warning. Without outliers there is no warning.
+    """
     far = stray_cameras([frame.camera for frame in frames])
     near = [frame.camera for frame, stray in zip(frames, far, strict=True) if not stray]
     if not far.any():
@@ -125,10 +128,10 @@ def _without_strays(frames: Sequence[Frame], source: Path) -> tuple[list[Camera]
 
 
 def photographed(path: Path, size: tuple[int | None, int | None] = (None, None)) -> list[PosedImage]:
-    """The photographs' own cameras, with their lenses, from a COLMAP model or a transforms.json.
+    """Read the photographs' cameras, with the distortion of their lenses, from a COLMAP model or a transforms.json.
 
-    Raises InputError for other sources of cameras, for panoramas, which cannot be warped from a pinhole picture, and
-    like `read_shot`.
+    Raises InputError like `read_shot`, for other sources of cameras, and for panoramas, which cannot be warped from a
+    pinhole picture.
     """
     images: list[PosedImage] | None = None
     if path.is_dir():
@@ -146,7 +149,7 @@ def photographed(path: Path, size: tuple[int | None, int | None] = (None, None))
         )
     if wrong := [image.name for image in images if image.lens.is_panorama]:
         raise InputError(f"{path}: {examples(wrong)} are panoramas, which cannot be warped from a pinhole picture")
-    cameras_of(images)  # warns about implausible cameras
+    cameras_of(images)  # called for its warnings on implausible cameras
     return images
 
 
@@ -164,9 +167,9 @@ def shot_around(
     up: str | None = None,
     own: Sequence[Camera] = (),
 ) -> Shot:
-    """The shot that --path, --count and --up ask for without --cameras.
+    """Return the shot that --path, --count and --up ask for if --cameras is not given.
 
-    The path goes among the photographs' own cameras if these are known and `up` is None. Otherwise it goes around the
+    The path goes among the photographs' cameras `own` if these are known and `up` is None. Otherwise it goes around the
     model, as in `cameras_around`. Raises InputError.
     """
     among_own = bool(own) and up is None
@@ -179,8 +182,9 @@ def shot_around(
 
 
 def check_around(path: str | None, *, among_own: bool = False) -> str:
-    """Check the name of a path around a model, or among the photographs' own cameras, and return it.
+    """Check the kind of path that --path gives when --cameras is not given, and return it.
 
+    among_own: True if the path goes among the photographs' cameras; False if it goes around the model.
     Raises InputError for None, and for a path that needs --cameras.
     """
     if path is None:
@@ -205,7 +209,7 @@ def _path(path: str, cameras: Sequence[Camera], count: int | None) -> tuple[Fram
 def _read_folder(path: Path, size: tuple[int | None, int | None], lenses: Lenses) -> Shot:
     listed = sorted(file.name for file in path.glob("transforms*.json"))
     if listed:
-        # next to a transforms.json, a model below colmap/ is nerfstudio's, in another world than the transforms.json
+        # a COLMAP model below colmap/ is nerfstudio's, and its world is not that of the transforms.json next to it
         model = find_model(path)
         if model is None or "colmap" in model.relative_to(path).parts:
             if listed != ["transforms.json"]:
@@ -236,7 +240,7 @@ def _read_json(path: Path, size: tuple[int | None, int | None], lenses: Lenses) 
 
 
 def _parsed(path: Path) -> dict[str, Any] | list[Any]:
-    """The JSON object or list in a file. Raises InputError."""
+    """Read the JSON object or list in a file of cameras. Raises InputError."""
     try:
         document = parse_json(read_document(path, "a file of cameras"), once=True)
     except ValueError as error:

@@ -47,7 +47,7 @@ class Shot:
     warnings: one line each, for the user.
     fps: frames per second, if the source gives it.
     unapplied: names of the source's settings that are not applied to the frames.
-    moment: the camera at a time in frames, if the source defines one for every time.
+    moment: function that returns the camera at a time in frames; None if the source only has cameras of frames.
     authored: times in frames at which the source has values, in increasing order.
     reach: first and last time in frames at which the source has values for the camera's transform.
     window: part of the frame that the source asks for, as in `usd_settings.Settings`.
@@ -68,8 +68,8 @@ class Shot:
         return [frame.camera for frame in self.frames]
 
     def standing(self, numbers: Sequence[int]) -> Shot:
-        """The shot with its only frame repeated at the frame numbers `numbers`. A shot of several frames is returned
-        unchanged."""
+        """Return the shot with its only frame repeated, once for each of the frame numbers `numbers`. A shot of several
+        frames is returned unchanged."""
         if len(self.frames) != 1 or not numbers:
             return self
         return replace(
@@ -77,7 +77,7 @@ class Shot:
         )
 
     def only(self, text: str) -> Shot:
-        """The frames of the shot that `text`, such as 1-100:2, lists. Adds a warning if the shot lacks some of them.
+        """Return the shot with the frames that `text`, such as 1-100:2, lists. Adds a warning if some do not exist.
 
         Raises InputError for a text that `parse_frames` refuses, and if the shot has none of the listed frames.
         """
@@ -94,14 +94,14 @@ class Shot:
         return replace(self, frames=tuple(frame for frame in self.frames if frame.number in asked), warnings=warnings)
 
     def without_optics(self) -> Shot:
-        """The shot without the USD stage's shutter and lens, whose settings are added to `unapplied`."""
+        """Return the shot without the shutter and lens of a USD stage. Their settings are added to `unapplied`."""
         named = [name for frame in self.frames if frame.optics for name in frame.optics.named()]
-        found = {name.partition(" ")[0]: name for name in reversed(named)}  # each setting with its first value
+        found = {name.partition(" ")[0]: name for name in reversed(named)}  # the first value of each setting
         frames = tuple(replace(frame, optics=frame.optics.still) if frame.optics else frame for frame in self.frames)
         return replace(self, frames=frames, unapplied=(*self.unapplied, *reversed(found.values())))
 
     def told(self, source: object, *more: str) -> tuple[str, ...]:
-        """The warnings, one line each. The last line names all settings of the source that are not applied.
+        """Return all warnings, one line each. The last line lists the settings of the source that are not applied.
 
         source: file or stage that the shot was read from, for the last line.
         more: further settings of the source that the caller does not apply.
@@ -130,7 +130,10 @@ class Shot:
 
 
 def whole_frames(where: str, what: str, begin: float, end: float) -> list[int]:
-    """The whole numbers from `begin` to `end`. Raises InputError if there are none or too many."""
+    """Return the whole numbers from `begin` to `end`. Raises InputError if there are none or too many.
+
+    where: file or prim, to begin the error's message. what: name of the numbers in the message, such as "frame".
+    """
     if not (isfinite(end - begin) and end - begin < MAX_SHOT_FRAMES):
         raise InputError(f"{where}: has the {what}s {begin:g} to {end:g}, expected at most {MAX_SHOT_FRAMES:,}")
     frames = list(range(ceil(begin), floor(end) + 1))

@@ -84,7 +84,7 @@ class KeyedTrack:
     held: bool = False
 
     def at(self, frame: float) -> Placement:
-        """The placement at a frame. Before the first key and after the last, it is that key's placement."""
+        """Return the placement at a frame. Before the first key and after the last, it is the nearest key's."""
 
         def value(name: str, *default: float, held: bool = self.held) -> Float64:
             channel = self.channels.get(name)
@@ -97,9 +97,9 @@ class KeyedTrack:
 
     @property
     def reach(self) -> tuple[float, float] | None:
-        """Frames of the first and the last key that move the model, None if nothing moves it.
+        """Frames of the first and the last key that move the model; None if nothing moves it.
 
-        Infinite if values are held, because such a model is never extrapolated.
+        If `held` is True, these are minus and plus infinity, because the model is never extrapolated.
         """
         if self.held:
             return -math.inf, math.inf
@@ -120,9 +120,11 @@ class KeyedTrack:
 
 
 def _between(channel: AnimatedProperty, frame: float, *, held: bool) -> Float64:
-    """Matrix (4, 4) at a frame, interpolated from a channel of matrices; at a key, the key's matrix.
+    """Return the matrix (4, 4) at a frame, interpolated between keys; at a key, it is the key's matrix.
 
     Translation and the logarithm of the scale are interpolated linearly, rotation along the shorter arc.
+
+    channel: the animated property "matrix". held: True takes the matrix of the latest key instead.
     """
     frames, matrices = channel.frames, channel.values.reshape(-1, 4, 4)
     after = int(np.searchsorted(frames, frame, side="right"))
@@ -134,7 +136,7 @@ def _between(channel: AnimatedProperty, frame: float, *, held: bool) -> Float64:
     (scale, turn, shift), (scale_after, turn_after, shift_after) = (
         edit.decompose(matrices[index], NODE_SIMILARITY_TOLERANCE) for index in (after - 1, after)
     )
-    # also between two matrices that both mirror, the difference is a rotation
+    # this is a rotation even if both matrices mirror
     way = Rotation.from_matrix(turn_after @ turn.T).as_rotvec()
     matrix = np.eye(4)
     size = scale ** (1 - share) * scale_after**share
@@ -200,7 +202,7 @@ class PlacedModel:
 
 
 def is_layout(path: Path) -> bool:
-    """True if a file name is a shot file's: any .json except meta.json, which is a model file."""
+    """Return True if a path has the name of a shot file: any .json except meta.json, which is a model file."""
     return path.suffix.lower() == ".json" and path.name.lower() != "meta.json"
 
 
@@ -334,7 +336,7 @@ def _known(where: str, values: dict[str, Any], names: tuple[str, ...]) -> None:
 
 
 def _track(reader: Keys) -> KeyedTrack:
-    """Read the track of a JSON object, from its own properties, which hold for all frames, and from its keys."""
+    """Read a model's properties over time from a JSON object: properties for all frames, 'keys' and 'matrices'."""
     interpolation = reader.frame.get("interpolation", "linear")
     if interpolation not in ("linear", "hold"):
         raise reader.wrong("interpolation", "linear or hold")
@@ -386,7 +388,7 @@ def _keys(reader: Keys) -> Iterator[tuple[float, Keys]]:
 
 
 def _matrices(reader: Keys) -> Iterator[tuple[float, Float64]]:
-    """Frame and matrix for each entry of 'matrices', one per frame from 'first_frame'."""
+    """Yield the frame number and matrix (16,) of each entry of 'matrices', one per frame from 'first_frame' on."""
     first, given = reader.require("first_frame", 1.0), reader.frame["matrices"]
     if not isinstance(given, list) or not given:
         raise reader.wrong("matrices", "a list of matrices of 16 numbers, one per frame")
@@ -397,7 +399,7 @@ def _matrices(reader: Keys) -> Iterator[tuple[float, Float64]]:
 
 
 def _matrix(reader: Keys) -> Float64:
-    """Matrix (16,) from 16 numbers, or from four rows of four."""
+    """Read the matrix (16,) of a JSON object: 16 numbers, or four rows of four. Raises InputError."""
     given = reader.frame["matrix"]
     if isinstance(given, list) and len(given) == 4 and all(isinstance(row, list) for row in given):
         reader.frame = {"matrix": [value for row in given for value in row]}
@@ -405,7 +407,7 @@ def _matrix(reader: Keys) -> Float64:
 
 
 def _value(reader: Keys, name: str) -> Float64:
-    """Value (d,) of the animated property `name` in a JSON object. Raises InputError."""
+    """Read the value (d,) of the animated property `name` in a JSON object. Raises InputError."""
     if name == "matrix":
         return _matrix(reader)
     if name == "visible":

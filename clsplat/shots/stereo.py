@@ -22,7 +22,7 @@ EYE_FIELD_PATTERN = re.compile(r"\{eye\}|%V|%v")
 
 
 def for_eye(pattern: str, eye: str) -> str:
-    """The file pattern with the eye's name filled in; unchanged if `eye` is empty."""
+    """Replace the field for an eye in a file pattern by the eye's name. If `eye` is empty, nothing is replaced."""
     return EYE_FIELD_PATTERN.sub(lambda match: eye[:1] if match[0] == "%v" else eye, pattern) if eye else pattern
 
 
@@ -41,7 +41,7 @@ def seen_by(camera: Camera, eye: Eye, distance: float, convergence: float = math
 
 
 def shot_of(shot: Shot, eye: Eye, distance: float, convergence: float = math.inf) -> Shot:
-    """The shot as the eye sees it. Raises InputError like `seen_by`."""
+    """Replace the cameras of a shot by the cameras of one eye, from `seen_by`. Raises InputError."""
 
     def seen(camera: Camera) -> Camera:
         return seen_by(camera, eye, distance, convergence)

@@ -32,16 +32,17 @@ from clsplat.models.instances import IDENTITY_ROWS, Changing, Placement, Track, 
 from clsplat.models.series import ModelSeries
 
 GAUSSIAN_ARRAYS = ("positions", "orientations", "scales", "opacities", "radiance:sphericalHarmonicsCoefficients")
-"""Arrays that Gaussians are read from. Each also has a half-precision variant, with an h at the end of its name."""
+"""Attributes of a prim that hold arrays of its Gaussians. In half precision, an h is added to the name."""
 GAUSSIAN_COLOUR_ATTRIBUTES = ("radiance:sphericalHarmonicsDegree", "primvars:displayColor", "primvars:displayOpacity")
-"""Further attributes that Gaussians are read from."""
+"""Attributes of a prim that also determine the colours and opacities of its Gaussians."""
 
 
 @dataclass(frozen=True, eq=False)
 class StageTrack:
-    """The `Track` of a prim in a USD stage.
+    """The `Track` of a prim in a USD stage: its world transform and visibility over time.
 
     where: prefix of error messages.
+    place: the prim's transforms and visibility in the stage.
     held: the stage. USD closes a stage when its last reference is gone, so the track keeps one.
     """
 
@@ -132,7 +133,7 @@ def read_here(path: Path) -> StageModels | None:
 
 
 def _model_of(path: Path, stage: Any, prim: Any, space: str) -> Gaussians | ModelSeries:
-    """The Gaussians of a prim, as a `ModelSeries` if it has time samples.
+    """Return the Gaussians of a prim: a `ModelSeries` if they have time samples, otherwise a model.
 
     stage: the opened stage. The result keeps it open, since USD closes a stage with its last reference.
     """
@@ -156,13 +157,13 @@ def _attributes(prim: Any) -> list[Any]:
 
 
 def _sample_times(prim: Any) -> list[float]:
-    """Time codes, in increasing order, at which the prim's arrays have samples; empty if the arrays do not change."""
+    """Return the time codes, in increasing order, at which a prim's Gaussians have samples; empty if there are none."""
     changing = [attribute for attribute in _attributes(prim) if attribute.ValueMightBeTimeVarying()]
     return sorted({float(time) for attribute in changing for time in attribute.GetTimeSamples()})
 
 
 def _add(sums: Any, prim: Any, time: Any) -> None:
-    """Add to a digest the values, at a time code, of the attributes from which a prim's Gaussians are read."""
+    """Update the digest `sums` with the values, at a time code, of all attributes that determine a prim's Gaussians."""
     for attribute in _attributes(prim):
         values = np.ascontiguousarray(np.asarray(attribute.Get(time)))
         sums.update(f"{attribute.GetName()} {values.dtype} {values.shape}\n".encode())

@@ -70,8 +70,8 @@ def focus_point(cameras: Sequence[Camera]) -> Float64:
 
 
 def covered_arc(azimuths: Float64) -> tuple[float, float]:
-    """Start and width, in radians, of the shortest arc that holds all azimuths (n,). The arc goes from its start in the
-    direction of increasing angles."""
+    """Return the start and width, in radians, of the shortest arc that contains all azimuths (n,). The arc goes from
+    its start in the direction of increasing angles."""
     ordered = np.sort(np.mod(azimuths, 2 * np.pi))
     gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
     widest = int(np.argmax(gaps))
@@ -79,8 +79,8 @@ def covered_arc(azimuths: Float64) -> tuple[float, float]:
 
 
 def extent_of(points: NDArray[Any], inside: float = 0.96) -> tuple[Float64, Float64]:
-    """Corners (3,) of the box that holds the fraction `inside` of the points (N, 3) along each axis. The rest are
-    outliers, of which models have many."""
+    """Return the corners (3,) of the box that contains the fraction `inside` of the points (N, 3) along each axis. The
+    points outside count as outliers."""
     if not len(points):
         return -np.ones(3), np.ones(3)
     some = points[:: max(1, len(points) // 100_000)]

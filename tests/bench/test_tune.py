@@ -169,7 +169,7 @@ def test_a_shape_that_local_memory_is_too_small_for(monkeypatch: pytest.MonkeyPa
 def test_a_broken_file_is_passed_over(content: str, default_device: Device) -> None:
     saved_path().parent.mkdir(parents=True)
     saved_path().write_text(content)
-    with pytest.warns(UserWarning, match=r"shapes\.json: is damaged, so no tuned shape is used"):
+    with pytest.warns(UserWarning, match=r"shapes\.json: the file is damaged, so no tuned shape is used"):
         assert shape_of(default_device.cl_device)[0] == default_shape(default_device.cl_device)
     save_shape(default_device.cl_device, replace(default_shape(default_device.cl_device), lanes=4))
     assert list(saved_shapes().values()) == ["4x1"], "it is written anew"

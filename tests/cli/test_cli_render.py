@@ -136,7 +136,7 @@ def test_cameras_that_cannot_be_rendered(model: str, pipeline: Pipeline, tmp_pat
         ({"camera_path": []}, out, f"{cameras}: has no keys in 'camera_path'"),
         ({}, [*out, "--count", "3"], "--count 3: expected --path with it"),
         ({}, [*out, "--path", "turntable", "--count", "0"], "--count 0: expected 1 to 100,000 frames"),
-        ({}, [*out, "--usd-camera", "c"], "is no USD stage"),
+        ({}, [*out, "--usd-camera", "c"], "is not a USD stage"),
         ({}, ["-o", str(tmp_path / "shot" / "a.exr")], "or a frame number such as ####"),
         ({}, ["-o", str(tmp_path / "shot" / "{nam}.exr")], "{nam} is not known, expected {name}, {frame}, ####, "),
     ]
@@ -152,7 +152,7 @@ def test_cameras_that_cannot_be_rendered(model: str, pipeline: Pipeline, tmp_pat
 def test_render_that_cannot_be(model: str, folder: str, pipeline: Pipeline, tmp_path: Path, capsys: Capture) -> None:
     out = str(tmp_path / "{name}.png")
     cases = [
-        (["--cameras", folder, "-o", str(tmp_path / "one.png")], "has no {name} in it, expected one to tell 2 cameras"),
+        (["--cameras", folder, "-o", str(tmp_path / "one.png")], "names a single file for 2 frames, expected"),
         (["--cameras", folder, "-o", str(tmp_path / "{name}.tga")], "extension '.tga', expected one of .exr, .png"),
         (["--cameras", folder, "-o", str(tmp_path / "{name}")], "extension 'none'"),
         (["--cameras", str(tmp_path / "none"), "-o", out], "none: no such folder"),

@@ -249,7 +249,7 @@ def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Captu
     cases = [
         ("--channels rgb,colour", "--channels rgb,colour: has 'colour', expected some of rgb, alpha"),
         ("--channels alpha --background white", "--channels alpha and --background exclude each other"),
-        ("--frames 3-", "--frames 3-: '3-' is no frame or range"),
+        ("--frames 3-", "--frames 3-: '3-' is not a frame or a range"),
         ("--frames 100-200", "--frames 100-200: holds none of the frames to render"),
         ("--quality 0", "--quality 0: expected 1 to 100"),
         ("--workers 0", "--workers 0: expected at least 1"),

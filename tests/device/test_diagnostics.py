@@ -112,7 +112,7 @@ def test_how_lists_are_made(default_device: Device, monkeypatch: pytest.MonkeyPa
     listed = {"index": default_device.index, "name": "a device", "shape": "1 lanes x 64 items"}
     monkeypatch.setenv("CLSPLAT_SHAPE", "1x64")
     (finding,) = list_findings([{**listed, "shape": "8 lanes x 1 items"}, listed])
-    lists = f"{default_device.index}: a device lists the Gaussians of tiles"
+    lists = f"{default_device.index}: training on a device lists each tile's Gaussians"
     assert (finding.state, finding.text) == ("ok", f"{lists} by append")
     monkeypatch.setenv("CLSPLAT_PRETEND", "no-atomics")
     (finding,) = list_findings([listed])

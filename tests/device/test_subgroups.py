@@ -63,6 +63,6 @@ def test_none_of_the_ways_works(device: Device, monkeypatch: pytest.MonkeyPatch)
     """The error names the device, and the shape that would do."""
     opened = with_ways(device)
     monkeypatch.setattr(context, "subgroup_ways", lambda device: [{"SUBGROUP": 8, "EXCHANGED(x,step)": "(x)"}])
-    message = r"items of a sub-group do not exchange the right values; .* such as CLSPLAT_SHAPE=1x64$"
+    message = r"the work-items of a sub-group got wrong values from each other; .* such as CLSPLAT_SHAPE=1x64$"
     refuses(message, opened.kernels, "blend_grad", error=DeviceError)
     assert opened.kernels("blend"), "other kernels have no sub-groups"

@@ -317,7 +317,7 @@ def test_a_picture_is_no_map(shot: list[str], tmp_path: Path, capsys: Capture, k
     write_stmap(tmp_path / "map.exr", values * (WIDTH, HEIGHT), WIDTH, HEIGHT)
     capsys.readouterr()
     assert render(shot, tmp_path / "a.exr", f"--stmap {tmp_path}/map.exr") == 2
-    assert "map.exr: looks like a picture: R and G have the same orientation in" in error_line(capsys)
+    assert "map.exr: looks like a picture: as an STMap, it would mirror some" in error_line(capsys)
 
 
 def test_maps_of_any_way_around_are_maps(tmp_path: Path) -> None:

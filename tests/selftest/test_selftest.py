@@ -206,7 +206,7 @@ def test_rounding_otherwise_is_told_and_forgiven(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        *((change, "expected STEM: WORDS => WORDS") for change in ("blend", "blend: a", ": a => b")),
+        *((change, "expected STEM: OLD => NEW") for change in ("blend", "blend: a", ": a => b")),
         ("blend: abacus => slide rule", r"blend\.cl does not contain abacus"),
         (
             "blender: alpha => beta",

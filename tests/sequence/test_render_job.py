@@ -145,7 +145,7 @@ def test_a_stretch_is_the_shot_there() -> None:
         np.testing.assert_allclose(stretch.at(time_).rotation, turned(angle).rotation, atol=1e-6)
     assert stretches(Shot(even.frames[:1]), lambda camera: camera, -1, 1)(1) is None
     mixed = Shot(numbered([turned(0), turned(0.1).resized(80, 60)]))
-    with pytest.raises(InputError, match="an open shutter: frame 1 is 40x30 perspective and frame 2 80x60"):
+    with pytest.raises(InputError, match="motion blur: frame 1 is 40x30 perspective and frame 2 80x60"):
         stretches(mixed, lambda camera: camera, -1, 1)
 
 

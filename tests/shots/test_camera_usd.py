@@ -209,7 +209,7 @@ def test_without_usd_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     with pytest.raises(InputError, match=r"USD needs usd-core, which is not installed: pip install 'clsplat\[usd\]'"):
         read_shot(tmp_path / "shot.usda")
     (tmp_path / "a.json").write_text("{}")
-    refuses(r"--usd-camera cam: .*a.json is no USD stage", read_shot, tmp_path / "a.json", usd_camera="cam")
+    refuses(r"--usd-camera cam: .*a.json is not a USD stage", read_shot, tmp_path / "a.json", usd_camera="cam")
 
 
 @pytest.mark.parametrize(

@@ -138,8 +138,8 @@ def test_names_that_are_missing_or_there_twice(tmp_path: Path) -> None:
         ([{**camera(), "position": None}, camera(1)], "camera 0 (IMG_0): has no 'position', expected an object"),
         ([camera(cx="middle")], "camera 0 (IMG_0): 'cx' is 'middle', expected a number"),
         ([camera(rotation=[1, 0, 0, 0])], "camera 0 (IMG_0): 'rotation' is [1, 0, 0, 0], expected three rows"),
-        ([camera(rotation=np.diag([1.0, 1, -1]).tolist())], "'rotation' is no rotation (determinant -1)"),
-        ([camera(rotation=np.diag([2.0, 2, 2]).tolist())], "'rotation' is no rotation (determinant 8)"),
+        ([camera(rotation=np.diag([1.0, 1, -1]).tolist())], "'rotation' is not a rotation (determinant -1)"),
+        ([camera(rotation=np.diag([2.0, 2, 2]).tolist())], "'rotation' is not a rotation (determinant 8)"),
         ([camera(rotation=[["a", 0, 0], [0, 1, 0], [0, 0, 1]])], "expected three rows of three numbers"),
         (
             [camera(), camera(1, position=[0, 1])],

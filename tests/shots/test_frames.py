@@ -42,15 +42,15 @@ def test_frames(text: str, frames: list[int]) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "'' is no frame or range"),
-        ("1,,2", "'' is no frame or range"),
-        ("1-", "'1-' is no frame or range"),
-        ("a-b", "'a-b' is no frame or range"),
-        ("1:2", "'1:2' is no frame or range"),
-        ("1.5", "'1.5' is no frame or range"),
-        ("1-10:-1", "'1-10:-1' is no frame or range"),
+        ("", "'' is not a frame or a range"),
+        ("1,,2", "'' is not a frame or a range"),
+        ("1-", "'1-' is not a frame or a range"),
+        ("a-b", "'a-b' is not a frame or a range"),
+        ("1:2", "'1:2' is not a frame or a range"),
+        ("1.5", "'1.5' is not a frame or a range"),
+        ("1-10:-1", "'1-10:-1' is not a frame or a range"),
         ("1-10:0", "the step 0, expected at least 1"),
-        ("1-10x-1", "'1-10x-1' is no frame or range"),
+        ("1-10x-1", "'1-10x-1' is not a frame or a range"),
         ("1-99999999", "lists more than 10,000,000 frames"),
         ("99999999-1", "lists more than 10,000,000 frames"),
     ],
@@ -119,7 +119,7 @@ def test_every_frame_has_a_file_of_its_own() -> None:
     assert output_paths("o/{name}.png", [(1, "a.jpg"), (2, "s/b.jpg")]) == [Path("o/a.png"), Path("o/s/b.png")]
     assert output_paths("o/##.png", [(1, "a.jpg"), (2, "a.png")]) == [Path("o/01.png"), Path("o/02.png")]
     refuses(r"would be the file of both a\.jpg and a\.png", output_paths, "o/{name}.png", [(1, "a.jpg"), (2, "a.png")])
-    with pytest.raises(InputError, match="expected one to tell 2 cameras apart, or a frame number such as ####"):
+    with pytest.raises(InputError, match="names a single file for 2 frames, expected"):
         output_paths("one.png", [(1, "a"), (2, "b")])
 
 

@@ -30,11 +30,11 @@ MAX_BINARY_CACHE_BYTES = 256 << 20
 500 KB; all binaries of the tests take 90 MB."""
 
 BINARIES_VARIABLE = "CLSPLAT_BINARIES"
-"""Environment variable that names another folder for the cached binaries."""
+"""Environment variable with the folder of the cached binaries, if it is not the default folder."""
 
 
 def folder() -> Path:
-    """The folder of the cached binaries."""
+    """Return the folder of the cached binaries: CLSPLAT_BINARIES, or else `binaries` in clsplat's cache folder."""
     return Path(os.environ.get(BINARIES_VARIABLE, "").strip() or cache_folder() / "binaries")
 
 
@@ -43,14 +43,17 @@ def _path(device: cl.Device, digest: str) -> Path:
         f"{name}={value}" for name, value in os.environ.items() if name.startswith(TARGET_VARIABLE_PREFIX)
     )
     driver = (device.name, device.platform.version, device.driver_version)
-    # the processor's features are part of the name: several machines may share a home
+    # the processor's features are part of the name, because several machines may share a home folder
     processor = " ".join((platform.machine(), platform.processor(), *sorted(features())))
     key = "\0".join((digest, *driver, processor, *settings))
     return folder() / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.bin"
 
 
 def load(context: cl.Context, device: cl.Device, digest: str, options: Sequence[str]) -> cl.Program | None:
-    """The saved program for a variant's digest; None if no file has it or the driver refuses it."""
+    """Return the cached program of a variant, given its digest and build options.
+
+    Returns None if the cache has no intact file of it, or the driver refuses the file.
+    """
     if not wants_cache(device):
         return None
     path = _path(device, digest)
@@ -62,7 +65,7 @@ def load(context: cl.Context, device: cl.Device, digest: str, options: Sequence[
     if hashlib.sha256(binary).digest() != content[:32]:
         return None
     with contextlib.suppress(OSError):
-        os.utime(path)  # so that the least recently used files are removed first
+        os.utime(path)  # marks the file as recently used, as the least recently used files are removed first
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", cl.CompilerWarning)
@@ -73,7 +76,7 @@ def load(context: cl.Context, device: cl.Device, digest: str, options: Sequence[
 
 
 def save(device: cl.Device, digest: str, program: cl.Program) -> None:
-    """Save a program that has kernels. If the folder is not writable, nothing is saved, and no error is raised."""
+    """Save the built program of the variant with this digest. Does nothing if the folder is not writable."""
     if not wants_cache(device):
         return
     try:
@@ -87,10 +90,11 @@ def save(device: cl.Device, digest: str, program: cl.Program) -> None:
 
 
 def _make_room(place: Path) -> None:
-    """Remove the least recently used files of a folder, until the rest take at most MAX_BINARY_CACHE_BYTES."""
+    """Remove the least recently used binaries in a folder until the rest take at most MAX_BINARY_CACHE_BYTES."""
     files = []
     for entry in os.scandir(place):
-        if not re.fullmatch(r"[0-9a-f]{32}\.bin", entry.name):  # CLSPLAT_BINARIES may name a folder of other files
+        # CLSPLAT_BINARIES may be a folder with other programs' files, which are kept
+        if not re.fullmatch(r"[0-9a-f]{32}\.bin", entry.name):
             continue
         with contextlib.suppress(OSError):  # another process may remove files too
             status = entry.stat()

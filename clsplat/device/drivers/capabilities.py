@@ -52,16 +52,16 @@ _CAPABILITIES_BY_WORD: dict[str, dict[str, Any]] = {
 _ATOMICS = {"cl_khr_global_int32_base_atomics", "cl_khr_local_int32_base_atomics"}
 """Extensions for integer atomics that a device of OpenCL 1.0 may lack. From OpenCL 1.1 on every device has them."""
 _LIMIT_FIELDS = {"group": "group", "local-memory": "local_memory", "allocation": "allocation"}
-"""Limits that CLSPLAT_PRETEND can lower: the fields of `Capabilities`, by their names in the variable."""
+"""Limits that CLSPLAT_PRETEND can lower, by their names in this variable, with the fields of `Capabilities`."""
 
 
 def pretended() -> str:
-    """The value of CLSPLAT_PRETEND, or an empty string."""
+    """Return the value of CLSPLAT_PRETEND, or an empty string if it is not set."""
     return os.environ.get(PRETEND_VARIABLE, "")
 
 
 def capabilities_of(device: cl.Device) -> Capabilities:
-    """The capabilities of a device, as changed by CLSPLAT_PRETEND. Raises DeviceError if its value is invalid."""
+    """Return a device's capabilities, changed as CLSPLAT_PRETEND says. Raises DeviceError if that is invalid."""
     from pyopencl import device_fp_config
 
     exact = bool(device.single_fp_config & device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT)
@@ -79,7 +79,7 @@ def capabilities_of(device: cl.Device) -> Capabilities:
             capabilities = replace(capabilities, **{limit: min(getattr(capabilities, limit), int(number))})
         else:
             raise DeviceError(
-                f"{PRETEND_VARIABLE}={pretended()}: {part.strip()!r} is none of {', '.join(_CAPABILITIES_BY_WORD)}, "
-                f"{', '.join(f'{size}=NUMBER' for size in _LIMIT_FIELDS)}"
+                f"{PRETEND_VARIABLE}={pretended()}: {part.strip()!r} is not known, expected one of "
+                f"{', '.join(_CAPABILITIES_BY_WORD)}, {', '.join(f'{size}=NUMBER' for size in _LIMIT_FIELDS)}"
             )
     return capabilities

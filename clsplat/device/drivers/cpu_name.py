@@ -28,9 +28,11 @@ CPU_NAMES_BY_FEATURES = (
 )
 """Processor names of LLVM, the most capable first, and the features that each requires, named as in Linux."""
 DEVICE_RECORD_BYTES = 2048
-"""Bytes of PoCL's device record (`cl_device_id`) to search for the processor name. In PoCL 3.0 it is at byte 640."""
+"""Number of bytes of PoCL's device record (`cl_device_id`) that are searched for the processor name. In PoCL 3.0 the
+name is at byte 640."""
 _kept: dict[int, ctypes.Array[ctypes.c_char]] = {}
-"""Processor names to which pointers in device records were set, by the pointer's address. They must stay in memory."""
+"""Processor names set by `name_processor`, by the address of the device record's pointer to the name. They are kept
+here because the driver reads them at every build."""
 
 
 @cache
@@ -45,8 +47,10 @@ def features(path: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
 
 
 def better_name(name: str, present: frozenset[str]) -> str:
-    """The best processor name for the features that are present. `name`, which LLVM 14 reports, is kept if it is as
-    good."""
+    """Return the best processor name of LLVM for a processor with the features `present`.
+
+    name: the name that LLVM 14 reports, which is returned if none is better.
+    """
     if not present or not (name == "generic" or name.startswith("znver")):
         return name
     by_features = next(better for better, needed in CPU_NAMES_BY_FEATURES if needed <= present)
@@ -54,9 +58,10 @@ def better_name(name: str, present: frozenset[str]) -> str:
 
 
 def name_processor(device: cl.Device) -> str:
-    """Set a processor name that the compiler of PoCL 3.0 accepts, on x86-64.
+    """Replace the processor name in a device record of PoCL 3.0 by a name that its compiler accepts.
 
-    Returns the name in use; empty for other drivers, or if the name is not found in the device record.
+    Returns the resulting name. For other drivers, and if no name is found in the record, nothing is changed, and the
+    result is "".
     """
     if not misnames_processors(device):
         return ""
@@ -66,14 +71,15 @@ def name_processor(device: cl.Device) -> str:
     name = _text(_word(address)) or ""
     better = better_name(name, features())
     if better != name:
-        # the name stays in memory while the process runs, as the driver reads it at every build
         _kept[address] = ctypes.create_string_buffer(better.encode())
         ctypes.c_void_p.from_address(address).value = ctypes.addressof(_kept[address])
     return better
 
 
 def _place(record: int) -> int | None:
-    """The address of the pointer to the processor name in a device record; None if it is not found.
+    """Find the pointer to the processor name in the device record at address `record`.
+
+    Returns the pointer's address; None if it is not found.
 
     The pointer follows the pointer to the target triple, such as x86_64-pc-linux-gnu.
     """
@@ -90,13 +96,13 @@ def _word(address: int) -> int:
 
 
 def _text(address: int) -> str | None:
-    """The printable text at an address, or None if there is none."""
+    """Return the text that begins at an address and ends with a zero byte; None if it is not printable ASCII."""
     text, end, _ = _memory(address, 64).partition(b"\0")
     return text.decode("ascii") if end and text.isascii() and text.decode("ascii").isprintable() else None
 
 
 def _memory(address: int, size: int) -> bytes:
-    """Bytes in this process's memory; empty if the address is not mapped."""
+    """Read `size` bytes of this process's memory from an address; empty if the address is not mapped."""
     with suppress(OSError, OverflowError), open("/proc/self/mem", "rb", buffering=0) as memory:
         return os.pread(memory.fileno(), size, address)
     return b""

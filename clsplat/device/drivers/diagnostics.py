@@ -33,14 +33,14 @@ def _outcome(*command: str) -> subprocess.CompletedProcess[str] | None:
 
 
 def _last_line(result: subprocess.CompletedProcess[str]) -> str:
-    """The reason why a process failed: the last line of its standard error, or its exit status."""
+    """Return why a process failed: the last line of its standard error, or its exit status if there is no line."""
     line = (result.stderr.strip().splitlines() or [f"status {result.returncode}"])[-1]
     return line.removeprefix("OSError: ").removeprefix("clsplat: error: ")
 
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """A finding about a part of the installation, printed as a line of text.
+    """A finding about a part of the installation, which `clsplat doctor` prints as a line of text.
 
     state: ok, note (no action needed) or missing.
     advice: an action to take, or empty.
@@ -64,7 +64,7 @@ def families() -> list[str]:
 
 
 def gpus(bus: Path = Path("/sys/bus/pci/devices")) -> list[str]:
-    """The makers of this machine's GPUs, each once; empty on systems other than Linux."""
+    """Return the makers of this machine's GPUs, such as NVIDIA, each once; empty on systems other than Linux."""
     makers = []
     for folder in sorted(bus.glob("*")):
         try:
@@ -77,7 +77,7 @@ def gpus(bus: Path = Path("/sys/bus/pci/devices")) -> list[str]:
 
 
 def driver_findings(files: Iterable[Path]) -> list[Diagnostic]:
-    """A finding for each .icd file: whether its library can be loaded."""
+    """Return a finding for each .icd file, which says whether the driver library that it names can be loaded."""
     return [_driver(path) for path in files]
 
 
@@ -97,7 +97,7 @@ def _driver(path: Path) -> Diagnostic:
 
 
 def listed_devices() -> tuple[list[dict[str, Any]], str]:
-    """The devices that `clsplat devices --json` lists; and the reason if it failed, otherwise an empty string."""
+    """Run `clsplat devices --json`. Return the devices that it lists, and the reason if it fails, or ""."""
     result = _outcome(*python_module("clsplat", "devices", "--json"))
     if result is None:
         return [], f"a driver does not answer within {driver_timeout():g} s"
@@ -109,7 +109,10 @@ def listed_devices() -> tuple[list[dict[str, Any]], str]:
 
 
 def device_findings(devices: Sequence[dict[str, Any]], trouble: str) -> list[Diagnostic]:
-    """A finding for each device, or a single finding if there is no device."""
+    """Return a finding for each device; or one finding with advice if there is no device or they were not listed.
+
+    trouble: why the devices could not be listed, or an empty string.
+    """
     if trouble or not devices:
         return [Diagnostic("device", "missing", trouble or "no OpenCL device found", driver_advice())]
     return [
@@ -119,8 +122,8 @@ def device_findings(devices: Sequence[dict[str, Any]], trouble: str) -> list[Dia
 
 
 def list_findings(devices: Sequence[dict[str, Any]]) -> list[Diagnostic]:
-    """A finding for each device with several work-items in a group: whether training lists each tile's Gaussians by
-    append or by radix sort."""
+    """Return a finding for each device whose kernels have several work-items in a group. It says whether training lists
+    each tile's Gaussians by append or by radix sort."""
     findings = []
     for info in devices:
         if " x 1 items" in info["shape"]:
@@ -131,13 +134,13 @@ def list_findings(devices: Sequence[dict[str, Any]]) -> list[Diagnostic]:
         else:
             fault = result.stdout if result.returncode == 0 else f"the probe fails: {_last_line(result)}"
         way = f"by radix sort, because {fault}" if fault else "by append"
-        text = f"{info['index']}: {name} lists the Gaussians of tiles {way}"
+        text = f"{info['index']}: training on {name} lists each tile's Gaussians {way}"
         findings.append(Diagnostic("lists", "note" if fault else "ok", text))
     return findings
 
 
 def gpu_findings(makers: Sequence[str], devices: Sequence[dict[str, Any]]) -> list[Diagnostic]:
-    """A finding for each maker of GPUs in this machine: whether OpenCL shows a GPU of this maker."""
+    """Return a finding for each of the GPU makers, which says whether OpenCL lists a GPU of this maker."""
     findings = []
     for maker in makers:
         shown = any(info["kind"] == "gpu" and of_maker(info["platform"], info["name"], maker) for info in devices)
@@ -148,7 +151,7 @@ def gpu_findings(makers: Sequence[str], devices: Sequence[dict[str, Any]]) -> li
 
 
 def access_findings(nodes: Sequence[Path] | None = None) -> list[Diagnostic]:
-    """On Linux, a finding for each GPU device node that this user may not open."""
+    """Return a finding for each of the GPU device nodes (by default all, on Linux) that this user may not open."""
     if nodes is None:
         nodes = [*Path("/dev/dri").glob("renderD*"), *(path for path in (Path("/dev/kfd"),) if path.exists())]
     closed = [node for node in nodes if not os.access(node, os.R_OK | os.W_OK)]
@@ -157,7 +160,7 @@ def access_findings(nodes: Sequence[Path] | None = None) -> list[Diagnostic]:
 
 
 def loader_finding() -> Diagnostic:
-    """A finding about pyopencl, which contains the driver loader: whether it can be imported."""
+    """Return a finding that says whether pyopencl, which contains OpenCL's driver loader, can be imported."""
     result = _outcome(sys.executable, "-c", "import pyopencl; print(pyopencl.VERSION_TEXT)")
     if result is None:
         text = f"the import of pyopencl does not finish within {driver_timeout():g} s"

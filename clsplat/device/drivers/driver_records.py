@@ -40,10 +40,10 @@ class Entry:
     """The record of a driver in one kernel shape.
 
     stages: self-test stages that passed.
-    kernels: builds and launches that passed their trial, by name (`sandbox`), with the salt (`Variant.anew`) of each.
+    kernels: names of the builds and launches that passed their trial, each with the salt (`Variant.anew`) of the build.
     failed: description of the driver's failure, or empty. When an entry is added to a record, None keeps the recorded
     failure.
-    trial: if a single kernel failed, its name and the input of `sandbox.again`.
+    trial: if a build or launch failed, its name and all that `sandbox.again` needs to repeat it.
     """
 
     stages: frozenset[str] = frozenset()
@@ -72,19 +72,19 @@ def _kernels_digest(broken: str) -> str:
 
 
 def device_key(device: cl.Device) -> str:
-    """Key of a device and its driver, with any pretended capabilities."""
+    """Return a key that identifies a device, its driver, and the capabilities that CLSPLAT_PRETEND sets."""
     words = [device.name.strip(), device.platform.version.strip(), device.driver_version.strip()]
     return " | ".join([*words, pretended()] if pretended() else words)
 
 
 def driver_key(device: cl.Device) -> str:
-    """Key of a driver's records for all shapes: device, driver, version of clsplat and kernel sources."""
+    """Return the key of a driver's record, made from device, driver, version of clsplat and kernel sources."""
     kernels = _kernels_digest(os.environ.get(BREAK_KERNEL_VARIABLE, ""))
     return f"{device_key(device)} | clsplat {package_version()} {kernels}"
 
 
 def _entry(value: object) -> Entry:
-    """Parse an entry of the file. A value that clsplat never writes gives an empty entry."""
+    """Parse an entry of the file of driver records. A value that clsplat never writes gives an empty entry."""
     given = value if isinstance(value, dict) else {}
     stages, kernels, failed = given.get("stages", []), given.get("kernels", {}), given.get("failed", "")
     trial = given.get("trial", {})
@@ -96,13 +96,13 @@ def _entry(value: object) -> Entry:
 
 
 _RECORDS_LOCK = threading.Lock()
-"""Lock for `_unwritten`, as each of several devices may be used by a thread of its own."""
+"""Lock for `_unwritten`, because several devices may be used at the same time, each in a thread of its own."""
 _unwritten: dict[Path, list[tuple[str, str, Entry]]] = {}
-"""Entries that could not be written yet, by file: driver, shape, and the entry to add."""
+"""Entries that are not written yet, by the path of the file of records: driver key, shape label and entry of each."""
 
 
 def _read() -> dict[str, Any]:
-    """The contents of the records' file, with the entries that are not written yet."""
+    """Return the contents of the file with the driver records, after the entries in `_unwritten` are added to them."""
     try:
         saved = parse_json(memory_path().read_bytes())
     except (OSError, ValueError):
@@ -129,13 +129,13 @@ def _add(saved: dict[str, Any], driver: str, shape: str, addition: Entry) -> Non
 
 
 def entries(device: cl.Device) -> dict[str, Entry]:
-    """All entries of the device's driver, by shape label, such as 8x1."""
+    """Return the entries of the record of this device's driver, by shape label, such as 8x1."""
     shapes = _read().get(driver_key(device))
     return {name: _entry(value) for name, value in shapes.items()} if isinstance(shapes, dict) else {}
 
 
 def entry(device: cl.Device, shape: str) -> Entry:
-    """The entry of the device's driver for a shape label, such as 8x1."""
+    """Return the entry of this device's driver for a shape label, such as 8x1; an empty entry if none is recorded."""
     return entries(device).get(shape, Entry())
 
 
@@ -148,10 +148,9 @@ def remember(
     failed: str | None = None,
     trial: Mapping[str, Any] | None = None,
 ) -> None:
-    """Add to the driver's entry for a shape label, such as 8x1.
+    """Add results to the entry of this device's driver for a shape label, such as 8x1, and write the file.
 
-    failed: None keeps the recorded failure.
-    trial: the failed trial, as in `Entry`.
+    stages, kernels, failed, trial: as in `Entry`. failed: None keeps the recorded failure.
 
     If the file cannot be written, a warning says so, and each process tests drivers again.
     """
@@ -167,7 +166,10 @@ def remember(
 
 
 def rewrite(path: Path, changed: Callable[[], Mapping[str, Any]]) -> None:
-    """Write the result of `changed` to a JSON file under a lock against other processes and threads. Raises OSError."""
+    """Write a JSON file, under a lock against other processes and threads. `changed` is called for its new content.
+
+    Raises OSError.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with briefly_locked(path):
         atomic_write(path, (json.dumps(changed(), indent=1) + "\n").encode())

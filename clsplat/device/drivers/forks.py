@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check that this process is no fork of a process that has used OpenCL. A fork lacks the driver's threads, so that an
-OpenCL call in it would wait forever."""
+"""Check that this process is not a fork of a process that has used OpenCL. A fork does not have the driver's threads,
+so that an OpenCL call in it would wait forever."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ TARGET_VARIABLE_PREFIX = "CL_CONFIG_"
 """Prefix of the environment variables that select the processor and options for Intel's compiler."""
 _ICD_FILENAMES = "OCL_ICD_FILENAMES"
 _INTEL_DRIVER_PATH = Path("Library", "bin", "intelocl64.dll")
-"""Path of intel-opencl-rt's driver below `sys.prefix`; the libraries that it needs are in the same folder."""
+"""Path below `sys.prefix` of the driver that the package intel-opencl-rt installs."""
 _POCL_CACHE = "POCL_CACHE_DIR"
 _POCL_AFFINITY = "POCL_AFFINITY"
 _POCL_COUNTS = ("POCL_CPU_MAX_CU_COUNT", "POCL_MAX_PTHREAD_COUNT", "POCL_MAX_COMPUTE_UNITS")
@@ -64,7 +64,7 @@ _GPU_PACKAGES = {
         "arch": "pacman -S intel-compute-runtime",
     },
 }
-"""Packages with a GPU's OpenCL driver, by maker and Linux family."""
+"""How to install a GPU's OpenCL driver, by the GPU's maker and the family of Linux distributions."""
 
 
 def kind_of(device: cl.Device) -> str:
@@ -75,7 +75,7 @@ def kind_of(device: cl.Device) -> str:
 
 
 def title(device: cl.Device) -> str:
-    """The device and its driver in a line of text. PoCL's build options, which follow two spaces, are left out."""
+    """Return the names of a device and its driver, without PoCL's build options, which follow two spaces."""
     return f"{device.name.strip()}, {device.platform.version.split('  ')[0].strip()}"
 
 
@@ -92,22 +92,22 @@ def _is_rusticl(device: cl.Device) -> bool:
 
 
 def most_lanes(device: cl.Device) -> int:
-    """Maximum pixels per vector that the driver's compiler handles on a CPU."""
+    """Return the maximum pixels per vector in kernels that the driver can compile and run on a CPU."""
     if _is_rusticl(device):  # llvmpipe hangs in larger kernels with vectors
         return 1
     return 8 if _pocl_version(device) == (3, 0) else 16  # PoCL 3.0 aborts on some float16 built-ins
 
 
 def subgroup_ways(device: cl.Device) -> list[dict[str, object]]:
-    """Sets of defines for kernels with sub-groups, in the order to try.
+    """Return sets of defines for kernels with sub-groups, in the order to try them.
 
     Empty if the device has no sub-groups whose size is known when a kernel is built. `Device.kernels` tests that
     work-items exchange the right values before it uses the defines.
     """
     extensions = device.extensions.split()
-    if "cl_nv_device_attribute_query" in extensions:  # lanes exchange values by inline PTX
+    if "cl_nv_device_attribute_query" in extensions:  # work-items exchange values by inline PTX
         return [{"SUBGROUP": 32, "SHUFFLE_PTX": True}]
-    if "cl_amd_device_attribute_query" in extensions:  # lanes exchange values by built-in functions
+    if "cl_amd_device_attribute_query" in extensions:  # work-items exchange values by built-in functions
         return [{"SUBGROUP": 32, "SHUFFLE_AMD": True}]
     functions = {"cl_khr_subgroup_shuffle": "SHUFFLE_KHR", "cl_intel_subgroups": "SHUFFLE_INTEL"}
     offered = [define for extension, define in functions.items() if extension in extensions]
@@ -156,16 +156,16 @@ def wants_cache(device: cl.Device) -> bool:
 
 
 def build_advice(log: str) -> str:
-    """Advice for a failed build, according to its log."""
+    """Return advice for the user after a failed build of a kernel, from the compiler's log."""
     if "unknown target CPU" in log:
         return "this driver is older than the processor: use another driver, such as your distribution's PoCL"
     return "CLSPLAT_DEBUG=1 shows the log and the source"
 
 
 def driver_advice(system: str | None = None, machine: str | None = None) -> str:
-    """Advice on the driver to install: a line without a full stop.
+    """Return advice on the driver to install: a line of text without a full stop.
 
-    system, machine: as `platform.system` and `platform.machine` return; None means this computer.
+    system, machine: as `platform.system` and `platform.machine` return them; None means this computer.
     """
     system, machine = system or platform.system(), (machine or platform.machine()).lower()
     pc = machine in ("x86_64", "amd64")
@@ -183,9 +183,9 @@ def driver_advice(system: str | None = None, machine: str | None = None) -> str:
 
 
 def gpu_advice(maker: str, families: Sequence[str]) -> str:
-    """Advice on the OpenCL driver for a maker's GPU.
+    """Return advice on the OpenCL driver to install for a maker's GPU.
 
-    families: this Linux distribution and those it is based on; empty on other systems.
+    families: names of this Linux distribution and of those it is based on; empty on other systems.
     """
     if not families:
         return f"install {maker}'s own graphics driver, which includes OpenCL"
@@ -200,9 +200,9 @@ def of_maker(platform_name: str, device_name: str, maker: str) -> bool:
 
 
 def driver_files(environment: Mapping[str, str] = os.environ) -> list[Path]:
-    """The .icd files; each contains the name of a driver's library.
+    """Return the paths of all .icd files. Each contains the name of a driver's library.
 
-    They are in the folder that OCL_ICD_VENDORS names, or without this variable in the system's folder. Others are in
+    The files are in the folder that OCL_ICD_VENDORS names, or without this variable in /etc/OpenCL/vendors, and in
     pyopencl's own folder of libraries.
     """
     folders = [Path(environment.get(_ICD_VENDORS) or "/etc/OpenCL/vendors")]
@@ -212,7 +212,7 @@ def driver_files(environment: Mapping[str, str] = os.environ) -> list[Path]:
 
 
 def no_device() -> DeviceError:
-    """The error to raise if no device is found."""
+    """Return the error to raise if OpenCL lists no device."""
     return DeviceError(f"no OpenCL device found: {driver_advice()}")
 
 
@@ -222,11 +222,11 @@ def offer_packaged(
     prefix: str = sys.prefix,
     environment: MutableMapping[str, str] = os.environ,
 ) -> None:
-    """Make OpenCL's loader find Intel's CPU driver that pip installed, in this process and its children, on Windows.
+    """Set OCL_ICD_FILENAMES so that, on Windows, OpenCL's loader finds the Intel CPU driver that pip has installed.
 
-    Windows' loader reads the registry, which pip does not write, and OCL_ICD_FILENAMES, except in a process with
-    administrator rights. A variable that is already set is kept. On Linux the loader finds PyPI's PoCL by itself;
-    macOS has no loader.
+    Otherwise the loader only finds drivers in the registry, which pip does not write. In a process with administrator
+    rights it ignores the variable. If the variable is already set, it is kept. On Linux the loader finds the PoCL that
+    pip has installed by itself; macOS has no loader.
     """
     driver = Path(prefix) / _INTEL_DRIVER_PATH
     if windows and _ICD_FILENAMES not in environment and driver.is_file():
@@ -264,8 +264,8 @@ def pin_threads(environment: MutableMapping[str, str] = os.environ) -> None:
     """Pin PoCL's thread number n to processor number n, in this process and its children.
 
     Otherwise two threads that wake up together may share a processor for whole kernels, while another is idle. Nothing
-    is pinned if this process or PoCL is limited to some processors: two processes of one thread each would then share
-    the first processor. A variable that is already set is kept.
+    is pinned if this process or PoCL is limited to some processors, because two processes of one thread each would then
+    share the first processor. If POCL_AFFINITY is already set, it is kept.
     """
     if sys.platform != "linux" or any(name in environment for name in (_POCL_AFFINITY, *_POCL_COUNTS)):
         return

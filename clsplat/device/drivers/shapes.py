@@ -36,10 +36,10 @@ class Shape:
     items: work-items per work-group in kernels whose items co-operate (1 on CPUs, which run a group as a sequential
     loop).
     chunks: number of chunks in a scan or sort if `items` is 1.
-    by_gaussian: in the gradient of blending, a work-item has a Gaussian and loops over pixels, instead of the reverse
-    (docs/decisions/0023-a-group-shares-a-tile.md). Only for lanes and items in BY_GAUSSIAN_SHAPES.
+    by_gaussian: in the gradient of blending, a work-item has a Gaussian and loops over pixels; if False, it has pixels
+    and loops over Gaussians (docs/decisions/0023-a-group-shares-a-tile.md). True only in BY_GAUSSIAN_SHAPES.
     subgroups: in the gradient of blending, the work-items of a sub-group sum by exchanging values. The sums have the
-    same bits. Only for lanes and items in SUBGROUP_SHAPES.
+    same bits. True only in SUBGROUP_SHAPES.
     """
 
     lanes: int
@@ -69,12 +69,12 @@ class Shape:
             or items & (items - 1)
             or (form and (lanes, items) not in _SHAPES_BY_SUFFIX[form])
         ):
-            raise ValueError(f"{label} is no kernel shape, expected LANESxITEMS, such as 8x1")
+            raise ValueError(f"{label} is not a kernel shape, expected LANESxITEMS, such as 8x1")
         return replace(self, lanes=lanes, items=items, by_gaussian=form == "g", subgroups=form == "s")
 
     @property
     def digit_bits(self) -> int:
-        """Bits of a digit of the radix sort, so few that a counter for each digit fits in local memory."""
+        """Bits per digit in the radix sort. Local memory has room for a counter for each value of a digit."""
         return 11 if self.items == 1 else 8
 
     @property
@@ -131,14 +131,14 @@ def candidates(device: cl.Device) -> list[Shape]:
 
 
 def asked_shape() -> str:
-    """The value of CLSPLAT_SHAPE, or an empty string. Raises DeviceError if it is invalid."""
+    """Return the value of CLSPLAT_SHAPE, or "" if it is not set. Raises DeviceError if it is not a shape label."""
     text = os.environ.get("CLSPLAT_SHAPE", "")
     if text and _parsed(text, Shape(1, 1, 1)) is None:
         raise DeviceError(
-            f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; lanes are 1, 4, 8 or 16; with "
-            f"{' or '.join(f'{lanes}x{items}' for lanes, items in BY_GAUSSIAN_SHAPES)}, suffix g selects a gradient by "
-            "Gaussian; with "
-            f"{', '.join(f'{lanes}x{items}' for lanes, items in SUBGROUP_SHAPES)}, suffix s selects sub-groups"
+            f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; with 1, 4, 8 or 16 lanes; "
+            f"{' or '.join(f'{lanes}x{items}' for lanes, items in BY_GAUSSIAN_SHAPES)} may end in g (in the gradient, "
+            "a work-item has a Gaussian), and "
+            f"{', '.join(f'{lanes}x{items}' for lanes, items in SUBGROUP_SHAPES)} in s (with sub-groups)"
         )
     return text
 
@@ -170,17 +170,17 @@ def wanted_shape(device: cl.Device) -> Shape:
 
 
 def failures(device: cl.Device) -> dict[str, str]:
-    """Recorded failures of the driver by shape label. Empty with CLSPLAT_TRUST_DRIVER=1."""
+    """Return descriptions of the driver's recorded failures, by shape label; empty with CLSPLAT_TRUST_DRIVER=1."""
     if regardless():
         return {}
     return {label: entry.failed for label, entry in driver_records.entries(device).items() if entry.failed}
 
 
 def shape_of(device: cl.Device) -> tuple[Shape, str]:
-    """The shape for a device that is opened without an explicit shape, and a warning or an empty string.
+    """Return the shape for a device that is opened without an explicit shape, and a warning or an empty string.
 
-    The shape is `wanted_shape`. If the driver has a recorded failure in that shape, it is the next shape without a
-    failure, and the warning says so. Raises DeviceError like `wanted_shape`.
+    The shape is `wanted_shape`. If the driver has a recorded failure in it, the next shape without a failure is
+    returned instead, and the warning says so. Raises DeviceError like `wanted_shape`.
     """
     wanted, failed = wanted_shape(device), failures(device)
     shape = shapes_to_try(device, wanted, failed)[0]
@@ -188,7 +188,7 @@ def shape_of(device: cl.Device) -> tuple[Shape, str]:
 
 
 def shape_text(device: cl.Device) -> str:
-    """The shape for the list of devices, or a note that the device cannot run CLSPLAT_SHAPE."""
+    """Return the shape in words for the list of devices, or a note that the device cannot run CLSPLAT_SHAPE."""
     try:
         shape, _ = shape_of(device)
     except DeviceError:
@@ -197,8 +197,8 @@ def shape_text(device: cl.Device) -> str:
 
 
 def shapes_in_turn(device: cl.Device) -> list[Shape]:
-    """All shapes in the order to try: the default, the others that `clsplat tune` measures, then smaller ones, which
-    demand less of a compiler."""
+    """Return all shapes for a device in the order to try them: the default, the others that `clsplat tune` measures,
+    then shapes with fewer lanes or items, which demand less of a compiler."""
     first = candidates(device)
     default = first[0]
     smaller = [replace(default, lanes=lanes, items=1) for lanes in (4, 1)] if default.items == 1 else []
@@ -207,8 +207,9 @@ def shapes_in_turn(device: cl.Device) -> list[Shape]:
 
 
 def shapes_to_try(device: cl.Device, first: Shape, failed: Mapping[str, str]) -> list[Shape]:
-    """The shape `first` and then those of `shapes_in_turn`, without shapes in which the driver has failed.
+    """Return the shape `first` and then those of `shapes_in_turn`, without the shapes in `failed`.
 
+    failed: the driver's recorded failures by shape label.
     If the driver has failed in every shape, `first` is tried again, because the cause may be gone.
     """
     shapes = dict.fromkeys((first, *shapes_in_turn(device)))
@@ -216,7 +217,10 @@ def shapes_to_try(device: cl.Device, first: Shape, failed: Mapping[str, str]) ->
 
 
 def instead(device: cl.Device, wanted: Shape, other: Shape, failure: str) -> str:
-    """The text of the warning that the shape `other` is used instead of the wanted shape."""
+    """Return the warning that the shape `other` is used because kernels failed in the shape `wanted`.
+
+    failure: description of the recorded failure.
+    """
     return (
         f"{title(device)}: kernels in the shape {wanted.label} failed: {failure}; {other.label} is "
         f"used instead (clsplat selftest tries {wanted.label} again)"
@@ -249,7 +253,7 @@ def saved_shapes() -> dict[str, str]:
         saved = None
     if not isinstance(saved, dict) or not all(isinstance(value, str) for value in saved.values()):
         warnings.warn(
-            f"{path}: is damaged, so no tuned shape is used; clsplat tune writes the file again", stacklevel=2
+            f"{path}: the file is damaged, so no tuned shape is used; clsplat tune writes it again", stacklevel=2
         )
         return {}
     return saved

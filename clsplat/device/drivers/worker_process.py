@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Worker processes, in which a driver may crash or hang without harm to this process, and reasons why they ended."""
+"""Worker processes, in which a driver may crash or hang without harm to this process; their messages and timeouts."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from clsplat.errors import DriverError, InputError, switched_on
 from clsplat.process import MAX_SIGNAL_WAIT_SECONDS, Interrupted, apart, endings
 
 CHILD_MESSAGE_PREFIX = "clsplat-child "
-"""Prefix of the lines by which a worker sends messages. It tells them from lines that a driver prints."""
+"""Prefix of the lines in which a worker process sends messages, to distinguish them from lines that a driver prints."""
 DRIVER_TIMEOUT_SECONDS = 120.0
 """Seconds without a message after which a driver counts as hung. The slowest known driver takes 60 seconds to build a
 kernel."""
@@ -34,7 +34,7 @@ _SIGKILL, _SIGTERM = -9, -15
 
 
 class TrialInterrupted(Interrupted):
-    """Raised if this process is asked to end while it waits for a driver's trial."""
+    """Raised in a thread that waits for a worker process, if this process is told to end, as by Ctrl-C."""
 
 
 class WorkerEndedError(Exception):
@@ -54,8 +54,8 @@ class WorkerEndedError(Exception):
 
 
 def driver_timeout() -> float:
-    """Seconds after which a driver counts as hung: CLSPLAT_DRIVER_TIMEOUT, or DRIVER_TIMEOUT_SECONDS. Raises InputError
-    if the variable is invalid."""
+    """Return the seconds after which a driver counts as hung: CLSPLAT_DRIVER_TIMEOUT, or else DRIVER_TIMEOUT_SECONDS.
+    Raises InputError if the variable is invalid."""
     text = os.environ.get(DRIVER_TIMEOUT_VARIABLE, "")
     if not text:
         return DRIVER_TIMEOUT_SECONDS
@@ -74,12 +74,12 @@ def regardless() -> bool:
 
 
 def tell(**values: object) -> None:
-    """Send a message from this process to its parent. A line break precedes it, as a driver may have printed text."""
+    """Send `values` to the parent process, as a line of JSON after a line break, as a driver may have printed text."""
     print(f"\n{CHILD_MESSAGE_PREFIX}{json.dumps(values)}", flush=True)
 
 
 def end_with_parent() -> None:
-    """End this process when its parent ends, even if a driver hangs. For a process that reads no messages."""
+    """End this process when its parent ends, even if a driver hangs. The process must not read its standard input."""
 
     def wait() -> None:
         while os.read(0, 1 << 10):
@@ -113,7 +113,7 @@ def ending_at_once() -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            if signal.getsignal(number) is interrupt:  # the previous handler may have installed another
+            if signal.getsignal(number) is interrupt:  # the previous handler may have installed another handler
                 signal.signal(number, handler)
 
 
@@ -128,7 +128,7 @@ def abandon() -> None:
 
 
 class WorkerProcess:
-    """A child process that answers in lines of JSON. Ctrl-C does not reach it. It ends with its parent, or by `close`.
+    """A child process that answers in lines of JSON. Ctrl-C does not reach it. It ends with its parent or by `close`.
 
     Raises DriverError if the process cannot be started.
     """
@@ -168,17 +168,17 @@ class WorkerProcess:
         self._errors.extend(line.strip() for line in self._process.stderr)
 
     def send(self, message: object) -> None:
-        """Send a line to the process. If it has ended, nothing is sent, and `receive` reports the end."""
+        """Send a message as a line of JSON. If the process has ended, the next `receive` raises the error."""
         assert self._process.stdin is not None
         with suppress(OSError):
             self._process.stdin.write(json.dumps(message) + "\n")
             self._process.stdin.flush()
 
     def receive(self, seconds: float, doing: str = "") -> dict[str, Any]:
-        """The next message of the process.
+        """Wait for the next message of the process and return it. After `seconds` without a message, kill the process.
 
         doing: the current work of the process, for the text of an error.
-        Raises TrialInterrupted or WorkerEndedError. After `seconds` without a message the process is ended.
+        Raises TrialInterrupted or WorkerEndedError.
         """
         until = time.monotonic() + seconds
         while True:
@@ -201,7 +201,7 @@ class WorkerProcess:
         return message
 
     def _last_words(self) -> str:
-        """The most informative line of the process's standard error, in brackets, or an empty string."""
+        """Return the most informative line of the process's standard error, in brackets; "" if there is no line."""
         self._readers[1].join(timeout=5)
         words = [line for line in self._errors if line]
         said = next((line for line in words if "ERROR" in line or "Assertion" in line), words[-1] if words else "")
@@ -217,23 +217,23 @@ class WorkerProcess:
         for reader in self._readers:
             reader.join(timeout=5)
         assert self._process.stdin is not None
-        with suppress(OSError, ValueError):  # the process may have ended; two threads may close the pipe
+        with suppress(OSError, ValueError):  # the process may have ended, or another thread closed the pipe
             self._process.stdin.close()
 
 
 _NO_PYTHON_ADVICE = (
-    "expected the path of this Python, to try the driver in a separate process; "
+    "expected the path of a Python that can try the driver in a separate process; "
     f"{TRUST_DRIVER_VARIABLE}=1 skips the trial"
 )
 
 
 def python_module(module: str, *words: str) -> list[str]:
-    """The command that runs a module of this package.
+    """Return the command that runs a module of this package with the arguments `words`.
 
     Unlike `python -m`, the command imports nothing from the current folder. Raises DriverError if Python does not know
     the path of its executable.
     """
-    if not sys.executable:  # another program may embed Python
+    if not sys.executable:  # so in a program that embeds Python
         raise DriverError(f"sys.executable is empty, {_NO_PYTHON_ADVICE}")
     root = str(Path(__file__).resolve().parents[3])
     code = (

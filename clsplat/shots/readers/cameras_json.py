@@ -24,7 +24,7 @@ from clsplat.shots.shot import MAX_SHOT_FRAMES, Frame, Shot
 CAMERAS_JSON_NAME = "cameras.json"
 """Name of the cameras' file in the output folder of a 3DGS training."""
 CAMERAS_JSON_ROTATION_TOLERANCE = 1e-2
-"""Largest deviation of a rotation's axes from right angles and unit length."""
+"""Largest accepted difference between R^T R and the identity matrix, where R is the rotation of an entry."""
 
 
 def read_cameras_json(path: Path, entries: list[Any], size: tuple[int | None, int | None]) -> Shot:
@@ -63,13 +63,13 @@ def _is_camera(entry: object) -> bool:
 
 
 def _called(entry: dict[str, Any]) -> str:
-    """An entry's name as " (NAME)", to put after its number in an error message; "" if it has none."""
+    """Return an entry's name as " (NAME)", to put after its number in an error message; "" if it has no name."""
     name = entry.get("img_name")
     return f" ({name[:80]})" if isinstance(name, str) and name.strip() else ""
 
 
 def _json(value: object) -> str:
-    """A value as it is written in the file, for an error message."""
+    """Write a value as in the JSON file, possibly shortened, for an error message."""
     return json.dumps(value) if value is None or isinstance(value, bool) else short(value)
 
 
@@ -90,13 +90,16 @@ def _camera(keys: Keys, size: tuple[int | None, int | None]) -> Camera:
 
 
 def _rotation(keys: Keys) -> Float64:
-    """Rotation (3, 3) of `cam_from_world`, made exactly orthogonal. Raises InputError if it is no rotation."""
+    """Return the rotation (3, 3) of `cam_from_world` of an entry, made exactly orthogonal.
+
+    Raises InputError if the entry's 'rotation' is not a rotation within CAMERAS_JSON_ROTATION_TOLERANCE.
+    """
     rows = numbers(keys.frame["rotation"])
     if rows.shape != (3, 3) or not np.isfinite(rows).all():
         raise keys.wrong("rotation", "three rows of three numbers")
     if np.abs(rows.T @ rows - np.eye(3)).max() > CAMERAS_JSON_ROTATION_TOLERANCE or np.linalg.det(rows) < 0:
         raise InputError(
-            f"{keys.where}: 'rotation' is no rotation (determinant {np.linalg.det(rows):.3g}), expected the rows of "
+            f"{keys.where}: 'rotation' is not a rotation (determinant {np.linalg.det(rows):.3g}), expected the rows of "
             "world_from_camera; check how it was exported"
         )
     u, _, v = np.linalg.svd(rows)

@@ -20,7 +20,7 @@ from clsplat.shots.shot import Shot, numbered, whole_frames
 
 CAMERAS_VERSION_KEY, CAMERAS_VERSION = "clsplat_cameras", 1
 FOCAL_PROPERTIES = ("fx", "fy", "fov_x", "fov_y", "pixel_size")
-"""Properties that set the focal length."""
+"""Properties of a camera file or of a key that set the focal length."""
 LENS_PROPERTIES = (*FOCAL_PROPERTIES, "cx", "cy", "shift", "roll")
 CAMERA_FILE_PROPERTIES = (
     CAMERAS_VERSION_KEY,
@@ -39,9 +39,10 @@ KEY_FRAME_PROPERTIES = ("frame", "seconds", "position", "world_from_cam", *LENS_
 
 
 def read_keyed(path: Path, document: dict[str, Any]) -> Shot:
-    """Read a camera file: one frame for each whole number from the first key to the last; of a loop, for one period.
+    """Read the frames of a camera file: those with whole numbers from the first key to the last, or, with
+    'loop_frames', one period from the first key. Cameras are interpolated smoothly between the keys (`interpolate`).
 
-    Cameras are interpolated smoothly between the keys (`interpolate`).
+    document: the file's parsed JSON object.
 
     Raises InputError, naming the file and the key, for another version, no keys, an unknown name, and missing or
     invalid values.
@@ -54,7 +55,7 @@ def read_keyed(path: Path, document: dict[str, Any]) -> Shot:
         )
     _known(str(path), document, CAMERA_FILE_PROPERTIES)
     if not (entries := objects(document, "keys")):
-        raise InputError(f"{path}: has no keys, expected 'keys' to be a list of at least one")
+        raise InputError(f"{path}: has no keys, expected 'keys' to be a list of at least one object")
     whole = Keys(path, None, {}, document)
     fps, first, loop = whole.number("fps"), whole.require("first_frame", 1.0), whole.number("loop_frames")
     if fps is not None and fps <= 0:
@@ -85,11 +86,14 @@ def _frame(keys: Keys, fps: float | None, first: float) -> float:
         return keys.require("frame")
     if fps is None:
         raise InputError(f"{keys.where}: has 'seconds', but the file has no 'fps', expected frames per second")
-    return round(first + keys.require("seconds") * fps, 6)  # so that 0.1 s at 30 fps is exactly frame 3
+    return round(first + keys.require("seconds") * fps, 6)  # rounded, so that 0.1 s at 30 fps is frame 3
 
 
 def _frames(path: Path, frames: list[float], loop: float | None) -> list[int]:
-    """Whole frames to render, from the frames of the keys, in increasing order. Raises InputError."""
+    """Return the numbers of the frames to render, in increasing order. Raises InputError.
+
+    frames: frame numbers of the keys, in increasing order. loop: the period in frames, or None.
+    """
     for before, after in pairwise(frames):
         if before == after:
             raise InputError(f"{path}: has two keys at frame {after:g}, expected one")
@@ -132,10 +136,9 @@ def _rotation(keys: Keys) -> Float64:
 
 
 def _focal(keys: Keys, projection: Projection, width: int, height: int) -> tuple[float, float]:
-    """Return fx and fy of a key, or of the whole file if the key gives none.
+    """Return the focal lengths fx and fy of a key, or of the whole file if the key gives no focal length.
 
-    They are in pixels: per scene unit of an orthographic camera, per radian of a camera that wraps around, otherwise at
-    depth 1.
+    Their unit is pixels per world unit for an orthographic camera, pixels per radian for a panorama, otherwise pixels.
     """
     source = keys.frame if any(name in keys.frame for name in FOCAL_PROPERTIES) else keys.document
     given = [name for name in FOCAL_PROPERTIES if name in source]

@@ -29,12 +29,12 @@ WORLD_UNITS_PER_APERTURE_UNIT = 0.1
 """World units per unit of apertures and focal lengths, in USD."""
 
 SUPPORTED_PROJECTIONS = names_of("usd")
-"""Accepted projections of a camera. Others are lenses with distortion, which are refused."""
+"""Values that are accepted in a camera's attributes of projection. Other values mean lenses with distortion."""
 
 
 def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), prim: str | None = None) -> Shot:
-    """Read the frames of a stage's camera, from the stage's start to its end time code. If the stage has none, they go
-    from the first time sample to the last.
+    """Read the frames of a stage's camera, one for each whole time code from startTimeCode to endTimeCode. If the stage
+    has neither, the frames go from the camera's first time sample to the last.
 
     The frame rate is the stage's timeCodesPerSecond; USD uses framesPerSecond if only that is authored. Each
     frame has the shutter and the lens of its time code. `Shot.moment` gives the camera at any time, with USD's own
@@ -56,7 +56,7 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
     """Read cameras like `read_usd`, from a file that is known not to crash USD's library."""
     from pxr import UsdGeom, UsdUtils
 
-    # captures the messages that USD would print: an unresolved layer may not concern the camera
+    # captures the messages that USD would print, as on a missing layer, which may not concern the camera
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
     stage = open_stage(path, path)
     with readable(path):
@@ -73,7 +73,7 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
 
         def moment(time: float) -> Camera:
             with readable(path):
-                prim = UsdGeom.Camera(stage.GetPrimAtPath(place))  # the reference to the stage keeps it open
+                prim = UsdGeom.Camera(stage.GetPrimAtPath(place))  # this reference to `stage` keeps it open
                 return _camera(f"{where} at {time:g}", prim, time, picture, settings)
 
         frames = numbered(map(moment, codes), codes[0], None if len(codes) == 1 or per_second <= 0 else per_second)
@@ -85,7 +85,7 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
         )
     lost = () if known or not asked else (f"camera ({asked}, which does not exist)",)
     unapplied = (*_unapplied(camera, codes), *settings.unapplied, *lost)
-    # cut the line's end, where USD prints the stage's address in memory
+    # cut off the end of each line, where USD prints the stage's address in memory
     lines = [message.commentary.split(" (instantiating")[0] for message in diagnostics.TakeUncoalescedDiagnostics()]
     warnings = tuple(f"{path}: USD says: {' '.join(line.split())}" for line in lines[:3])
     moved = [time for source in _moved(camera) for time in source.GetTimeSamples()]
@@ -94,7 +94,10 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
 
 
 def _unapplied(camera: Any, codes: list[int]) -> tuple[str, ...]:
-    """Names and first values of authored camera attributes that would change a frame but are not applied."""
+    """Return names and first values of the camera's authored attributes that would change a frame but are not applied.
+
+    codes: time codes of the frames.
+    """
     from pxr import UsdGeom
 
     usual: dict[str, object] = {"exposure": 0.0, "exposure:iso": 100.0}
@@ -104,7 +107,10 @@ def _unapplied(camera: Any, codes: list[int]) -> tuple[str, ...]:
 
 
 def _optics(where: str, camera: Any, code: int, settings: Settings, metres: float, fps: float) -> Optics:
-    """Shutter and lens at a time code. Raises InputError for invalid values."""
+    """Return the camera's shutter and lens at the time code `code`. Raises InputError for invalid values.
+
+    metres: length of a world unit in metres. fps: frames per second, 0 if unknown.
+    """
     opens, closes = (
         _number(where, attribute, code) for attribute in (camera.GetShutterOpenAttr(), camera.GetShutterCloseAttr())
     )
@@ -135,7 +141,7 @@ def _optics(where: str, camera: Any, code: int, settings: Settings, metres: floa
 
 
 def _authored(prim: Any, name: str, usual: Any, codes: list[int]) -> str:
-    """Name and value of an attribute if it is authored with another value than `usual`, else ''."""
+    """Return the name and first value of an attribute that is authored and differs from `usual`; otherwise ''."""
     attribute = prim.GetAttribute(name)
     if not attribute or not attribute.HasAuthoredValue():
         return ""
@@ -161,7 +167,7 @@ def _find(path: Path, cameras: list[Any], prim: str | None) -> Any:
 
 
 def _moved(camera: Any) -> Iterator[Any]:
-    """Yield the camera and those of its ancestors that can have a transform."""
+    """Yield the camera and each of its ancestors that can have a transform."""
     from pxr import UsdGeom
 
     prim = camera.GetPrim()
@@ -172,10 +178,10 @@ def _moved(camera: Any) -> Iterator[Any]:
 
 
 def _time_codes(where: str, stage: Any, camera: Any) -> tuple[list[int], tuple[float, ...]]:
-    """Whole time codes to render, and the times of all values of the camera or of an ancestor's transform.
+    """Return the whole time codes to render, and all times at which the camera or an ancestor's transform has a value.
 
-    The codes are the stage's range. If it has none, they go from the first time that has a value to the last. All
-    values are read once, to find those that USD cannot read.
+    The time codes are the stage's range. If it has none, they go from the first time with a value to the last. Each
+    value is read once, so that an error is raised now if USD cannot read it.
     """
     attributes = camera.GetPrim().GetAttributes()
     ops = [op for moved in _moved(camera) for op in moved.GetOrderedXformOps()]
@@ -200,7 +206,7 @@ def _number(where: str, attribute: Any, code: float) -> float:
 
 
 def _aperture(where: str, camera: Any, code: float) -> tuple[float, float]:
-    """Width and height of the camera's aperture."""
+    """Return the width and height of the camera's aperture at a time code, in USD's unit of apertures."""
     horizontal = _number(where, camera.GetHorizontalApertureAttr(), code)
     vertical = _number(where, camera.GetVerticalApertureAttr(), code)
     if not (horizontal > 0 and vertical > 0):

@@ -14,7 +14,7 @@ CONFORM_POLICIES = (
     *("expandAperture", "cropAperture", "adjustApertureWidth", "adjustApertureHeight"),
     "adjustPixelAspectRatio",
 )
-"""Values of aspectRatioConformPolicy."""
+"""Values that USD allows for the attribute aspectRatioConformPolicy of render settings."""
 FULL_DATA_WINDOW = (0.0, 0.0, 1.0, 1.0)
 """The data window that covers the whole frame."""
 
@@ -42,14 +42,17 @@ class Settings:
     unapplied: tuple[str, ...] = ()
 
     def aspect(self, aperture: tuple[float, float]) -> float:
-        """Ratio of width to height in pixels, for a picture of which the user gives only one side."""
+        """Return the ratio of width to height of a picture in pixels, if the user gives only one of them.
+
+        aperture: width and height of the camera's aperture.
+        """
         if self.resolution is not None:
             return self.resolution[0] / self.resolution[1]
         pixels = 1.0 if self.policy == "adjustPixelAspectRatio" else self.pixel_aspect
         return aperture[0] / aperture[1] / pixels
 
     def conformed(self, aperture: tuple[float, float], size: tuple[int, int]) -> tuple[float, float]:
-        """Width and height of the camera's aperture after it is adapted to a picture of `size` pixels by `policy`."""
+        """Return the width and height of a camera's aperture, adapted by `policy` to a picture of `size` pixels."""
         across, down = aperture
         wanted = size[0] * self.pixel_aspect / size[1]
         if self.policy == "adjustPixelAspectRatio":
@@ -65,14 +68,14 @@ class Settings:
 
 
 def window_named(window: tuple[float, float, float, float] | None) -> tuple[str, ...]:
-    """Name and value of a data window, for a warning; empty if it covers the whole frame."""
+    """Return the name and value of the data window `window`, for a warning; empty if it covers the whole frame."""
     return (
         () if window in (None, FULL_DATA_WINDOW) else (f"dataWindowNDC ({', '.join(f'{edge:g}' for edge in window)})",)
     )
 
 
 def camera_of_settings(stage: Any) -> str:
-    """Path of the camera that a render product, or else the stage's render settings, names; '' for none."""
+    """Return the path of the camera that a render product or else the stage's render settings name; '' if none do."""
     settings = _stage_settings(stage)
     for prim in (*_products(settings), settings) if settings else ():
         if targets := prim.GetCameraRel().GetForwardedTargets():
@@ -81,7 +84,8 @@ def camera_of_settings(stage: Any) -> str:
 
 
 def read_settings(path: Path, stage: Any, camera: Any) -> Settings:
-    """Read the render settings that the stage's metadata name. The first product of the camera overrides them.
+    """Read the render settings to which the stage's metadata point. Values in the first render product that uses the
+    camera override them.
 
     Raises InputError, naming the prim, for invalid values.
     """
@@ -123,7 +127,7 @@ def _stage_settings(stage: Any) -> Any:
 
 
 def _unnamed(stage: Any) -> tuple[str, ...]:
-    """Names, for a warning, of at most three render settings that the stage's metadata do not point to."""
+    """Return a text for a warning on each RenderSettings prim, at most three, if the stage's metadata name none."""
     from pxr import UsdRender
 
     paths = [str(prim.GetPath()) for prim in stage.Traverse() if prim.IsA(UsdRender.Settings)]
@@ -141,7 +145,7 @@ def _products(settings: Any) -> list[Any]:
 
 
 def _authored(prims: list[Any], name: str) -> Any:
-    """The attribute `name` of the first prim that has an authored value for it, else the last prim's attribute."""
+    """Return the attribute `name` of the first of the prims in which it is authored, or else of the last prim."""
     attributes = [prim.GetAttribute(name) for prim in prims]
     return next((attribute for attribute in attributes if attribute.HasAuthoredValue()), attributes[-1])
 
