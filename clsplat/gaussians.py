@@ -138,7 +138,7 @@ class Gaussians:
         sh_degree : int, optional
             Pad SH with zeros up to this degree, in formats that store several degrees. None means the model's degree.
         comments : sequence of str
-            Lines such as `colour.comment` for the header, in formats that have a header.
+            Lines for the header, such as the colour space (`colour.comment`), in formats that have a header.
 
         Raises
         ------
@@ -169,7 +169,7 @@ class GaussiansOfFile(Gaussians):
         self.antialiased, self.by_rays = like.antialiased, like.by_rays
 
     def __getstate__(self) -> dict[str, Any]:
-        """Copy and pickle the arrays too, because the file may be gone when the copy is used."""
+        """Include the arrays in copies and pickles, because the file may be gone when they are used."""
         return {"means": self.means, **vars(self)}
 
     def __getattr__(self, name: str) -> Any:

@@ -54,9 +54,9 @@ def error_of(picture: NDArray[Any], wanted: NDArray[Any]) -> dict[str, float]:
 
 
 def settings() -> dict[str, BenchSwitches]:
-    """Return the settings to measure, by name: presets, single switches changed, and all exact switches off.
+    """Return the settings to measure, by name: presets, the defaults with one switch changed, and all exact ones off.
 
-    Equal settings are joined, with both names.
+    Equal settings are measured once, with their names joined.
     """
     named = {f"preset {name}": config.switches() for name, config in RASTERIZER_PRESETS.items()}
     flags = [switch.name for switch in fields(BenchSwitches) if switch.default is True]
@@ -263,8 +263,8 @@ def settings_table(result: dict[str, Any]) -> str:
         rows.append((point["name"], *times, psnr, f"{point['max_abs']:.2g}", front_mark))
     known, (_, _, width, height) = result["exact_against_float64"], result["crop"]
     note = (
-        f"error against {result['error_is_against']}; exact against float64 on {width}x{height} pixels: "
-        f"{known['psnr']:.1f} dB, {known['max_abs']:.2g}"
+        f"errors are against {result['error_is_against']}; exact against the float64 reference on {width}x{height} "
+        f"pixels: PSNR {known['psnr']:.1f} dB, largest error {known['max_abs']:.2g}"
     )
     lines = [*aligned(rows), "", note]
     if (faster := result["exact_switches_faster"]) is not None:

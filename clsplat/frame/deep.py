@@ -34,7 +34,7 @@ Convert = Callable[[Float32, Float32], Float32]
 Weighted = tuple[Float32, Float32]
 """Planes of a deep picture, and weights (H, W) of its pixels."""
 _MERGE_MEMORY_DIVISOR = 16
-"""Divisor of the device's memory limit that gives the limit of a merge. Rendering uses the rest."""
+"""A merge may use the device's memory limit divided by this. Rendering uses the rest."""
 _WARP_BATCH_PIXELS = 1 << 14
 """Number of pixels that are warped at a time, which limits the memory on the host."""
 
@@ -54,7 +54,7 @@ def drawn_in_slices(renderer: Renderer, gaussians: Callable[[], Gaussians], bins
 
 
 def deep_in_strips(draw: DrawDeep, rows: Callable[[Camera], int]) -> DrawDeep:
-    """A DrawDeep that renders the planes in strips.
+    """A DrawDeep that renders a picture with `draw`, strip by strip.
 
     rows: function from a camera to the number of rows of a strip.
     """

@@ -38,9 +38,9 @@ def drawn_by(
 ) -> Draw:
     """A Draw that renders with the kernels.
 
-    after, before: cameras of whole frames at the end of motion and of backward motion.
+    after, before: cameras of the whole next and previous frame, for the channels motion and backward.
     cut: function from a camera to the holdout surfaces in its picture; None without a holdout.
-    moved, earlier: Gaussians at the end of motion and of backward motion; None if they do not move.
+    moved, earlier: the Gaussians at the next and the previous frame, for these channels; None if they do not move.
     mattes: mattes by channel name.
 
     The planes may be non-contiguous, as the encoder makes them contiguous, perhaps in another thread.

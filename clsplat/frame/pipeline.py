@@ -57,7 +57,7 @@ class FrameRequest:
     at: function from a time to the camera of the whole frame in its final size. The time is in frames, 0 at this frame.
     after, before: cameras of the next and the previous frame, for the channels motion and backward.
     lens: lens distortion, as the position in an undistorted picture of each pixel; None for an undistorted frame.
-    sampling: the sampling of this frame; None uses the job's.
+    sampling: settings of this frame's samples of shutter and lens; None uses the job's.
     cut: function from a camera to the holdout surfaces in its picture, for all samples of the frame.
     models: function from a time to the Gaussians; None uses the pipeline's model.
     moved: the model at the next and at the previous frame, for the channels motion and backward; None if it does not
@@ -211,7 +211,7 @@ class FramePipeline:
         return self._sampling(frame).on or self.config.framing.supersample > 1 or frame.lens is not None
 
     def is_blank(self, planes: Planes, frame: FrameRequest) -> bool | None:
-        """True if the planes of `draw`, before conversion, show only the background. None if no channel tells."""
+        """True if the planes of `draw`, before conversion, show only the background; None if no channel shows it."""
         for name in ("alpha", "count", "depth"):
             if name in planes:
                 return not planes[name].any()

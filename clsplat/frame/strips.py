@@ -40,12 +40,12 @@ def strip_rows(
 
     names: names of the channels to render.
     config: the framing; with supersampling, rendered strips are larger than written strips.
-    planes: bytes per pixel of further planes.
+    planes: bytes per pixel that the frame needs in addition to its channels, such as for a holdout.
     """
     samples = config.supersample if config else 1
     most = min(frame_pixels(device, feature_floats(names), planes), STRIP_PIXELS)
     across = -(-camera.width * samples // TILE) * TILE * samples
-    rows = most // across - 2 * TILE  # less two tiles: windows may begin inside a tile, and filters have margins
+    rows = most // across - 2 * TILE  # two spare: windows may begin inside a tile, and filters read margins
     if rows >= camera.height:
         return camera.height
     return max(rows // TILE, 1) * TILE
@@ -55,12 +55,12 @@ def deep_rows(device: Device, camera: Camera, bins: int, pictures: int = 1) -> i
     """Number of rows of a deep picture's strips, a multiple of the tile size.
 
     bins: maximum number of slices per pixel.
-    pictures: number of pictures of which each pixel is the mean.
+    pictures: number of pictures that are averaged.
     """
     floats = DEEP_FLOATS * bins
     most = DEEP_STRIP_FLOATS if pictures == 1 else DEEP_MERGE_FLOATS // min(pictures, DEEP_PICTURES)
     pixels = min(most // floats, frame_pixels(device, planes=4 * floats))
-    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # 2 TILE: padding of the first and last tile
+    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # 2 TILE pixels of padding
 
 
 def strips(camera: Camera, rows: int) -> Iterator[Camera]:

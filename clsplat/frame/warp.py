@@ -44,7 +44,11 @@ def warped(draw: Draw, warp: Warp) -> Draw:
 
 
 def _taken(plane: NDArray[Any], places: Float64, samples: int, name: str) -> NDArray[Any]:
-    """Sample a plane (h, w) or (h, w, floats) at positions (k rows, k columns, 2)."""
+    """Return the pixels (rows, columns) of a warped plane, from an undistorted plane (h, w) or (h, w, floats).
+
+    places: positions (k rows, k columns, 2) of the samples in the undistorted plane; k is `samples`.
+    name: name of the channel, which determines the interpolation.
+    """
     height, width = places.shape[0] // samples, places.shape[1] // samples
     channel = FRAME_CHANNELS.get(name)
     result = np.empty((height, width, *plane.shape[2:]), plane.dtype)

@@ -148,7 +148,7 @@ def rasterize(
     check_given(covars, quaternions, scales)
     floats = {name: jnp.asarray(array, jnp.float32) for name, array in arrays.items() if array is not None}
     for name, side in (("viewmats", 4), ("intrinsics", 3)):
-        if floats[name].shape == (side, side):  # the matrix of a single camera
+        if floats[name].shape == (side, side):  # a single matrix, without the axis of cameras
             floats[name] = floats[name][None]
     if backgrounds is not None and floats["backgrounds"].shape == floats["colors"].shape[-1:]:
         floats["backgrounds"] = jnp.tile(floats["backgrounds"], (len(floats["viewmats"]), 1))

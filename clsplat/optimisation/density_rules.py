@@ -15,7 +15,7 @@ from clsplat.arrays import Float32
 FRESH = np.uint32(1 << 31)
 """Bit of an entry in a row list. It marks the row as a new Gaussian, whose moments start at zero."""
 UNWANTED, USELESS = -1.0, -2.0
-"""Scores of Gaussians that are not densified, and of those that are pruned because they contribute too little."""
+"""Scores that mark Gaussians: never densify (UNWANTED); prune, because they contribute too little (USELESS)."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,8 @@ class MarkRules:
     - It is not new and its radius on an image, in pixels, is over `radius`.
     - It contributes at most `contribution` to every view.
 
-    cut_off: (value, row). A Gaussian passes if its score is over `value`, or equals `value` in a row up to `row`.
+    cut_off: (value, row). A Gaussian passes if its score is over `value`, or equals `value` and its
+        row is at most `row`.
     """
 
     gradient: float = inf

@@ -20,8 +20,8 @@ class MissedSteps:
     """Factors for Gaussians that missed the last 0 to MOST_MISSED steps.
 
     groups: names of the parameter groups.
-    factors: (MOST_MISSED + 1, groups, 3), by the number of missed steps. The first is a parameter's movement, as a
-        multiple of its first moment over the root of its second. The other two multiply the first and second moment.
+    factors: (MOST_MISSED + 1, groups, 3), by the number of missed steps. The last axis has a parameter's movement, as a
+        multiple of its first moment over the root of its second, then the factors of the first and second moment.
     """
 
     def __init__(self, config: OptimiserConfig, groups: Sequence[str], factors: Float64 | None = None) -> None:
@@ -33,7 +33,7 @@ class MissedSteps:
         self._decays = np.array([config.beta1, config.beta2], np.float32).astype(np.float64)
 
     def add(self, scales: Mapping[str, float]) -> None:
-        """Add a step to the factors (equations (190) and (191) of docs/gradients.md).
+        """Take one more step into account in the factors (equations (190) and (191) of docs/gradients.md).
 
         scales: rate sqrt(1 - beta2^t) / (1 - beta1^t) of each group that the step updates.
         """

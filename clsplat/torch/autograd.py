@@ -29,7 +29,7 @@ RASTERIZATION_INPUTS = ("means", "quaternions", "scales", "covars", "opacities",
 
 
 class Batches:
-    """A tensor as a sequence of arrays, one for each batch; all None if the tensor is None."""
+    """A tensor as a sequence of arrays, one for each batch. Each is None if the tensor is None."""
 
     def __init__(self, value: Tensor | None, batch: tuple[int, ...]) -> None:
         array = None if value is None else as_array(value)
@@ -137,13 +137,13 @@ class BatchResults:
         rows = array
         if len(array) < math.prod(self.sizes):
             rows = np.zeros((math.prod(self.sizes), *array.shape[1:]), np.float32)
-            # rows are copied as single items, which takes half the time
+            # copy each row as one item of bytes, which takes half the time
             one = np.dtype((np.void, array.itemsize * math.prod(array.shape[1:])))
             rows.reshape(-1).view(one)[self.in_view] = array.reshape(-1).view(one)
         return rows.reshape(*self.sizes, *array.shape[1:])
 
     def gradient(self, each: list[dict[str, Any]], name: str, like: Tensor | None) -> Tensor | None:
-        """The gradient with respect to the argument `like`, in its shape and dtype; None if a batch has none.
+        """The gradient with respect to the argument `like`, in its shape and dtype; None if a batch lacks it.
 
         each: gradients by name, for each batch.
         """
@@ -204,7 +204,8 @@ class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torc
     def forward(ctx: Any, call: BatchResults, *inputs: Tensor | None) -> tuple[Tensor | None, ...]:
         """The arrays PROJECTED_SPLAT_NAMES, and the colours (..., C, N, 3) if there are SH coefficients.
 
-        inputs: RASTERIZATION_INPUTS. covars are upper triangles; colors are None unless they are SH coefficients.
+        inputs: the tensors that RASTERIZATION_INPUTS names. covars are upper triangles; colors are None unless they are
+        SH coefficients.
         """
         ctx.call = call
         ctx.save_for_backward(*inputs)
@@ -289,7 +290,7 @@ class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch ha
         has_depths = all(found.get("depths") is not None for found in each)
         if call.absolute:
             means2d.absgrad = call.in_layout(each, "absolute", means2d, hand_on=False)
-        if values is not None and values.dim() == len(call.batch) + 2:  # the same values for all cameras
+        if values is not None and values.dim() == len(call.batch) + 2:  # all cameras share the values
             each = [{**found, "colors2d": found["colors2d"].sum(0)} for found in each]
         return (
             None,

@@ -83,7 +83,7 @@ def rasterization(
     rays: Tensor | None = None,
     lidar_coeffs: Any = None,
     external_distortion_coeffs: Any = None,
-    ut_params: Any = None,  # noqa: ARG001  # settings of with_ut
+    ut_params: Any = None,  # noqa: ARG001  # has an effect only with with_ut
     extra_signals: Tensor | None = None,
     extra_signals_sh_degree: int | None = None,
     renderer_config: Any = None,
@@ -234,7 +234,9 @@ def rasterization(
         results = given.rasterized(settings, batch, differentiable=differentiable)
     expected = render_mode.endswith("ED")
     call = BatchResults(results, batch, packed=packed, sparse=sparse_grad, absolute=absgrad, expected_depth=expected)
-    if not differentiable and not given.have_tangents:  # for dual tensors, PyTorch will raise an error
+    if (
+        not differentiable and not given.have_tangents
+    ):  # `_with_gradient` passes dual tensors to PyTorch, which refuses them
         return *call.pixels(means), _meta(call, means, None, width, height, tile_size)
     splats, images, alphas = _with_gradient(call, given, settings.sh_degree, depth_alone=depth_alone)
     return images, alphas, _meta(call, means, splats, width, height, tile_size)

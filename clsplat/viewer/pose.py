@@ -45,7 +45,7 @@ class Pose:
     height: int
 
     def camera(self, width: int | None = None, height: int | None = None) -> Camera:
-        """Return the camera for the size of the page, or for another size. `angle` defines the field of view.
+        """Return the camera for the size of the page, or for another size. The method `angle` gives its field of view.
 
         The camera's numbers have the same bits as if written to a camera file (`path_document`) and read again.
         """
