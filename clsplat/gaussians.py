@@ -161,7 +161,7 @@ MAX_PARAMETER = 1e19
 class GaussiansOfFile(Gaussians):
     """A model in a file. Its arrays are read on first use, since main memory may have no room for them.
 
-    like: Gaussians with the model's origin, near plane and other properties.
+    like: Gaussians that have the same origin, near plane and other properties as the model.
     """
 
     def __init__(self, path: Path, like: Gaussians) -> None:

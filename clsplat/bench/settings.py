@@ -39,7 +39,7 @@ ALL_EXACT_SWITCHES_OFF = "all exact switches off"
 MAX_PSNR_DB = 160.0
 """PSNR in dB that is reported for equal images instead of infinity."""
 APPROXIMATING_SETTINGS = ("sh_degree_limit", "sh_tolerance", "sh_storage", "alpha_min", "transmittance_min")
-"""Settings that are approximate unless they have the value of `exact`. Of `extent`, only 3sigma is approximate."""
+"""Settings that are approximate unless they have the preset exact's value. Of `extent`, only 3sigma is approximate."""
 
 
 def error_of(picture: NDArray[Any], wanted: NDArray[Any]) -> dict[str, float]:

@@ -3,8 +3,8 @@
 
 Each candidate runs in a separate process, because a driver may abort.
 `clsplat tune` saves the result (device/drivers/shapes.py).
-The search never starts automatically: other load may disturb a trial, so that another shape is chosen.
-Gradients have other bits in another shape, so the same seed would then give other results.
+The search never starts automatically: while other programs run, it may choose another shape. Gradients have other bits
+in another shape, so the same seed would then give other results.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ def strips(camera: Camera, rows: int) -> Iterator[Camera]:
 
 
 def in_strips(draw: Draw, rows: int) -> Draw:
-    """A Draw that renders a picture in strips and joins them. This saves memory on the device, not on the host."""
+    """Return a function (`Draw`) that renders a picture in strips and joins them, to save memory on the device."""
 
     def drawn(camera: Camera, names: Collection[str]) -> Planes:
         parts = [draw(strip, names) for strip in strips(camera, rows)]
@@ -133,5 +133,5 @@ def write_in_strips(
     if header.window is None:
         spec.full_height = camera.height
     pieces = chain(iter([first]), (pixels for pixels, _ in parts))
-    del first  # frees the memory before the third strip is drawn
+    del first  # frees the first strip's memory before the third is drawn
     write_rows(path, spec, extension[1:], ((pixels, len(pixels)) for pixels in pieces))

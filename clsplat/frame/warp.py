@@ -24,11 +24,12 @@ _SAMPLE_ROWS_PER_BATCH = 128
 
 
 def warped(draw: Draw, warp: Warp) -> Draw:
-    """A Draw of warped pictures. Of the camera that it is called with, only size and window are used.
+    """Return a function (`Draw`) that renders warped pictures.
 
-    `draw` renders windows of the undistorted frame, with rgb in linear light. A pixel's rgb and alpha are means of
-    `Warp.samples` x `Warp.samples` samples, interpolated by the Catmull-Rom cubic. Other channels come from the nearest
-    pixel. Where nothing is visible, ids are -1 and all other values 0.
+    It uses only size and window of the camera that it is called with. `draw` renders windows of the undistorted frame,
+    with rgb in linear light. A pixel's rgb and alpha are means of `Warp.samples` x `Warp.samples` samples, interpolated
+    by the Catmull-Rom cubic. Other channels come from the nearest pixel. Where nothing is visible, ids are -1 and all
+    other values 0.
     """
 
     def bent(camera: Camera, names: Collection[str]) -> Planes:

@@ -279,7 +279,7 @@ class PendingForwards:
         self._lock = threading.Lock()
 
     def add(self, result: Rasterization) -> np.int32:
-        """Store a pass, and return its number. If there are too many passes, the oldest is deleted."""
+        """Store the result of a forward pass, and return its number. If there are too many, the oldest is deleted."""
         with self._lock:
             number = next(self._numbers) % 2**31
             self._results[number] = result
@@ -288,7 +288,7 @@ class PendingForwards:
         return np.int32(number)
 
     def pop(self, number: int) -> Rasterization | None:
-        """Remove and return a pass; None if it has been deleted."""
+        """Remove and return the result of the pass with this number; None if it has been deleted."""
         with self._lock:
             return self._results.pop(number, None)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thresholds by which density control clones, splits and prunes Gaussians, as float32 that the device compares with."""
+"""Thresholds by which density control clones, splits and prunes Gaussians, as float32 for comparisons on the device."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ UNWANTED, USELESS = -1.0, -2.0
 
 @dataclass(frozen=True)
 class MarkRules:
-    """Thresholds by which Gaussians are densified or pruned, each computed with `edge`. The defaults change nothing.
+    """Thresholds by which Gaussians are densified or pruned, each computed with `edge`. No Gaussian meets the defaults.
 
     A Gaussian is densified if its mean gradient norm is over `gradient` and it passes `cut_off`. It is split if the log
     of its largest scale is over `large`, otherwise cloned.

@@ -19,7 +19,7 @@ class Exploration:
         scales, three per Gaussian in world units.
     amount: factor of the noise, in 1 / world units. The noise is proportional to the covariance, in squared world
         units.
-    dead: opacity at which half of the noise is added.
+    dead: opacity at which the noise is halved.
     key: two 32-bit words, different for each step. They and a Gaussian's row determine its noise.
     """
 

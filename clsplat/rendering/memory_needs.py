@@ -132,7 +132,7 @@ def frame_pixels(device: Device, features: int = 0, planes: int = 0) -> int:
 
     features, planes: as for `plan_frame`.
     """
-    per_pixel = _pixel_bytes(features, planes) + 1  # + 1: a pixel's share of the arrays by tile
+    per_pixel = _pixel_bytes(features, planes) + 1  # + 1 byte: a pixel's share of the arrays with a row for each tile
     largest = max(12, 4 * (features + 2) if features else 0, planes)
     return min(device.budget // (4 * per_pixel), device.max_allocation // largest)
 

@@ -193,7 +193,7 @@ def plan_by_chunk(need: Need, budget: int, max_allocation: int) -> Plan:
     by_row = need.row - need.statistics - need.held + need.banded
 
     def without_pairs(slots: int) -> int:
-        """Bytes of a pool of `slots` slots and of the arrays by Gaussian in view, but not of the pairs."""
+        """Bytes of a pool of `slots` slots and of the arrays with a row for each Gaussian in view; no pairs yet."""
         return slots * by_slot + max(CHUNK_ROWS * listed_chunks(slots), need.in_view) * by_row
 
     def wanted(slots: int) -> int:
@@ -207,7 +207,7 @@ def plan_by_chunk(need: Need, budget: int, max_allocation: int) -> Plan:
     most //= CHUNK_ROWS
     slots = bisect_right(range(1, most + 1), room, key=wanted)
     if slots == 0 and most > 0 and without_pairs(1) + PAIRS_IN_VIEW * CHUNK_ROWS * need.pair <= room:
-        slots = 1  # with fewer pairs, as few views have a tile that lists all rows
+        slots = 1  # one slot with fewer pairs: few views have a tile that lists all rows
     if slots == 0:
         raise _too_little(need, budget - room + wanted(1), budget)
     pairs = min((room - without_pairs(slots)) // need.pair, need.most_pairs)

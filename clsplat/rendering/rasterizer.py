@@ -186,7 +186,7 @@ class Rasterizer:
         return self._camera, self._background
 
     def keep(self, camera: Camera, background: NDArray[np.float32]) -> tuple[DeviceArray, DeviceArray]:
-        """Camera and background on the device, for passes by capacity.
+        """Upload camera and background, and keep them on the device for passes by capacity. Returns both arrays.
 
         A camera's array exists as long as the camera object, so that a training sends each of its cameras once. The
         background's array is always the same, and is sent again if `background` is not the object of the last call.
@@ -295,7 +295,7 @@ class Rasterizer:
         return self._list(self.device_of(frame.camera), frame.projected, band, tiles_of(frame.camera))
 
     def by_band(self, frame: ForwardPass, work_on: Callable[[ListedBand], R]) -> list[R]:
-        """Results of `work_on` for the frame's bands, in order.
+        """Call `work_on` with the lists of each band of the frame, in order. Returns the results.
 
         The lists of a band are not kept, as the next band may need the memory for larger lists.
         """
@@ -338,7 +338,10 @@ class Rasterizer:
         return self.by_band(frame, lambda listed: channels(device, work, wanted, rows, listed.lists, *pixels))[-1].means
 
     def deep(self, frame: ForwardPass, bins: int) -> DeviceArray:
-        """The frame in slices by depth, for a deep picture: the array of `stages.deep`."""
+        """Blend the frame in slices by depth, for a deep picture. Returns the array of `stages.deep`.
+
+        bins: maximum number of slices per pixel.
+        """
         device = self.device_of(frame.camera)
         pixels = (frame.inputs, frame.blended)
         return self.by_band(frame, lambda listed: deep(device, self.work, bins, listed.lists, *pixels))[-1]

@@ -21,7 +21,7 @@ _HALF_MAX = float(np.finfo(np.float16).max)
 
 
 def change_bounds(band: NDArray[np.float32], degree: int) -> NDArray[np.float64]:
-    """The largest change (n, 3) of each channel, over all directions, from leaving out a band (n, 2 degree + 1, 3).
+    """Upper bounds (n, 3) of how much a colour changes, in any direction, without a band (n, 2 degree + 1, 3) of SH.
 
     Cauchy-Schwarz bounds the sum of coefficients c times basis Y in a direction. By Unsöld's theorem the squares of a
     band's Y sum to (2 degree + 1) / 4 pi in every direction. So |sum of c Y| <= sqrt((2 degree + 1) / 4 pi) |c|.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two autograd functions of `rasterization`: projection and pixels."""
+"""The two autograd functions of `rasterization`: projection of Gaussians to splats, and blending to pixels."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class BatchResults:
         return np.flatnonzero((radii[..., 0] > 0) & (radii[..., 1] > 0))
 
     def splats(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The arrays PROJECTED_SPLAT_NAMES in the layout of `meta`, with the device and dtype of `like`."""
+        """The arrays named in PROJECTED_SPLAT_NAMES, in the layout of `meta`, with the device and dtype of `like`."""
         arrays = (self.laid_out(self.stacked(name)) for name in PROJECTED_SPLAT_NAMES)
         means2d, conics, depths, opacities = (as_tensor(array, like) for array in arrays)
         return means2d, conics, depths, opacities
@@ -202,7 +202,7 @@ class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torc
 
     @staticmethod
     def forward(ctx: Any, call: BatchResults, *inputs: Tensor | None) -> tuple[Tensor | None, ...]:
-        """The arrays PROJECTED_SPLAT_NAMES, and the colours (..., C, N, 3) if there are SH coefficients.
+        """The arrays named in PROJECTED_SPLAT_NAMES, and the colours (..., C, N, 3) if there are SH coefficients.
 
         inputs: the tensors that RASTERIZATION_INPUTS names. covars are upper triangles; colors are None unless they are
         SH coefficients.
@@ -290,7 +290,9 @@ class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch ha
         has_depths = all(found.get("depths") is not None for found in each)
         if call.absolute:
             means2d.absgrad = call.in_layout(each, "absolute", means2d, hand_on=False)
-        if values is not None and values.dim() == len(call.batch) + 2:  # all cameras share the values
+        if (
+            values is not None and values.dim() == len(call.batch) + 2
+        ):  # all cameras share the values, and add their gradients
             each = [{**found, "colors2d": found["colors2d"].sum(0)} for found in each]
         return (
             None,

@@ -113,7 +113,9 @@ def test_a_page_in_their_place_is_not_kept(server: str, monkeypatch: pytest.Monk
 def test_a_limit_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     for text in ("soon", "-1", "nan", "inf"):
         monkeypatch.setenv(lpips_weights.LPIPS_TIMEOUT_VARIABLE, text)
-        refuses(f"{lpips_weights.LPIPS_TIMEOUT_VARIABLE} is '{text}', expected a number of seconds", lpips_weights.limit)
+        refuses(
+            f"{lpips_weights.LPIPS_TIMEOUT_VARIABLE} is '{text}', expected a number of seconds", lpips_weights.limit
+        )
 
 
 @pytest.mark.usefixtures("installed")
