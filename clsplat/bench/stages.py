@@ -130,7 +130,7 @@ def _table(stages: Mapping[str, StageRecord], limits: Limits, contributing: int)
 
 
 def calls_of(device: Device, work: Callable[[], object]) -> Calls:
-    """Count the OpenCL queue calls of `work`, which must have run before, so that it neither builds nor allocates."""
+    """Count the queue calls of `work`. Run `work` once before, so that it builds no kernels and allocates nothing."""
     before = replace(device.calls)
     work()
     return device.calls.since(before)

@@ -73,7 +73,7 @@ def keep_depths(
     records: Sequence[Mapping[str, Any]],
     folder: Path,
 ) -> None:
-    """Replace the PNG files in `folder` by depth pictures of the worst views, with the views' names.
+    """Replace the PNG files in `folder` by depth pictures of the views with the lowest PSNR, with the views' names.
 
     render: function that returns a model's image (H, W, 3) over black, and its alpha (H, W).
     records: records of the views in eval.json, in the order of `views`.

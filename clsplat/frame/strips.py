@@ -45,7 +45,7 @@ def strip_rows(
     samples = config.supersample if config else 1
     most = min(frame_pixels(device, feature_floats(names), planes), STRIP_PIXELS)
     across = -(-camera.width * samples // TILE) * TILE * samples
-    rows = most // across - 2 * TILE  # two spare: windows may begin inside a tile, and filters read margins
+    rows = most // across - 2 * TILE  # two tiles spare: windows may begin inside a tile, and filters read margins
     if rows >= camera.height:
         return camera.height
     return max(rows // TILE, 1) * TILE
@@ -60,7 +60,7 @@ def deep_rows(device: Device, camera: Camera, bins: int, pictures: int = 1) -> i
     floats = DEEP_FLOATS * bins
     most = DEEP_STRIP_FLOATS if pictures == 1 else DEEP_MERGE_FLOATS // min(pictures, DEEP_PICTURES)
     pixels = min(most // floats, frame_pixels(device, planes=4 * floats))
-    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # 2 TILE pixels of padding
+    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # with 2 TILE columns of padding
 
 
 def strips(camera: Camera, rows: int) -> Iterator[Camera]:

@@ -35,7 +35,7 @@ class MissedSteps:
     def add(self, scales: Mapping[str, float]) -> None:
         """Take one more step into account in the factors (equations (190) and (191) of docs/gradients.md).
 
-        scales: rate sqrt(1 - beta2^t) / (1 - beta1^t) of each group that the step updates.
+        scales: learning rate times sqrt(1 - beta2^t) / (1 - beta1^t), for each group that the step updates.
         """
         self.factors[1:] = self.factors[:-1]
         self.factors[0] = 0.0, 1.0, 1.0

@@ -111,7 +111,7 @@ def plan_step(
         if device.shares_memory
         else (target.SOURCE_PIXEL_BYTES + step.masks * target.MASK_PIXEL_BYTES) * step.photographs,
         statistics=statistics,
-        held=0 if step.by_chunk else None,  # bounds and lists of chunks are in main memory
+        held=0 if step.by_chunk else None,  # 0, as bounds and lists of chunks are in main memory
         pool=step.pool,
         in_view=step.in_view,
     )
@@ -159,7 +159,7 @@ def _frame_need(device: Device, gaussians: int, floats: int, planes: int, config
         row=project.gaussian_bytes(keeps_culled=not switches.frustum_cull) + duplicate.DUPLICATE_GAUSSIAN_BYTES,
         banded=duplicate.BAND_GAUSSIAN_BYTES,
         model=4 * floats,
-        widest=4 * max(floats - floats_of(1), 4),  # of the higher SH bands, or the quaternions
+        widest=4 * max(floats - floats_of(1), 4),  # the largest array: higher SH bands, or quaternions
         pair=pair,
         most_pairs=min(device.max_allocation // 4, MAX_PAIRS_PER_BAND),
         planes=planes,

@@ -355,8 +355,8 @@ class _MotionEnd:
 def _motion_end(
     name: str, camera: Camera, other: Camera | None, gaussians: Gaussians | None, *, asked: bool
 ) -> _MotionEnd:
-    """Return the end of the vectors of a channel of motion, which lead from `camera` to `other`, or to `camera` itself
-    without another camera.
+    """Return the end of the vectors of a channel of motion. They lead from `camera` to `other`; if `other` is None, to
+    `camera` itself.
 
     name: name of the channel, for the InputError that this may raise.
     asked: True if the channel is wanted.

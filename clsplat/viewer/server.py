@@ -66,7 +66,7 @@ class Address:
             addresses = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
             family, kind, protocol, _, address = addresses[0]
             with socket.socket(family, kind, protocol) as probe:
-                if os.name == "posix":  # as asyncio does; on Windows it would take over another server's port
+                if os.name == "posix":  # asyncio sets this option; on Windows it would take over another server's port
                     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(address)
                 probe.listen()
