@@ -74,8 +74,8 @@ class Gaussians:
         return {group.field: getattr(self, group.field) for group in PARAMETER_GROUPS.values()}
 
     def local(self, camera: Camera) -> Camera:
-        """Adapt a camera in world coordinates to the model: relative to its origin, with its near plane and
-        `by_rays`."""
+        """Adapt a camera in world coordinates to the model: relative to the model's origin, with the model's near plane
+        and `by_rays`."""
         return camera.from_origin(self.origin).before(self.near).along_rays(self.by_rays)
 
     def check(self) -> None:

@@ -35,7 +35,7 @@ from clsplat.stages.device_gaussians import AnyGaussians, upload_gaussians
 REFERENCE_CROP_SIDE_PX = 192
 """Side in pixels of the central crop that is compared with the float64 reference. Smaller images are compared whole."""
 ALL_EXACT_SWITCHES_OFF = "all exact switches off"
-"""Name of the setting with all exact switches off. A switch with several values has the value that skips least."""
+"""Name of the setting with all exact switches off. A switch with several values has the one that skips least work."""
 MAX_PSNR_DB = 160.0
 """PSNR in dB that is reported for equal images instead of infinity."""
 APPROXIMATING_SETTINGS = ("sh_degree_limit", "sh_tolerance", "sh_storage", "alpha_min", "transmittance_min")
@@ -107,8 +107,8 @@ def compare(
     say = progress or no_progress
     if subject.camera.model.along_rays:
         raise InputError(
-            f"{subject.name}: is drawn along rays, which --plot does not support; expected a projected model and a "
-            "pinhole camera"
+            f"{subject.name}: is drawn along rays, which --plot does not support; expected a model that is drawn by "
+            "projection, and a pinhole camera"
         )
     tried = {name: config.switches() for name, config in (candidates or settings()).items()}
     camera = subject.camera
@@ -221,7 +221,7 @@ def _points(
 
 
 def _exact_switches_faster(points: Mapping[str, Mapping[str, Any]], exact: str | None) -> dict[str, float] | None:
-    """Times with all exact switches off, divided by the times with all on; None unless both were measured.
+    """Return time with all exact switches off / time with all on, of frame and step; None unless both were measured.
 
     exact: name of the exact preset among the points.
     """

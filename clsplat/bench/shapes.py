@@ -55,7 +55,7 @@ def tune(device: cl.Device, index: int, progress: Callable[[Shape], None]) -> tu
     """Try the candidate shapes on a device and save the fastest. Returns all trials, and the fastest shape.
 
     index: the device's index among all devices.
-    Raises DriverError if no candidate works, and OSError.
+    Raises DriverError if no candidate works, and OSError if the shape cannot be saved.
     """
     trials = []
     for shape in candidates(device):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Strips of a large picture: rendering strip by strip to save device memory, and writing so to save host memory."""
+"""Strips of a large picture: rendering strip by strip saves device memory, and writing strip by strip host memory."""
 
 from __future__ import annotations
 
@@ -92,19 +92,19 @@ def in_strips(draw: Draw, rows: int) -> Draw:
 def check_parts(camera: Camera, encoding: Encoding, views: int = 1) -> None:
     """Raise InputError if an EXR file of several parts or views would have to be written in strips.
 
-    A file stores whole parts and views one after the other, so that a strip of all of them cannot be written.
+    A file stores whole parts and views one after the other, so that it cannot be written by rows of all of them.
 
     views: number of views in the file, 2 for a stereo pair.
     """
     if views > 1:
         raise InputError(
-            f"--stereo: a picture of {camera.width}x{camera.height} is written in strips here, expected a file for "
-            "each eye: put {eye} into the name that -o gives"
+            f"--stereo: a picture of {camera.width}x{camera.height} is too large to be written at once, expected a file "
+            "for each eye: put {eye} into the name that -o gives"
         )
     if encoding.parts == "several":
         raise InputError(
-            f"--parts several: a picture of {camera.width}x{camera.height} is written in strips here, expected "
-            "--parts one"
+            f"--parts several: a picture of {camera.width}x{camera.height} is too large to be written at once, "
+            "expected --parts one"
         )
 
 

@@ -126,10 +126,10 @@ COLUMNS, ROWS: the bounding box in tiles: 16 bits for the first tile, 16 for the
 """
 
 SLOT = ("G", "GU", "GV", "GUU", "GUV", "GVV", "RED", "GREEN", "BLUE", "ABSX", "ABSY")
-"""Partial gradients of a (tile, Gaussian) pair. The last two exist only with absolute gradients.
+"""Partial gradients of a (tile, Gaussian) pair. ABSX and ABSY exist only if absolute gradients are computed.
 
-If contributions are computed, the sum of blending weights follows. If depths are compared, the gradient with respect to
-nearness, 1 / depth, is last (`kernels/shared/splat.h`: SLOT_WEIGHT, SLOT_NEAR).
+If contributions are computed, the sum of blending weights follows. If the loss compares depths, the gradient with
+respect to nearness, 1 / depth, is last (`kernels/shared/splat.h`: SLOT_WEIGHT, SLOT_NEAR).
 """
 
 SLOT_PLAIN = SLOT.index("ABSX")

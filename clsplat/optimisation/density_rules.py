@@ -13,7 +13,7 @@ import numpy as np
 from clsplat.arrays import Float32
 
 FRESH = np.uint32(1 << 31)
-"""Bit of an entry in a row list. It marks the row as a new Gaussian, whose moments start at zero."""
+"""Bit of an entry in a list of a model's rows. It marks the row as a new Gaussian, whose moments start at zero."""
 UNWANTED, USELESS = -1.0, -2.0
 """Scores that mark Gaussians: never densify (UNWANTED); prune, because they contribute too little (USELESS)."""
 

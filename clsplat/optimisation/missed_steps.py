@@ -12,8 +12,8 @@ from clsplat.config.training import OptimiserConfig
 
 MOST_MISSED = 256
 """Largest number of steps that a Gaussian may miss. Every 256 steps all Gaussians make up for the steps that they
-missed, which takes as long as one step of Adam over all rows. The 256th missed step moves a parameter by 2e-12 of the
-first one's movement."""
+missed, which takes as long as one step of Adam over all rows. The 256th missed step moves a parameter by 2e-12 of
+what the first one does."""
 
 
 class MissedSteps:
@@ -29,7 +29,7 @@ class MissedSteps:
             factors = np.zeros((MOST_MISSED + 1, len(groups), 3))
             factors[:, :, 1:] = 1.0
         self.groups, self.factors = tuple(groups), factors
-        # float32, as in Adam's kernels: over 256 steps, 0.999 in float64 gives moments that differ by 3e-6
+        # rounded to float32, as in Adam's kernels: with 0.999 in float64, moments would differ by 3e-6 over 256 steps
         self._decays = np.array([config.beta1, config.beta2], np.float32).astype(np.float64)
 
     def add(self, scales: Mapping[str, float]) -> None:

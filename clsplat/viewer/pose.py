@@ -58,8 +58,8 @@ class Pose:
     def angle(self, width: int, height: int) -> float:
         """Return the vertical field of view, in radians, of a picture of this size.
 
-        It is the page's if the page's aspect ratio is at least the picture's, or at least 1. Otherwise the picture has
-        the page's horizontal field of view; a picture wider than high is treated as a square.
+        It is the page's field of view if the page's aspect ratio is at least the picture's, or at least 1. Otherwise
+        the picture has the page's horizontal field of view; a picture wider than high is treated as a square.
         """
         page, picture = self.width / self.height, min(width / height, 1.0)
         return self.fov if page >= picture else 2 * math.atan(math.tan(0.5 * self.fov) * page / picture)

@@ -61,7 +61,7 @@ class Address:
         if not 0 <= self.port <= 65535:
             raise InputError(f"--port {self.port}: expected 0 to 65535; 0 takes any free port")
         if self.paths is not None and not self.paths.is_dir():
-            raise InputError(f"--paths {self.paths}: no such folder, expected one for saved camera paths")
+            raise InputError(f"--paths {self.paths}: no such folder, expected an existing one for saved camera paths")
         try:
             addresses = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
             family, kind, protocol, _, address = addresses[0]
@@ -233,7 +233,7 @@ def refused(headers: Any, *, local: bool) -> str:
     """Return the reason why a request is refused, or '' if it is accepted.
 
     A request from a page of another server is refused: its origin and host differ in name or port.
-    Any port is accepted, since a tunnel (ssh -L) may change it.
+    Their port may differ from the server's, since a tunnel (ssh -L) may change it.
     A server that only this machine can reach also refuses other host names, against DNS rebinding.
     A request without an origin does not come from a page, and is accepted.
     """
