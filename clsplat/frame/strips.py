@@ -98,8 +98,8 @@ def check_parts(camera: Camera, encoding: Encoding, views: int = 1) -> None:
     """
     if views > 1:
         raise InputError(
-            f"--stereo: a picture of {camera.width}x{camera.height} is too large to be written at once, expected a file "
-            "for each eye: put {eye} into the name that -o gives"
+            f"--stereo: a picture of {camera.width}x{camera.height} is too large to be written at once, expected a "
+            "file for each eye: put {eye} into the name that -o gives"
         )
     if encoding.parts == "several":
         raise InputError(

@@ -25,7 +25,7 @@ PROJECTED_SPLAT_NAMES = ("means2d", "conics", "depths", "opacities")
 """Names of the splat arrays that `ProjectionFunction` returns."""
 
 RASTERIZATION_INPUTS = ("means", "quaternions", "scales", "covars", "opacities", "colors", "viewmats", "intrinsics")
-"""Names of the gradients from `Rasterization.vjp_projection`, in the order of the inputs of `ProjectionFunction`."""
+"""Names of the inputs of `ProjectionFunction`, in order. `Rasterization.vjp_projection` names gradients by them."""
 
 
 class Batches:
@@ -239,7 +239,7 @@ class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torc
                 depths=item(depths, index),
                 cameras=cameras,
             )
-            if "covars" in found:  # an off-diagonal entry is in two places, which share its gradient equally
+            if "covars" in found:  # off-diagonal entries are twice in the matrix: add both gradients, which are equal
                 found["covars"] = found["covars"][:, UPPER_TRIANGLE_INDICES[0], UPPER_TRIANGLE_INDICES[1]] * np.array(
                     [1, 2, 2, 1, 2, 1], np.float32
                 )

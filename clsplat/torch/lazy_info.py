@@ -21,7 +21,7 @@ class Meta(dict[str, Any]):
         self._makers: dict[str, Callable[[], dict[str, Any]]] = {}
 
     def later(self, names: tuple[str, ...], make: Callable[[], dict[str, Any]]) -> None:
-        """Let `make` return the entries `names` on the first access to one of them."""
+        """Compute the entries `names` by a call of `make`, on the first access to one of them."""
         for name in names:
             super().__setitem__(name, None)
             self._makers[name] = make
@@ -43,7 +43,7 @@ class Meta(dict[str, Any]):
 
     def get(self, name: str, default: Any = None) -> Any:
         """The entry, or `default` if there is none."""
-        return self[name] if name in self else default  # noqa: SIM401  # its replacement would call this method
+        return self[name] if name in self else default  # noqa: SIM401  # the suggested code would call this method again
 
     def __setitem__(self, name: str, value: Any) -> None:
         self._makers.pop(name, None)

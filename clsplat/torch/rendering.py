@@ -28,7 +28,7 @@ HIT_DISTANCE_RENDER_MODES = ("d", "Ed", "RGB-d", "RGB-Ed")
 """Render modes that gsplat 1.6 supports only with `with_eval3d`."""
 GSPLAT_TILE_SIZE_PX = 16
 PACKED_ID_NAMES = ("batch_ids", "camera_ids", "gaussian_ids")
-"""Names of a splat's indices in `meta`."""
+"""Names in `meta` of the arrays with each splat's batch, camera and Gaussian index."""
 
 
 class RollingShutterType(Enum):

@@ -46,7 +46,7 @@ GSPLAT_PACKAGES = ("gsplat", "gsplat.cuda", "gsplat.optimizers")
 TWO_RADII_SINCE_VERSION = (1, 5)
 """The first version of gsplat in which a splat has two radii."""
 FUNCTIONS_CHANGED_IN_1_5 = (fully_fused_projection, isect_tiles)
-"""Functions whose results or arguments changed in gsplat 1.5."""
+"""Functions whose results or arguments changed in gsplat 1.5, and which are not replaced in older versions."""
 
 
 def install_as_gsplat() -> list[str]:
@@ -136,7 +136,7 @@ def _own(name: str) -> str:
 def _has(module: str) -> bool:
     try:
         return find_spec(module) is not None
-    except ModuleNotFoundError:  # the parent package is missing
+    except ModuleNotFoundError:  # a parent package of the module is missing
         return False
 
 
