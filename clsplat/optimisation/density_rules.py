@@ -70,5 +70,5 @@ def _ordered(value: float) -> int:
 
 
 def _number(order: int) -> Float32:
-    """The inverse of `_ordered`: an array (1,) of float32, so that NumPy compares it in float32."""
+    """Return the float32 at position `order` (see `_ordered`), as an array (1,), so that NumPy compares in float32."""
     return np.array([order if order >= 0 else -order | 0x80000000], np.uint32).view(np.float32)

@@ -283,14 +283,14 @@ class Renderer:
         return Motion(*cameras, self._moved(on_device, ahead), self._moved(on_device, back))
 
     def _sent(self, end: _MotionEnd, gaussians: Gaussians | AnyGaussians) -> DeviceArray:
-        """Upload the packed camera of `end`, relative to the origin of the means of `end`."""
+        """Upload the packed camera of `end` (`_MotionEnd`), relative to the origin of the means of `end`."""
         counted = gaussians if end.gaussians is None else end.gaussians
         local = counted.local(end.camera) if isinstance(counted, Gaussians) else end.camera
         return upload(self.device, pack_camera(local))
 
     def _moved(self, gaussians: AnyGaussians, end: _MotionEnd) -> AnyGaussians | None:
-        """The means of `end`, on the device or the host like `gaussians`; None if they do not move. Raises
-        ValueError if their number is not that of the model."""
+        """The means of `end` (`_MotionEnd`), on the device or the host like `gaussians`; None if they do not move.
+        Raises ValueError if their number is not that of the model."""
         moved = end.gaussians
         if moved is None:
             return None

@@ -78,12 +78,12 @@ class Meta(dict[str, Any]):
         return name, self.pop(name)
 
     def values(self) -> Any:
-        """A view of the values, after computing all of them."""
+        """Compute all entries, and return a view of their values."""
         self._made_all()
         return super().values()
 
     def items(self) -> Any:
-        """A view of names and values, after computing all of them."""
+        """Compute all entries, and return a view of their names and values."""
         self._made_all()
         return super().items()
 

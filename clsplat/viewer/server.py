@@ -187,8 +187,8 @@ def _quiet() -> Iterator[None]:
 def _guarded(address: Address) -> Iterator[None]:
     """Make servers that are created inside the context refuse requests from pages of other servers.
 
-    The servers also end a connection with an invalid message, with a line on standard error. viser has no settings for
-    this, so `serve` of its websocket library is replaced.
+    The servers also close a connection that sends an invalid message, and print a line on standard error. viser has no
+    settings for this, so `serve` of its websocket library is replaced.
     """
     from websockets.asyncio import server
 
@@ -208,7 +208,7 @@ def _guarded(address: Address) -> Iterator[None]:
             asyncio.get_running_loop().set_exception_handler(_tell)
             try:
                 await handler(connection)
-            except Exception as error:  # noqa: BLE001  # a message may cause any error
+            except Exception as error:  # noqa: BLE001  # a message may cause any exception
                 _tell(None, {"exception": error})
                 await connection.close(1007)
 
