@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
-TYPE_CHECKING = False  # not from `typing`: Ctrl-C during its import would print a traceback (see __main__.py)
+TYPE_CHECKING = False  # not imported from `typing`: Ctrl-C during the import would print a traceback
 if TYPE_CHECKING:
     from typing import Any
 

@@ -21,9 +21,9 @@ def main() -> int:
             from clsplat.cli.main import main as run
 
             return run()
-    except KeyboardInterrupt as error:  # Ctrl-C before `run` could catch it
+    except KeyboardInterrupt as error:  # Ctrl-C before the command line could catch it
         print("clsplat: interrupted", file=sys.stderr)
-        return 128 + getattr(error, "number", 2)  # the status of `process.status_of`, which may not be imported yet
+        return 128 + getattr(error, "number", 2)  # what `process.status_of` returns; it may not be imported yet
 
 
 if __name__ == "__main__":

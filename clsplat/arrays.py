@@ -15,7 +15,7 @@ Bool = NDArray[np.bool_]
 
 
 def numbers(given: Any) -> Float64:
-    """Convert a list of numbers, or nested lists, to an array. Returns (0,) for other values, and for booleans."""
+    """Convert a list of numbers, or nested lists, to an array. Other values, and booleans, give an empty array (0,)."""
     rows = given if isinstance(given, list) else []
     if any(isinstance(value, bool) for row in rows for value in (row if isinstance(row, list) else [row])):
         return np.empty(0)

@@ -28,7 +28,7 @@ def warn(text: str) -> None:
 
 
 def examples(names: Iterable[object], most: int = 3) -> str:
-    """The first items of a list as text, and the number of further ones."""
+    """A text such as "a, b, c and 4 more": the first `most` items of a list, and the number of the others."""
     listed = [str(name) for name in names]
     more = len(listed) - most
     return ", ".join(listed[:most]) + (f" and {more:,} more" if more > 0 else "")
@@ -106,7 +106,7 @@ def switched_on(variable: str) -> bool:
 
 
 class DeviceError(InputError):
-    """Error if there is no OpenCL device, or none that matches the request."""
+    """Error if no OpenCL device is found, or no device that matches the request."""
 
 
 @contextmanager

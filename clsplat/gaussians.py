@@ -74,8 +74,8 @@ class Gaussians:
         return {group.field: getattr(self, group.field) for group in PARAMETER_GROUPS.values()}
 
     def local(self, camera: Camera) -> Camera:
-        """Adapt a camera in world coordinates to the model: relative to its origin, with its near plane and
-        `by_rays`."""
+        """Adapt a camera in world coordinates to the model: relative to the model's origin, with the model's near plane
+        and `by_rays`."""
         return camera.from_origin(self.origin).before(self.near).along_rays(self.by_rays)
 
     def check(self) -> None:
@@ -138,7 +138,7 @@ class Gaussians:
         sh_degree : int, optional
             Pad SH with zeros up to this degree, in formats that store several degrees. None means the model's degree.
         comments : sequence of str
-            Lines such as `colour.comment` for the header, in formats that have a header.
+            Lines for the header, such as the colour space (`colour.comment`), in formats that have a header.
 
         Raises
         ------
@@ -161,7 +161,7 @@ MAX_PARAMETER = 1e19
 class GaussiansOfFile(Gaussians):
     """A model in a file. Its arrays are read on first use, since main memory may have no room for them.
 
-    like: Gaussians with the model's origin, near plane and other properties.
+    like: Gaussians that have the same origin, near plane and other properties as the model.
     """
 
     def __init__(self, path: Path, like: Gaussians) -> None:
@@ -169,7 +169,7 @@ class GaussiansOfFile(Gaussians):
         self.antialiased, self.by_rays = like.antialiased, like.by_rays
 
     def __getstate__(self) -> dict[str, Any]:
-        """Copy and pickle the arrays too, because the file may be gone when the copy is used."""
+        """Include the arrays in copies and pickles, because the file may be gone when they are used."""
         return {"means": self.means, **vars(self)}
 
     def __getattr__(self, name: str) -> Any:

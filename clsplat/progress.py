@@ -65,7 +65,7 @@ class _Bar:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         if sys.stderr.isatty():
-            # Frames take similar times, so rich can estimate the remaining time. A training's text has an estimate.
+            # rich estimates the remaining time of frames, which take similar times. Training adds its own estimate.
             more = [MofNCompleteColumn(), TimeRemainingColumn()] if counted else []
             columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), *more)
             self.live = Progress(
@@ -147,7 +147,7 @@ class TrainProgress(_Bar):
         return "" if seconds is None else f"  {duration(seconds)} left"
 
     def _print_line(self) -> None:
-        with suppress(OSError):  # the reader of the output has ended: training goes on
+        with suppress(OSError):  # the program that reads the output has ended: training goes on
             print(f"{self._numbers()}{self._left()}", file=sys.stderr, flush=True)
         self.printed_at, self.printed_step = time.monotonic(), self.last.step
 

@@ -52,7 +52,7 @@ def check_plot(path: Path) -> None:
     if path.suffix.lower() not in PLOT_EXTENSIONS:
         raise InputError(f"{path}: has the extension {path.suffix or 'none'!r}, expected .svg or .png")
     if not path.parent.is_dir():
-        raise InputError(f"{path.parent}: no such folder, expected one for the plot")
+        raise InputError(f"{path.parent}: no such folder, expected an existing one for the plot")
     try:
         import_module("matplotlib")
     except ImportError as error:
@@ -75,7 +75,7 @@ def plot_settings(path: Path, result: Mapping[str, Any], title: str) -> tuple[Pa
 
 
 def _draw_switches(result: Mapping[str, Any], title: str) -> Any:
-    """Draw a bar chart of the times of a frame and a step without one exact switch, relative to those with all."""
+    """Draw a bar chart of the gain by each exact switch: time without it, divided by time with all exact switches."""
     exact = _exact_point(result)
     rows = []
     if exact is not None:
@@ -180,13 +180,13 @@ def _exact_point(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 
 def _around(values: Sequence[float], below: float) -> tuple[float, float]:
-    """Return axis limits: the range of the values, extended by a tenth above, and by the fraction `below` below."""
+    """Return axis limits: the values' range, extended by 0.1 of its length above and by `below` of its length below."""
     span = max(values) - min(values) or 1.0
     return min(values) - below * span, max(values) + 0.1 * span
 
 
 def _steps(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Turn the points of a Pareto front into a staircase: horizontal to the next cost, then vertical."""
+    """Turn points (cost, quality) of a Pareto front into a staircase: horizontal to the next cost, then vertical."""
     path = list(corners[:1])
     for (_, quality), (cost, better) in pairwise(corners):
         path += [(cost, quality), (cost, better)]
@@ -221,7 +221,7 @@ def _label_points(
 
 
 def _sheet(titles: Sequence[str], notes: Sequence[str], inches: float) -> tuple[Any, Any]:
-    """Make a figure with axes `inches` high. The titles are above, the first in bold, and the notes below.
+    """Make a figure with, from top to bottom, the titles (the first in bold), axes of `inches` height, and the notes.
 
     Returns the figure and the axes.
     """

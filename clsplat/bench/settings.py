@@ -35,11 +35,11 @@ from clsplat.stages.device_gaussians import AnyGaussians, upload_gaussians
 REFERENCE_CROP_SIDE_PX = 192
 """Side in pixels of the central crop that is compared with the float64 reference. Smaller images are compared whole."""
 ALL_EXACT_SWITCHES_OFF = "all exact switches off"
-"""Name of the setting with all exact switches off. A switch with several values has the value that skips least."""
+"""Name of the setting with all exact switches off. A switch with several values has the one that skips least work."""
 MAX_PSNR_DB = 160.0
 """PSNR in dB that is reported for equal images instead of infinity."""
 APPROXIMATING_SETTINGS = ("sh_degree_limit", "sh_tolerance", "sh_storage", "alpha_min", "transmittance_min")
-"""Settings that are approximate unless they have the value of `exact`. Of `extent`, only 3sigma is approximate."""
+"""Settings that are approximate unless they have the preset exact's value. Of `extent`, only 3sigma is approximate."""
 
 
 def error_of(picture: NDArray[Any], wanted: NDArray[Any]) -> dict[str, float]:
@@ -54,9 +54,9 @@ def error_of(picture: NDArray[Any], wanted: NDArray[Any]) -> dict[str, float]:
 
 
 def settings() -> dict[str, BenchSwitches]:
-    """Return the settings to measure, by name: presets, single switches changed, and all exact switches off.
+    """Return the settings to measure, by name: presets, the defaults with one switch changed, and all exact ones off.
 
-    Equal settings are joined, with both names.
+    Equal settings are measured once, with their names joined.
     """
     named = {f"preset {name}": config.switches() for name, config in RASTERIZER_PRESETS.items()}
     flags = [switch.name for switch in fields(BenchSwitches) if switch.default is True]
@@ -107,8 +107,8 @@ def compare(
     say = progress or no_progress
     if subject.camera.model.along_rays:
         raise InputError(
-            f"{subject.name}: is drawn along rays, which --plot does not support; expected a projected model and a "
-            "pinhole camera"
+            f"{subject.name}: is drawn along rays, which --plot does not support; expected a model that is drawn by "
+            "projection, and a pinhole camera"
         )
     tried = {name: config.switches() for name, config in (candidates or settings()).items()}
     camera = subject.camera
@@ -221,7 +221,7 @@ def _points(
 
 
 def _exact_switches_faster(points: Mapping[str, Mapping[str, Any]], exact: str | None) -> dict[str, float] | None:
-    """Times with all exact switches off, divided by the times with all on; None unless both were measured.
+    """Return time with all exact switches off / time with all on, of frame and step; None unless both were measured.
 
     exact: name of the exact preset among the points.
     """
@@ -263,8 +263,8 @@ def settings_table(result: dict[str, Any]) -> str:
         rows.append((point["name"], *times, psnr, f"{point['max_abs']:.2g}", front_mark))
     known, (_, _, width, height) = result["exact_against_float64"], result["crop"]
     note = (
-        f"error against {result['error_is_against']}; exact against float64 on {width}x{height} pixels: "
-        f"{known['psnr']:.1f} dB, {known['max_abs']:.2g}"
+        f"errors are against {result['error_is_against']}; exact against the float64 reference on {width}x{height} "
+        f"pixels: PSNR {known['psnr']:.1f} dB, largest error {known['max_abs']:.2g}"
     )
     lines = [*aligned(rows), "", note]
     if (faster := result["exact_switches_faster"]) is not None:

@@ -3,8 +3,8 @@
 
 Each candidate runs in a separate process, because a driver may abort.
 `clsplat tune` saves the result (device/drivers/shapes.py).
-The search never starts automatically: other load may disturb a trial, so that another shape is chosen.
-Gradients have other bits in another shape, so the same seed would then give other results.
+The search never starts automatically: while other programs run, it may choose another shape. Gradients have other bits
+in another shape, so the same seed would then give other results.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def tune(device: cl.Device, index: int, progress: Callable[[Shape], None]) -> tu
     """Try the candidate shapes on a device and save the fastest. Returns all trials, and the fastest shape.
 
     index: the device's index among all devices.
-    Raises DriverError if no candidate works, and OSError.
+    Raises DriverError if no candidate works, and OSError if the shape cannot be saved.
     """
     trials = []
     for shape in candidates(device):

@@ -113,7 +113,7 @@ def _pairs_of(rasterizer: Rasterizer, frame: ForwardPass) -> dict[str, int]:
 
 
 def _table(stages: Mapping[str, StageRecord], limits: Limits, contributing: int) -> dict[str, dict[str, Any]]:
-    """Return a record for each stage, with its rates, also as fractions of the device's limits.
+    """Return a record for each stage: measurements, rates of bytes and pairs, and rates as fractions of the limits.
 
     contributing: number of (pixel, Gaussian) pairs that change a pixel.
     """
@@ -130,7 +130,7 @@ def _table(stages: Mapping[str, StageRecord], limits: Limits, contributing: int)
 
 
 def calls_of(device: Device, work: Callable[[], object]) -> Calls:
-    """Count the queue calls of `work`. Run `work` before, so that kernels are built and memory is allocated."""
+    """Count the queue calls of `work`. Run `work` once before, so that it builds no kernels and allocates nothing."""
     before = replace(device.calls)
     work()
     return device.calls.since(before)
@@ -141,7 +141,7 @@ class _Cost:
     """Cost of a frame or a training step. Times are medians.
 
     wall_ms, host_ms: elapsed time, and processor time of this thread.
-    calls: numbers of queue calls.
+    calls: numbers of OpenCL queue calls, by kind.
     by_wall: True if the stages' times are elapsed times, because the driver's events have no times.
     """
 
@@ -189,7 +189,7 @@ def _measure(device: Device, work: Callable[[], object], repeat: int) -> _Cost:
 
 @dataclass(frozen=True, eq=False)
 class _Picture(View):
-    """View whose photograph is in memory, in a single size."""
+    """View that returns the photograph `pixels`, which is in memory, for every size."""
 
     pixels: Float32 = field(kw_only=True)
 
@@ -201,7 +201,7 @@ def trainer_of(subject: Subject, device: Device, config: RasterizerConfig) -> Tr
     """Make a trainer whose steps do all the work of training. Learning rates are zero, so the model does not change."""
     camera = subject.camera
     photograph = subject.photograph
-    if photograph is None:  # use the mirrored frame: similar, with a gradient everywhere
+    if photograph is None:  # train on the mirrored frame: similar colours, but a gradient everywhere
         mirrored = Renderer(device, config=config).render(subject.gaussians, camera).image[:, ::-1]
         photograph = np.rint(255 * np.clip(mirrored, 0, 1)).astype(np.uint8)
     lens = Lens("PINHOLE", camera.width, camera.height, (camera.fx, camera.fy, camera.cx, camera.cy))
@@ -246,7 +246,7 @@ def table(result: dict[str, Any]) -> str:
     lines = [
         f"{result['device']}, {driver}, {limit['lanes']} lanes x {limit['items']} items",
         f"{result['source']}: {seen}, at {size}",
-        f"pairs: {pairs['listed']:,} with tiles; with pixels, {of_pixels}",
+        f"pairs: {pairs['listed']:,} of a tile and a Gaussian; of a pixel and a Gaussian, {of_pixels}",
         f"limits: {most}, {copying:.1f} GB/s for copying",
         "",
     ]
@@ -268,7 +268,9 @@ def table(result: dict[str, Any]) -> str:
             )
         )
     lines += aligned(rows)
-    note = "ms from events" if result["timer"] == "events" else "ms from wall time, as the driver's events have none"
+    note = (
+        "ms from events" if result["timer"] == "events" else "ms from wall time, as the driver's events have no times"
+    )
     times = f"frame {result['frame_ms']:.2f} ms, training step {result['iteration_ms']:.2f} ms"
     load = f"load average {result['load_average'] or 0:.1f}"
     counts = [("queue", *(name.replace("_", " ") for name in result["frame_calls"]), "host ms")]

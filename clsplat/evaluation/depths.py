@@ -23,7 +23,7 @@ from clsplat.spherical_harmonics import SH_C0
 DEPTH_PICTURE_VIEWS = 3
 """Number of views that get a depth picture."""
 MIN_DEPTH_PICTURE_ALPHA = 0.5
-"""Alpha above which a pixel has a depth."""
+"""Alpha above which a pixel of a depth picture shows a depth. Other pixels are black."""
 DEPTH_GREY_QUANTILES = (0.02, 0.98)
 """Quantiles of the depths that map to white and to the darkest grey."""
 FARTHEST_DEPTH_GREY = 0.15
@@ -53,8 +53,9 @@ def depth_picture(depth: NDArray[Any], alpha: NDArray[Any]) -> Float32:
 def coloured(gaussians: Gaussians, camera: Camera) -> Gaussians:
     """Return a copy of the model in which each Gaussian's colour is a grey that encodes the Gaussian's depth.
 
-    The DEPTH_GREY_QUANTILES of the depths in front of the camera map to 0 and 1. Depths are z, or distances from the
-    camera for fisheyes and panoramas. A render of the copy shows depths, with the kernels of a normal frame.
+    Grey is 0 up to the first of the DEPTH_GREY_QUANTILES of the depths in front of the camera, and 1 from the second
+    on. Depths are z, or distances from the camera for fisheyes and panoramas. A render of the copy shows depths, with
+    the kernels of a normal frame.
     """
     offsets = gaussians.means + gaussians.origin - camera.position
     depths = camera.drawn_depths(offsets)
@@ -72,7 +73,7 @@ def keep_depths(
     records: Sequence[Mapping[str, Any]],
     folder: Path,
 ) -> None:
-    """Write depth pictures of the worst views to `folder`, as PNG files with the views' names. Remove earlier ones.
+    """Replace the PNG files in `folder` by depth pictures of the views with the lowest PSNR, with the views' names.
 
     render: function that returns a model's image (H, W, 3) over black, and its alpha (H, W).
     records: records of the views in eval.json, in the order of `views`.

@@ -156,7 +156,7 @@ def _scores(
 
 
 def photograph_of(view: View) -> tuple[Image, NDArray[np.bool_] | None]:
-    """Load a view's pixels, and its mask (H, W), True for pixels to compare; None instead of a mask if it has none.
+    """Load a view's pixels, and its mask (H, W), True for pixels to compare. Without a mask the second result is None.
 
     Raises InputError if the mask excludes every pixel.
     """
@@ -165,7 +165,7 @@ def photograph_of(view: View) -> tuple[Image, NDArray[np.bool_] | None]:
         return image, None
     counts = image[:, :, 4] > 0
     if not counts.any():
-        raise InputError(f"{view.name}: its mask leaves nothing to measure; hold out another view")
+        raise InputError(f"{view.name}: its mask excludes all pixels; hold out another view")
     return image[:, :, :4] * counts[:, :, None], counts
 
 
@@ -176,6 +176,7 @@ def picture_names(names: Sequence[str]) -> list[str]:
     ".png" is appended instead.
     """
     stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
-    keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]  # the same names on every system
+    # ignores case on every system, so that the names are the same everywhere
+    keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]
     uses = Counter(keys)
     return [(stem if uses[key] == 1 else name) + ".png" for stem, key, name in zip(stems, keys, names, strict=True)]

@@ -23,7 +23,7 @@ LPIPS_TIMEOUT_VARIABLE = "CLSPLAT_LPIPS_TIMEOUT"
 LPIPS_DOWNLOAD_SECONDS = 300.0
 """Default time limit of the download in seconds, which LPIPS_TIMEOUT_VARIABLE overrides."""
 LPIPS_SERVER_SILENCE_SECONDS = 20.0
-"""Seconds without a byte after which a server or proxy counts as silent."""
+"""Seconds without a byte from the server or a proxy after which the download fails."""
 
 
 def place() -> Path:
@@ -33,28 +33,28 @@ def place() -> Path:
 
 
 def limit() -> float:
-    """Return the download's time limit in seconds. Raises InputError if the variable is no number, or is negative."""
+    """Return the download's time limit in seconds. Raises InputError if LPIPS_TIMEOUT_VARIABLE has an invalid value."""
     text = os.environ.get(LPIPS_TIMEOUT_VARIABLE) or str(LPIPS_DOWNLOAD_SECONDS)
     try:
         seconds = float(text)
     except ValueError:
         seconds = math.nan
     if not 0 <= seconds < threading.TIMEOUT_MAX:
-        raise InputError(f"{LPIPS_TIMEOUT_VARIABLE} is {text!r}, expected seconds, or 0 for no download")
+        raise InputError(f"{LPIPS_TIMEOUT_VARIABLE} is {text!r}, expected a number of seconds, or 0 for no download")
     return seconds
 
 
 def fetch() -> None:
     """Download the weights if the file is missing, with progress on standard error.
 
-    Raises ClsplatError, whose message has a command that downloads the file.
+    Raises ClsplatError if that fails. The message has a curl command for the download.
     """
     path, seconds = place(), limit()
     if is_file(path):
         return
-    advice = f"curl --create-dirs -o {path} {VGG16_WEIGHTS_URL}"
+    advice = f"download them with: curl --create-dirs -o {path} {VGG16_WEIGHTS_URL}"
     if seconds == 0:
-        raise ClsplatError(f"VGG-16's weights are missing; download them: {advice}")
+        raise ClsplatError(f"VGG-16's weights are missing; {advice}")
     transfer = _Transfer(daemon=True)  # in a thread, so that this call can end even if name resolution hangs
     progress = StageProgress()
     transfer.start()
@@ -67,9 +67,9 @@ def fetch() -> None:
         )
     transfer.cancelled = True
     if transfer.is_alive():
-        raise ClsplatError(f"VGG-16's weights did not arrive in {seconds:g} s ({LPIPS_TIMEOUT_VARIABLE}): {advice}")
+        raise ClsplatError(f"VGG-16's weights did not arrive in {seconds:g} s ({LPIPS_TIMEOUT_VARIABLE}); {advice}")
     if transfer.trouble is not None:
-        raise ClsplatError(f"VGG-16's weights could not be downloaded ({transfer.trouble}): {advice}")
+        raise ClsplatError(f"VGG-16's weights could not be downloaded ({transfer.trouble}); {advice}")
 
 
 class _Transfer(threading.Thread):

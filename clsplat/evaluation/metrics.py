@@ -58,7 +58,7 @@ def corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None = Non
 
 
 def ssim(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> float:
-    """Mean structural similarity of pixels and channels, with the 11x11 Gaussian window of Wang et al. 2004, sigma 1.5.
+    """Mean structural similarity over pixels and channels, by the 11x11 Gaussian window of Wang et al. 2004, sigma 1.5.
 
     Pixels outside the mask are black in both images. The mean is over the windows centred on pixels in the mask.
 
@@ -123,7 +123,7 @@ def _lpips_model() -> Callable[[Image, Image], float] | str:
             torch: Any = import_module("torch")
             network = package.LPIPS(net="vgg", verbose=False).eval()
     except Exception as error:  # noqa: BLE001  # an evaluation continues without LPIPS
-        return f"its network could not be loaded ({' '.join(str(error).split())[:100]})"
+        return f"LPIPS's network could not be loaded ({' '.join(str(error).split())[:100]})"
 
     def measure(a: Image, b: Image) -> float:
         tensors = [torch.from_numpy(x.astype(np.float32)).permute(2, 0, 1)[None] * 2 - 1 for x in (a, b)]

@@ -32,7 +32,7 @@ WINDOWS_RETRY_SECONDS = 2.0
 """Seconds during which an operation is repeated on Windows while another program has the file open. A virus scanner or
 an indexer closes a new file within one second."""
 TEMPORARY_NAME = re.compile(rf"\.(.+)\.([0-9a-f]{{20}}){re.escape(TEMPORARY_SUFFIX)}", re.DOTALL)
-"""Pattern of the names that `temporary_name` makes. Its groups are the target's name, and digits for the process."""
+"""Pattern of the names that `temporary_name` makes. Its groups: the target's name, and the token for `is_abandoned`."""
 
 
 @cache
@@ -107,7 +107,7 @@ def atomic_name(path: str | os.PathLike[str], needs: int | None = None) -> Itera
         written = 0
         with suppress(OSError):
             written = temporary.stat().st_size
-            temporary.unlink()  # removed first, since the message may state the free space
+            temporary.unlink()  # removed before `write_error` measures the free space
         names = (None, str(temporary), str(path))
         if isinstance(error, OSError) and error.errno and not isinstance(error, WriteError) and error.filename in names:
             # The system's error names the temporary file, or no file if the disk is full. Users know only `path`.

@@ -18,11 +18,9 @@ from clsplat.errors import InputError, WriteError, reason_of
 MAX_DOCUMENT_BYTES = 32 << 20
 """Largest size of a JSON or TOML file in bytes. The parsed file takes up to 24 times as much memory."""
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"
+"""First bytes of the pointer file that Git LFS leaves in place of a file that was not fetched."""
 MAX_LFS_POINTER_BYTES = 1024
-"""First bytes, and largest size in bytes, of the pointer file that Git LFS leaves in place of a file.
-
-Specification: https://github.com/git-lfs/git-lfs/blob/main/docs/spec.md.
-"""
+"""Largest size in bytes of a pointer file of Git LFS (https://github.com/git-lfs/git-lfs/blob/main/docs/spec.md)."""
 
 
 def digest(path: str | os.PathLike[str]) -> str:
@@ -31,7 +29,7 @@ def digest(path: str | os.PathLike[str]) -> str:
 
 
 def known_digest(path: Path) -> str:
-    """`digest` of a file, cached until its modification time changes. Raises InputError if the file is missing."""
+    """SHA-256 of a file's content, cached until its modification time changes. Raises InputError for a missing file."""
     try:
         changed = path.stat().st_mtime_ns
     except OSError as error:
@@ -69,8 +67,8 @@ def is_file(path: str | os.PathLike[str]) -> bool:
 def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
     """Context manager that opens a file to read.
 
-    Raises InputError if the file is missing, cannot be read, or is no regular file, such as a pipe, which could block
-    for ever. Also raises InputError for the pointer that Git LFS leaves in place of a file that was not fetched.
+    Raises InputError if the file is missing, cannot be read, or is not a regular file: a pipe could block for
+    ever. Also raises InputError for the pointer that Git LFS leaves in place of a file that was not fetched.
 
     expected: text that follows "expected" in error messages.
     """
@@ -80,7 +78,7 @@ def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
         if stat.S_ISDIR(mode):
             raise InputError(f"{path}: is a folder, expected {expected}")
         if not stat.S_ISREG(mode):
-            raise InputError(f"{path}: is no regular file, expected {expected}")
+            raise InputError(f"{path}: is not a regular file, expected {expected}")
         file = open(path, "rb")  # noqa: SIM115  # closed below
     except FileNotFoundError:
         raise InputError(f"{path}: no such file, expected {expected}") from None

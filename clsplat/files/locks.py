@@ -81,7 +81,7 @@ def _is_given_up(claimed: Path) -> bool:
     token = claimed.read_text(encoding="ascii", errors="replace")
     if not token:  # the marker is being written now, or its process was killed while it wrote
         return age > EMPTY_CLAIM_SECONDS
-    if token[:12] == f"{machine_mark()}{os.getpid():08x}":  # in a container an earlier process may have had this id
+    if token[:12] == f"{machine_mark()}{os.getpid():08x}":  # this process, or in a container an earlier one with its id
         return token[12:] != _PROCESS_TOKEN
     return is_abandoned(claimed, token)
 
@@ -111,7 +111,7 @@ def _take(lock: Path, token: bytes) -> bool:
 
 
 def abandoned(targets: Iterable[Path]) -> list[Path]:
-    """Temporary files and claims that processes left beside the files `targets` before they ended.
+    """Temporary files and claims beside the files `targets`, left by processes that have ended.
 
     A process on another machine counts as ended if its file has not changed for ABANDONED_FILE_SECONDS.
     """

@@ -44,7 +44,7 @@ class NetworkRate:
         self._moved, self._seconds = 0, 0.0
 
     def count(self, nbytes: int, seconds: float) -> str:
-        """Add bytes that were read or written in `seconds`. Returns the report for the user when it is due, else ""."""
+        """Add bytes that were read or written in `seconds`. Returns a report for the user, or "" before it is due."""
         if not self._network:
             return ""
         self._moved += nbytes

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""File names: those that an operating system refuses, and those that it treats as the same file."""
+"""Checks of file names: names that an operating system refuses, and names that it treats as the same file."""
 
 from __future__ import annotations
 

@@ -28,13 +28,13 @@ from clsplat.stages.deep import DEEP_FLOATS
 from clsplat.stages.deep_merge import deep_merge, merge_bytes
 
 DrawDeep = Callable[[Camera], Float32]
-"""Function from a camera to the planes of its deep picture. The planes may be a view of another array."""
+"""Function that renders a deep picture, from a camera to planes, which may be a view of another array."""
 Convert = Callable[[Float32, Float32], Float32]
 """Function from premultiplied rgb (h, w, 3) and its alpha (h, w) to rgb in another colour space."""
 Weighted = tuple[Float32, Float32]
 """Planes of a deep picture, and weights (H, W) of its pixels."""
 _MERGE_MEMORY_DIVISOR = 16
-"""Divisor of the device's memory limit that gives the limit of a merge. Rendering uses the rest."""
+"""A merge may use the device's memory limit divided by this. Rendering uses the rest."""
 _WARP_BATCH_PIXELS = 1 << 14
 """Number of pixels that are warped at a time, which limits the memory on the host."""
 
@@ -46,7 +46,7 @@ def render_deep(renderer: Renderer, gaussians: Gaussians, camera: Camera, bins: 
 
 
 def drawn_in_slices(renderer: Renderer, gaussians: Callable[[], Gaussians], bins: int) -> DrawDeep:
-    """A DrawDeep that renders with the kernels.
+    """Return a function (`DrawDeep`) that renders deep pictures with the kernels.
 
     gaussians: function that returns the model; it is called only when the picture is drawn.
     """
@@ -54,7 +54,7 @@ def drawn_in_slices(renderer: Renderer, gaussians: Callable[[], Gaussians], bins
 
 
 def deep_in_strips(draw: DrawDeep, rows: Callable[[Camera], int]) -> DrawDeep:
-    """A DrawDeep that renders the planes in strips.
+    """Return a function (`DrawDeep`) that renders a deep picture with `draw`, strip by strip.
 
     rows: function from a camera to the number of rows of a strip.
     """
@@ -62,7 +62,7 @@ def deep_in_strips(draw: DrawDeep, rows: Callable[[Camera], int]) -> DrawDeep:
 
 
 def deep_converted(draw: DrawDeep, convert: Convert) -> DrawDeep:
-    """A DrawDeep that converts the colours of `draw` to another colour space."""
+    """Return a function (`DrawDeep`) that converts the colours of the pictures of `draw` to another colour space."""
 
     def drawn(camera: Camera) -> Float32:
         planes = np.array(draw(camera))
@@ -114,9 +114,9 @@ class Merge:
 
 
 def deep_sampled(draws: Sequence[DrawDeep], cameras: Sequence[Camera], merge: Merge) -> DrawDeep:
-    """A DrawDeep of the mean over samples of shutter and lens.
+    """Return a function (`DrawDeep`) that renders the mean of deep pictures over samples of shutter and lens.
 
-    Of the camera that the DrawDeep is called with, only size and window are used.
+    It uses only size and window of the camera that it is called with.
 
     draws, cameras: for each sample, a DrawDeep and a camera of the whole frame.
     """
@@ -130,10 +130,11 @@ def deep_sampled(draws: Sequence[DrawDeep], cameras: Sequence[Camera], merge: Me
 
 
 def deep_warped(draw: DrawDeep, warp: Warp, merge: Merge) -> DrawDeep:
-    """A DrawDeep of warped pictures. Of the camera that it is called with, only size and window are used.
+    """Return a function (`DrawDeep`) that renders warped deep pictures.
 
-    A pixel is the mean over `Warp.samples` by `Warp.samples` positions, each interpolated bilinearly, because the
-    negative weights of a cubic filter would give invalid slices. Pixels in which nothing is visible have no slices.
+    It uses only size and window of the camera that it is called with. A pixel is the mean over `Warp.samples` by
+    `Warp.samples` positions, each interpolated bilinearly, because the negative weights of a cubic filter would give
+    invalid slices. Pixels in which nothing is visible have no slices.
     """
 
     def bent(camera: Camera) -> Float32:

@@ -79,7 +79,7 @@ def _samples(
     _, floats, height, width = slices.shape
     planes = np.ascontiguousarray(slices.swapaxes(0, 1)).reshape(floats, -1)
     counts = (slices[:, 3] > 0).sum(axis=0, dtype=np.int32)
-    # a pixel's used slices precede its empty ones, so that sample k of pixel p is at index k h w + p of a plane
+    # sample k of pixel p is at index k h w + p in a row of `planes`, because a pixel's empty slices come last
     first = np.cumsum(counts.ravel(), dtype=np.int64) - counts.ravel()
     pixels = np.repeat(np.arange(height * width), counts.ravel())
     at = (np.arange(len(pixels)) - first[pixels]) * (height * width) + pixels

@@ -22,7 +22,7 @@ Planes = dict[str, NDArray[Any]]
 """Channels by name, (height, width) or (height, width, floats). rgb is composited over the background. Over black it is
 premultiplied by alpha."""
 Draw = Callable[[Camera, Collection[str]], Planes]
-"""Function from a camera and the names of channels to their planes."""
+"""Function that renders a picture, from a camera and the names of channels to the channels' planes."""
 
 
 def drawn_by(
@@ -36,12 +36,12 @@ def drawn_by(
     earlier: Gaussians | None = None,
     mattes: Mapping[str, Matte] | None = None,
 ) -> Draw:
-    """A Draw that renders with the kernels.
+    """Return a function (`Draw`) that renders pictures with the kernels.
 
-    after, before: cameras of whole frames at the end of motion and of backward motion.
+    after, before: cameras of the whole next and previous frame, for the channels motion and backward.
     cut: function from a camera to the holdout surfaces in its picture; None without a holdout.
-    moved, earlier: Gaussians at the end of motion and of backward motion; None if they do not move.
-    mattes: mattes by channel name.
+    moved, earlier: the Gaussians at the next and the previous frame, for these channels; None if they do not move.
+    mattes: Cryptomatte mattes, by channel name.
 
     The planes may be non-contiguous, as the encoder makes them contiguous, perhaps in another thread.
     """
@@ -79,7 +79,7 @@ def drawn_by(
 
 
 def in_two(light: Draw, rest: Draw) -> Draw:
-    """A Draw that takes rgb and alpha from `light`, and the other channels from `rest`."""
+    """Return a function (`Draw`) that takes rgb and alpha from `light`, and the other channels from `rest`."""
 
     def draw(camera: Camera, names: Collection[str]) -> Planes:
         of_light, others = light_and_rest(names)

@@ -41,7 +41,7 @@ class Places(Protocol):
         """Width and height of the warped frame that belongs to an undistorted frame."""
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """Return positions (h, w, 2) in the undistorted frame of positions x (w,), y (h,) in the warped frame.
+        """Return the positions (h, w, 2) in the undistorted frame that belong to x (w,), y (h,) in the warped frame.
 
         All are in pixels. NaN where nothing is visible.
         """
@@ -49,7 +49,7 @@ class Places(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ByMap:
-    """The mapping by an STMap (`Places`)."""
+    """A mapping (`Places`) that an STMap defines."""
 
     stmap: StMap
 
@@ -58,14 +58,14 @@ class ByMap:
         return self.stmap.width, self.stmap.height
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """Return `Places.places` by the STMap."""
+        """Return the positions that the STMap gives, as `Places.places` specifies."""
         u, v = np.moveaxis(self.stmap.at(x, y), 2, 0)
         return np.stack([u * frame.width, (1 - v) * frame.height], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
 class ByLens:
-    """The mapping by a photograph's lens.
+    """A mapping (`Places`) that a photograph's lens defines.
 
     The undistorted frame is rendered with the camera that `Lens.bare` returns, at any size. The warped picture has the
     same size and the lens's distortion, as the photograph has.
@@ -78,7 +78,7 @@ class ByLens:
         return frame.width, frame.height
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """Return `Places.places` by the lens."""
+        """Return the positions that the lens gives, as `Places.places` specifies."""
         bare = self.lens.bare(frame.rotation, frame.translation)
         across, down = np.meshgrid((x - frame.cx) / frame.fx * bare.fx, (y - frame.cy) / frame.fy * bare.fy)
         pixels = np.stack([(across + bare.cx).ravel(), (down + bare.cy).ravel()], axis=1)
@@ -139,7 +139,7 @@ class Warp:
 
     @cached_property
     def samples(self) -> int:
-        """Number of samples across and down a warped pixel; 1 if none is over MAX_SINGLE_SAMPLE_PX when undistorted."""
+        """Number of samples across a warped pixel, and down; 1 if no warped pixel is over MAX_SINGLE_SAMPLE_PX."""
         most = np.nanmax(self._grid[1], initial=0.0)
         return 1 if most <= MAX_SINGLE_SAMPLE_PX else min(int(np.ceil(most - 1e-3)), MAX_WARP_SAMPLES)
 

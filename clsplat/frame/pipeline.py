@@ -57,7 +57,7 @@ class FrameRequest:
     at: function from a time to the camera of the whole frame in its final size. The time is in frames, 0 at this frame.
     after, before: cameras of the next and the previous frame, for the channels motion and backward.
     lens: lens distortion, as the position in an undistorted picture of each pixel; None for an undistorted frame.
-    sampling: the sampling of this frame; None uses the job's.
+    sampling: settings of this frame's samples of shutter and lens; None uses the job's.
     cut: function from a camera to the holdout surfaces in its picture, for all samples of the frame.
     models: function from a time to the Gaussians; None uses the pipeline's model.
     moved: the model at the next and at the previous frame, for the channels motion and backward; None if it does not
@@ -75,12 +75,12 @@ class FrameRequest:
 
 
 def at_each_time(apply: Callable[[Draw], Draw]) -> Pass:
-    """A pass that applies a function to the Draw of every time."""
+    """Return a pass that applies a function to the `Draw` of every time."""
     return lambda draw: lambda time: apply(draw(time))
 
 
 def _at_its_samples(at: Callable[[float], Camera], sampling: SamplingConfig, draw: DrawAt) -> DrawAt:
-    """A pass that averages samples over the time of the shutter and the area of the lens."""
+    """Return a `DrawAt` that averages the pictures of `draw` over the time of the shutter and the area of the lens."""
     (middle, cameras), times = sample_cameras(at, sampling), sampling.sample_times
     return lambda time: sampled(draw(time), middle, cameras, lambda index: draw(times[index]))
 
@@ -102,7 +102,7 @@ class FramePipeline:
 
         recorded: the model's colour space (`colour.recorded_space`).
         background: colour of the background in the model's colour space; black if alpha is written.
-        mattes: mattes by channel name.
+        mattes: Cryptomatte mattes, by channel name.
         Raises InputError for settings and colour spaces that are not compatible.
         """
         self.config = config or PictureConfig()
@@ -112,9 +112,10 @@ class FramePipeline:
         self._mattes = mattes or {}
 
     def draw(self, frame: FrameRequest) -> tuple[Draw, Callable[[Planes], Planes]]:
-        """The Draw of a frame, and a function that converts its planes to the file's colours without the device.
+        """Return a function (`Draw`) that renders a frame, and one that converts its planes to the file's colours.
 
-        The Draw is called with the camera of the picture or of a strip, and uses only this camera's size and window.
+        The first is called with the camera of the picture or of a strip, and uses only this camera's size and window.
+        The second does not use the device.
         """
         draw = self._by_kernels(frame)
         for apply in self._passes(frame):
@@ -153,12 +154,12 @@ class FramePipeline:
         return passes
 
     def _to_light(self, draw: Draw) -> Draw:
-        """A Draw that converts the pictures of `draw` to linear light."""
+        """Return a function (`Draw`) that converts the pictures of `draw` to linear light."""
         colours = self.colours
         return lambda camera, names: converted(draw(camera, names), colours, colours.model, colours.light)
 
     def _in_strips(self, frame: FrameRequest, draw: Draw) -> Draw:
-        """A Draw that renders in strips, which leave device memory for the model and its pairs."""
+        """Return a function (`Draw`) that renders in strips, which leave device memory for the model and its pairs."""
         device, framing = self._renderer.device, self.config.framing
 
         def drawn(camera: Camera, names: Collection[str]) -> Planes:
@@ -211,7 +212,7 @@ class FramePipeline:
         return self._sampling(frame).on or self.config.framing.supersample > 1 or frame.lens is not None
 
     def is_blank(self, planes: Planes, frame: FrameRequest) -> bool | None:
-        """True if the planes of `draw`, before conversion, show only the background. None if no channel tells."""
+        """True if the planes of `draw`, before conversion, show only the background; None if no channel shows it."""
         for name in ("alpha", "count", "depth"):
             if name in planes:
                 return not planes[name].any()

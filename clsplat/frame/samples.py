@@ -58,10 +58,10 @@ def finer(camera: Camera, config: FramingConfig) -> Camera:
 
 
 def supersampled(draw: Draw, config: FramingConfig) -> Draw:
-    """A Draw that filters rgb and alpha of a picture `supersample` times larger. Other channels are not filtered.
+    """Return a function (`Draw`) that filters rgb and alpha of pictures `supersample` times larger.
 
-    `draw` must return rgb in linear light, because only linear light may be averaged. The order of summation does not
-    depend on the position of the picture in its frame.
+    Other channels are not filtered. `draw` must return rgb in linear light, because only linear light may be averaged.
+    The order of summation does not depend on the position of the picture in its frame.
     """
     samples = config.supersample
     if samples == 1:
@@ -131,11 +131,11 @@ def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tup
 
 
 def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera], light: Callable[[int], Draw] | None = None) -> Draw:
-    """A Draw whose rgb and alpha are means over samples. Other channels cannot be averaged and come from the middle
-    camera.
+    """Return a function (`Draw`) whose rgb and alpha are means over samples. Other channels cannot be averaged and come
+    from the middle camera.
 
-    middle, cameras: cameras of whole frames. Of the camera that the Draw is called with, only size and window are used.
-    light: function from a sample's number to its Draw; None uses `draw` for all samples.
+    middle, cameras: cameras of whole frames. The result uses only size and window of the camera that it is called with.
+    light: function from a sample's number to the sample's `Draw`; None uses `draw` for all samples.
     `draw` must return rgb in linear light. Sums are float64, in the order of the cameras.
     """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Strips of a large picture: rendering strip by strip to save device memory, and writing so to save host memory."""
+"""Strips of a large picture: rendering strip by strip saves device memory, and writing strip by strip host memory."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ def strip_rows(
 
     names: names of the channels to render.
     config: the framing; with supersampling, rendered strips are larger than written strips.
-    planes: bytes per pixel of further planes.
+    planes: bytes per pixel that the frame needs in addition to its channels, such as for a holdout.
     """
     samples = config.supersample if config else 1
     most = min(frame_pixels(device, feature_floats(names), planes), STRIP_PIXELS)
     across = -(-camera.width * samples // TILE) * TILE * samples
-    rows = most // across - 2 * TILE  # less two tiles: windows may begin inside a tile, and filters have margins
+    rows = most // across - 2 * TILE  # two tiles spare: windows may begin inside a tile, and filters read margins
     if rows >= camera.height:
         return camera.height
     return max(rows // TILE, 1) * TILE
@@ -55,12 +55,12 @@ def deep_rows(device: Device, camera: Camera, bins: int, pictures: int = 1) -> i
     """Number of rows of a deep picture's strips, a multiple of the tile size.
 
     bins: maximum number of slices per pixel.
-    pictures: number of pictures of which each pixel is the mean.
+    pictures: number of pictures that are averaged.
     """
     floats = DEEP_FLOATS * bins
     most = DEEP_STRIP_FLOATS if pictures == 1 else DEEP_MERGE_FLOATS // min(pictures, DEEP_PICTURES)
     pixels = min(most // floats, frame_pixels(device, planes=4 * floats))
-    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # 2 TILE: padding of the first and last tile
+    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # with 2 TILE columns of padding
 
 
 def strips(camera: Camera, rows: int) -> Iterator[Camera]:
@@ -80,7 +80,7 @@ def strips(camera: Camera, rows: int) -> Iterator[Camera]:
 
 
 def in_strips(draw: Draw, rows: int) -> Draw:
-    """A Draw that renders a picture in strips and joins them. This saves memory on the device, not on the host."""
+    """Return a function (`Draw`) that renders a picture in strips and joins them, to save memory on the device."""
 
     def drawn(camera: Camera, names: Collection[str]) -> Planes:
         parts = [draw(strip, names) for strip in strips(camera, rows)]
@@ -92,19 +92,19 @@ def in_strips(draw: Draw, rows: int) -> Draw:
 def check_parts(camera: Camera, encoding: Encoding, views: int = 1) -> None:
     """Raise InputError if an EXR file of several parts or views would have to be written in strips.
 
-    A file stores whole parts and views one after the other, so that a strip of all of them cannot be written.
+    A file stores whole parts and views one after the other, so that it cannot be written by rows of all of them.
 
     views: number of views in the file, 2 for a stereo pair.
     """
     if views > 1:
         raise InputError(
-            f"--stereo: a picture of {camera.width}x{camera.height} is written in strips here, expected a file for "
-            "each eye: put {eye} into the name that -o gives"
+            f"--stereo: a picture of {camera.width}x{camera.height} is too large to be written at once, expected a "
+            "file for each eye: put {eye} into the name that -o gives"
         )
     if encoding.parts == "several":
         raise InputError(
-            f"--parts several: a picture of {camera.width}x{camera.height} is written in strips here, expected "
-            "--parts one"
+            f"--parts several: a picture of {camera.width}x{camera.height} is too large to be written at once, "
+            "expected --parts one"
         )
 
 
@@ -133,5 +133,5 @@ def write_in_strips(
     if header.window is None:
         spec.full_height = camera.height
     pieces = chain(iter([first]), (pixels for pixels, _ in parts))
-    del first  # frees the memory before the third strip is drawn
+    del first  # frees the first strip's memory before the third is drawn
     write_rows(path, spec, extension[1:], ((pixels, len(pixels)) for pixels in pieces))

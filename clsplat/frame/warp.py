@@ -24,11 +24,12 @@ _SAMPLE_ROWS_PER_BATCH = 128
 
 
 def warped(draw: Draw, warp: Warp) -> Draw:
-    """A Draw of warped pictures. Of the camera that it is called with, only size and window are used.
+    """Return a function (`Draw`) that renders warped pictures.
 
-    `draw` renders windows of the undistorted frame, with rgb in linear light. A pixel's rgb and alpha are means of
-    `Warp.samples` x `Warp.samples` samples, interpolated by the Catmull-Rom cubic. Other channels come from the nearest
-    pixel. Where nothing is visible, ids are -1 and all other values 0.
+    It uses only size and window of the camera that it is called with. `draw` renders windows of the undistorted frame,
+    with rgb in linear light. A pixel's rgb and alpha are means of `Warp.samples` x `Warp.samples` samples, interpolated
+    by the Catmull-Rom cubic. Other channels come from the nearest pixel. Where nothing is visible, ids are -1 and all
+    other values 0.
     """
 
     def bent(camera: Camera, names: Collection[str]) -> Planes:
@@ -44,7 +45,11 @@ def warped(draw: Draw, warp: Warp) -> Draw:
 
 
 def _taken(plane: NDArray[Any], places: Float64, samples: int, name: str) -> NDArray[Any]:
-    """Sample a plane (h, w) or (h, w, floats) at positions (k rows, k columns, 2)."""
+    """Return the pixels (rows, columns) of a warped plane, from an undistorted plane (h, w) or (h, w, floats).
+
+    places: positions (k rows, k columns, 2) of the samples in the undistorted plane; k is `samples`.
+    name: name of the channel, which determines the interpolation.
+    """
     height, width = places.shape[0] // samples, places.shape[1] // samples
     channel = FRAME_CHANNELS.get(name)
     result = np.empty((height, width, *plane.shape[2:]), plane.dtype)

@@ -12,8 +12,8 @@ import numpy as np
 
 SCHEDULABLE_CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 if SCHEDULABLE_CORES == 1:
-    # On a single core XLA has a single thread, which a callback would block while it waits for the same thread to copy
-    # the arguments. XLA reads NPROC, the number of threads, when JAX makes its first array.
+    # On one core XLA has one thread. A callback would block this thread, and wait for it to copy the arguments.
+    # XLA reads its number of threads from NPROC when JAX makes its first array.
     os.environ.setdefault("NPROC", "2")
 
 

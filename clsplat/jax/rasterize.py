@@ -148,7 +148,7 @@ def rasterize(
     check_given(covars, quaternions, scales)
     floats = {name: jnp.asarray(array, jnp.float32) for name, array in arrays.items() if array is not None}
     for name, side in (("viewmats", 4), ("intrinsics", 3)):
-        if floats[name].shape == (side, side):  # the matrix of a single camera
+        if floats[name].shape == (side, side):  # a single matrix, without the axis of cameras
             floats[name] = floats[name][None]
     if backgrounds is not None and floats["backgrounds"].shape == floats["colors"].shape[-1:]:
         floats["backgrounds"] = jnp.tile(floats["backgrounds"], (len(floats["viewmats"]), 1))
@@ -279,7 +279,7 @@ class PendingForwards:
         self._lock = threading.Lock()
 
     def add(self, result: Rasterization) -> np.int32:
-        """Store a pass, and return its number. If there are too many passes, the oldest is deleted."""
+        """Store the result of a forward pass, and return its number. If there are too many, the oldest is deleted."""
         with self._lock:
             number = next(self._numbers) % 2**31
             self._results[number] = result
@@ -288,7 +288,7 @@ class PendingForwards:
         return np.int32(number)
 
     def pop(self, number: int) -> Rasterization | None:
-        """Remove and return a pass; None if it has been deleted."""
+        """Remove and return the result of the pass with this number; None if it has been deleted."""
         with self._lock:
             return self._results.pop(number, None)
 

@@ -17,25 +17,25 @@ TILE = 16
 """Side of a tile in pixels (Kerbl et al. 2023, section 6)."""
 
 LOSS_ROWS, LOSS_COLUMNS, LOSS_GROUP_ROWS, LOSS_GROUP_COLUMNS = 2, 640, 7, 54
-"""Block sizes of the loss kernel.
+"""Sizes of the blocks of pixels that work-groups of the loss kernel process (`kernels/loss.cl`).
 
 LOSS_ROWS: rows that a work-group of one item processes together, as their windows share pixels.
-LOSS_COLUMNS: maximum columns in a block of such a work-group.
+LOSS_COLUMNS: maximum columns in a block of a work-group of one item.
 LOSS_GROUP_ROWS, LOSS_GROUP_COLUMNS: rows and columns of a block for a work-group of several items.
 
-Five fields of a block must fit in 32 KiB of local memory. In a group of several items, a block has LOSS_PARTS parts.
-For vertical windows these are its columns, margins included; for horizontal windows, 63 runs of six pixels. So nearly
-every part has work in both directions.
+Five arrays with a value for each pixel of a block must fit in 32 KiB of local memory. Several items share a block's
+LOSS_PARTS parts. For vertical windows, the parts are the 64 columns of the block and its margins; for horizontal
+windows, 63 runs of six pixels. So nearly every part has work in both directions.
 """
 
 LOSS_PARTS = 64
-"""Number of parts of a block in a work-group of several items, and maximum items of such a group. It is
-LOSS_GROUP_COLUMNS plus five columns on each side."""
+"""Number of parts into which a work-group of several items divides a block of the loss, and the maximum number of these
+items. It is LOSS_GROUP_COLUMNS plus margins of five columns on each side."""
 
 LOSS_RING = 16
-"""Number of rows of derivatives that a work-group of one item stores.
+"""Number of rows of SSIM's partial derivatives that a work-group of one item stores at a time.
 
-It is a power of two and a multiple of LOSS_ROWS, and at least the window's 11 plus LOSS_ROWS - 1.
+It is a power of two and a multiple of LOSS_ROWS, and at least the window's 11 rows plus LOSS_ROWS - 1.
 """
 
 CHUNK_ROWS = 1024
@@ -62,7 +62,7 @@ CAMERA = (*_ROUNDED, "NEAR", "FAR", "HAND", "WINDOW_X", "WINDOW_Y", *_LENS, *(f"
 - HAND: 1, or -1 if the rotation is a reflection.
 - The position in the whole frame of the image's first pixel (`Camera.window`).
 - A fisheye's coefficients, and the largest angle and distance from the axis that the lens shows.
-- _LOW: the rounding errors of the first item's values in float32. With them, a mean on the image is accurate to
+- _LOW: the rounding errors in float32 of the first item of this list. With them, a mean on the image is accurate to
   1e-6 pixels, and the ellipse of a needle to 1e-4.
 """
 
@@ -82,7 +82,7 @@ EWA_CAMERA = (
 - The view matrix, which need not be a rotation; intrinsics; the limits of x/z and y/z in the Jacobian; the cofactors
   of the matrix's 3 x 3 part.
 - Near and far plane, the image's size, the low-pass in px^2, and the radius up to which Gaussians are culled.
-- _LOW: the rounding errors of the first item's values in float32.
+- _LOW: the rounding errors in float32 of the first item of this list.
 """
 
 EWA_GRADIENT = _TRANSFORM
@@ -92,7 +92,7 @@ SUM_ROWS = 64
 """Number of adjacent values of a row that one work-item of `kernels/sums.cl` adds."""
 
 NO_CHUNK = 0x3FFFFF
-"""Entry of a list of chunks that stands for no chunk. As a chunk, its rows are past the end of every model."""
+"""Number in a list of chunks that means "no chunk". A chunk of this number would be past the end of every model."""
 
 _SEEN = ("LOG2O", "RED", "GREEN", "BLUE", "DEPTH")
 """Fields that have the same meaning and position in SPLAT and RAY, so that blending can read both."""
@@ -126,10 +126,10 @@ COLUMNS, ROWS: the bounding box in tiles: 16 bits for the first tile, 16 for the
 """
 
 SLOT = ("G", "GU", "GV", "GUU", "GUV", "GVV", "RED", "GREEN", "BLUE", "ABSX", "ABSY")
-"""Partial gradients of a (tile, Gaussian) pair. The last two exist only with absolute gradients.
+"""Partial gradients of a (tile, Gaussian) pair. ABSX and ABSY exist only if absolute gradients are computed.
 
-If contributions are computed, the sum of blending weights follows. If depths are compared, the gradient with respect to
-nearness, 1 / depth, is last (`kernels/shared/splat.h`: SLOT_WEIGHT, SLOT_NEAR).
+If contributions are computed, the sum of blending weights follows. If the loss compares depths, the gradient with
+respect to nearness, 1 / depth, is last (`kernels/shared/splat.h`: SLOT_WEIGHT, SLOT_NEAR).
 """
 
 SLOT_PLAIN = SLOT.index("ABSX")
@@ -180,7 +180,7 @@ class SlotFields(NamedTuple):
 
     @property
     def defines(self) -> dict[str, object]:
-        """Preprocessor defines of kernels that write and read slots with these fields; empty for SLOT_PLAIN alone."""
+        """Preprocessor defines of kernels that write or read slots with these fields; empty for plain gradients."""
         wanted = {
             "ABSOLUTE_GRADIENTS": self.absolute,
             "CONTRIBUTIONS": self.contributions,

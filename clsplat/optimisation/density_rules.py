@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thresholds by which density control clones, splits and prunes Gaussians, as float32 that the device compares with."""
+"""Thresholds by which density control clones, splits and prunes Gaussians, as float32 for comparisons on the device."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import numpy as np
 from clsplat.arrays import Float32
 
 FRESH = np.uint32(1 << 31)
-"""Bit of an entry in a row list. It marks the row as a new Gaussian, whose moments start at zero."""
+"""Bit of an entry in a list of a model's rows. It marks the row as a new Gaussian, whose moments start at zero."""
 UNWANTED, USELESS = -1.0, -2.0
-"""Scores of Gaussians that are not densified, and of those that are pruned because they contribute too little."""
+"""Scores that mark Gaussians: never densify (UNWANTED); prune, because they contribute too little (USELESS)."""
 
 
 @dataclass(frozen=True)
 class MarkRules:
-    """Thresholds by which Gaussians are densified or pruned, each computed with `edge`. The defaults change nothing.
+    """Thresholds by which Gaussians are densified or pruned, each computed with `edge`. No Gaussian meets the defaults.
 
     A Gaussian is densified if its mean gradient norm is over `gradient` and it passes `cut_off`. It is split if the log
     of its largest scale is over `large`, otherwise cloned.
@@ -32,7 +32,8 @@ class MarkRules:
     - It is not new and its radius on an image, in pixels, is over `radius`.
     - It contributes at most `contribution` to every view.
 
-    cut_off: (value, row). A Gaussian passes if its score is over `value`, or equals `value` in a row up to `row`.
+    cut_off: (value, row). A Gaussian passes if its score is over `value`, or equals `value` and its
+        row is at most `row`.
     """
 
     gradient: float = inf
@@ -69,5 +70,5 @@ def _ordered(value: float) -> int:
 
 
 def _number(order: int) -> Float32:
-    """The inverse of `_ordered`: an array (1,) of float32, so that NumPy compares it in float32."""
+    """Return the float32 at position `order` (see `_ordered`), as an array (1,), so that NumPy compares in float32."""
     return np.array([order if order >= 0 else -order | 0x80000000], np.uint32).view(np.float32)

@@ -25,7 +25,7 @@ class Thinning:
 
     @property
     def threshold(self) -> int:
-        """Number below which a Gaussian's 32-bit random word means that it is dropped."""
+        """Number below which a Gaussian's 32-bit random word means that the Gaussian is dropped."""
         return round(self.rate * 2**32)
 
     @property

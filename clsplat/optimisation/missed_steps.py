@@ -12,16 +12,16 @@ from clsplat.config.training import OptimiserConfig
 
 MOST_MISSED = 256
 """Largest number of steps that a Gaussian may miss. Every 256 steps all Gaussians make up for the steps that they
-missed, which takes as long as one step of Adam over all rows. The 256th missed step moves a parameter by 2e-12 of the
-first one's movement."""
+missed, which takes as long as one step of Adam over all rows. The 256th missed step moves a parameter by 2e-12 of
+what the first one does."""
 
 
 class MissedSteps:
     """Factors for Gaussians that missed the last 0 to MOST_MISSED steps.
 
     groups: names of the parameter groups.
-    factors: (MOST_MISSED + 1, groups, 3), by the number of missed steps. The first is a parameter's movement, as a
-        multiple of its first moment over the root of its second. The other two multiply the first and second moment.
+    factors: (MOST_MISSED + 1, groups, 3), by the number of missed steps. The last axis has a parameter's movement, as a
+        multiple of its first moment over the root of its second, then the factors of the first and second moment.
     """
 
     def __init__(self, config: OptimiserConfig, groups: Sequence[str], factors: Float64 | None = None) -> None:
@@ -29,13 +29,13 @@ class MissedSteps:
             factors = np.zeros((MOST_MISSED + 1, len(groups), 3))
             factors[:, :, 1:] = 1.0
         self.groups, self.factors = tuple(groups), factors
-        # float32, as in Adam's kernels: over 256 steps, 0.999 in float64 gives moments that differ by 3e-6
+        # rounded to float32, as in Adam's kernels: with 0.999 in float64, moments would differ by 3e-6 over 256 steps
         self._decays = np.array([config.beta1, config.beta2], np.float32).astype(np.float64)
 
     def add(self, scales: Mapping[str, float]) -> None:
-        """Add a step to the factors (equations (190) and (191) of docs/gradients.md).
+        """Take one more step into account in the factors (equations (190) and (191) of docs/gradients.md).
 
-        scales: rate sqrt(1 - beta2^t) / (1 - beta1^t) of each group that the step updates.
+        scales: learning rate times sqrt(1 - beta2^t) / (1 - beta1^t), for each group that the step updates.
         """
         self.factors[1:] = self.factors[:-1]
         self.factors[0] = 0.0, 1.0, 1.0

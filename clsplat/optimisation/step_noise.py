@@ -15,11 +15,11 @@ from clsplat.config.training import TrainConfig
 class Exploration:
     """Penalties and noise of a step.
 
-    opacity, scale: weights of two loss terms. One is the sum of the visible Gaussians' opacities, the other of their
+    opacity, scale: weights of two loss terms: the sum of the visible Gaussians' opacities, and the sum of their
         scales, three per Gaussian in world units.
     amount: factor of the noise, in 1 / world units. The noise is proportional to the covariance, in squared world
-    units.
-    dead: opacity at which half of the noise is added.
+        units.
+    dead: opacity at which the noise is halved.
     key: two 32-bit words, different for each step. They and a Gaussian's row determine its noise.
     """
 
@@ -50,10 +50,11 @@ NO_EXPLORATION = Exploration()
 
 
 def exploration_of(config: TrainConfig, step: int, means_rate: float, count: int, length_unit: float) -> Exploration:
-    """Penalties and noise of step number `step`, of `count` Gaussians.
+    """Penalties and noise of step number `step`, for a model of `count` Gaussians.
 
     Noise is added only with growth mcmc and before the cooldown. Its amount is relative to the scene's length unit.
-    means_rate, length_unit: world units.
+    means_rate: learning rate of the means, in world units.
+    length_unit: the scene's length unit, in world units.
     """
     density = config.density
     if density.growth != "mcmc":
@@ -77,6 +78,6 @@ def _penalties(opacity: float, scale: float, count: int, length_unit: float) -> 
 
 
 def step_key(seed: int, step: int) -> tuple[int, int]:
-    """Two random 32-bit words of a step, in a training with this seed."""
+    """Two random 32-bit words for step number `step` of a training with this seed."""
     first, second = np.random.SeedSequence(seed, spawn_key=(step,)).generate_state(2)
     return int(first), int(second)

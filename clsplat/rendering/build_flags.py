@@ -27,7 +27,7 @@ def kernel_defines(
     config, default = config.switches(), RasterizerConfig()
     defines: dict[str, object] = {}
     if config.extent == "3sigma":
-        # Skips of rows and columns are off: they skip whole cells, so that results would depend on the kernel shape.
+        # No skips: rows and columns are skipped by whole cells, so that the image would depend on the kernel shape.
         defines.update(EXTENT_BUDGET=_literal(9 * _HALF_LOG2E), NO_ROW_SKIP=True, NO_COLUMN_SKIP=True)
     elif config.extent == "constant":
         defines["EXTENT_BUDGET"] = _literal(-math.log2(config.alpha_min))

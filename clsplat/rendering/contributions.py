@@ -26,11 +26,11 @@ CONTRIBUTION_SLOT_FIELDS = SlotFields(contributions=True)
 def largest_contributions(
     gaussians: Gaussians, cameras: Sequence[Camera], device: Device, config: RasterizerConfig | None = None
 ) -> Float32:
-    """The largest contribution (n,) of each Gaussian to one camera's image, in pixels.
+    """Each Gaussian's largest contribution (n,) to the image of any of the cameras, in pixels.
 
     A contribution is the sum over the image's pixels of alpha times transmittance, like `--density.min-contribution`.
-    It is 0 if the camera does not see the Gaussian. The kernel of blending's gradient computes contributions, for any
-    gradient of the image. Raises CapacityError if the device's memory is too small.
+    It is 0 if the camera does not see the Gaussian. The kernel blend_grad computes contributions, whatever the
+    gradient of the image is. Raises CapacityError if the device's memory is too small.
     """
     config = config or RasterizerConfig()
     alpha_alone = drop_sh(gaussians, 0)  # contributions do not depend on colour

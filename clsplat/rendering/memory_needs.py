@@ -22,14 +22,14 @@ _EXTRA_CHANNEL_PLANES = 4
 MODELS = 3
 """Number of arrays per parameter in a training step of one view: the parameter and Adam's two moments."""
 _VISIBLE_MARK_BYTES = 4
-"""Bytes per Gaussian in a step of several views, for the mark that some view shows it."""
+"""Bytes per Gaussian, in a step of several views, for marks of the Gaussians that a view shows."""
 _SMALL_ARRAYS_BYTES = 4096
 """Upper bound in bytes of the camera, background, totals and other small arrays together."""
 
 
 @dataclass(frozen=True)
 class StepMemory:
-    """Memory of a training step in addition to a frame's, by its settings.
+    """Settings and sizes that determine the device memory of a training step in addition to that of a frame.
 
     fields: the fields of a slot, which holds the gradient of a pair.
     photographs: number of pixels of all photographs that may stay on the device.
@@ -38,8 +38,8 @@ class StepMemory:
     row_bytes: bytes per Gaussian of the training's components.
     pixel_bytes: bytes per pixel of the training's components.
     by_chunk: True if a step may run over the chunks in view.
-    pool: bytes for parameters and moments of the Gaussians on the device; if None, the plan chooses the number.
-    in_view: number of rows of the chunks that a view shows at most, as far as known.
+    pool: bytes for parameters and moments of the Gaussians on the device; None lets the plan choose.
+    in_view: largest number of rows in the chunks that one view shows, as far as known.
     """
 
     fields: SlotFields
@@ -65,10 +65,10 @@ def plan_frame(
 ) -> Plan:
     """Plan the device memory for a frame without training. Raises CapacityError.
 
-    floats: parameters of a Gaussian (`ShStorage.floats`).
+    floats: number of floats of a Gaussian's parameters (`ShStorage.floats`).
     features: floats of each Gaussian that are blended to extra channels.
-    planes: bytes per pixel of further planes.
-    moved: number of further sets of means, for motion.
+    planes: bytes per pixel that the frame needs in addition to its channels, such as for a holdout.
+    moved: number of sets of means at other frames, for the channels of motion.
     """
     need = _frame_need(device, gaussians, floats, _plane_bytes(camera, _pixel_bytes(features, planes)), config)
     return _plan(device, replace(need, row=need.row + 4 * (features + 3 * moved)))
@@ -111,7 +111,7 @@ def plan_step(
         if device.shares_memory
         else (target.SOURCE_PIXEL_BYTES + step.masks * target.MASK_PIXEL_BYTES) * step.photographs,
         statistics=statistics,
-        held=0 if step.by_chunk else None,  # the bounds and the lists of chunks are in main memory
+        held=0 if step.by_chunk else None,  # 0, as bounds and lists of chunks are in main memory
         pool=step.pool,
         in_view=step.in_view,
     )
@@ -119,7 +119,7 @@ def plan_step(
 
 
 def plan_view(device: Device, made: Plan, in_view: int) -> Plan:
-    """Return a copy of the plan `made`, of steps over the chunks in view, that allows views of up to `in_view` rows.
+    """Return a plan like `made`, of steps over the chunks in view, with memory for views of up to `in_view` rows.
     Raises CapacityError."""
     return plan_by_chunk(replace(made.need, in_view=in_view), made.allowed, device.max_allocation)
 
@@ -129,8 +129,10 @@ def frame_pixels(device: Device, features: int = 0, planes: int = 0) -> int:
 
     All planes together may take at most a quarter of the memory, so that the rest is left for the model and its pairs.
     A plane must fit in one allocation.
+
+    features, planes: as for `plan_frame`.
     """
-    per_pixel = _pixel_bytes(features, planes) + 1  # one more for the pixel's share of the arrays by tile
+    per_pixel = _pixel_bytes(features, planes) + 1  # + 1 byte: a pixel's share of the arrays with a row for each tile
     largest = max(12, 4 * (features + 2) if features else 0, planes)
     return min(device.budget // (4 * per_pixel), device.max_allocation // largest)
 
@@ -147,6 +149,7 @@ def _plane_bytes(camera: Camera, pixel_bytes: int) -> int:
 def _frame_need(device: Device, gaussians: int, floats: int, planes: int, config: RasterizerConfig) -> Need:
     """The memory need of a frame without extra channels.
 
+    floats: number of floats of a Gaussian's parameters.
     planes: bytes of all arrays that are as large as the image.
     """
     switches = config.switches()
@@ -156,7 +159,7 @@ def _frame_need(device: Device, gaussians: int, floats: int, planes: int, config
         row=project.gaussian_bytes(keeps_culled=not switches.frustum_cull) + duplicate.DUPLICATE_GAUSSIAN_BYTES,
         banded=duplicate.BAND_GAUSSIAN_BYTES,
         model=4 * floats,
-        widest=4 * max(floats - floats_of(1), 4),  # the higher SH bands, or quaternions
+        widest=4 * max(floats - floats_of(1), 4),  # the largest array: higher SH bands, or quaternions
         pair=pair,
         most_pairs=min(device.max_allocation // 4, MAX_PAIRS_PER_BAND),
         planes=planes,

@@ -35,12 +35,12 @@ class Need:
     planes: bytes of all arrays that are as large as the image.
     scratch: bytes of all other arrays.
     photographs: bytes of the photographs, which the device keeps between steps if it has room.
-    statistics: bytes of `row` that are part of a chunk's record, where Gaussians are streamed by chunk.
+    statistics: bytes of `row` that are stored in a chunk's record, if Gaussians are streamed by chunk.
     held: bytes of `row` that every Gaussian needs, in view or not, in a step over the chunks in view; None if steps run
-    over all chunks.
-    pool: bytes for parameters, moments and statistics of the Gaussians on the device; if None, the plan chooses the
-        number.
-    in_view: number of rows of the chunks that a view shows at most, in a step over the chunks in view, as far as known.
+        over all chunks.
+    pool: bytes for parameters, moments and statistics of the Gaussians on the device; None lets the plan choose.
+    in_view: largest number of rows in the chunks that one view shows, as far as known; 0 unless steps run over the
+        chunks in view.
     """
 
     gaussians: int
@@ -70,7 +70,7 @@ class Need:
 
     @property
     def record(self) -> int:
-        """Bytes of a Gaussian in a chunk."""
+        """Bytes of a Gaussian in a chunk's record: parameters, moments and statistics."""
         return self.model + self.statistics
 
     @property
@@ -115,7 +115,7 @@ class Plan:
 
     @property
     def tight(self) -> bool:
-        """True if the work is divided or rows are moved by the host, so that no memory is to spare."""
+        """True if memory is short, so that the work is divided, or the host moves the rows for density control."""
         return any(self.pieces) or not self.gathers
 
     def __str__(self) -> str:
@@ -155,7 +155,7 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
         return whole
     if need.held is not None:
         return plan_by_chunk(need, budget, max_allocation)
-    for_rows = min(room // 4, room - need.gaussians * need.pair)  # a tile may contain all Gaussians
+    for_rows = min(room // 4, room - need.gaussians * need.pair)  # one tile may list all Gaussians
     rows = max(min(for_rows // need.model, max_allocation // need.widest, need.gaussians), alignment)
     rows -= rows % alignment
     streamed = made(rows, streamed=True)
@@ -184,8 +184,8 @@ def _rounded_up(nbytes: int) -> str:
 def plan_by_chunk(need: Need, budget: int, max_allocation: int) -> Plan:
     """Plan steps over the chunks in view. Raises CapacityError if not even one chunk fits.
 
-    Arrays of a view have memory for `need.in_view` rows, even if that is more than the pool has, and for as many rows
-    as the pool.
+    The arrays with a row for each Gaussian in view have memory for as many rows as the pool, or for `need.in_view` rows
+    if these are more.
     """
     assert need.held is not None, "steps over the chunks in view"
     room = budget - need.planes - need.scratch - need.gaussians * need.held - CHUNK_ROWS * need.record
@@ -193,12 +193,12 @@ def plan_by_chunk(need: Need, budget: int, max_allocation: int) -> Plan:
     by_row = need.row - need.statistics - need.held + need.banded
 
     def without_pairs(slots: int) -> int:
-        """Bytes of `slots` slots and of the arrays by row in view, without pairs."""
+        """Bytes of a pool of `slots` slots and of the arrays with a row for each Gaussian in view; no pairs yet."""
         return slots * by_slot + max(CHUNK_ROWS * listed_chunks(slots), need.in_view) * by_row
 
     def wanted(slots: int) -> int:
-        """Bytes of `without_pairs` and of the pairs. There is at least a pair for each row in view, as a tile may
-        contain all."""
+        """Bytes of `without_pairs` and of the pairs: at least one for each row in view, as one tile may list all
+        rows."""
         return without_pairs(slots) + max(PAIRS_IN_VIEW * CHUNK_ROWS * slots, need.in_view) * need.pair
 
     most = min(max_allocation // need.widest, need.gaussians + CHUNK_ROWS - 1)
@@ -207,7 +207,7 @@ def plan_by_chunk(need: Need, budget: int, max_allocation: int) -> Plan:
     most //= CHUNK_ROWS
     slots = bisect_right(range(1, most + 1), room, key=wanted)
     if slots == 0 and most > 0 and without_pairs(1) + PAIRS_IN_VIEW * CHUNK_ROWS * need.pair <= room:
-        slots = 1  # few views have a tile that contains all rows
+        slots = 1  # one slot with fewer pairs: few views have a tile that lists all rows
     if slots == 0:
         raise _too_little(need, budget - room + wanted(1), budget)
     pairs = min((room - without_pairs(slots)) // need.pair, need.most_pairs)

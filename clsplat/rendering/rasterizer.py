@@ -130,7 +130,7 @@ class Rasterizer:
         self._antialiased: bool | None = None
         self.antialias(on=antialiased)
         self.work = work or Workspace(device)
-        self._sent: WeakKeyDictionary[Camera, NDArray[np.float32]] = WeakKeyDictionary()  # training has few cameras
+        self._sent: WeakKeyDictionary[Camera, NDArray[np.float32]] = WeakKeyDictionary()
         """Each camera's packed fields and last background, as `send` sends them. The device may still read them."""
         aligned = -(-len(CAMERA) // device.row_alignment) * device.row_alignment
         self._view = allocate(device, (aligned + 3,), np.float32)
@@ -186,7 +186,7 @@ class Rasterizer:
         return self._camera, self._background
 
     def keep(self, camera: Camera, background: NDArray[np.float32]) -> tuple[DeviceArray, DeviceArray]:
-        """Camera and background on the device, for passes by capacity.
+        """Upload camera and background, and keep them on the device for passes by capacity. Returns both arrays.
 
         A camera's array exists as long as the camera object, so that a training sends each of its cameras once. The
         background's array is always the same, and is sent again if `background` is not the object of the last call.
@@ -219,9 +219,9 @@ class Rasterizer:
         room: capacity with which to run without waiting for the number of pairs. If there are more pairs, the pass has
         no effect (docs/decisions/0025-launch-by-capacity.md). None counts the pairs first.
         thinning: random dropout of the model's Gaussians in this pass.
-        nearness: like `nearness` of `blend`.
-        chunks: the only chunks of the model that may be in view. None: the whole model or, if it is streamed and its
-            pool can find the chunks in view, these chunks. ChunkNumbers cannot be given together with `room`.
+        nearness: also blend 1 / depth (see `blend`).
+        chunks: the only chunks of the model that may be in view. None means all, or those that the pool of a streamed
+            model finds in view. ChunkNumbers cannot be given together with `room`.
         """
         device, work = self.device_of(camera), self.work
         if chunks is None and isinstance(gaussians, HostGaussians) and gaussians.pool is not None and gaussians.culls:
@@ -246,7 +246,7 @@ class Rasterizer:
             bands = plan_bands(device, work, projected, counted, tiles_of(camera), self.capacity)
             listed, one = None, len(bands) == 1
             for band in bands:
-                del listed  # this band may need the memory for larger arrays
+                del listed  # frees memory, which this band may need for larger arrays
                 listed = self._list(device, projected, band, tiles_of(camera), counted if one else None)
                 blended = blend(device, work, listed.lists, inputs, record=records and one, nearness=nearness)
             assert listed is not None, "an image has at least one tile"
@@ -264,10 +264,10 @@ class Rasterizer:
     def _in_view(
         self, gaussians: HostGaussians, pool: ChunkPool, camera: Camera
     ) -> tuple[AnyGaussians, ChunkList | ChunkNumbers | None]:
-        """The pool's rows and the slots of the chunks that the camera may show.
+        """Find the chunks of a streamed model that the camera may show. Returns the model and the chunks to project.
 
-        If the pool has too few slots: the whole model and the numbers of these chunks. If the pool cannot find them:
-        the whole model alone.
+        If the pool has slots for these chunks, the result is the pool's rows and the chunks' slots. If it has too few,
+        it is the whole model and the chunks' numbers. If the pool cannot find them, it is the whole model and None.
         """
         if pool.cull is None:
             return gaussians, None
@@ -295,7 +295,7 @@ class Rasterizer:
         return self._list(self.device_of(frame.camera), frame.projected, band, tiles_of(frame.camera))
 
     def by_band(self, frame: ForwardPass, work_on: Callable[[ListedBand], R]) -> list[R]:
-        """Results of `work_on` for the frame's bands, in order.
+        """Call `work_on` with the lists of each band of the frame, in order. Returns the results.
 
         The lists of a band are not kept, as the next band may need the memory for larger lists.
         """
@@ -316,6 +316,8 @@ class Rasterizer:
     ) -> Channels:
         """Blend the frame's extra channels.
 
+        wanted: the features to blend.
+        motion: cameras and means to which the vectors of the channels motion and backward lead.
         held: the holdout, as for `hold_out`.
         """
         device, work = self.device_of(frame.camera), self.work
@@ -324,10 +326,10 @@ class Rasterizer:
         return self.by_band(frame, lambda listed: channels(device, work, wanted, rows, listed.lists, *pixels))[-1]
 
     def shares(self, frame: ForwardPass, rows: DeviceArray, held: Held | None = None) -> DeviceArray:
-        """Blend any values of the Gaussians. Returns planes (floats + 2, rows, stride); the first `floats` are the
-        weighted means of `rows`.
+        """Blend any values of the Gaussians. Returns planes (floats + 2, height, stride): the weighted means of the
+        values, and two planes of depths.
 
-        rows: (n, floats), any values of each Gaussian.
+        rows: (n, floats), the values of each Gaussian.
         held: the holdout, as for `hold_out`.
         """
         device, work = self.device_of(frame.camera), self.work
@@ -336,7 +338,10 @@ class Rasterizer:
         return self.by_band(frame, lambda listed: channels(device, work, wanted, rows, listed.lists, *pixels))[-1].means
 
     def deep(self, frame: ForwardPass, bins: int) -> DeviceArray:
-        """The frame in slices by depth, for a deep picture: the array of `stages.deep`."""
+        """Blend the frame in slices by depth, for a deep picture. Returns the array of `stages.deep`.
+
+        bins: maximum number of slices per pixel.
+        """
         device = self.device_of(frame.camera)
         pixels = (frame.inputs, frame.blended)
         return self.by_band(frame, lambda listed: deep(device, self.work, bins, listed.lists, *pixels))[-1]
@@ -369,7 +374,8 @@ class Rasterizer:
         fields: SlotFields = PLAIN_SLOTS,
         by_lens: DeviceArray | None = None,
     ) -> Screen:
-        """Fill the visible rows of `gradients`, and `by_lens` (see `project_grad`).
+        """Compute the gradients of a view: fill the visible Gaussians' rows of `gradients`, and `by_lens` (see
+        `project_grad`).
 
         Returns the view's screen-space gradients for density control, with the columns of `fields`.
         """

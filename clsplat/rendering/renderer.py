@@ -67,7 +67,7 @@ Other channels, if requested: (H, W) or (H, W, floats) float32, as docs/channels
 
 
 def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:
-    """The SH coefficients of a model that the settings keep for rendering, and how they are stored.
+    """Choose which SH coefficients of a model are kept for rendering, by the settings, and how they are stored.
 
     Raises InputError if a coefficient is too large for float16.
     """
@@ -277,20 +277,20 @@ class Renderer:
     def _motion(
         self, gaussians: Gaussians | AnyGaussians, on_device: AnyGaussians, ahead: _MotionEnd, back: _MotionEnd
     ) -> Motion:
-        """The cameras and means at the moments to which motion and backward motion lead. The means are on the device or
-        the host, like the model."""
+        """The cameras and means to which the vectors of the channels motion and backward lead. The means are on the
+        device or the host, like the model."""
         cameras = self._sent(ahead, gaussians), self._sent(back, gaussians)
         return Motion(*cameras, self._moved(on_device, ahead), self._moved(on_device, back))
 
     def _sent(self, end: _MotionEnd, gaussians: Gaussians | AnyGaussians) -> DeviceArray:
-        """Upload the packed camera of the moment `end`, relative to the origin of the means at this moment."""
+        """Upload the packed camera of `end` (`_MotionEnd`), relative to the origin of the means of `end`."""
         counted = gaussians if end.gaussians is None else end.gaussians
         local = counted.local(end.camera) if isinstance(counted, Gaussians) else end.camera
         return upload(self.device, pack_camera(local))
 
     def _moved(self, gaussians: AnyGaussians, end: _MotionEnd) -> AnyGaussians | None:
-        """The means at the moment `end`, on the device or the host like `gaussians`; None if they do not move. Raises
-        ValueError if their number is not that of the model."""
+        """The means of `end` (`_MotionEnd`), on the device or the host like `gaussians`; None if they do not move.
+        Raises ValueError if their number is not that of the model."""
         moved = end.gaussians
         if moved is None:
             return None
@@ -314,7 +314,7 @@ class Renderer:
 
         features: floats of each Gaussian that are blended to extra channels.
         planes: bytes per pixel in addition to the picture's.
-        moved: number of further sets of means, for motion.
+        moved: number of sets of means at other frames, for the channels of motion.
         """
         if isinstance(gaussians, HostGaussians) and features:
             return replace(gaussians, culls=False), camera
@@ -342,10 +342,10 @@ class Renderer:
 
 @dataclass(frozen=True, eq=False)
 class _MotionEnd:
-    """The moment before or after a frame to which one of the channels of motion leads.
+    """Camera and Gaussians of the next or previous frame, to which the vectors of a channel of motion lead.
 
     camera: in world coordinates.
-    gaussians: the Gaussians with their means at that moment; None if they do not move, or the channel is not wanted.
+    gaussians: the Gaussians with their means at that frame; None if they do not move, or the channel is not wanted.
     """
 
     camera: Camera
@@ -355,8 +355,8 @@ class _MotionEnd:
 def _motion_end(
     name: str, camera: Camera, other: Camera | None, gaussians: Gaussians | None, *, asked: bool
 ) -> _MotionEnd:
-    """Return the moment to which a channel of motion leads. Motion is from `camera` to `other`, or to `camera` if
-    `other` is None.
+    """Return the end of the vectors of a channel of motion. They lead from `camera` to `other`; if `other` is None, to
+    `camera` itself.
 
     name: name of the channel, for the InputError that this may raise.
     asked: True if the channel is wanted.
@@ -366,24 +366,23 @@ def _motion_end(
     if asked and camera.model.without_motion:
         raise InputError(f"{name} is not defined for {camera.model.without_motion}")
     if asked and other.projection != camera.projection:
-        raise InputError(f"{name} leads to a camera that is {other.projection}, expected {camera.projection}")
+        raise InputError(f"{name}: the other frame's camera is {other.projection}, expected {camera.projection}")
     return _MotionEnd(other, gaussians if asked else None)
 
 
 def _pixels_of(planes: Channels, camera: Camera, *, contiguous: bool) -> tuple[NDArray[Any], NDArray[Any]]:
-    """The planes of `Channels` on the host, first `means`, then `whole`, without padding and with the plane axis
-    last."""
+    """Copy the arrays `means` and `whole` of `Channels` to the host, without padding and with the plane axis last."""
     arrays = (planes.means, planes.whole)
     means, whole = (array.get()[:, : camera.height, : camera.width].transpose(1, 2, 0) for array in arrays)
     return (np.ascontiguousarray(means), np.ascontiguousarray(whole)) if contiguous else (means, whole)
 
 
 def _in_the_world(named: ChannelResult, camera: Camera, gaussians: Gaussians | AnyGaussians) -> ChannelResult:
-    """Convert channels from the kernels' coordinates: depths along the camera's axis, positions in the world."""
+    """Convert depths and positions of the kernels to depths along the camera's axis and positions in the world."""
     origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
     if (of_distances := camera.depths_of_distances()) is not None:
         named |= {name: named[name] * of_distances for name in ("depth", *DEPTH_PLANES)}
-    if "position" in named and origin.any():  # float32 limits the precision of the sum
+    if "position" in named and origin.any():  # the sum is rounded to float32
         shown = named["count"][:, :, None] > 0
         named["position"] = np.where(shown, named["position"] + origin, 0).astype(np.float32)
     return named

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clsplat.errors import InputError
 
 MIN_DROPPED_SH_FRACTION = 0.5
-"""Minimum fraction of the coefficients above band 0 that can be left out, for each Gaussian to have its own SH degree.
+"""Each Gaussian gets its own SH degree if more than this fraction of the coefficients above band 0 is then left out.
 
 From this fraction on, a frame takes no longer with a degree for each Gaussian than without (docs/performance.md).
 """
@@ -21,7 +21,7 @@ _HALF_MAX = float(np.finfo(np.float16).max)
 
 
 def change_bounds(band: NDArray[np.float32], degree: int) -> NDArray[np.float64]:
-    """The largest change (n, 3) of each channel, over all directions, from leaving out a band (n, 2 degree + 1, 3).
+    """Upper bounds (n, 3) of how much a colour changes, in any direction, without a band (n, 2 degree + 1, 3) of SH.
 
     Cauchy-Schwarz bounds the sum of coefficients c times basis Y in a direction. By Unsöld's theorem the squares of a
     band's Y sum to (2 degree + 1) / 4 pi in every direction. So |sum of c Y| <= sqrt((2 degree + 1) / 4 pi) |c|.
@@ -55,8 +55,8 @@ def needed_degrees(sh: NDArray[np.float32], tolerance: float) -> NDArray[np.uint
 
 
 def coefficients_in_use(degrees: NDArray[np.uint8]) -> tuple[int, bool]:
-    """Number of coefficients per channel up to the highest degree in use; and True if each Gaussian should store only
-    its own degree, as that leaves out enough (MIN_DROPPED_SH_FRACTION).
+    """Return the number of coefficients per channel up to the highest needed degree; and True if each Gaussian should
+    store only its own degree, because this leaves out more than MIN_DROPPED_SH_FRACTION of those above band 0.
 
     degrees: (n,), the degree that each Gaussian needs.
     """

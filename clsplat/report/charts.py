@@ -164,8 +164,8 @@ def _kept(curve: ChartSeries, log_y: bool) -> Points:
 
 
 def _heights(drawn: Sequence[ChartSeries], log_y: bool) -> list[list[float]]:
-    """Return the y values of each series, as logarithms if `log_y`. Values of areas are added to those of the areas
-    below."""
+    """Return the y values of each series, as logarithms if `log_y`. The values of stacked areas are summed from the
+    lowest area up."""
     heights = [[math.log10(y) if log_y else y for _, y in curve.points] for curve in drawn]
     stacked: list[list[float]] = np.cumsum(heights, axis=0).tolist() if drawn[0].kind == "area" else heights
     return stacked
@@ -222,5 +222,5 @@ def _shape(curve: ChartSeries, pixels: Points, floor: float) -> dict[str, Any]:
 def _described(curve: ChartSeries) -> str:
     if curve.kind == "bars":
         top = max(curve.points, key=lambda point: point[1])
-        return f"{curve.name}: the largest bin has {short(top[1])} and begins at {short(top[0])}."
+        return f"{curve.name}: the largest bin counts {short(top[1])} and begins at {short(top[0])}."
     return f"{curve.name}: {short(curve.points[0][1])} at first, {short(curve.points[-1][1])} at the end."

@@ -41,7 +41,7 @@ class MaskedPhotograph:
 
 
 def masked_photographs(scene: Scene, *, only_files: bool) -> tuple[list[MaskedPhotograph], int]:
-    """Draw evenly spaced photographs that have masks. Returns them, and the number of all photographs with masks.
+    """Draw masks over a few of the photographs that have masks. Also returns the number of all photographs with masks.
 
     only_files: ignore masks that are alpha channels.
     Unreadable files are skipped.

@@ -27,7 +27,8 @@ CURVE_KEYS = ("step", "loss", "psnr", "gaussians", "seconds")
 MAX_NAME_CHARACTERS = 200
 """Maximum number of characters of a displayed name of a view, stage or device."""
 MAX_EVALUATED_VIEWS, MAX_STAGES, MAX_SESSIONS, MAX_SAMPLES = 10_000, 40, 100, 2000
-"""Maximum numbers of entries that are read. clsplat writes fewer; the limits protect from files of other origin."""
+"""Maximum numbers that are read of views in an evaluation, stages of a step, training sessions, and records of
+stages or evaluations. clsplat writes fewer; the limits protect from files of other programs."""
 MAX_DRAWN_VALUE = 1e30
 """Largest magnitude of a number in a chart."""
 
@@ -37,7 +38,7 @@ class RunNumbers:
     """Numbers of a run, from its files.
 
     curves: for each of CURVE_KEYS, the values in all records of metrics.jsonl.
-    stages: records with a step, and the milliseconds of each of the step's stages.
+    stages: for each measured step, a record with its number and the milliseconds of each stage.
     evaluations: held-out scores during training and at its end, in the order of steps.
     evaluation: contents of eval.json.
     sessions: start, device, driver and versions of each training session.
@@ -96,7 +97,7 @@ def read_run_numbers(run: Run, model: Gaussians | None = None, *, describe: bool
     """Read all numbers of a run folder.
 
     model: contents of model.ply, if already loaded.
-    describe: read and describe the model.
+    describe: True to read model.ply and describe it.
     Raises InputError if metrics.jsonl cannot be read. Other missing or damaged data is reported as a note.
     """
     records = [
@@ -173,7 +174,7 @@ def _numbers(values: Mapping[str, Any], limit: int) -> dict[str, float]:
 
 
 def _evaluation(value: object) -> Record | None:
-    """Return the valid parts of an evaluation in the format of eval.json, or None if `value` is no evaluation."""
+    """Return the valid parts of an evaluation in the format of eval.json, or None if it is something else."""
     if not isinstance(value, dict) or not isinstance(value.get("views"), list):
         return None
     views = []

@@ -123,7 +123,7 @@ def show(
     """
     try:
         paths = picture_names(names)
-    except ValueError:  # a view's name that no file can have, such as ""
+    except ValueError:  # a view may have a name that no file can have, such as ""
         return []
     views = {view.name: view for view in scene.views} if scene is not None else {}
     space = photos_space(view.path for view in views.values())

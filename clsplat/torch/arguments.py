@@ -106,7 +106,7 @@ def as_array(value: Tensor) -> Float32:
     """The values of a tensor as a C-contiguous float32 array.
 
     The array shares memory with a dense float32 tensor on the CPU. Other tensors are copied, with one warning for each
-    kind.
+    dtype and device.
     """
     if value.dtype != torch.float32 or value.device.type != "cpu":
         kind = f"{str(value.dtype).removeprefix('torch.')} on {value.device.type}"

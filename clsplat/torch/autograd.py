@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two autograd functions of `rasterization`: projection and pixels."""
+"""The two autograd functions of `rasterization`: projection of Gaussians to splats, and blending to pixels."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ PROJECTED_SPLAT_NAMES = ("means2d", "conics", "depths", "opacities")
 """Names of the splat arrays that `ProjectionFunction` returns."""
 
 RASTERIZATION_INPUTS = ("means", "quaternions", "scales", "covars", "opacities", "colors", "viewmats", "intrinsics")
-"""Names of the gradients from `Rasterization.vjp_projection`, in the order of the inputs of `ProjectionFunction`."""
+"""Names of the inputs of `ProjectionFunction`, in order. `Rasterization.vjp_projection` names gradients by them."""
 
 
 class Batches:
-    """A tensor as a sequence of arrays, one for each batch; all None if the tensor is None."""
+    """A tensor as a sequence of arrays, one for each batch. Each is None if the tensor is None."""
 
     def __init__(self, value: Tensor | None, batch: tuple[int, ...]) -> None:
         array = None if value is None else as_array(value)
@@ -71,7 +71,7 @@ class BatchResults:
         return np.flatnonzero((radii[..., 0] > 0) & (radii[..., 1] > 0))
 
     def splats(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The arrays PROJECTED_SPLAT_NAMES in the layout of `meta`, with the device and dtype of `like`."""
+        """The arrays named in PROJECTED_SPLAT_NAMES, in the layout of `meta`, with the device and dtype of `like`."""
         arrays = (self.laid_out(self.stacked(name)) for name in PROJECTED_SPLAT_NAMES)
         means2d, conics, depths, opacities = (as_tensor(array, like) for array in arrays)
         return means2d, conics, depths, opacities
@@ -137,13 +137,13 @@ class BatchResults:
         rows = array
         if len(array) < math.prod(self.sizes):
             rows = np.zeros((math.prod(self.sizes), *array.shape[1:]), np.float32)
-            # rows are copied as single items, which takes half the time
+            # copy each row as one item of bytes, which takes half the time
             one = np.dtype((np.void, array.itemsize * math.prod(array.shape[1:])))
             rows.reshape(-1).view(one)[self.in_view] = array.reshape(-1).view(one)
         return rows.reshape(*self.sizes, *array.shape[1:])
 
     def gradient(self, each: list[dict[str, Any]], name: str, like: Tensor | None) -> Tensor | None:
-        """The gradient with respect to the argument `like`, in its shape and dtype; None if a batch has none.
+        """The gradient with respect to the argument `like`, in its shape and dtype; None if a batch lacks it.
 
         each: gradients by name, for each batch.
         """
@@ -202,9 +202,10 @@ class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torc
 
     @staticmethod
     def forward(ctx: Any, call: BatchResults, *inputs: Tensor | None) -> tuple[Tensor | None, ...]:
-        """The arrays PROJECTED_SPLAT_NAMES, and the colours (..., C, N, 3) if there are SH coefficients.
+        """The arrays named in PROJECTED_SPLAT_NAMES, and the colours (..., C, N, 3) if there are SH coefficients.
 
-        inputs: RASTERIZATION_INPUTS. covars are upper triangles; colors are None unless they are SH coefficients.
+        inputs: the tensors that RASTERIZATION_INPUTS names. covars are upper triangles; colors are None unless they are
+        SH coefficients.
         """
         ctx.call = call
         ctx.save_for_backward(*inputs)
@@ -238,7 +239,7 @@ class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torc
                 depths=item(depths, index),
                 cameras=cameras,
             )
-            if "covars" in found:  # an off-diagonal entry is in two places, which share its gradient equally
+            if "covars" in found:  # off-diagonal entries are twice in the matrix: add both gradients, which are equal
                 found["covars"] = found["covars"][:, UPPER_TRIANGLE_INDICES[0], UPPER_TRIANGLE_INDICES[1]] * np.array(
                     [1, 2, 2, 1, 2, 1], np.float32
                 )
@@ -289,7 +290,9 @@ class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch ha
         has_depths = all(found.get("depths") is not None for found in each)
         if call.absolute:
             means2d.absgrad = call.in_layout(each, "absolute", means2d, hand_on=False)
-        if values is not None and values.dim() == len(call.batch) + 2:  # the same values for all cameras
+        if (
+            values is not None and values.dim() == len(call.batch) + 2
+        ):  # all cameras share the values, and add their gradients
             each = [{**found, "colors2d": found["colors2d"].sum(0)} for found in each]
         return (
             None,

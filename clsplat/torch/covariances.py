@@ -73,7 +73,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 def sparse_upper(covars: Tensor) -> Tensor:
     """The upper triangles (N, 6) of matrices (N, 3, 3).
 
-    If the gradient with respect to the triangles is a COO tensor, that with respect to the matrices is one too.
+    If the gradient with respect to the triangles is a COO tensor, so is the gradient with respect to the matrices.
     """
     upper: Tensor = _SparseUpper.apply(covars)
     return upper

@@ -20,7 +20,7 @@ from clsplat.torch.autograd import Batches
 
 @dataclass(frozen=True)
 class RasterizationSettings:
-    """The checked settings of a call, by their names in `clsplat.rasterize`."""
+    """The checked settings of a call of `rasterization`, by their names in `clsplat.rasterize`."""
 
     width: int
     height: int
@@ -39,7 +39,7 @@ class RasterizationSettings:
 
 @dataclass(frozen=True, eq=False)
 class GivenTensors:
-    """The tensors of a call, by gsplat's names."""
+    """The tensors of a call of `rasterization`, by gsplat's names."""
 
     means: Tensor
     quats: Tensor | None

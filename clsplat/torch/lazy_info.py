@@ -21,7 +21,7 @@ class Meta(dict[str, Any]):
         self._makers: dict[str, Callable[[], dict[str, Any]]] = {}
 
     def later(self, names: tuple[str, ...], make: Callable[[], dict[str, Any]]) -> None:
-        """Let `make` return the entries `names` on the first access to one of them."""
+        """Compute the entries `names` by a call of `make`, on the first access to one of them."""
         for name in names:
             super().__setitem__(name, None)
             self._makers[name] = make
@@ -43,7 +43,7 @@ class Meta(dict[str, Any]):
 
     def get(self, name: str, default: Any = None) -> Any:
         """The entry, or `default` if there is none."""
-        return self[name] if name in self else default  # noqa: SIM401  # its replacement would call this method
+        return self[name] if name in self else default  # noqa: SIM401  # the suggested code would call this method again
 
     def __setitem__(self, name: str, value: Any) -> None:
         self._makers.pop(name, None)
@@ -78,12 +78,12 @@ class Meta(dict[str, Any]):
         return name, self.pop(name)
 
     def values(self) -> Any:
-        """A view of the values, after computing all of them."""
+        """Compute all entries, and return a view of their values."""
         self._made_all()
         return super().values()
 
     def items(self) -> Any:
-        """A view of names and values, after computing all of them."""
+        """Compute all entries, and return a view of their names and values."""
         self._made_all()
         return super().items()
 

@@ -17,7 +17,7 @@ from clsplat.torch.autograd import Batches, BatchResults, item
 from clsplat.torch.compile_guards import differentiable_once, outside_graphs
 
 PROJECTION_INPUTS = ("means", "quaternions", "scales", "covars", "viewmats", "intrinsics")
-"""Names of the gradients that the library's `vjp` returns, in the order of the inputs of `_Projection`."""
+"""Names of the inputs of `_Projection`, in order. The library's `vjp` names gradients by them."""
 PROJECTION_OUTPUTS = ("means2d", "depths", "conics", "compensations")
 
 

@@ -28,7 +28,7 @@ HIT_DISTANCE_RENDER_MODES = ("d", "Ed", "RGB-d", "RGB-Ed")
 """Render modes that gsplat 1.6 supports only with `with_eval3d`."""
 GSPLAT_TILE_SIZE_PX = 16
 PACKED_ID_NAMES = ("batch_ids", "camera_ids", "gaussian_ids")
-"""Names of a splat's indices in `meta`."""
+"""Names in `meta` of the arrays with each splat's batch, camera and Gaussian index."""
 
 
 class RollingShutterType(Enum):
@@ -83,7 +83,7 @@ def rasterization(
     rays: Tensor | None = None,
     lidar_coeffs: Any = None,
     external_distortion_coeffs: Any = None,
-    ut_params: Any = None,  # noqa: ARG001  # settings of with_ut
+    ut_params: Any = None,  # noqa: ARG001  # has an effect only with with_ut
     extra_signals: Tensor | None = None,
     extra_signals_sh_degree: int | None = None,
     renderer_config: Any = None,
@@ -234,7 +234,9 @@ def rasterization(
         results = given.rasterized(settings, batch, differentiable=differentiable)
     expected = render_mode.endswith("ED")
     call = BatchResults(results, batch, packed=packed, sparse=sparse_grad, absolute=absgrad, expected_depth=expected)
-    if not differentiable and not given.have_tangents:  # for dual tensors, PyTorch will raise an error
+    if (
+        not differentiable and not given.have_tangents
+    ):  # `_with_gradient` passes dual tensors to PyTorch, which refuses them
         return *call.pixels(means), _meta(call, means, None, width, height, tile_size)
     splats, images, alphas = _with_gradient(call, given, settings.sh_degree, depth_alone=depth_alone)
     return images, alphas, _meta(call, means, splats, width, height, tile_size)
@@ -243,7 +245,7 @@ def rasterization(
 def _with_gradient(
     call: BatchResults, given: GivenTensors, sh_degree: int | None, *, depth_alone: bool
 ) -> tuple[list[Tensor], Tensor, Tensor]:
-    """The arrays PROJECTED_SPLAT_NAMES, the images and the alphas, as differentiable tensors."""
+    """The arrays named in PROJECTED_SPLAT_NAMES, the images and the alphas, as differentiable tensors."""
     covars, colors = given.covars, given.colors
     if covars is not None:
         covars = (
@@ -293,7 +295,7 @@ def _meta(
     """The dictionary `meta` of `rasterization`, with gsplat's entries in gsplat's order.
 
     like: a tensor from which the entries take device and dtype.
-    splats: the arrays PROJECTED_SPLAT_NAMES; None computes them on first access, without gradient.
+    splats: the arrays named in PROJECTED_SPLAT_NAMES; None computes them on first access, without gradient.
     """
     batches, cameras, _ = call.sizes
     like = like.new_empty(0)  # empty, so that the dictionary does not keep the caller's tensor alive

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adam on the rows in view: pure PyTorch, on the device of the tensors."""
+"""Adam that updates only the Gaussians in view: pure PyTorch, on the device of the tensors."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class Look:
     def changes(self, degree: int) -> Look | None:
         """Return the settings that edit a model of this SH degree, or None if they do not change it.
 
-        The mode of the result is always "colour", as the displayed channel is no edit.
+        The mode of the result is always "colour", as the displayed channel does not edit the model.
         """
         asked = replace(self, mode="colour", degree=min(self.degree, degree))
         return None if asked == Look(degree=degree) else asked

@@ -87,7 +87,7 @@ class ViserPage:
         self.viewer = viewing.join(self)
 
     def show(self, image: Image, level: Level, text: str) -> None:
-        """Show a picture (H, W, 3) with a remark."""
+        """Show a picture (H, W, 3) of this exactness, with the remark `text`."""
         self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=level.quality)
         self._shown += 1
         if self._shown == 2:  # create controls only after the first picture, because they keep a browser busy
@@ -267,7 +267,7 @@ class ViserPage:
             button("Save path", lambda: self.tell(f"saved as {save_path(folder, document()).name}"))
 
     def _add_frustum(self, name: str, pose: Pose, kind: str, **options: Any) -> Any:
-        """Draw a camera. kind: key of CAMERA_COLOURS."""
+        """Draw a camera in the browser's scene. kind: key of CAMERA_COLOURS."""
         start = self.world.start
         return self.client.scene.add_camera_frustum(
             name,

@@ -95,7 +95,7 @@ def path_document(
 
 
 def save_path(folder: Path, document: str) -> Path:
-    """Write the document to path-001.json, or with the next unused number. Returns the path.
+    """Write a camera file to path-001.json, or with the next unused number. Returns the path.
 
     A page cannot choose the name, for safety. Raises OSError, and InputError if no number is unused.
     """

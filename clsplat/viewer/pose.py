@@ -45,7 +45,7 @@ class Pose:
     height: int
 
     def camera(self, width: int | None = None, height: int | None = None) -> Camera:
-        """Return the camera for the size of the page, or for another size. `angle` defines the field of view.
+        """Return the camera for the size of the page, or for another size. The method `angle` gives its field of view.
 
         The camera's numbers have the same bits as if written to a camera file (`path_document`) and read again.
         """
@@ -58,8 +58,8 @@ class Pose:
     def angle(self, width: int, height: int) -> float:
         """Return the vertical field of view, in radians, of a picture of this size.
 
-        It is the page's if the page's aspect ratio is at least the picture's, or at least 1. Otherwise the picture has
-        the page's horizontal field of view; a picture wider than high is treated as a square.
+        It is the page's field of view if the page's aspect ratio is at least the picture's, or at least 1. Otherwise
+        the picture has the page's horizontal field of view; a picture wider than high is treated as a square.
         """
         page, picture = self.width / self.height, min(width / height, 1.0)
         return self.fov if page >= picture else 2 * math.atan(math.tan(0.5 * self.fov) * page / picture)

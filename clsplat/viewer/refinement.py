@@ -97,7 +97,7 @@ class Refinement:
         return Level(2 * self._level.scale, exact=False)
 
     def wait(self, now: float, model: int = 0) -> float | None:
-        """Return the seconds until a picture is due, or None if none is due before camera, `Look` or model change."""
+        """Return the seconds until a picture is due; None if none is due until camera, `Look` or model changes."""
         if self.moving:
             return 0.0
         if self._level.exact and self._model == model:

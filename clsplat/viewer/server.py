@@ -61,12 +61,12 @@ class Address:
         if not 0 <= self.port <= 65535:
             raise InputError(f"--port {self.port}: expected 0 to 65535; 0 takes any free port")
         if self.paths is not None and not self.paths.is_dir():
-            raise InputError(f"--paths {self.paths}: no such folder, expected one for saved camera paths")
+            raise InputError(f"--paths {self.paths}: no such folder, expected an existing one for saved camera paths")
         try:
             addresses = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
             family, kind, protocol, _, address = addresses[0]
             with socket.socket(family, kind, protocol) as probe:
-                if os.name == "posix":  # as asyncio does; on Windows this option would take over another server's port
+                if os.name == "posix":  # asyncio sets this option; on Windows it would take over another server's port
                     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(address)
                 probe.listen()
@@ -187,8 +187,8 @@ def _quiet() -> Iterator[None]:
 def _guarded(address: Address) -> Iterator[None]:
     """Make servers that are created inside the context refuse requests from pages of other servers.
 
-    The servers also end a connection with an invalid message, with a line on standard error. viser has no settings for
-    this, so `serve` of its websocket library is replaced.
+    The servers also close a connection that sends an invalid message, and print a line on standard error. viser has no
+    settings for this, so `serve` of its websocket library is replaced.
     """
     from websockets.asyncio import server
 
@@ -208,7 +208,7 @@ def _guarded(address: Address) -> Iterator[None]:
             asyncio.get_running_loop().set_exception_handler(_tell)
             try:
                 await handler(connection)
-            except Exception as error:  # noqa: BLE001  # a message may cause any error
+            except Exception as error:  # noqa: BLE001  # a message may cause any exception
                 _tell(None, {"exception": error})
                 await connection.close(1007)
 
@@ -233,7 +233,7 @@ def refused(headers: Any, *, local: bool) -> str:
     """Return the reason why a request is refused, or '' if it is accepted.
 
     A request from a page of another server is refused: its origin and host differ in name or port.
-    Any port is accepted, since a tunnel (ssh -L) may change it.
+    Their port may differ from the server's, since a tunnel (ssh -L) may change it.
     A server that only this machine can reach also refuses other host names, against DNS rebinding.
     A request without an origin does not come from a page, and is accepted.
     """

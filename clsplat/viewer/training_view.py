@@ -27,7 +27,7 @@ STATUS_INTERVAL_SECONDS = 0.5
 class TrainingView:
     """Hook that `clsplat.api.train` calls between two steps, to render pictures for all viewers.
 
-    last: number of the last training step, for the text of the progress.
+    last: number of the last training step, for the progress text.
     """
 
     def __init__(self, viewing: Viewing, server: Server, background: tuple[float, float, float], last: int) -> None:

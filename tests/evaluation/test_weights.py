@@ -113,7 +113,9 @@ def test_a_page_in_their_place_is_not_kept(server: str, monkeypatch: pytest.Monk
 def test_a_limit_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     for text in ("soon", "-1", "nan", "inf"):
         monkeypatch.setenv(lpips_weights.LPIPS_TIMEOUT_VARIABLE, text)
-        refuses(f"{lpips_weights.LPIPS_TIMEOUT_VARIABLE} is '{text}', expected seconds", lpips_weights.limit)
+        refuses(
+            f"{lpips_weights.LPIPS_TIMEOUT_VARIABLE} is '{text}', expected a number of seconds", lpips_weights.limit
+        )
 
 
 @pytest.mark.usefixtures("installed")
@@ -135,7 +137,9 @@ def test_train_says_once_what_is_missing(
     captured = ran(capsys, command_train, scene, tmp_path / "run", config, "--json")
     told = [line for line in captured.err.splitlines() if line.startswith("no LPIPS: ")]
     assert len(told) == 1
-    assert told[0].startswith("no LPIPS: VGG-16's weights did not arrive in 0.2 s (CLSPLAT_LPIPS_TIMEOUT): curl")
+    assert told[0].startswith(
+        "no LPIPS: VGG-16's weights did not arrive in 0.2 s (CLSPLAT_LPIPS_TIMEOUT); download them with: curl"
+    )
     assert captured.err.index("no LPIPS") < captured.err.index("step 2/2"), "before the work"
     result = json.loads(captured.out)
     assert result["lpips_missing"] == told[0].removeprefix("no LPIPS: ")

@@ -81,5 +81,5 @@ def test_backward_motion_is_forward_motion_of_the_frame_before(projection: Proje
 def test_backward_motion_of_another_projection_is_refused() -> None:
     gaussians, camera = scenes.one()
     other = replace(camera, projection="orthographic")
-    with pytest.raises(InputError, match="backward leads to a camera that is orthographic, expected perspective"):
+    with pytest.raises(InputError, match="backward: the other frame's camera is orthographic, expected perspective"):
         Renderer(open_device()).render_channels(gaussians, camera, ("backward",), before=other)

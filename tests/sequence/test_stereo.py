@@ -299,7 +299,7 @@ def test_a_pair_in_strips_is_no_file_of_one_eye(tmp_path: Path) -> None:
     left, right = (Task(1, "1", camera, tmp_path / "a.exr", eye=eye, holdout=tmp_path / "z.exr") for eye in EYES)
     frames, pair = InStrips(Renderer(), scenes.one()[0], options), replace(left, right=right)
     frames.check([pair])
-    refuses("a picture of 64x40 is written in strips here, expected a file for each eye", frames, pair)
+    refuses("a picture of 64x40 is too large to be written at once, expected a file for each eye", frames, pair)
     assert not (tmp_path / "a.exr").exists()
 
 

@@ -195,7 +195,7 @@ def test_motion_where_an_angle_is_none(device: Device, projection: Projection) -
 
 def test_motion_to_another_projection_is_none(default_device: Device) -> None:
     camera = panorama(64, 32)
-    with pytest.raises(InputError, match="motion leads to a camera that is fisheye, expected equirectangular"):
+    with pytest.raises(InputError, match="motion: the other frame's camera is fisheye, expected equirectangular"):
         motion_of(default_device, [0.0, 0, 1], camera, replace(camera, projection="fisheye"))
 
 

@@ -39,7 +39,7 @@ CUDA_ONLY_NAMES = (
 )
 """Functions that gsplat implements only in CUDA and that clsplat does not have."""
 CUDA_ONLY_MODULES = ("gsplat.cuda._wrapper", "gsplat.rendering", "gsplat.losses_fused")
-"""Modules of gsplat in which these functions are defined."""
+"""Modules of gsplat that define the functions of CUDA_ONLY_NAMES."""
 PURE_PYTHON_NAMES = (
     "PngCompression",
     "Strategy",
@@ -51,7 +51,7 @@ PURE_PYTHON_NAMES = (
     "rasterization_2dgs_inria_wrapper",
     "rasterization_inria_wrapper",
 )
-"""Names in gsplat's Python code that need no CUDA. They are not replaced if gsplat is installed."""
+"""Functions and classes in gsplat's Python code that need no CUDA. They are not replaced if gsplat is installed."""
 
 
 def what_is_absent(name: str) -> str:

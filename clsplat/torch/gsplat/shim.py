@@ -46,7 +46,7 @@ GSPLAT_PACKAGES = ("gsplat", "gsplat.cuda", "gsplat.optimizers")
 TWO_RADII_SINCE_VERSION = (1, 5)
 """The first version of gsplat in which a splat has two radii."""
 FUNCTIONS_CHANGED_IN_1_5 = (fully_fused_projection, isect_tiles)
-"""Functions whose results or arguments changed in gsplat 1.5."""
+"""Functions whose results or arguments changed in gsplat 1.5, and which are not replaced in older versions."""
 
 
 def install_as_gsplat() -> list[str]:
@@ -98,7 +98,7 @@ def install_as_gsplat() -> list[str]:
 
 
 def strategy(name: str) -> Any:
-    """A class of `gsplat.strategy`, with clsplat's replacements for the functions that need CUDA.
+    """Return a class of `gsplat.strategy`, with clsplat's replacements for the functions that need CUDA.
 
     Raises ImportError if gsplat is not installed, ClsplatError if it is older than 1.5.
     """
@@ -115,8 +115,11 @@ def strategy(name: str) -> Any:
 
 
 def _of_gsplat(place: str, name: str) -> Any:
-    """The attribute `name`, which the replacement module `place` lacks: a function that raises InputError, or a gsplat
-    strategy. Raises AttributeError for other names, and ImportError if gsplat is needed and not installed."""
+    """Return what `place`, a module in place of gsplat's, gives for a `name` that clsplat lacks.
+
+    This is a function that raises InputError, or a gsplat strategy. Raises AttributeError for other names, and
+    ImportError if gsplat is needed and not installed.
+    """
     if name in absent_names.CUDA_ONLY_NAMES:
         return absent_names.refuses(name)
     if place == "gsplat" and name in {"DefaultStrategy", "MCMCStrategy"}:
@@ -133,7 +136,7 @@ def _own(name: str) -> str:
 def _has(module: str) -> bool:
     try:
         return find_spec(module) is not None
-    except ModuleNotFoundError:  # the parent package is missing
+    except ModuleNotFoundError:  # a parent package of the module is missing
         return False
 
 
@@ -147,7 +150,7 @@ def _is_ours(value: Any) -> bool:
 
 
 def _with_one_radius(function: Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]) -> Callable[..., Any]:
-    """`rasterization` with one radius per splat, the larger of the two, as before gsplat 1.5.
+    """Wrap `rasterization` to return one radius per splat, the larger of the two, as before gsplat 1.5.
 
     The radii are (C, N), or (nnz,) if packed.
     """
