@@ -52,7 +52,7 @@ def ssim(x: Float64, y: Float64) -> tuple[Float64, Float64]:
     d_covariance = 2 * luminance / (luminance_norm * structure_norm)
     d_var = -values / structure_norm
     d_mean = 2 * mean_y * structure / (luminance_norm * structure_norm) - 2 * mean_x * values / luminance_norm
-    # The variances and the covariance depend on the mean too.
+    # add the parts through variances and covariance, which depend on the mean too
     d_mean = d_mean - 2 * mean_x * d_var - mean_y * d_covariance
     gradient = blur(d_mean) + 2 * x * blur(d_var) + y * blur(d_covariance)
     return values, gradient
