@@ -47,7 +47,7 @@ class ChunkBounds:
 
     @classmethod
     def measured(cls, means: Float32, log_scales: Float32) -> ChunkBounds:
-        """Return the bounds of chunks of a model with means and log scales (n, 3). Bounds of NaNs are NaN."""
+        """Return the bounds of the chunks of a model, given means and log scales (n, 3). NaNs give bounds of NaN."""
         starts = np.arange(0, len(means), CHUNK_ROWS)
         if len(starts) == 0:
             return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
@@ -138,7 +138,7 @@ def largest_step(config: OptimiserConfig) -> float:
     if root >= 1 or beta2 >= 1 or config.epsilon < _LEAST_EPSILON:
         return math.inf
     limit = (1 - beta1) / math.sqrt((1 - beta2) * (1 - root**2))
-    # moments have float32 decays, and corrections float64 decays: they differ most at the first step
+    # kernels round decays for moments, but not for corrections, which matters most at the first step
     first = (1 - beta1) / (1 - config.beta1)
     second = math.sqrt((1 - config.beta2) / (1 - beta2))
     return limit * max(first, 1.0) * max(second, 1.0) * (1 + _SLACK)

@@ -33,13 +33,13 @@ _ROUNDING = 1e-5
 """Slack relative to the terms of a plane's function. Kernels that compute in two floats round the result to float32, by
 6e-8."""
 _CANCELLED = 1e-11
-"""Slack relative to coordinates in the world, which may cancel in the camera's axes. It covers the rounding of two
-floats and of float64."""
+"""Slack relative to world coordinates, for their rounding in two floats and in float64: large coordinates may cancel in
+the camera's axes."""
 _ANGLE_SLACK = 1e-4
-"""Slack of directions in radians. In float32 they are rounded by 1e-6, and 22 times that near a pole."""
+"""Slack of directions in radians. In float32 they are rounded by 1e-6, and by 22e-6 near a pole."""
 _LEAST_AHEAD = 2e-4
-"""Tangent of the angle to the plane z = 0 under which an end of a box along rays is infinite (LEAST_AHEAD in
-kernels/shared/camera/perspective_rays.h), doubled."""
+"""Twice the tangent of the angle to the plane z = 0 below which the kernels take an end of a Gaussian's box as infinite
+(LEAST_AHEAD in kernels/shared/camera/perspective_rays.h)."""
 _POLE = 0.99
 """Limit of sin(half angle of a cone) / sin(angle between its middle and an axis). Only below it does the cone count as
 clear of the axis. The kernels use 0.999."""

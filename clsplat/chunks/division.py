@@ -13,7 +13,7 @@ from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.optimisation.density_rules import FRESH
 
 NEW = -1
-"""Value of `Division.kept` for a chunk that no old chunk equals."""
+"""Value of `Division.kept` for a chunk if no old chunk had exactly its rows."""
 _COUNTED_ROWS = 1 << 14
 """Number of entries of the row list that are counted at a time. It limits the memory for copies of them."""
 
@@ -46,7 +46,7 @@ class Division:
     """The chunks of a model after rows have moved.
 
     starts: (chunks + 1,) int64, the first row of each chunk, then the number of all rows.
-    kept: (chunks,) int64, for each chunk the number that it had before, or NEW if rows of it have changed.
+    kept: (chunks,) int64, for each chunk the number that it had before, or NEW if no old chunk had exactly its rows.
     """
 
     starts: NDArray[np.int64]

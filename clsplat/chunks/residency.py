@@ -35,7 +35,9 @@ class Moves:
 class Residency:
     """Record of which chunks of a model are in which slots on the device.
 
-    It decides only how many copies a training makes, not its results. slots, chunks: number of slots and of chunks.
+    Results do not depend on the slots; only the number of copies does.
+
+    slots, chunks: number of slots on the device, and of chunks of the model.
     """
 
     def __init__(self, slots: int, chunks: int) -> None:

@@ -48,7 +48,7 @@ class SlotTable:
         return _end(self._used)
 
     def hold(self, kept: Sequence[NDArray[np.int64]]) -> None:
-        """Protect from being overwritten only these slots. kept: slots of the chunks of each kept checkpoint."""
+        """Protect the slots `kept`, and no others, from being overwritten. They are given for each kept checkpoint."""
         self._held, self._named_end = np.zeros(self.size, np.bool_), 0
         for slots in kept:
             self._held[slots[(slots >= 0) & (slots < self.size)]] = True
@@ -86,7 +86,7 @@ class SlotTable:
         return min(self.least_growth(lacking), self.most - self.size)
 
     def least_growth(self, lacking: int) -> int:
-        """Return the smallest number of slots to add to the file, which is large enough that it seldom grows."""
+        """Return the smallest number of slots to add if `lacking` are missing, so large that the file seldom grows."""
         return max(lacking, len(self.current) // _GROWTH_SHARE)
 
     def grow(self, slots: int) -> None:

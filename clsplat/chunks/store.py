@@ -125,7 +125,7 @@ class ChunkStore:
 
     @property
     def nbytes(self) -> int:
-        """Size in bytes: of all rows for a store in main memory, of the chunks' slots for one in a scratch file."""
+        """Size in bytes: in main memory of the records of all rows, in a scratch file of one slot for each chunk."""
         if self.path is None:
             return self.count * self.record.itemsize // CHUNK_ROWS
         return self.chunks * self.file.slot_bytes

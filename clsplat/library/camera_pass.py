@@ -206,7 +206,7 @@ class CameraPass:
         self._has_background = background is not None
 
     def _values(self) -> Float32 | DeviceArray:
-        """Return the values to blend (N, X): by the render mode colours, the depth, or colours and then the depth."""
+        """Return the values to blend (N, X). The render mode says whether they are colours, the depth, or both."""
         if not self.with_depth:
             return self._colours.array if isinstance(self._colours, Hosted) else self._colours
         depths = self.depths[:, None]

@@ -227,7 +227,7 @@ def screen_gaussians(
     conics: (n, 3), a, b, c of the inverse covariance.
     opacities: (n,), 0 to 1.
     colours: (n, D), D at least 1.
-    depths: (n,). Gaussians are blended in this order, and those of equal depth by index.
+    depths: (n,). Gaussians are blended in order of depth, and those of equal depth in order of their index.
     radii: (n, 2) int32; a radius of 0 culls the Gaussian.
 
     If the device shares the host's memory, C-contiguous float32 host arrays are not copied.

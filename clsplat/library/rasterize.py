@@ -294,7 +294,8 @@ def rasterize(
     backgrounds : (C, D) or (D,) array_like, optional
         Black if None.
     render_mode : str
-        "RGB", "D" (depth), "ED" (expected depth, divided by alpha), "RGB+D" or "RGB+ED". Depths are along the axis.
+        "RGB", "D" (depth), "ED" (expected depth: depth divided by alpha), "RGB+D" or "RGB+ED". Depths are along the
+        camera's axis.
     rasterize_mode : str
         "classic", or "antialiased": lower opacities to compensate for eps2d.
     camera_model : str

@@ -65,7 +65,7 @@ class LibrarySession:
             self._idle.append(work)
 
     def capped(self, alpha_max: float) -> Device:
-        """Return the device with kernels that limit a Gaussian's alpha at a pixel to `alpha_max`."""
+        """Return the device, with kernels that limit a Gaussian's alpha at a pixel to `alpha_max`."""
         defines = kernel_defines(RasterizerConfig(), alpha_max=alpha_max)
         return self.device.with_switches(defines) if defines else self.device
 

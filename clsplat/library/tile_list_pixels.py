@@ -109,7 +109,7 @@ def rasterize_to_pixels(
     ----------
     means2d : (..., N, 2) array_like
         Pixels; the first pixel's centre is at 0.5. In packed arrays, here and below, M replaces "..., N": they list the
-    Gaussians of all images one after the other.
+        Gaussians of all images one after the other.
     conics : (..., N, 3) array_like
         a, b, c of the inverse covariance, 1 / px^2.
     colors : (..., N, D) array_like

@@ -23,7 +23,7 @@ from clsplat.sequence.finished_frames import is_complete
 from clsplat.sequence.task import RenderOptions, Task
 
 CLAIM_HEARTBEAT_SECONDS = 60.0
-"""Seconds between updates of a claim file's modification time. A claim is abandoned ABANDONED_FILE_SECONDS after it."""
+"""Seconds between updates of a claim file's modification time, so that it stays younger than ABANDONED_FILE_SECONDS."""
 CLAIM_POLL_SECONDS = 0.25
 """Seconds between checks of frames that other jobs have claimed."""
 CLAIM_WARNING_SECONDS = 10.0

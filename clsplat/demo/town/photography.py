@@ -71,7 +71,7 @@ class TakenPhotograph:
 
 
 def take(config: TownConfig, photograph: TownPhotograph) -> TakenPhotograph:
-    """Take a planned photograph. A pixel is the mean of four rays, or one ray's colour if all meet the same surface."""
+    """Take a planned photograph. A pixel is the mean of four rays, or is shaded once if all meet the same surface."""
     camera = photograph.camera
     blocks = blocks_in_sight(config.seed, camera)
     moving = len(blocks)

@@ -170,7 +170,7 @@ def _fisheye_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
     x = camera.cx + camera.fx * radius * edge[..., 0] / level
     y = camera.cy + camera.fy * radius * edge[..., 1] / level
     bounds = np.stack([x.min(axis=1), x.max(axis=1), y.min(axis=1), y.max(axis=1)], axis=1)
-    whole = theta + angle >= np.pi  # cones that contain the backward direction, the whole edge of the picture
+    whole = theta + angle >= np.pi  # the backward direction is imaged on the whole edge of the picture
     bounds[whole] = (-1e9, 1e9, -1e9, 1e9)
     return bounds
 

@@ -86,7 +86,7 @@ def write_town(
         points = _write_model(result, config, planned, seen)
         record = {"town": config.record(), "photographs": len(planned), "points": points}
         atomic_write(result / TOWN_RECORD_FILE, (json.dumps(record, indent=2) + "\n").encode())
-        check_folder(output, overwrite=overwrite)  # again, as another process may have written there
+        check_folder(output, overwrite=overwrite)  # another process may have written there
         move_into_place(work, place)
     except KeyboardInterrupt as error:
         error.args = ("before the town was complete: no file of it is left, and the same command starts anew",)
@@ -124,7 +124,7 @@ def _take_all(
     try:
         for done, observations in enumerate(pool.map(partial(_take_and_write, result, config), planned), 1):
             seen.append(observations)
-            os.utime(result.parent)  # or other machines would take the folder as abandoned
+            os.utime(result.parent)  # otherwise other machines count the folder as abandoned
             progress("taking photographs", CountedFraction(done, len(planned), "taken"))
     finally:
         pool.shutdown(cancel_futures=True)
