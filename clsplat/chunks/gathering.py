@@ -185,7 +185,7 @@ def _copy(
 ) -> None:
     """Copy the rows at positions `at` (m,) of the records `old` to positions `places` (m,) of `records`.
 
-    Row r of record k has the position CHUNK_ROWS k + r. fresh: (m,), True for new rows. values: values not copied.
+    Row r of record k has the position CHUNK_ROWS k + r. fresh: (m,), True for new rows. values: as for `gathered`.
     """
     parts, wanted = list(_by_chunk(places)), set(records.dtype.names or ()) - values.anew
     for name in (name for name in old.dtype.names or () if name in wanted):

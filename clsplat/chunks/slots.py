@@ -48,7 +48,7 @@ class SlotTable:
         return _end(self._used)
 
     def hold(self, kept: Sequence[NDArray[np.int64]]) -> None:
-        """Protect the slots `kept`, and no others, from being overwritten. They are given for each kept checkpoint."""
+        """Protect only the slots `kept` from being overwritten. They are an array for each kept checkpoint."""
         self._held, self._named_end = np.zeros(self.size, np.bool_), 0
         for slots in kept:
             self._held[slots[(slots >= 0) & (slots < self.size)]] = True

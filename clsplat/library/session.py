@@ -61,7 +61,7 @@ class LibrarySession:
         return work
 
     def _take_back(self, work: PassWorkspace) -> None:
-        if len(self._idle) < MAX_IDLE_WORKSPACES:  # without the lock, as append is atomic: finalizers run in any thread
+        if len(self._idle) < MAX_IDLE_WORKSPACES:  # needs no lock, though any thread may call it: append is atomic
             self._idle.append(work)
 
     def capped(self, alpha_max: float) -> Device:

@@ -186,7 +186,7 @@ def blend_grad(
         gradients.colors[gaussian] = (weight[:, :, None] * d_image[box]).sum(axis=(0, 1))
         behind[box] += alpha[:, :, None] * (color - behind[box])
 
-        free = added & (splat.raw <= BLEND_ALPHA_MAX)  # an alpha that is limited does not depend on the Gaussian
+        free = added & (splat.raw <= BLEND_ALPHA_MAX)  # an alpha at its limit passes no gradient on
         _set_shape_gradients(gradients, projected, gaussian, splat, np.where(free, d_alpha, 0.0), alpha)
     return gradients
 

@@ -273,7 +273,7 @@ def framed(camera: Camera, config: FramingConfig) -> Camera:
 
 
 def lens_of(task: Task, pictures: PictureConfig) -> Places | None:
-    """Return the lens or STMap that distorts the picture; None without one. Raises InputError for an unreadable map."""
+    """Return the lens or STMap that distorts the picture; None without distortion. Raises InputError for a bad map."""
     if stmap := pictures.warp.stmap:
         return ByMap(read_stmap(Path(stmap)))
     return ByLens(task.lens) if task.lens is not None else None

@@ -84,9 +84,9 @@ def _grid(period: float, width: float, offset: float = 0.0) -> Pixels:
 
 
 def _bricks(rows: int, columns: int, joint: float, generator: np.random.Generator) -> tuple[Pixels, Pixels]:
-    """Lay bricks in staggered rows. Returns two images (h, w): 1 on joints, 0 elsewhere; and a value per brick.
+    """Lay bricks in staggered rows. Returns two images (h, w).
 
-    Each brick has a random value from -1 to 1 in all its texels.
+    The first is 1 on joints and 0 elsewhere. The second has a random value from -1 to 1 for each brick.
 
     rows, columns: number of bricks. joint: width of a joint in texels.
     """

@@ -239,9 +239,9 @@ class _Rays:
             self._meet(part, hit, enter, face)
 
     def _turned(self, part: Slices, turn: Float32) -> tuple[Float32, Float32, Float32]:
-        """Return reciprocals of the x and y, and the y, of rays' directions in the axes of a solid.
+        """Return 1 / x, 1 / y and y of rays' directions in a solid's own axes.
 
-        turn: (2,), cosine and sine of the solid's rotation about z.
+        part: slices of the rays, as from `slices`. turn: (2,), cosine and sine of the solid's rotation about z.
         """
         x, y = self.x[part], self.y[part]
         if turn[1] == 0:

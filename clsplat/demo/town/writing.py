@@ -124,7 +124,7 @@ def _take_all(
     try:
         for done, observations in enumerate(pool.map(partial(_take_and_write, result, config), planned), 1):
             seen.append(observations)
-            os.utime(result.parent)  # otherwise other machines count the folder as abandoned
+            os.utime(result.parent)  # so that no other machine takes the folder as abandoned
             progress("taking photographs", CountedFraction(done, len(planned), "taken"))
     finally:
         pool.shutdown(cancel_futures=True)
