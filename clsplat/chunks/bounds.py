@@ -22,7 +22,7 @@ _ROUNDING = 1e-6
 """Relative slack of sqrt(r), the ratio in `largest_step`, for the rounding of a step's moments. It is more than eight
 roundings of float32."""
 _SLACK = 1e-3
-"""Relative slack of the bounds of a step. It covers the rounding of a step, and second moments that underflow."""
+"""Relative slack of the bound of a step of Adam. It covers the step's rounding, and second moments that underflow."""
 GROUP_FACTOR = 1.5
 """Factor on half the diagonal of a group's box, for a sphere that contains the spheres around the boxes of its chunks.
 These reach at most sqrt(2) half diagonals from the middle of the group's box."""
@@ -47,7 +47,7 @@ class ChunkBounds:
 
     @classmethod
     def measured(cls, means: Float32, log_scales: Float32) -> ChunkBounds:
-        """Measure the chunks of a model, from means and log scales (n, 3). The bounds of a chunk with a NaN are NaN."""
+        """Return the bounds of the chunks of a model, given means and log scales (n, 3). NaNs give bounds of NaN."""
         starts = np.arange(0, len(means), CHUNK_ROWS)
         if len(starts) == 0:
             return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
@@ -68,9 +68,9 @@ class ChunkBounds:
 
     @cached_property
     def terms(self) -> Float64:
-        """Rows (8, B): the boxes' middles (3), half sides (3), largest standard deviations, and magnitudes.
+        """Array (8, B) whose rows are the boxes' middles (3), half sides (3), largest standard deviations, magnitudes.
 
-        The magnitude is the sum of the absolute coordinates of the box's farthest corner; rounding is relative to it.
+        A magnitude is the sum of the absolute coordinates of the box's farthest corner; rounding is relative to it.
         """
         with np.errstate(over="ignore", invalid="ignore"):
             middle, half = 0.5 * (self.lowest + self.highest).T, 0.5 * (self.highest - self.lowest).T
@@ -86,8 +86,8 @@ class ChunkBounds:
     def widened(self, mean_step: float | Float64, log_scale_step: float | Float64, updates: int = 0) -> ChunkBounds:
         """Return the bounds after training steps that may have moved the Gaussians.
 
-        mean_step, log_scale_step: the most by which a mean's coordinate, and a log scale, have moved: a number, or one
-            for each chunk (B,).
+        mean_step, log_scale_step: the most by which a coordinate of a mean, and a log scale, have changed: a number for
+            all chunks, or an array (B,).
         updates: number of updates of a parameter in these steps, each of which rounds it to float32.
         """
         with np.errstate(invalid="ignore", over="ignore"):
@@ -99,12 +99,12 @@ class ChunkBounds:
 
 
 def _with_rounding(step: float | Float64, size: Float64, updates: int) -> Float64:
-    """Return the most (B,) by which values move in `updates` updates that are rounded to float32.
+    """Return the largest change (B,) of values by `updates` updates, each of which is rounded to float32.
 
-    After a movement d the values are at most size + d, so that each rounding is at most (size + d) 2^-24.
+    After a change by d the values are at most size + d, so that each rounding is at most (size + d) 2^-24.
 
-    step: the most by which the updates add up to without rounding.
-    size: (B,), the largest absolute values at first.
+    step: the largest sum of all updates, without rounding.
+    size: (B,), the largest absolute values before the updates.
     """
     share = updates * _HALF_ULP
     if share >= 1:
@@ -114,7 +114,7 @@ def _with_rounding(step: float | Float64, size: Float64, updates: int) -> Float6
 
 
 def largest_step(config: OptimiserConfig) -> float:
-    """Return the most by which a step of Adam moves a parameter, as a multiple of the learning rate: 7.3 by default.
+    """Return the largest change of a parameter by a step of Adam, as a multiple of the learning rate: 7.3 by default.
 
     Let b1, b2 be the decays, r = b1^2 / b2 < 1, and S(x) = 1 + x + ... + x^(t - 1). After t steps with gradients g_i,
     Cauchy and Schwarz give for the moments m and v:
@@ -138,15 +138,14 @@ def largest_step(config: OptimiserConfig) -> float:
     if root >= 1 or beta2 >= 1 or config.epsilon < _LEAST_EPSILON:
         return math.inf
     limit = (1 - beta1) / math.sqrt((1 - beta2) * (1 - root**2))
-    # Decays of corrections and moments differ by rounding; so the quotient of a moment's factor and its correction is
-    # between 1 and its value at the first step.
+    # kernels round decays for moments, but not for corrections, which matters most at the first step
     first = (1 - beta1) / (1 - config.beta1)
     second = math.sqrt((1 - config.beta2) / (1 - beta2))
     return limit * max(first, 1.0) * max(second, 1.0) * (1 + _SLACK)
 
 
 def largest_resumed_step(config: OptimiserConfig, ratio: float, step: int) -> float:
-    """Return `largest_step` after a resume, for moments that a training with other decays may have made.
+    """Return `largest_step` after a resume from a checkpoint whose moments may be from a training with other decays.
 
     Let c be the limit in `largest_step`, so that (1 - b1)^2 / (1 - b2) = (1 - r) c^2. If |m| <= d sqrt(v) with d >= c,
     Cauchy and Schwarz give for the next moments
@@ -162,7 +161,7 @@ def largest_resumed_step(config: OptimiserConfig, ratio: float, step: int) -> fl
 
 
 def hidden_path(config: OptimiserConfig, step: float | None = None) -> float:
-    """Return the most by which any number of steps with gradient 0 move a parameter: 66 learning rates by default.
+    """Return the largest change of a parameter by any number of steps with gradient 0: 66 learning rates by default.
 
     In the k-th step with gradient 0, the first moment has fallen to b1^k times its value, and the root of the second to
     b2^(k / 2) times. So by the argument of `largest_step` that step is at most (b1 / sqrt(b2))^k times the bound of a
@@ -176,7 +175,7 @@ def hidden_path(config: OptimiserConfig, step: float | None = None) -> float:
 
 
 def _decays(config: OptimiserConfig) -> tuple[float, float, float]:
-    """The kernel's decays b1 and b2 in float32, and sqrt(r) = b1 / sqrt(b2) with its slack."""
+    """Return the kernel's float32 decays b1 and b2, and sqrt(r) = b1 / sqrt(b2), enlarged by _ROUNDING."""
     beta1, beta2 = float(np.float32(config.beta1)), float(np.float32(config.beta2))
     root = beta1 / math.sqrt(beta2) * (1 + _ROUNDING) if beta2 > 0 else math.inf
     return beta1, beta2, root

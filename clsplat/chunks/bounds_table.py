@@ -13,17 +13,17 @@ from clsplat.arrays import Bool, Float32, Float64
 from clsplat.chunks.bounds import GROUP_FACTOR, ChunkBounds
 
 GROUP = 64
-"""Consecutive chunks in a group, and groups in a group of the next level."""
+"""Number of consecutive chunks in a group, and of groups in a group of the next level."""
 MOST_ON_TOP = 2048
-"""Largest number of bounds that are tested without groups above them. Testing them takes about as long as the calls of
-NumPy for another level of groups."""
+"""Maximum number of bounds on the highest level. Testing so many takes about as long as the calls of NumPy for another
+level of groups."""
 _FLOATS = 7
-"""Floats of bounds: lowest (3) and highest coordinates (3) of the means, largest log scale."""
+"""Number of floats of a chunk's bounds: lowest (3) and highest coordinates (3) of its means, and largest log scale."""
 
 Sees = Callable[[ChunkBounds], Bool]
 """Function that returns True (n,) for bounds in view, such as `culling.visible` for a picture."""
 Movement = Callable[[NDArray[np.integer]], Float64]
-"""Function from numbers of chunks (n,) to the most by which their means and log scales have moved (2, n)."""
+"""Function from numbers of chunks (n,) to the largest changes (2, n) of their means' coordinates and log scales."""
 
 
 class BoundsTable:
@@ -42,32 +42,32 @@ class BoundsTable:
         self._most_moved = np.zeros((2, 1))
 
     def measure(self, numbers: NDArray[np.uint32], found: Float32) -> None:
-        """Store the measured bounds of some chunks. found: (n, 7), in the order of `_FLOATS`."""
+        """Store the measured bounds `found` (n, 7) of the chunks `numbers` (n,); `_FLOATS` has the order of columns."""
         self._levels[0][numbers] = found
         self._moved[:, numbers] = 0.0
         self._most_moved = self._moved.max(axis=1, initial=0.0, keepdims=True)
         changed = numbers.astype(np.int64)
         for below, level in pairwise(self._levels):
             changed = np.unique(changed // GROUP)
-            members = below[np.minimum(_members(changed), len(below) - 1)]  # the last group repeats its last member
+            members = below[np.minimum(_members(changed), len(below) - 1)]  # pads the last group with its last member
             sides = np.hstack([members[:, :, :3].min(axis=1), members[:, :, 3:].max(axis=1)])
             with np.errstate(invalid="ignore"):
                 finite = np.isfinite(members.sum(axis=(1, 2)))
             level[changed] = np.where(finite[:, None], sides, np.nan)
 
     def move(self, numbers: NDArray[np.uint32], steps: Float64) -> None:
-        """Record that a training step has moved the Gaussians of some chunks.
+        """Record that a training step has moved the Gaussians of the chunks `numbers` (n,).
 
-        steps: (2, n or 1), the most by which a mean's coordinate, and a log scale, have moved.
+        steps: (2, n or 1), the largest change of a mean's coordinate, and of a log scale.
         """
         self._moved[:, numbers] += steps
         self._most_moved = np.maximum(self._most_moved, self._moved[:, numbers].max(axis=1, initial=0.0, keepdims=True))
 
     def seen(self, sees: Sees, hidden: Movement, most_hidden: Float64, updates: int) -> NDArray[np.uint32]:
-        """Return the chunks for which `sees` is True, in rising order. Only chunks of groups in view are tested.
+        """Return the numbers of the chunks for which `sees` is True, rising. Only chunks of groups in view are tested.
 
-        hidden: movements of chunks that `move` has not recorded.
-        most_hidden: (2, 1), the largest of these movements for any chunk.
+        hidden: function that returns the changes of chunks that `move` has not recorded.
+        most_hidden: (2, 1), the largest of these changes in any chunk.
         updates: number of updates of a parameter since the oldest measurement (`ChunkBounds.widened`).
         """
         most = self._most_moved + most_hidden
@@ -82,7 +82,7 @@ class BoundsTable:
 
 
 def _members(groups: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Numbers (n, GROUP) of the members of these groups. The last group may have numbers past the last member."""
+    """Return the numbers (n, GROUP) of the members of groups (n,). The last group may list numbers past the end."""
     return GROUP * groups[:, None] + np.arange(GROUP)
 
 

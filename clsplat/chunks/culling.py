@@ -30,18 +30,19 @@ _LOW_PASS_ROOT = math.sqrt(0.3)
 _REACH_SLACK = 1.001
 """Factor on a Gaussian's reach. The kernels round it by 1e-4 at most, and along rays enlarge it by at most 1e-4."""
 _ROUNDING = 1e-5
-"""Slack relative to the terms of a plane. A mean in two floats is rounded to float32 at the end, by 6e-8."""
+"""Slack relative to the terms of a plane's function. Kernels that compute in two floats round the result to float32, by
+6e-8."""
 _CANCELLED = 1e-11
-"""Slack relative to coordinates in the world, which may cancel in the camera's axes. It covers the rounding of two
-floats and of float64."""
+"""Slack relative to world coordinates, for their rounding in two floats and in float64: large coordinates may cancel in
+the camera's axes."""
 _ANGLE_SLACK = 1e-4
-"""Slack of directions in radians. In float32 they are rounded by 1e-6, and 22 times that near a pole."""
+"""Slack of directions in radians. In float32 they are rounded by 1e-6, and by 22e-6 near a pole."""
 _LEAST_AHEAD = 2e-4
-"""Tangent of the angle to the plane z = 0 under which an end of a box along rays is infinite (LEAST_AHEAD in
-kernels/shared/camera/perspective_rays.h), doubled."""
+"""Twice the tangent of the angle to the plane z = 0 below which the kernels take an end of a Gaussian's box as infinite
+(LEAST_AHEAD in kernels/shared/camera/perspective_rays.h)."""
 _POLE = 0.99
-"""Limit of sin(half angle of a cone) / sin(angle between its middle and an axis). From this value on, the cone counts
-as containing the axis. The kernels use 0.999."""
+"""Limit of sin(half angle of a cone) / sin(angle between its middle and an axis). Only below it does the cone count as
+clear of the axis. The kernels use 0.999."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +70,11 @@ class PictureBorders:
     culls: False if every chunk counts as visible.
     square: True if a Gaussian is listed in all tiles of a square, whose half side is the ellipse's longest half axis.
         This axis is at most the root of the sum of the squared half width and half height.
-    reach: standard deviations at which a Gaussian ends.
+    reach: number of standard deviations at which a Gaussian ends.
     stretch: largest factor by which the camera's matrix changes a length; 1 for an exact rotation.
-    low, high: (2,), borders of the tiles in pixels, from the principal point.
+    low, high: (2,), left and upper, right and lower border of the tiles, in pixels from the principal point.
     slack: (2,), rounding error in pixels of image positions near the picture.
-    depths: least and largest depth.
+    depths: depths of the near and the far plane.
     """
 
     camera: Camera
@@ -90,10 +91,10 @@ class PictureBorders:
     def of(
         cls, camera: Camera, config: RasterizerConfig = _DEFAULT_RASTERIZER, opacity_factor: float = 1.0
     ) -> PictureBorders:
-        """The picture of a camera.
+        """Return the borders of a camera's picture.
 
         config: the rasterizer's settings, on which a Gaussian's reach depends.
-        opacity_factor: the factor by which the pass multiplies opacities (thinning), at least 1.
+        opacity_factor: factor, at least 1, by which random dropout of Gaussians multiplies the others' opacities.
         """
         switches = config.switches()
         reach = 3.0 if switches.extent == "3sigma" else math.sqrt(2 * math.log(opacity_factor / switches.alpha_min))
@@ -169,7 +170,7 @@ def visible(picture: PictureBorders, bounds: ChunkBounds) -> Bool:
 
 
 def _beyond_planes(bounds: ChunkBounds, picture: PictureBorders) -> Bool:
-    """True (B,) for chunks beyond a side of the picture on an image plane, or beyond the near or far plane."""
+    """Return True (B,) for chunks beyond a side of a picture with an image plane, or beyond the near or far plane."""
     planes = picture.planes
     # einsum instead of @, because BLAS would start threads even for this small product, and they spin while they wait
     farthest_corner = np.einsum("pk,kb->pb", planes.terms, bounds.terms)
@@ -211,7 +212,7 @@ def _cones(bounds: ChunkBounds, picture: PictureBorders) -> _Cones:
     to_box = np.maximum(np.abs(middle) - half, 0.0)
     least = np.maximum(distance - radius, np.sqrt(np.einsum("ij,ij->j", to_box, to_box)))
     least = np.maximum(least, picture.depths[0]) * (1 - _ROUNDING)
-    spread = np.arcsin(radius / distance)  # NaN if the camera is inside
+    spread = np.arcsin(radius / distance)  # NaN if the camera is in the sphere
     return _Cones(middle, half, distance, radius, least, picture.stretch * terms[6], spread, bounds.factor)
 
 
@@ -241,13 +242,12 @@ def _caps(cones: _Cones, picture: PictureBorders, pixel: float) -> tuple[Float64
 
 
 def _half_turn(sine: Float64, level: Float64) -> Float64:
-    """Return half of the angle (B,) that cones cover around an axis; NaN for a cone that nearly contains the axis.
+    """Return half of the angle (B,) that chunks' cones cover around an axis; NaN if a cone nearly contains the axis.
 
-    If a chunk's cone, of half angle `whole`, does not contain the axis, the cones of its Gaussians do so even less:
-    sin(whole - spread) / sin(a - spread) falls with the spread, if a, the angle to the axis, is larger than `whole`.
+    Let w be a cone's half angle, and a > w the angle between its middle and the axis. Then the cones of the chunk's
+    Gaussians do not contain the axis either, as sin(w - spread) / sin(a - spread) falls with the spread.
 
-    sine: (B,), sine of `whole`.
-    level: (B,), sine of a, the angle between a cone's middle and the axis.
+    sine, level: (B,), sin w and sin a.
     """
     ratio = sine / level
     return np.where(ratio < _POLE, np.arcsin(ratio), np.nan) + _ANGLE_SLACK
@@ -305,10 +305,10 @@ def _beyond_fisheye(cones: _Cones, picture: PictureBorders) -> Bool:
     """Return True (B,) for chunks beyond a side of a fisheye's picture, or beyond its largest angle.
 
     The kernels bound a Gaussian by a rectangle in the picture, whose sides are along and across the direction from the
-    axis to the mean. It reaches from `inner` to `outer`, and `aside` to both sides. If a Gaussian may contain the axis,
-    or reach the largest angle, the kernels take a square around the axis. Here 1.5 `outer` is then taken on all sides,
-    which no corner of such a rectangle exceeds. A rectangle never reaches beyond 2 `outer`, which is less than the
-    square of a group.
+    axis to the mean. The rectangle reaches from radius `inner` to `outer`, and `aside` to both sides. If a Gaussian may
+    contain the axis, or reach the largest angle, the kernels take a square around the axis. The bound here is then
+    1.5 `outer` on all sides, which no corner of a Gaussian's rectangle exceeds. A rectangle never reaches beyond 2
+    `outer`, which is less than the square of a group.
     """
     camera, (x, y, z), fold = picture.camera, cones.middle, picture.camera.fold[0]
     widest = 1.5 / MIN_FISHEYE_SLOPE if any(camera.radial) else max(1.0, 0.5 / (math.pi * camera.fx))
@@ -317,9 +317,10 @@ def _beyond_fisheye(cones: _Cones, picture: PictureBorders) -> Bool:
     theta = np.arctan2(across, z)
     sine, spread_sine = across / cones.distance, cones.radius / cones.distance
     spread_cosine = np.sqrt(1 - spread_sine * spread_sine)
-    least_sine = sine * spread_cosine - np.abs(z / cones.distance) * spread_sine  # of the angles theta +- spread
+    least_sine = sine * spread_cosine - np.abs(z / cones.distance) * spread_sine  # the smaller sine of theta +- spread
     ratio = np.sin(cap) / least_sine
-    turn_sine = spread_sine / sine + _ANGLE_SLACK  # of half the angle that the means cover around the axis
+    # means cover an angle around the axis; this is the sine of half of it
+    turn_sine = spread_sine / sine + _ANGLE_SLACK
     turn_cosine = np.sqrt(1 - turn_sine * turn_sine)
     ring = (least_sine > 0) & (ratio < _POLE) & (turn_sine < 1)
     ring &= (theta - whole > _ANGLE_SLACK) & (theta + whole < fold - _ANGLE_SLACK)

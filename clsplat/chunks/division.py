@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Division of a store's rows into chunks, and new chunks where density control has changed rows."""
+"""Division of a streamed model's rows into chunks, and new chunks where density control has changed rows."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from clsplat.layouts.columns import CHUNK_ROWS
 from clsplat.optimisation.density_rules import FRESH
 
 NEW = -1
-"""Value of `Division.kept` for a chunk that equals no old chunk."""
+"""Value of `Division.kept` for a chunk if no old chunk had exactly its rows."""
 _COUNTED_ROWS = 1 << 14
-"""Number of list entries that are counted at a time, which limits the size of copies."""
+"""Number of entries of the row list that are counted at a time. It limits the memory for copies of them."""
 
 
 def chunks_of(rows: int) -> int:
@@ -25,19 +25,19 @@ def chunks_of(rows: int) -> int:
 
 def listed_chunks(chunks: int) -> int:
     """Return the padded length of a list of `chunks` chunks: at least 1, and at most a quarter more than `chunks`. Few
-    lengths occur, so that arrays of a length can be reused."""
+    different lengths occur, so that device arrays can be reused."""
     wanted = max(chunks, 1)
     unit = 1 << max(wanted.bit_length() - 3, 0)
     return -(-wanted // unit) * unit
 
 
 def even_starts(count: int) -> NDArray[np.int64]:
-    """Return `Division.starts` for `count` rows, if all chunks but the last are full."""
+    """Return the first row of each chunk of `count` rows, then `count`, if all chunks but the last are full."""
     return np.append(np.arange(0, count, CHUNK_ROWS), count)
 
 
 def chunk_of(starts: NDArray[np.int64], rows: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
-    """Return the number of the chunk that has each row. starts: as in `Division`."""
+    """Return, for each of `rows` (n,), the number of its chunk. starts: first rows of the chunks, as in `Division`."""
     return np.searchsorted(starts, rows, side="right") - 1
 
 
@@ -46,7 +46,7 @@ class Division:
     """The chunks of a model after rows have moved.
 
     starts: (chunks + 1,) int64, the first row of each chunk, then the number of all rows.
-    kept: (chunks,) int64, the number of the old chunk that a chunk equals, or NEW.
+    kept: (chunks,) int64, for each chunk the number that it had before, or NEW if no old chunk had exactly its rows.
     """
 
     starts: NDArray[np.int64]
@@ -84,8 +84,8 @@ def divided(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> Division:
 
 
 def _changes(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return two arrays by old chunk: the number of new rows whose source is in the chunk, and True if these rows are
-    not exactly the chunk's old rows."""
+    """Return two arrays with an element for each old chunk: the number of rows after density control whose source is in
+    the chunk, and True if they differ from the chunk's old rows. entries, starts: as in `divided`."""
     lengths = np.diff(starts)
     counts, stay, before = np.zeros_like(lengths), np.zeros_like(lengths), -1
     for begin in range(0, len(entries), _COUNTED_ROWS):
@@ -101,5 +101,5 @@ def _changes(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> tuple[ND
 
 
 def _equal(rows: int, parts: int) -> NDArray[np.int64]:
-    """Return the lengths of `parts` parts of `rows` rows, which differ by at most one."""
+    """Divide `rows` rows into parts whose lengths differ by at most one. Returns the lengths (parts,)."""
     return np.diff(np.arange(parts + 1) * rows // max(parts, 1))

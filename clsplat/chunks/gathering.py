@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows of a streamed model after density control: which rows are kept and copied, and the records of the new chunks.
 
-New rows stand behind the rows that they are copied from. So a new record needs only a few old ones.
+New rows stand behind the rows that they are copied from. So only a few old records are read for each new record.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from clsplat.optimisation.density_rules import FRESH
 BLOCK_CHUNKS = 16
 """Number of chunks that are read or written at a time in passes over many chunks."""
 _KEPT, _CLONE, _FIRST_HALF, _SECOND_HALF = range(4)
-"""Kinds of rows after density control. A row list sorted by kind has the rows in the order of these numbers."""
+"""Kinds of rows after density control, in the order of a row list that is sorted by kind."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,30 +47,30 @@ class SourceList:
         return 2 * len(self.seconds)
 
     def by_kind(self) -> NDArray[np.uint32]:
-        """Return the order (m,) that sorts the rows by kind: remaining rows, clones, first halves, second halves."""
+        """Return the indices (m,) that sort the rows by kind: remaining rows, clones, first halves, second halves."""
         kinds = np.where(self.rows < FRESH, np.uint8(_KEPT), np.uint8(_CLONE))
         kinds[self.seconds - 1], kinds[self.seconds] = _FIRST_HALF, _SECOND_HALF
         return np.argsort(kinds, kind="stable").astype(np.uint32)
 
     def entries(self) -> NDArray[np.uint32]:
-        """Return the rows, sorted by kind."""
+        """Return `rows`, sorted by kind as in `by_kind`."""
         return self.rows[self.by_kind()]
 
 
 def row_entries(rows: NDArray[np.uint32], fresh: NDArray[np.bool_] | None) -> NDArray[np.uint32]:
-    """Return source rows as entries of a row list: with the bit FRESH set where `fresh` is True."""
+    """Return source rows (m,) with the bit FRESH set where `fresh` is True. fresh: (m,); None if no row is new."""
     return rows.astype(np.uint32) if fresh is None else np.where(fresh, rows | FRESH, rows).astype(np.uint32)
 
 
 def in_source_order(parts: Iterable[NDArray[np.uint32]]) -> SourceList:
-    """Merge row lists into one, in the order of their source rows.
+    """Concatenate row lists, and sort them by source row.
 
-    parts: a list for each range of old rows, sorted as by `SourceList.by_kind`.
+    parts: a list for each range of old rows, in the order of the ranges. Each is sorted as by `SourceList.by_kind`.
     """
     rows, seconds, count = [], [], 0
     for part in parts:
         entries = part[beside_parents(part & ~FRESH)]
-        twice = entries[1:] == entries[:-1]  # only a split Gaussian has two equal entries
+        twice = entries[1:] == entries[:-1]  # only the halves of a split Gaussian have equal entries
         seconds.append((np.flatnonzero(twice) + (count + 1)).astype(np.uint32))
         rows.append(entries)
         count += len(entries)
@@ -78,7 +78,7 @@ def in_source_order(parts: Iterable[NDArray[np.uint32]]) -> SourceList:
 
 
 def _joined(parts: list[NDArray[np.uint32]]) -> NDArray[np.uint32]:
-    """Concatenate the parts. The memory of each part is freed as soon as the part is copied."""
+    """Concatenate `parts`, and empty it: each part is freed as soon as it is copied."""
     whole = np.empty(sum(map(len, parts)), np.uint32)
     end = len(whole)
     while parts:
@@ -94,11 +94,11 @@ Reader = Callable[[NDArray[np.int64]], NDArray[Any]]
 
 @dataclass(frozen=True, eq=False)
 class NewValues:
-    """Values of fields that are not copied from the source row.
+    """Values that rows get instead of a copy of their source row, for some fields of a record, such as "first/means".
 
-    fresh: the value of a field in FRESH rows, by the field's kind, the part of its name before "/": for example "first"
-        for first moments. Fields of kinds that are not listed are copied.
-    initial: values of new fields, and of the fields `anew`; 0 if a field is not listed.
+    fresh: the value in FRESH rows by a field's kind, which is the part of its name before "/", such as "first" for
+        first moments. Fields of other kinds are copied.
+    initial: the values, by field, of new fields and of the fields in `anew`; 0 if a field is not listed.
     anew: fields that get their initial value in every row.
     """
 
@@ -115,7 +115,7 @@ class OldChunks:
     """The chunks of a model before its rows move.
 
     starts: first rows of the chunks, as in `Division`.
-    read: function that returns the records of some of these chunks.
+    read: function that returns the records of chunks, given their numbers.
     """
 
     starts: NDArray[np.int64]
@@ -132,12 +132,13 @@ def gathered(
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
     """Yield numbers and records of the new chunks, up to BLOCK_CHUNKS at a time.
 
-    Row j of the model becomes a copy of the old row rows[j]; with None all rows stay. SH coefficients that the old
-    records do not have are zero.
-
-    record: type of the new records. Fields that it does not have are left out.
+    rows: for each row of the new model, the old row that it is a copy of, with the bit FRESH set if it is new; None for
+        the same rows as before.
+    to: the new chunks. Only records of chunks that are NEW are made.
+    record: type of the new records. Old fields that it lacks are left out, and SH coefficients that it adds are zero.
     passed: function that is called after each yield with the number of the first old chunk that may still be read. The
         number is valid only if the sources in `rows` rise.
+    values: values that are not copied.
     """
     new = np.flatnonzero(to.kept == NEW)
     for begin in range(0, len(new), BLOCK_CHUNKS):
@@ -162,9 +163,9 @@ def gathered(
 def _entries(
     rows: NDArray[np.uint32] | None, starts: NDArray[np.int64], numbers: NDArray[np.int64]
 ) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
-    """Return the row list's entries of new chunks `numbers`, and their positions in the records of these chunks.
+    """Return the sources (m,) of all rows of the new chunks `numbers` (k,), and the position (m,) of each row.
 
-    rows: the row list; None for all old rows. starts: first row of each new chunk, and the end of the last one.
+    A position is CHUNK_ROWS i + j for row j of chunk numbers[i]. rows: as for `gathered`. starts: as in `Division`.
     """
     entries, places = [], []
     for place, number in enumerate(numbers.tolist()):
@@ -182,9 +183,9 @@ def _copy(
     fresh: NDArray[np.bool_],
     values: NewValues,
 ) -> None:
-    """Copy rows at positions `at` of old records to positions `places` of new ones.
+    """Copy the rows at positions `at` (m,) of the records `old` to positions `places` (m,) of `records`.
 
-    Positions count on from record to record: row r of record k is at CHUNK_ROWS k + r.
+    Row r of record k has the position CHUNK_ROWS k + r. fresh: (m,), True for new rows. values: as for `gathered`.
     """
     parts, wanted = list(_by_chunk(places)), set(records.dtype.names or ()) - values.anew
     for name in (name for name in old.dtype.names or () if name in wanted):
@@ -199,7 +200,7 @@ def _copy(
 
 
 def _by_chunk(places: NDArray[np.int64]) -> Iterator[tuple[int, Any, slice]]:
-    """Split rising positions (k,) by record. Yields a record's number, the rows in it, and their slice of `places`."""
+    """Split rising positions (m,) by record. Yields a record's index, its rows, and their slice of `places`."""
     chunks = places // CHUNK_ROWS
     ends = np.flatnonzero(np.diff(chunks, append=-1)) + 1
     begin = 0

@@ -15,14 +15,15 @@ from numpy.typing import NDArray
 from clsplat.layouts.columns import CHUNK_ROWS
 
 MANIFEST_KEY = "chunks"
-"""Key of the manifest in a checkpoint's state."""
+"""Key under which a checkpoint's state holds the manifest."""
 MANIFEST_ARRAYS = ("chunks/lengths", "chunks/slots", "chunks/checksums", "chunks/constants")
 """Names of the manifest's arrays in a checkpoint."""
 WRITTEN, ZERO, INFINITE = np.arange(3, dtype=np.uint8)
 CONSTANTS = {int(ZERO): 0.0, int(INFINITE): np.inf}
-"""Value of all elements of a chunk's field, by the field's code. A field with the code WRITTEN is in the slot."""
+"""Values by code. If all elements of a field of a chunk have one of these values, only its code is stored. The elements
+of fields with the code WRITTEN are in the slot."""
 _MOST_FIELDS, _MOST_FLOATS = 64, 64
-"""Limits for damaged files: number of fields of a record, and number of elements of a row of a field."""
+"""Maximum number of fields of a record, and of elements in a row of a field. A manifest with more is damaged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,12 +32,12 @@ class Manifest:
 
     path: the scratch file.
     slot_bytes: bytes of a slot; the record is at its beginning, and may be shorter.
-    fields: shape of a row of each field, float32, by name.
+    fields: shape of a row of each field of a record, by the field's name. Fields are float32.
     lengths: (chunks,) int64, the number of rows of each chunk.
     slots: (chunks,) int64, the slot of each chunk; NO_SLOT if nothing is written.
-    checksums: (chunks, fields with elements) uint32, the crc32 of each field of each chunk.
-    constants: uint8 in the shape of `checksums`: WRITTEN if the field is in the slot, or a key of CONSTANTS if all its
-        elements have that value.
+    checksums: (chunks, fields) uint32, the crc32 of each field of each chunk. Fields without elements are left out.
+    constants: uint8 in the shape of `checksums`: WRITTEN if the field is in the slot, otherwise the key of CONSTANTS
+        for the value of all its elements.
     """
 
     path: Path
@@ -48,18 +49,21 @@ class Manifest:
     constants: NDArray[np.uint8]
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the manifest's arrays by their names in a checkpoint."""
+        """Return the arrays that a checkpoint stores for the manifest, keyed by MANIFEST_ARRAYS."""
         return dict(zip(MANIFEST_ARRAYS, (self.lengths, self.slots, self.checksums, self.constants), strict=True))
 
     def state(self) -> dict[str, Any]:
-        """Return the manifest's entries of a checkpoint's state."""
+        """Return the parts of the manifest that are not arrays, as an entry of a checkpoint's state."""
         fields = {name: list(shape) for name, shape in self.fields.items()}
         sizes = {"rows": CHUNK_ROWS, "slot_bytes": self.slot_bytes}
         return {MANIFEST_KEY: {"file": str(self.path), **sizes, "fields": fields}}
 
 
 def manifest_of(arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) -> Manifest | None:
-    """Read a checkpoint's manifest; None if it has the Gaussians as arrays. Raises ValueError for damaged data."""
+    """Read the manifest from a checkpoint's arrays and state. Raises ValueError for damaged data.
+
+    Returns None if the checkpoint has no manifest, because its arrays hold the Gaussians.
+    """
     if (record := state.get(MANIFEST_KEY)) is None:
         return None
     if not isinstance(record, dict) or not set(MANIFEST_ARRAYS) <= arrays.keys():
@@ -67,13 +71,15 @@ def manifest_of(arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) ->
     lengths, slots, checksums, constants = (arrays[key] for key in MANIFEST_ARRAYS)
     file, slot_bytes, fields = record.get("file"), record.get("slot_bytes"), record.get("fields")
     if not isinstance(file, str) or type(slot_bytes) is not int or record.get("rows") != CHUNK_ROWS:
-        raise ValueError(f"its chunks are not as this version writes them ({CHUNK_ROWS} rows each)")
+        found = f"file {file!r:.80}, slot_bytes {slot_bytes!r:.80} and rows {record.get('rows')!r:.80}"
+        raise ValueError(f"its list of chunks has {found}, expected a path, a whole number and {CHUNK_ROWS}")
     if not isinstance(fields, dict) or len(fields) > _MOST_FIELDS or not all(map(_is_shape, fields.values())):
         raise ValueError("the fields of its chunks are not as this version writes them")
     shapes = {name: tuple(shape) for name, shape in fields.items()}
     filled = sum(0 not in shape for shape in shapes.values())
-    if not _record_bytes(shapes) <= slot_bytes <= _MOST_FIELDS * _MOST_FLOATS * 4 * CHUNK_ROWS:
-        raise ValueError(f"its chunks are not as this version writes them (in slots of {slot_bytes} bytes)")
+    least, most = _record_bytes(shapes), _MOST_FIELDS * _MOST_FLOATS * 4 * CHUNK_ROWS
+    if not least <= slot_bytes <= most:
+        raise ValueError(f"its chunks are in slots of {slot_bytes} bytes, expected {least} to {most} bytes")
     by_chunk, by_field = lengths.shape[:1], (*lengths.shape[:1], filled)
     wanted = (
         (lengths, by_chunk, np.int64),
@@ -83,9 +89,9 @@ def manifest_of(arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) ->
     )
     for array, shape, kind in wanted:
         if array.shape != shape or array.dtype != kind:
-            raise ValueError(f"its list of chunks has shape {array.shape} of {array.dtype}, expected {shape}")
+            raise ValueError(f"its list of chunks has {array.dtype} {array.shape}, expected {np.dtype(kind)} {shape}")
     if not 1 <= lengths.min(initial=CHUNK_ROWS + 1) <= lengths.max(initial=1) <= CHUNK_ROWS:
-        raise ValueError(f"its chunks have lengths that are not from 1 to {CHUNK_ROWS}")
+        raise ValueError(f"its list of chunks is empty, or a chunk has no rows or more than {CHUNK_ROWS}")
     written = slots[slots >= 0]
     if slots.min() < -1 or len(np.unique(written)) < len(written):
         raise ValueError("two of its chunks are in the same slot, or a slot number is below -1")
@@ -99,7 +105,7 @@ def _record_bytes(fields: Mapping[str, tuple[int, ...]]) -> int:
 
 
 def _is_shape(value: object) -> bool:
-    """True for a JSON list that is a shape of at most `_MOST_FLOATS` elements."""
+    """Return True for a JSON list that is the shape of an array with at most `_MOST_FLOATS` elements."""
     if not isinstance(value, list) or not all(type(size) is int and 0 <= size <= _MOST_FLOATS for size in value):
         return False
     return prod(value) <= _MOST_FLOATS

@@ -9,15 +9,16 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float32
 
 ORDERED_ROWS = 65_536
-"""Largest number of rows of a model that is not sorted along the curve."""
+"""Models with more rows than this are sorted along the curve. Smaller models keep their order."""
 MORTON_BITS_PER_AXIS = 21
-"""Bits of a cell's coordinate along each axis; three of them fit into 64 bits."""
+"""Number of bits of a cell's coordinate along each axis. Three coordinates fit into 64 bits."""
 OUTLIER_SHARE = 1000
-"""One in this many means at either end of each axis is an outlier, which the box that is divided into cells omits."""
+"""The box that is divided into cells leaves out outliers: along each axis, the lowest and the highest 1/1000 of the
+means' coordinates."""
 _BLOCK_ROWS = 1 << 15
-"""Number of rows whose codes are computed at a time, so that they stay in the processor's cache."""
+"""Number of rows whose Morton codes are computed at a time, so that they stay in the processor's cache."""
 _NOWHERE = np.uint64(2**64 - 1)
-"""Code of a mean that is not finite, behind all others."""
+"""Code of means that are not finite. It is larger than all Morton codes, so that they come last."""
 _SPREAD_STEPS = (
     (32, 0x1F00000000FFFF),
     (16, 0x1F0000FF0000FF),
@@ -28,11 +29,11 @@ _SPREAD_STEPS = (
 
 
 def space_order(means: Float32) -> NDArray[np.uint32]:
-    """Rows (n,) in the order of their means (n, 3) along a Z-order curve (Morton 1966).
+    """Return row numbers (n,) in the order of the rows' means (n, 3) along a Z-order curve (Morton 1966).
 
     The curve goes through cubic cells, 2^21 along the longest side of a box around the means without outliers
-    (OUTLIER_SHARE). Means outside the box count as at its border. Rows of one cell keep their order. Rows whose means
-    are not finite are last.
+    (OUTLIER_SHARE). A mean outside the box belongs to the nearest cell. Rows of one cell keep their order. Rows whose
+    means are not finite are last.
 
     The order is the same on every machine, because cells are computed by single operations in float64.
     """
@@ -57,7 +58,7 @@ def space_order(means: Float32) -> NDArray[np.uint32]:
 
 
 def beside_parents(sources: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Return the stable order (m,) of new rows by their source, so that copies stand directly behind their source.
+    """Return the indices (m,) that sort new rows by source, stably, so that copies stand directly behind their source.
 
     Takes linear time if the sources are a few ascending runs, as density control makes them.
 
@@ -67,9 +68,9 @@ def beside_parents(sources: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 
 def every_third_bit(numbers: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Insert two zeros between the bits of numbers (n,) under 2^21.
+    """Insert two zero bits between neighbouring bits of numbers (n,) below 2^21.
 
-    Three results, shifted by 0, 1 and 2 bits, make a Morton code.
+    The results for x, y and z, shifted by 0, 1 and 2 bits, together are the Morton code of a cell (x, y, z).
     """
     for shift, mask in _SPREAD_STEPS:
         numbers = (numbers | numbers << np.uint64(shift)) & np.uint64(mask)
@@ -77,7 +78,7 @@ def every_third_bit(numbers: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def _middle_box(means: Float32) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the lowest and the highest coordinates (3,) of means (n, 3), without the outliers of each axis."""
+    """Return the lowest and the highest coordinates (3,) of means (n, 3), without outliers (OUTLIER_SHARE)."""
     left_out = len(means) // OUTLIER_SHARE
     ends = [left_out, len(means) - 1 - left_out]
     sides = [np.partition(means[:, axis], ends)[ends] for axis in range(3)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cache policy of a streamed model: which chunks are on the device, by least recent use. No OpenCL."""
+"""Cache policy of a streamed model: which chunks are on the device. The least recently used chunks leave it first."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 CROSSING_SHARE = 8
-"""Records of one in this many slots, and of at least one, cross the bus at a time. Memory for them is set aside."""
+"""The number of slots divided by this, at least 1, is the number of chunks that are copied to or from the device at a
+time. The device has memory for their records in addition to the slots."""
 _NOTHING = -1
-"""Number of the chunk in a free slot, and slot of a chunk that is not on the device."""
+"""Stands for the chunk in a free slot, and for the slot of a chunk that is not on the device."""
 
 
 @dataclass(frozen=True, eq=False)
 class Moves:
     """Copies between store and device that bring the chunks of a step to the device.
 
-    slots: (k,) uint32, the slot of each chunk of the step after the copies.
-    fetched, fetched_to: numbers of the chunks that are not on the device yet, and their new slots.
-    evicted, evicted_from: numbers of the chunks that leave the device for them, and their old slots.
+    slots: (k,) uint32, the slot that each chunk of the step has after the copies.
+    fetched, fetched_to: numbers of the chunks to copy to the device, and the slots that they get.
+    evicted, evicted_from: numbers of the chunks that leave the device to make room, and the slots that they had.
     """
 
     slots: NDArray[np.uint32]
@@ -32,9 +33,11 @@ class Moves:
 
 
 class Residency:
-    """Record of the chunks in `slots` slots on the device, of a model of `chunks` chunks.
+    """Record of which chunks of a model are in which slots on the device.
 
-    Results do not depend on which chunk is in which slot; only the number of copies does.
+    Results do not depend on the slots; only the number of copies does.
+
+    slots, chunks: number of slots on the device, and of chunks of the model.
     """
 
     def __init__(self, slots: int, chunks: int) -> None:
@@ -46,16 +49,16 @@ class Residency:
         self._uses = 0
 
     def plan(self, numbers: NDArray[np.integer[Any]]) -> Moves:
-        """Plan the copies that bring these chunks to the device. The least recently used chunks leave for them.
+        """Plan the copies that bring the chunks `numbers` (k,) to the device, in place of the least recently used.
 
-        The record does not change until `evict` and `use`, so that it stays true if a copy fails.
-        Raises ValueError for more chunks than slots.
+        Only `evict` and `use` change the record, so that it stays right if a copy fails. Raises ValueError for more
+        chunks than slots.
         """
         if len(numbers) > self.slots:
-            raise ValueError(f"numbers: {len(numbers)} chunks, expected at most {self.slots}")
+            raise ValueError(f"numbers: {len(numbers)} chunks, expected at most {self.slots}, the number of slots")
         slots, used = self._slot_of[numbers], self._used.copy()
         missing = slots == _NOTHING
-        used[slots[~missing]] = self._uses + 1  # the chunks of this step are not evicted
+        used[slots[~missing]] = self._uses + 1  # counts as used last, so that no chunk of this step is evicted
         to = np.sort(np.argsort(used, kind="stable")[: np.count_nonzero(missing)])
         slots[missing] = to
         leaving = to[self._chunk_in[to] != _NOTHING]
@@ -64,11 +67,11 @@ class Residency:
         return Moves(by_slot[0], fetched, by_slot[1], self._chunk_in[leaving], by_slot[2])
 
     def evict(self, moves: Moves) -> None:
-        """Record that the evicted chunks have left the device, so that their slots are free."""
+        """Record that the evicted chunks of a plan have left the device, so that their slots are free."""
         self._slot_of[moves.evicted] = self._chunk_in[moves.evicted_from] = _NOTHING
 
     def use(self, moves: Moves) -> None:
-        """Record that the fetched chunks are on the device, and that all chunks of the plan are used now."""
+        """Record that the fetched chunks of a plan are on the device, and that all its chunks are used now."""
         self._uses += 1
         self._slot_of[moves.fetched], self._chunk_in[moves.fetched_to] = moves.fetched_to, moves.fetched
         self._used[moves.slots] = self._uses

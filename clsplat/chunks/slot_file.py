@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads and writes a scratch file, whose slots hold the records of chunks."""
+"""Reads and writes scratch files, whose slots hold the records of a model's chunks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from clsplat.files.atomic import remove, require_room, sync_folder, write_error
 
 
 class ScratchError(InputError):
-    """A scratch file cannot be read, or differs from what was written. None of the wrong rows have been used."""
+    """Raised if a scratch file cannot be read, or differs from what was written. No wrong row has been used."""
 
 
 class SlotFile:
@@ -95,9 +95,9 @@ class SlotFile:
         sync_folder(self.path.parent)
 
     def grow(self, slots: int, more: int, least: int) -> int:
-        """Reserve disk space for slots after the first `slots`, so that a full disk is found before rows are written.
+        """Reserve disk space behind the first `slots` slots, so that a full disk is found before rows are written.
 
-        Returns their number: `more`, or `least` if the disk has no room for so many. Raises WriteError.
+        Returns the number of new slots: `more`, or `least` if the disk has too little room. Raises WriteError.
         """
         try:
             self._reserve(slots * self.slot_bytes, more * self.slot_bytes)
@@ -119,7 +119,7 @@ class SlotFile:
             raise error if isinstance(error, WriteError) else write_error(self.path, error, needs=nbytes) from None
 
     def cut(self, slots: int) -> None:
-        """Cut the file after its first `slots` slots, if possible."""
+        """Cut the file after its first `slots` slots. If the system does not allow this, the file stays longer."""
         with suppress(OSError):
             self._file.truncate(slots * self.slot_bytes)
 
@@ -128,7 +128,7 @@ class SlotFile:
         self._file.close()
 
     def read(self, slots: NDArray[np.int64], records: NDArray[Any]) -> None:
-        """Fill `records` (k,) from slots (k,). Records whose slot is NO_SLOT stay as they are. Raises ScratchError."""
+        """Read slots (k,) into `records` (k,). Records whose slot is NO_SLOT stay unchanged. Raises ScratchError."""
         for place, slot, length in self._runs(slots, records.itemsize):
             self.read_at(slot, 0, records[place : place + length])
 
@@ -140,15 +140,14 @@ class SlotFile:
     def read_ahead(self, slots: NDArray[np.int64]) -> None:
         """Ask the system to read slots from the disk while other work goes on.
 
-        The request may take as long as the disk needs, so a thread makes it. Until it is done, further calls do
-        nothing.
+        A thread makes the request, because it may block until the disk has read. Until then further calls do nothing.
         """
         if hasattr(os, "posix_fadvise") and (self.request is None or self.request.done()):
             self.request = _reader().submit(self._request, list(runs(slots)))
 
     def _request(self, pieces: Sequence[tuple[int, int, int]]) -> None:
         size = self.slot_bytes
-        with suppress(OSError, ValueError):  # the file has been closed, or its disk does not support this
+        with suppress(OSError, ValueError):  # the file is closed, or its disk cannot read ahead
             for _, slot, length in pieces:
                 os.posix_fadvise(self._file.fileno(), slot * size, length * size, os.POSIX_FADV_WILLNEED)
 
@@ -178,9 +177,9 @@ class SlotFile:
         self.moved(values.nbytes, time.perf_counter() - start)
 
     def _runs(self, slots: NDArray[np.int64], nbytes: int) -> Iterator[tuple[int, int, int]]:
-        """Yield (index, slot, length) of records of `nbytes` bytes that are read or written together.
+        """Yield (index, slot, length) as `runs` does, for records of `nbytes` bytes to read or write at once.
 
-        Records that are shorter than a slot are read or written one by one.
+        Records that are shorter than a slot are yielded one by one.
         """
         for place, slot, length in runs(slots):
             step = length if nbytes == self.slot_bytes else 1
@@ -197,8 +196,8 @@ def _reader() -> ThreadPoolExecutor:
 def runs(slots: NDArray[np.int64]) -> Iterator[tuple[int, int, int]]:
     """Yield (index, slot, length) of each run of consecutive slot numbers.
 
-    They are the index in `slots` at which the run begins, its first slot number and its length. Entries that are
-    NO_SLOT are left out.
+    index: position in `slots` at which the run begins.
+    slot, length: first slot number of the run, and number of its slots. Entries that are NO_SLOT are left out.
     """
     ends = np.flatnonzero((np.diff(slots) != 1) | (slots[:-1] == NO_SLOT)) + 1
     for begin, end in pairwise([0, *ends.tolist(), len(slots)]):

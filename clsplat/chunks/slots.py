@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 NO_SLOT = -1
-"""Slot number of a chunk that has not been written. Each field of such a chunk has one value in all elements."""
+"""Slot number of a chunk that has not been written. All elements of a field are then equal (`manifest.CONSTANTS`)."""
 MAX_TENTHS = 22
-"""Maximum number of slots of a file, in tenths of the number of chunks. It has room for two copies of each chunk: one
-of the latest checkpoint, and one that later steps change."""
+"""Maximum number of slots of a file, in tenths of the number of chunks. 22 allow two copies of each chunk, one for the
+latest checkpoint and one that later steps change, and a tenth more."""
 _GROWTH_SHARE = 16
-"""A file grows by the number of chunks divided by this, or by more if more slots are needed."""
+"""The number of chunks divided by this is the smallest number of slots by which a file grows."""
 
 
 class SlotTable:
@@ -24,7 +24,7 @@ class SlotTable:
     A slot that a kept checkpoint names (`hold`) is not overwritten: when its chunk is written next, the chunk goes to a
     free slot. The lowest free slots are taken first. The file grows only when no slot is free.
 
-    current: (chunks,) int64, the slot of each chunk of the model.
+    current: (chunks,) int64, the slot of each chunk of the model; NO_SLOT if it has not been written.
     """
 
     def __init__(self, current: NDArray[np.int64], size: int) -> None:
@@ -34,7 +34,7 @@ class SlotTable:
 
     @property
     def most(self) -> int:
-        """Maximum number of slots, beyond which old checkpoints are removed first."""
+        """Maximum number of slots. Before the file gets more, old checkpoints are removed."""
         return max(MAX_TENTHS * len(self.current) // 10, 1)
 
     @property
@@ -44,11 +44,11 @@ class SlotTable:
 
     @property
     def end(self) -> int:
-        """One more than the last slot that is in use; 0 if all slots are free."""
+        """Number of the last slot in use, plus 1; 0 if all slots are free."""
         return _end(self._used)
 
     def hold(self, kept: Sequence[NDArray[np.int64]]) -> None:
-        """Protect the slots that these checkpoints name from being overwritten, and no other slots."""
+        """Protect only the slots `kept` from being overwritten. They are an array for each kept checkpoint."""
         self._held, self._named_end = np.zeros(self.size, np.bool_), 0
         for slots in kept:
             self._held[slots[(slots >= 0) & (slots < self.size)]] = True
@@ -61,32 +61,32 @@ class SlotTable:
 
     @property
     def end_of_held(self) -> int:
-        """One more than the last slot that a kept checkpoint names; 0 if none names one."""
+        """Number of the last slot that a kept checkpoint names, plus 1; 0 without kept checkpoints."""
         return max(_end(self._held), self._named_end)
 
     def name_current(self) -> None:
-        """Count the present slots in `end_of_held`, as a checkpoint is about to name them. `hold` ends that."""
+        """Include the model's present slots in `end_of_held` until `hold`, because a new checkpoint will name them."""
         self._named_end = int(self.current.max(initial=NO_SLOT)) + 1
 
     def in_place(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
-        """Return True for each chunk whose own slot may be overwritten."""
+        """Return True (k,) for those of the chunks `numbers` (k,) whose own slot may be overwritten."""
         slots: NDArray[np.int64] = self.current[numbers]
         writable: NDArray[np.bool_] = slots != NO_SLOT
         writable[writable] = ~self._held[slots[writable]]
         return writable
 
     def needed(self, numbers: NDArray[np.integer[Any]]) -> int:
-        """Return the number of free slots that are needed to write these chunks."""
+        """Return the number of free slots that are needed to write the chunks `numbers` (k,)."""
         return int(np.count_nonzero(~self.in_place(numbers)))
 
     def growth(self, lacking: int) -> int:
-        """Return by how many slots the file should grow if `lacking` are missing; 0 if it would exceed `most`."""
+        """Return the number of slots to add to the file if `lacking` are missing; 0 if it would exceed `most`."""
         if self.size + lacking > self.most:
             return 0
         return min(self.least_growth(lacking), self.most - self.size)
 
     def least_growth(self, lacking: int) -> int:
-        """Return by how many slots the file grows at least at a time, so that it seldom grows."""
+        """Return the smallest number of slots to add if `lacking` are missing, so large that the file seldom grows."""
         return max(lacking, len(self.current) // _GROWTH_SHARE)
 
     def grow(self, slots: int) -> None:
@@ -95,11 +95,11 @@ class SlotTable:
         self._held, self._used = (np.append(marks, np.zeros(slots, np.bool_)) for marks in (self._held, self._used))
 
     def cut(self, size: int) -> None:
-        """Record that the file was cut to `size` slots, at least `end`."""
+        """Record that the file was cut to `size` slots, which include all slots in use."""
         self.size, self._held, self._used = size, self._held[:size], self._used[:size]
 
     def take(self, count: int) -> NDArray[np.int64]:
-        """Reserve free slots for new chunks, until `become` or `give_up`."""
+        """Reserve `count` free slots for new chunks, until `become` or `give_up`. Returns the slots."""
         slots = np.flatnonzero(~self._used)[:count]
         self._taken = np.append(self._taken, slots)
         self._used[slots] = True
@@ -111,19 +111,19 @@ class SlotTable:
         self._mark()
 
     def become(self, current: NDArray[np.int64]) -> None:
-        """Replace the model's chunks by those in these slots. Slots that are no longer used become free."""
+        """Record that the model's chunks are now in the slots `current`. Slots that are no longer used become free."""
         self.current = current
         self.give_up()
 
     def targets(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
-        """Return the slots to write these chunks to. There must be enough free slots (`needed`)."""
+        """Return the slots (k,) to write the chunks `numbers` (k,) to. Enough slots must be free (`needed`)."""
         slots: NDArray[np.int64] = self.current[numbers]
         moving = ~self.in_place(numbers)
         slots[moving] = np.flatnonzero(~self._used)[: np.count_nonzero(moving)]
         return slots
 
     def written(self, numbers: NDArray[np.integer[Any]], slots: NDArray[np.int64]) -> None:
-        """Record that these chunks have been written to these slots."""
+        """Record that the chunks `numbers` (k,) have been written to `slots` (k,)."""
         self.current[numbers], self._used[slots] = slots, True
 
 

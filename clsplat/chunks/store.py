@@ -30,20 +30,20 @@ from clsplat.files.atomic import remove
 from clsplat.layouts.columns import CHUNK_ROWS
 
 KeptSlots = Sequence[NDArray[np.int64]]
-"""Slots of the chunks of each kept checkpoint."""
+"""For each kept checkpoint, the slots (chunks,) of its chunks."""
 
 
 def record_type(fields: Mapping[str, tuple[int, ...]]) -> np.dtype[Any]:
-    """Return the structured NumPy type of a record. fields: shape of a row of each field, float32, by name."""
+    """Return the structured NumPy type of a record. fields: shape of a row of each float32 field, by its name."""
     return np.dtype([(name, np.float32, (CHUNK_ROWS, *shape)) for name, shape in fields.items() if prod(shape)])
 
 
 class ChunkStore:
     """Records of the chunks of a model of `count` Gaussians, all zero at first.
 
-    fields: shape of a row of each field, by name. Fields without elements are not in the records.
+    fields: shape of a row of each field, by names such as "first/means". Records lack fields without elements.
     path: scratch file for the records, which is created; None keeps the records in main memory.
-    widest: the largest shapes that the fields will have, by name. Slots of the file have room for these.
+    widest: the largest shapes that the fields will have, by name. Slots of the file have room for them.
     starts: (chunks + 1,) int64, the chunks' first rows, then the number of rows. By default all but the last are full.
     opened: the existing scratch file and the manifest of a checkpoint, to continue from.
     release: function that is called before the file becomes larger than `SlotTable.most`. It removes the oldest
@@ -86,7 +86,7 @@ class ChunkStore:
             current = np.full(self.chunks, NO_SLOT, np.int64)
         if (most := int(current.max(initial=NO_SLOT))) >= size:
             self.file.close()
-            raise ScratchError(f"{path}: has been cut to {size} chunks, expected at least {most + 1}")
+            raise ScratchError(f"{path}: has been cut to {size} slots, expected at least {most + 1}")
         self.slots = SlotTable(current, size)
 
     @classmethod
@@ -96,7 +96,7 @@ class ChunkStore:
         return cls(int(manifest.lengths.sum()), manifest.fields, manifest.path, opened=(file, manifest))
 
     def manifest(self) -> Manifest:
-        """Flush the file to the disk, and return the list of its chunks for a checkpoint. Raises WriteError."""
+        """Flush the scratch file to the disk, and return its manifest for a checkpoint. Raises WriteError."""
         assert self.path is not None
         self.file.sync()
         if self.has_checkpoints:
@@ -115,7 +115,7 @@ class ChunkStore:
         return len(self.starts) - 1
 
     def lengths(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
-        """Return the number of rows of each of these chunks."""
+        """Return the number of rows (k,) of the chunks `numbers` (k,)."""
         return np.asarray(self.starts[numbers + 1] - self.starts[numbers])
 
     def verify(self) -> None:
@@ -125,13 +125,13 @@ class ChunkStore:
 
     @property
     def nbytes(self) -> int:
-        """Size in bytes: of all rows for a store in main memory, of the chunks' slots for one in a scratch file."""
+        """Size in bytes: in main memory of the records of all rows, in a scratch file of one slot for each chunk."""
         if self.path is None:
             return self.count * self.record.itemsize // CHUNK_ROWS
         return self.chunks * self.file.slot_bytes
 
     def close(self) -> None:
-        """End the use of the store: free its memory, or remove its file unless a checkpoint names slots of it."""
+        """Free the store's memory, close its file, and remove the file unless a checkpoint names slots of it."""
         self._memory.clear()
         if self.path is None or self.file.closed:
             return
@@ -144,7 +144,7 @@ class ChunkStore:
                 remove(self.path)
 
     def read(self, numbers: NDArray[np.integer[Any]]) -> NDArray[Any]:
-        """Read the records (k,) of these chunks. Rows past the end of a chunk are undefined.
+        """Read the records (k,) of the chunks `numbers` (k,). Rows past the end of a chunk are undefined.
 
         Raises ScratchError if the file cannot be read, or differs from what was written.
         """
@@ -164,12 +164,12 @@ class ChunkStore:
         return records
 
     def read_ahead(self, numbers: NDArray[np.integer[Any]]) -> None:
-        """Ask the system to read the records of these chunks from the scratch file, without waiting for them."""
+        """Ask the system to read the records of the chunks `numbers` from the scratch file, and do not wait."""
         if self.path is not None:
             self.file.read_ahead(self.slots.current[numbers])
 
     def write(self, numbers: NDArray[np.integer[Any]], records: NDArray[Any]) -> None:
-        """Replace the records of these chunks. Raises WriteError if they cannot be written."""
+        """Replace the records of the chunks `numbers` by `records`. Raises WriteError if they cannot be written."""
         if self.path is None:
             for place, (number, length) in enumerate(zip(numbers, self.lengths(numbers).tolist(), strict=True)):
                 self._memory[number] = _packed(records[place : place + 1], length)
@@ -188,12 +188,11 @@ class ChunkStore:
         changes: Callable[[], None],
         fields: Mapping[str, tuple[int, ...]] | None = None,
     ) -> None:
-        """Rearrange the model: row j becomes a copy of row rows[j]. With None all rows stay.
+        """Rearrange the model's rows. Chunks that do not change are neither read nor written.
 
-        Chunks that do not change are neither read nor written.
-
-        rows: source rows in rising order, with the bit FRESH set for new rows.
-        values: values of fields that are not copied.
+        rows: the old row that each row becomes a copy of, in rising order, with the bit FRESH set for new rows. None
+            leaves all rows in place.
+        values: values that are not copied.
         changes: function that is called before the first row changes. With a scratch file, all new chunks have then
             been written to free slots, so that an error changes nothing.
         fields: new shapes of the fields, for more SH coefficients. Then all rows stay, and all chunks are written.
@@ -261,7 +260,7 @@ class ChunkStore:
         return rows
 
     def set_records(self, start: int, stop: int, rows: NDArray[Any]) -> None:
-        """Replace the rows [start, stop). rows: as `get_records` returns them. Raises WriteError and ScratchError."""
+        """Replace the rows [start, stop) by records as from `get_records`. Raises WriteError and ScratchError."""
         numbers, mine, evenly = self._covering(start, stop)
         records = rows
         if not evenly:
@@ -274,7 +273,7 @@ class ChunkStore:
     def _covering(self, start: int, stop: int) -> tuple[NDArray[np.int64], NDArray[np.bool_], bool]:
         """Find the chunks that have the rows [start, stop).
 
-        Returns their numbers (k,), marks (k, CHUNK_ROWS) of these rows in the chunks, and True if the chunks have no
+        Returns their numbers (k,), a mask (k, CHUNK_ROWS) of these rows in the chunks, and True if the chunks have no
         other rows and all but the last are full.
         """
         first, last = chunk_of(self.starts, np.array([start, stop - 1])).tolist()
@@ -286,7 +285,7 @@ class ChunkStore:
         return numbers, mine, whole and bool((lengths[:-1] == CHUNK_ROWS).all())
 
     def hold(self, kept: KeptSlots) -> None:
-        """Protect the slots of these checkpoints, and no others, from being overwritten.
+        """Protect the slots of the checkpoints `kept`, and no other slots, from being overwritten.
 
         A file with more slots than `SlotTable.most` is cut after its last used slot.
         """
@@ -314,14 +313,14 @@ class ChunkStore:
             self._set_field(number, field, rows)
 
     def get_at(self, field: str, places: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
-        """Read rows of a field. places: (k,), their indices. Raises ScratchError if the file is damaged."""
+        """Read the rows with indices `places` (k,) of a field. Raises ScratchError if the file is damaged."""
         rows = np.empty((len(places), *self.fields[field]), np.float32)
         for number, mine in self._by_chunk(places) if rows.size else ():
             rows[mine] = self._field(number, field)[places[mine] - self.starts[number]]
         return rows
 
     def set_at(self, field: str, places: NDArray[np.integer[Any]], values: NDArray[np.float32]) -> None:
-        """Replace rows of a field. places: (k,), their indices. Raises WriteError and ScratchError."""
+        """Replace the rows with indices `places` (k,) of a field by `values`. Raises WriteError and ScratchError."""
         for number, mine in self._by_chunk(places) if values.size else ():
             rows = self._field(number, field)
             rows[places[mine] - self.starts[number]] = values[mine]
@@ -330,7 +329,7 @@ class ChunkStore:
     def rows_of(
         self, numbers: NDArray[np.integer[Any]], kinds: Sequence[str], names: Iterable[str]
     ) -> dict[str, dict[str, NDArray[np.float32]]]:
-        """Read all rows of these chunks, of the fields `kind`/`name`. Returns arrays by kind and name."""
+        """Read all rows of chunks, for each field named kind/name. Returns {kind: {name: rows}}."""
         records, mine = self.read(numbers), np.arange(CHUNK_ROWS) < self.lengths(numbers)[:, None]
 
         def rows(field: str) -> NDArray[np.float32]:
@@ -346,7 +345,7 @@ class ChunkStore:
             yield np.arange(begin, min(begin + BLOCK_CHUNKS, self.chunks))
 
     def change(self, field: str, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> None:
-        """Apply a function to the rows of a field, chunk by chunk. Chunks that do not change are not written.
+        """Replace the rows of a field by change(rows), chunk by chunk. Chunks that do not change are not written.
 
         Raises WriteError and ScratchError.
         """
@@ -381,8 +380,8 @@ class ChunkStore:
         self._given_back = before
 
     def _pieces(self, start: int, stop: int) -> Iterator[tuple[int, slice, slice]]:
-        """Split the rows [start, stop) by chunk. Yields a chunk's number, the rows' slice of [start, stop), and their
-        slice of the chunk."""
+        """Split the rows [start, stop) by chunk. Yields a chunk's number, and two slices for its rows: relative to
+        `start`, and to the chunk's first row."""
         number = int(chunk_of(self.starts, np.array(start)))
         while number < self.chunks and (first := int(self.starts[number])) < stop:
             begin, end = max(start, first), min(stop, int(self.starts[number + 1]))
@@ -390,7 +389,7 @@ class ChunkStore:
             number += 1
 
     def _by_chunk(self, places: NDArray[np.integer[Any]]) -> Iterator[tuple[int, NDArray[np.int64]]]:
-        """Split row indices (k,) by chunk. Yields a chunk's number, and the positions in `places` of its rows."""
+        """Group row indices `places` (k,) by chunk. Yields a chunk's number, and where in `places` its rows are."""
         chunks = chunk_of(self.starts, places)
         order = np.argsort(chunks, kind="stable")
         ends = np.flatnonzero(np.diff(chunks[order])) + 1
@@ -398,7 +397,7 @@ class ChunkStore:
             yield int(chunks[mine[0]]), mine
 
     def _in_memory(self, number: int) -> NDArray[np.uint8]:
-        """Return the record of a chunk in main memory, as bytes; zeros if it has not been written."""
+        """Return the bytes of a chunk's record in main memory; zeros if it has not been written."""
         held = self._memory[number]
         if held is None:
             rows = int(self.starts[number + 1] - self.starts[number])
@@ -406,7 +405,7 @@ class ChunkStore:
         return held
 
     def _field(self, number: int, field: str) -> NDArray[np.float32]:
-        """Return a field of a chunk: a copy (CHUNK_ROWS, ...) from a file, in main memory a view (rows, ...)."""
+        """Return a field of a chunk: from a file a copy (CHUNK_ROWS, ...), from main memory a view (rows, ...)."""
         kind, offset = self.record.fields[field][:2]  # type: ignore[index]  # it has fields
         of_field = number, self._names.index(field)
         constant = int(self._constants[of_field])
@@ -426,7 +425,7 @@ class ChunkStore:
         return rows
 
     def _set_field(self, number: int, field: str, rows: NDArray[np.float32]) -> None:
-        """Write a changed field that `_field` returned. In main memory it was a view, and nothing is left to do."""
+        """Write a changed field from `_field` to the file. A field in main memory has been changed in place."""
         if self.path is None:
             return
         numbers = np.array([number])
@@ -440,7 +439,7 @@ class ChunkStore:
         self._checksums[of_field], self._constants[of_field] = zlib.crc32(rows.data), WRITTEN
 
     def _make_room(self, needed: Callable[[], int]) -> None:
-        """Grow the file to `needed()` free slots, up to `SlotTable.most` by removing checkpoints. Raises WriteError."""
+        """Grow the file to `needed()` free slots, or else remove checkpoints to free slots. Raises WriteError."""
         assert self.path is not None
         while (lacking := needed() - self.slots.free) > 0:
             more = self.slots.growth(lacking)
@@ -449,13 +448,13 @@ class ChunkStore:
                 continue
             try:
                 self.slots.grow(self.file.grow(self.slots.size, more or self.slots.least_growth(lacking), lacking))
-            except WriteError:  # the disk is full, but an old checkpoint may give up slots
+            except WriteError:  # if the disk is full, remove an old checkpoint to free slots
                 if (kept := self.release()) is None:
                     raise
                 self.slots.hold(kept)
 
     def _check(self, number: int, names: Sequence[str], record: Any) -> None:
-        """Raise ScratchError if the checksum of a field differs from the checksum when it was written."""
+        """Raise ScratchError if a field of the chunk's record has another checksum than when it was written."""
         for name in names:
             of_field = number, self._names.index(name)
             if self._constants[of_field] == WRITTEN and zlib.crc32(record[name]) != self._checksums[of_field]:
@@ -463,7 +462,7 @@ class ChunkStore:
 
 
 def _filled(records: NDArray[Any], rows: int) -> NDArray[np.bool_]:
-    """Return marks (k, CHUNK_ROWS) of the first `rows` rows of records (k,)."""
+    """Return a mask (k, CHUNK_ROWS) of the first `rows` rows of records (k,)."""
     return np.arange(len(records) * CHUNK_ROWS).reshape(-1, CHUNK_ROWS) < rows
 
 
@@ -474,7 +473,7 @@ def _checksums(records: NDArray[Any]) -> NDArray[np.uint32]:
 
 
 def _carried(values: NDArray[Any], to: Division, shape: tuple[int, int]) -> NDArray[Any]:
-    """Return the values (chunks, fields) after a move. Kept chunks keep their values, and new chunks have zeros."""
+    """Return `values` (old chunks, fields) in the order of the new chunks of `to`, with zeros for NEW chunks."""
     carried, stays = np.zeros(shape, values.dtype), to.kept != NEW
     if stays.any():
         carried[stays] = values[to.kept[stays]]
@@ -482,14 +481,14 @@ def _carried(values: NDArray[Any], to: Division, shape: tuple[int, int]) -> NDAr
 
 
 def _packed(record: NDArray[Any], rows: int) -> NDArray[np.uint8]:
-    """Return the first `rows` rows of each field of a record (1,) as bytes, one field after the other."""
+    """Return the bytes of the first `rows` rows of a record (1,), one field after the other."""
     if rows == CHUNK_ROWS:
         return np.array(record).view(np.uint8)
     return np.concatenate([record[name][0, :rows].reshape(-1) for name in record.dtype.names or ()]).view(np.uint8)
 
 
 def _unpack(packed: NDArray[np.uint8], rows: int, record: NDArray[Any]) -> None:
-    """Copy the rows that `_packed` has returned to a record (1,)."""
+    """Copy the bytes of `rows` rows, as from `_packed`, to a record (1,)."""
     if rows == CHUNK_ROWS:
         record.view(np.uint8)[:] = packed
         return

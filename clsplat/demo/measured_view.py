@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A view of the demo's scene for timing a training step. It is the same on every machine, as it needs no structure from
-motion."""
+"""Gaussians and a photograph of the demo's scene for timing a training step. They are the same on every machine, as the
+camera is known and not recovered by structure from motion."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ COEFFICIENTS = 16
 def measured_view(count: int = MEASURED_GAUSSIANS) -> tuple[Gaussians, Camera, NDArray[np.uint8]]:
     """Return Gaussians on the surfaces of the demo's scene, and the camera and pixels of its first photograph.
 
-    The Gaussians are the initial ones of a training from `count` points, with zeros for the higher SH bands. Each
-    surface has a number of them in proportion to its texels.
+    The Gaussians are those with which a training from `count` points starts, with zeros for the higher SH bands. Their
+    number on each surface is proportional to its texels.
     """
     surfaces = still_life()
     bake(surfaces, seed=0)

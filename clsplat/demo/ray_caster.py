@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Photographs of a small textured still life, rendered by a plain NumPy ray caster without splats.
 
-The demo and the tests of structure from motion need photos that are free of licences, have no known poses, and were
-not made by a splat renderer.
+The demo and the tests of structure from motion need photos without a licence and without poses, which were not made by
+a splat renderer.
 
 The scene is diffuse, apart from a mild highlight on the two balls. So its light (sun with soft shadows, sky) is baked
 into one texture per object, and a photo needs only the nearest hit and a texture look-up for each ray.
@@ -64,24 +64,24 @@ class Noise:
             )
             total += np.float32(weight) * sample
             weight *= gain
-        # the B-spline's smoothing leaves about a third of the lattice's range, so the sum is amplified
+        # amplify the sum, because the B-spline reduces the range of the lattice's values to about a third
         return np.asarray(np.tanh(2.2 * total).astype(np.float32))
 
 
 def smooth_square(phase: Float32, softness: float) -> Float32:
-    """Square wave of period 1 in [0, 1] with soft edges. Hard edges would alias in the texture."""
+    """Return a square wave with period 1 and values in [0, 1] at phases (n,). Edges are soft, to avoid aliasing."""
     return np.asarray(0.5 + 0.5 * np.tanh(np.sin(2 * np.pi * phase) / softness))
 
 
 def palette_colour(value: Float32, colours: Palette) -> Float32:
-    """Linear interpolation between equally spaced colours: value (n,) in [0, 1] to colour (n, 3)."""
+    """Map values (n,) in [0, 1] to colours (n, 3), by linear interpolation between equally spaced colours."""
     stops = np.linspace(0.0, 1.0, len(colours))
     channels = [np.interp(value, stops, levels) for levels in zip(*colours, strict=True)]
     return np.stack(channels, axis=-1).astype(np.float32)
 
 
 def speckled(colour: Float32, points: Float32, noise: Noise, wavelength: float) -> Float32:
-    """Add soft dark and light specks to a colour (n, 3), since SIFT finds and matches blobs of a few pixels."""
+    """Add soft dark and light specks to colours (n, 3) at points (n, 3), since SIFT finds and matches small blobs."""
     fine = noise(points + 11, wavelength, 2, gain=0.8)[:, None]
     dark, light = np.clip(-1.7 * fine - 0.5, 0, 1), np.clip(1.7 * fine - 0.5, 0, 1)
     return np.asarray(colour * (1 - 0.55 * dark) + (0.97 - colour) * (0.45 * light))
@@ -94,7 +94,7 @@ def dot(a: Float32, b: Float32) -> Float32:
 
 @dataclass
 class Surface(ABC):
-    """An object: its intersection with rays, its texture mapping and its baked colours.
+    """An object of the scene, with its intersections with rays, its texture mapping and its baked colours.
 
     rows, columns: size of the texture in texels. A texel is about a pixel wide in the photos.
     """
@@ -105,26 +105,26 @@ class Surface(ABC):
 
     @abstractmethod
     def distance(self, origin: Float32, direction: Float32) -> Float32:
-        """Distance (n,) to the nearest hit in front, infinity for a miss.
+        """Return the distance (n,) at which each ray first meets the surface; infinite for a miss.
 
-        origin: (n, 3) or (3,).
-        direction: (n, 3).
+        origin: (n, 3) or (3,), the rays' origins.
+        direction: (n, 3), the rays' directions.
         """
 
     @abstractmethod
     def texture_coordinates(self, points: Float32) -> tuple[Float32, Float32]:
-        """Row and column in [0, 1] of points (n, 3) on the surface."""
+        """Return texture coordinates of points (n, 3) on the surface: row and column, (n,) each, in [0, 1]."""
 
     @abstractmethod
     def point(self, row: Float32, column: Float32) -> tuple[Float32, Float32]:
-        """Position and normal, (n, 3) each, at texture coordinates (n,): the inverse of `texture_coordinates`."""
+        """Return positions and normals, (n, 3) each, at texture coordinates (n,). Inverts `texture_coordinates`."""
 
     @abstractmethod
     def albedo(self, points: Float32, noise: Noise) -> Float32:
-        """Diffuse colour in [0, 1], (n, 3), at points (n, 3)."""
+        """Return the diffuse colour (n, 3), from 0 to 1, at points (n, 3). noise: noise of the material."""
 
     def colour(self, points: Float32) -> Float32:
-        """Bilinear look-up in the baked texture at points (n, 3), as (n, 3)."""
+        """Return colours (n, 3) at points (n, 3), by a bilinear look-up in the baked texture."""
         row, column = self.texture_coordinates(points)
         y = np.clip(row * np.float32(self.rows) - 0.5, 0, self.rows - 1.001)
         x = np.clip(column * np.float32(self.columns) - 0.5, 0, self.columns - 1.001)
@@ -137,7 +137,7 @@ class Surface(ABC):
         return np.asarray(top * (1 - fy) + bottom * fy)
 
     def grid(self, rows: int, columns: int) -> tuple[Float32, Float32]:
-        """Position and normal at the centres of a rows x columns grid over the texture, (rows * columns, 3) each."""
+        """Return positions and normals, (rows * columns, 3) each, at the cells' centres of a grid over the texture."""
         row, column = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
         return self.point(row.ravel().astype(np.float32), column.ravel().astype(np.float32))
 
@@ -178,7 +178,7 @@ class Wall(Surface):
         b = origin[..., 0] * direction[:, 0] + origin[..., 1] * direction[:, 1]
         c = origin[..., 0] ** 2 + origin[..., 1] ** 2 - np.float32(WALL_RADIUS_METRES**2)
         with np.errstate(divide="ignore", invalid="ignore"):
-            t = (-b + np.sqrt(np.maximum(b * b - a * c, 0))) / a  # from inside, the larger root is the hit in front
+            t = (-b + np.sqrt(np.maximum(b * b - a * c, 0))) / a  # the larger root: rays start inside
             z = origin[..., 2] + t * direction[:, 2]
         return np.where((t > 1e-3) & (z < WALL_HEIGHT_METRES) & (z > 0), t, np.inf).astype(np.float32)
 
@@ -238,7 +238,7 @@ class Ball(Surface):
 
 @dataclass
 class Box(Surface):
-    """Upright box, rotated about z by `turn`. Its six faces lie next to each other in the texture."""
+    """Upright box, rotated about z by `turn` radians. Its six faces lie next to each other in the texture."""
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     half: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -328,7 +328,7 @@ def bake_surface(surface: Surface, suns: Float32, blockers: Sequence[Surface], n
     blockers: surfaces that cast shadows.
     """
     points, normals = surface.grid(surface.rows, surface.columns)
-    # soft shadows vary slowly, so they are cast on a grid four times coarser, and interpolated
+    # compute soft shadows on a grid four times coarser, and interpolate, because they vary slowly
     rows, columns = surface.rows // 4, surface.columns // 4
     coarse_points, coarse_normals = surface.grid(rows, columns)
     start = coarse_points + 2e-3 * coarse_normals
@@ -385,7 +385,7 @@ def render(surfaces: list[Surface], camera: Camera, samples: int = 2) -> Float32
     distances = np.stack([surface.distance(origin, direction) for surface in surfaces])
     nearest = distances.min(axis=0)
     hit_index = np.where(np.isfinite(nearest), distances.argmin(axis=0), -1)
-    colour = np.zeros_like(direction)  # every ray hits the floor, the wall or an object
+    colour = np.zeros_like(direction)  # no ray stays black: each hits the floor, the wall or an object
     for index, surface in enumerate(surfaces):
         rays = np.flatnonzero(hit_index == index)
         if not len(rays):

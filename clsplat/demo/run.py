@@ -38,7 +38,7 @@ DEMO_FOLDERS = ("photos", "scene", "run", "turntable")
 def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_ITERATIONS) -> Evaluation:
     """Run the demo: write photos/, scene/, run/ and turntable/ in `output`. Returns the evaluation, as in eval.json.
 
-    Complete photos and cameras of an interrupted demo are reused.
+    Photos and cameras that an interrupted demo has completed are reused.
     device: name of the device, as for `clsplat devices`.
     iterations: number of training steps.
     Raises InputError if the folder has other files. Errors of COLMAP, training and rendering are passed on.
@@ -77,7 +77,7 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
 
 
 def claim(output: Path) -> None:
-    """Mark a folder as written by the demo. Raises InputError if an unmarked folder has what the demo would replace."""
+    """Mark a folder as the demo's. Raises InputError if it has no mark, but files that the demo would replace."""
     if is_file(output / DEMO_MARKER_FILE_NAME):
         return
     existing = [name for name in DEMO_FOLDERS if (output / name).exists() or (output / name).is_symlink()]
@@ -92,9 +92,9 @@ def claim(output: Path) -> None:
 
 
 def make_scene(output: Path, progress: Progress = no_progress) -> Path:
-    """Create photos in output/photos and recover their scene in output/scene. Returns the scene's path.
+    """Create photos in output/photos, and recover cameras and points in output/scene. Returns the scene's path.
 
-    Complete results are reused. Raises InputError if output/photos holds other files.
+    Results that are complete already are reused. Raises InputError if output/photos holds other files.
     """
     photos, scene = output / "photos", output / "scene"
     existing = sorted(path.name for path in photos.glob("[!.]*"))

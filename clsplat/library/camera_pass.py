@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pass of one camera over arrays of Gaussians: projection, colours and pixels, and their gradients."""
+"""Rendering of arrays of Gaussians by one camera: projection, colours and pixels, and their gradients."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ MIN_EXPECTED_DEPTH_ALPHA = np.float32(1e-10)
 class Given:
     """The checked arrays of a call of `rasterize`.
 
-    count: number of Gaussians.
-    cameras: number of cameras.
+    count: N, the number of Gaussians.
+    cameras: C, the number of cameras.
+    colors: (N, D) or (C, N, D); with sh_degree, SH coefficients (N, K, 3) or (C, N, K, 3).
     """
 
     count: int
@@ -75,21 +76,21 @@ class Given:
 
     @property
     def channels(self) -> int:
-        """D, the number of values of a Gaussian that are blended, not counting its depth."""
+        """Number D of a Gaussian's values that are blended, not counting its depth."""
         return int(self.colors.shape[-1])
 
     @property
     def by_camera(self) -> bool:
-        """True if colors are given for each camera."""
+        """True if each camera has colors of its own."""
         return self.colors.ndim == (3 if self.sh_degree is None else 4)
 
     def colors_of(self, camera: int) -> Float32:
-        """Colours (N, D) or SH coefficients (N, K, 3) for one camera."""
+        """Return the colours (N, D) or SH coefficients (N, K, 3) for one camera. camera: its index."""
         return self.colors[camera] if self.by_camera else self.colors
 
 
 def check_coefficients(sh_degree: int, found: int) -> None:
-    """Raise InputError if colors has fewer SH coefficients than the degree needs."""
+    """Raise InputError if `found`, the number of SH coefficients in colors, is too small for the degree."""
     if found < (wanted := (sh_degree + 1) ** 2):
         raise InputError(f"colors has {found} SH coefficients, expected {wanted} or more for sh_degree {sh_degree}")
 
@@ -108,7 +109,7 @@ class Gradients:
         self.intrinsics: list[Float64] = []
 
     def sh(self, device: Device) -> tuple[DeviceArray, bool]:
-        """The device array for the SH gradient of a camera, and True if it already holds the sum of earlier cameras."""
+        """Return the device array for a camera's SH gradient, and True if it holds the sum of earlier cameras."""
         given = self.given
         add = bool(self.coefficients) and not given.by_camera
         if not add:
@@ -116,7 +117,7 @@ class Gradients:
         return self.coefficients[-1].array, add
 
     def by_name(self, *, cameras: bool) -> dict[str, Any]:
-        """The gradients on the host, by the names of the arguments of `rasterize`."""
+        """Return the gradients on the host, by argument of `rasterize`. cameras: include viewmats and intrinsics."""
         found = {name: one.get() for name, one in self.room.hosted.items()}
         if self.given.shapes.covariance_layout == "full":
             found["covars"] = full_gradient(found["covars"])
@@ -137,8 +138,8 @@ class PassSettings:
 
     mode: one of RASTERIZE_RENDER_MODES.
     alpha_max: maximum of a Gaussian's alpha at a pixel.
-    compensated: multiply opacities by the compensation for the low-pass filter.
-    absolute: also compute sums over pixels of absolute gradients.
+    compensated: multiply opacities by factors that compensate for the low-pass filter.
+    absolute: also compute sums over pixels of absolute gradients with respect to means2d.
     differentiable: keep data that speed up the gradient.
     """
 
@@ -153,7 +154,7 @@ class PassSettings:
 class ViewGradients:
     """Gradients with respect to a camera's projected Gaussians, on the host. None counts as 0.
 
-    on_image: gradients with respect to the arrays of `Ewa` except the compensations, by name.
+    on_image: gradients with respect to means2d, depths and conics, by these names.
     opacities: (N,), with respect to the compensated opacities.
     colors: (N, D), with respect to the blended colours.
     """
@@ -164,11 +165,11 @@ class ViewGradients:
 
 
 class CameraPass:
-    """The pass of one camera over the Gaussians. The object keeps device memory for the gradient until it is deleted.
+    """A camera's image of the Gaussians. The object keeps device memory for the gradient until it is deleted.
 
     given: the checked arrays of the call of `rasterize`.
     index: index of the camera.
-    background: (D,), or None for black.
+    background: (D,) behind the blended values, or None for black.
     """
 
     def __init__(
@@ -205,20 +206,20 @@ class CameraPass:
         self._has_background = background is not None
 
     def _values(self) -> Float32 | DeviceArray:
-        """The values to blend (N, X), as the render mode wants them: colours, then the depth."""
+        """Return the values to blend (N, X). The render mode says whether they are colours, the depth, or both."""
         if not self.with_depth:
             return self._colours.array if isinstance(self._colours, Hosted) else self._colours
         depths = self.depths[:, None]
         return np.concatenate([self.colors, depths], axis=1) if self.with_colours else depths
 
     def _behind(self, background: Float32 | None) -> Float32 | None:
-        """The background (X,) of the values to blend, with a depth of 0; None for black."""
+        """Return the background (X,) behind the blended values, with 0 for the depth; None for black."""
         if background is None or not self.with_colours:
             return None
         return np.append(background, np.float32(0)) if self.with_depth else np.ascontiguousarray(background)
 
     def splats(self, name: str) -> NDArray[Any]:
-        """A result of the projection, by its name in `Ewa`."""
+        """Return an array of the projection, such as "means2d", by its name in `Ewa`."""
         with self._session.lock:
             return self.projected.get(name)
 
@@ -229,7 +230,7 @@ class CameraPass:
 
     @property
     def compensations(self) -> Float32 | None:
-        """Factors (N,) of the opacities for the low-pass filter; None if opacities are not compensated."""
+        """Factors (N,) of the opacities that compensate for the low-pass filter; None without compensation."""
         return None if self.projected.arrays.compensations is None else self.splats("compensations")
 
     @property
@@ -247,7 +248,7 @@ class CameraPass:
 
     @cached_property
     def image(self) -> Float32:
-        """The blended image (H, W, X). An expected depth is divided by alpha."""
+        """The blended image (H, W, X), with the values of the render mode. An expected depth is divided by alpha."""
         image = self.pixels.image
         if not self._settings.mode.endswith("ED"):
             return image
@@ -286,7 +287,10 @@ class CameraPass:
         return found
 
     def add_gradients(self, gradients: Gradients, by: ViewGradients, *, cameras: bool) -> None:
-        """Add this camera's gradients to `gradients`. by: the gradients with respect to the projected Gaussians."""
+        """Add this camera's gradients to `gradients`.
+
+        by: gradients with respect to the projected Gaussians. cameras: include view matrix and intrinsics.
+        """
         session, given, device = self._session, self._given, self._session.device
         on_image, compensations = by.on_image, self.compensations
         if by.opacities is not None:
@@ -298,7 +302,7 @@ class CameraPass:
             at += by.colors
         with session.lock:
             placed = image_gradients(device, on_image)
-            device.under_way.append(placed)  # host memory must exist until the device has read it
+            device.under_way.append(placed)  # keeps the host's arrays until the device has read them
             room, add = gradients.room.arrays, gradients.views > 0
             by_camera = self.projected.gradient(placed, room, add=add, by_camera=cameras)
             by_centre = self._colours_back(gradients, room.means, by.colors, cameras=cameras)
@@ -314,8 +318,9 @@ class CameraPass:
     def _colours_back(
         self, gradients: Gradients, d_means: DeviceArray, by_colour: Float32 | None, *, cameras: bool
     ) -> DeviceArray | None:
-        """Add the gradients with respect to the SH coefficients, and to the means through the viewing directions.
+        """Add the gradients of SH colours: with respect to coefficients, and through viewing directions to the means.
 
+        d_means: the array of means' gradients to add to. by_colour: (N, 3), gradient with respect to the colours.
         Returns the gradient with respect to the camera's centre if `cameras` is True.
         """
         session, count = self._session, self._given.count

@@ -17,7 +17,7 @@ Shape = tuple[int | str, ...]
 
 
 def floats(name: str, values: Any, *shapes: Shape) -> Float32:
-    """The argument `name` as a C-contiguous float32 array of one of these shapes, where a string stands for any size.
+    """Convert the argument `name` to a C-contiguous float32 array of one of `shapes`. A string stands for any size.
 
     Raises InputError for another shape, for values that are not real numbers, and for NaN and infinite numbers.
     """
@@ -28,7 +28,7 @@ def floats(name: str, values: Any, *shapes: Shape) -> Float32:
         flat = result.reshape(-1)
         finite = np.isfinite(flat @ flat) or bool(
             np.isfinite(flat).all()
-        )  # a dot product is faster than isfinite; if it overflows, isfinite decides
+        )  # try a dot product first, which is faster than isfinite; it may overflow
     if not finite:
         at = np.unravel_index(int(np.argmin(np.isfinite(result))), result.shape)
         place = ", ".join(str(int(index)) for index in at)
@@ -37,7 +37,7 @@ def floats(name: str, values: Any, *shapes: Shape) -> Float32:
 
 
 def gradient(name: str, values: Any, shape: tuple[int, ...]) -> Float32 | None:
-    """The gradient with respect to an output, as a C-contiguous float32 array of the output's shape; None stays None.
+    """Convert the argument `name`, a gradient or None, to a C-contiguous float32 array of this shape, or None.
 
     Raises InputError like `floats`, except that NaN and infinite numbers are accepted.
     """
@@ -50,20 +50,20 @@ def gradient(name: str, values: Any, shape: tuple[int, ...]) -> Float32 | None:
 
 
 def matrices(name: str, given: Any, side: int, count: int | str) -> Float64:
-    """The argument as matrices (count, side, side) float64; it may be one matrix. Raises InputError like `floats`."""
+    """Convert one matrix or several to float64 (count, side, side). Raises InputError like `floats`."""
     floats(name, given, (count, side, side), (side, side))
-    array: Float64 = np.array(given, np.float64)  # a copy: the caller may change the array later
+    array: Float64 = np.array(given, np.float64)  # copied, because the caller may change the array later
     return array.reshape(-1, side, side)
 
 
 def plain(given: Any) -> Any:
-    """The Python number in an array or tensor with a single element. Other arguments are returned unchanged."""
+    """Return the Python number in an array or tensor with a single element. Other arguments are returned unchanged."""
     one = hasattr(given, "item") and prod(getattr(given, "shape", (0,))) == 1
     return given.item() if one else given
 
 
 def whole(given: Any) -> int | None:
-    """The integer value of an integer, a float such as 40.0, or an array or tensor with one such element; else None."""
+    """Return the value of an int, a float such as 40.0, or an array or tensor with one such number; otherwise None."""
     number = plain(given)
     if isinstance(number, bool) or not isinstance(number, (int, float)) or number != number // 1:
         return None
@@ -71,7 +71,7 @@ def whole(given: Any) -> int | None:
 
 
 def sizes(name: str, given: Any, count: int) -> list[int]:
-    """The argument as lengths in pixels for `count` cameras, from one for all or one for each. Raises InputError."""
+    """Return a length in pixels for each of `count` cameras, given one for all or one for each. Raises InputError."""
     each = [whole(size) for size in ([given] * count if np.ndim(given) == 0 else given)]
     lengths = [size for size in each if size is not None and 0 < size < 2**24]
     if not len(lengths) == len(each) == count:
@@ -82,7 +82,7 @@ def sizes(name: str, given: Any, count: int) -> list[int]:
 
 
 def number(name: str, given: Any, least: float, most: float = np.inf) -> float:
-    """The argument as a float from `least` to `most`. Raises InputError if it is anything else."""
+    """Return the argument `name` as a float. Raises InputError unless it is a number from `least` to `most`."""
     value = plain(given)
     if not isinstance(value, (int, float)) or isinstance(value, bool) or not least <= value <= most:
         bound = f"from {least:g} to {most:g}" if np.isfinite(most) else f"of at least {least:g}"
@@ -91,24 +91,24 @@ def number(name: str, given: Any, least: float, most: float = np.inf) -> float:
 
 
 def degree(name: str, given: Any, highest: int, otherwise: str = "") -> int:
-    """The argument as a degree of spherical harmonics, 0 to `highest`. Raises InputError if it is anything else.
+    """Return the argument `name` as an int. Raises InputError unless it is an SH degree from 0 to `highest`.
 
-    otherwise: other accepted values, as text for the error message.
+    otherwise: text for the error message about other accepted values, such as ", or None".
     """
     found = whole(given)
     if found is None or not 0 <= found <= highest:
-        raise InputError(f"{name} is {given!r:.80}, expected 0 to {highest}{otherwise}")
+        raise InputError(f"{name} is {given!r:.80}, expected a whole number from 0 to {highest}{otherwise}")
     return found
 
 
 def choice(name: str, given: Any, choices: Sequence[str]) -> None:
-    """Raise InputError unless the argument is one of the choices."""
+    """Raise InputError unless the argument `name`, whose value is `given`, is one of the choices."""
     if given not in choices:
         raise InputError(f"{name} is {given!r:.80}, expected one of {', '.join(choices)}")
 
 
 def check_shape(name: str, found: Sequence[int], *shapes: Shape) -> None:
-    """Raise InputError unless the argument has one of these shapes, where a string stands for any size."""
+    """Raise InputError unless the argument's shape `found` is one of `shapes`. A string stands for any size."""
 
     def fits(shape: Shape) -> bool:
         pairs = zip(found, shape, strict=True)

@@ -59,7 +59,7 @@ class HarmonicColors:
             device = session.device
             by_directions, by_sh = hosted(device, given.directions.shape), hosted(device, given.sh.shape)
             d_colours = from_host(device, values.reshape(-1, 3))
-            colours = given.directions  # a placeholder: the kernel reads colours only if directions are from a camera
+            colours = given.directions  # a placeholder: without a camera the kernel reads no colours
             gradients = HarmonicsGradients(by_sh.array, by_directions.array)
             harmonics_grad(device, session.scratch, given, colours, d_colours, gradients)
             batch = self.colors.shape[:-1]
@@ -95,7 +95,7 @@ def spherical_harmonics(
     Returns
     -------
     HarmonicColors
-        The colours. Unlike the colours of a model, they are not raised by 0.5.
+        The colours, which are the bare sums. A model's colours have 0.5 added.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def spherical_harmonics(
     sh = floats("coefficients", coefficients, (*batch, "K", 3))
     used = (degree + 1) ** 2
     if sh.shape[-2] < used:
-        raise InputError(f"coefficients: got {sh.shape[-2]}, expected {used} or more for degree {degree}")
+        raise InputError(f"coefficients: got K = {sh.shape[-2]}, expected {used} or more for degree {degree}")
     mask = None if masks is None else _mask(masks, batch)
     session = session_of(device)
     with session.lock:
@@ -131,7 +131,10 @@ def spherical_harmonics(
 
 
 def _mask(masks: ArrayLike, batch: tuple[int, ...]) -> NDArray[np.int32]:
-    """The masks, flattened to one axis of integers: 1 where a colour is evaluated. Raises InputError."""
+    """Return the masks as integers on one axis: 1 where a colour is evaluated, otherwise 0.
+
+    batch: the shape that the masks must have. Raises InputError for another shape.
+    """
     shown = np.asarray(masks)
     if shown.shape != batch:
         raise InputError(f"masks: got shape {shown.shape}, expected {batch}")

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels from arrays of projected Gaussians, and their vector-Jacobian product.
+"""Images blended from arrays of projected Gaussians, and their vector-Jacobian product.
 
-DEFAULT_ALPHA_MAX of `rendering.build_flags` caps a Gaussian's alpha, unless the caller gives another cap.
+A Gaussian's alpha at a pixel is at most DEFAULT_ALPHA_MAX of `rendering.build_flags`, unless the caller gives another
+maximum.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class PixelGradients:
 class ListedPixels:
     """An image from projected Gaussians and tile lists. The object keeps memory for its gradient until it is deleted.
 
-    listing: function that makes the tile lists, in arrays of the workspace that it is given.
+    listing: function that makes the tile lists in arrays of a workspace, its argument.
     gaussians, size, background, alpha_max, backward: as in `PixelPass`.
     """
 
@@ -99,7 +100,7 @@ class ListedPixels:
             if depth > SPLAT_VALUES:
                 rows = (listed.projected, gaussians.values, self._background, blended)
                 values(capped, ValuePass(listed.lists, *rows), self._image.array)
-            # host memory must exist until the device has finished
+            # keeps the host's arrays until the device has finished
             device.under_way.append((gaussians, self._background, self._image, self._alpha))
 
     @property
@@ -116,7 +117,7 @@ class ListedPixels:
 
     @property
     def tile_counts(self) -> NDArray[np.int32]:
-        """Number (n,) of 16 x 16 pixel tiles that each Gaussian reaches, 0 if it is culled. A copy."""
+        """Number (n,) of 16 x 16 pixel tiles that each Gaussian reaches; 0 if it is culled. Returns a copy."""
         with self._session.lock:
             return self._listed.projected.tile_counts.get().view(np.int32)
 
@@ -140,7 +141,7 @@ class ListedPixels:
         return arrays
 
     def background_gradient(self, d_image: NDArray[Any]) -> Float32:
-        """The gradient (D,) of the loss with respect to the background."""
+        """Return the gradient (D,) of the loss with respect to the background. d_image: as for `gradient`."""
         left = np.float32(1) - self.alpha
         by_row = np.matmul(left[:, None, :], np.asarray(d_image, np.float32))  # (H, 1, D)
         by_background: Float32 = by_row.sum(axis=(0, 1), dtype=np.float64).astype(np.float32)
@@ -149,9 +150,9 @@ class ListedPixels:
     def gradient_on_device(
         self, d_image: NDArray[Any], d_alpha: NDArray[Any] | None = None, *, absolute: bool = False
     ) -> PixelGradients:
-        """Compute the arrays of `gradient`, except for the background, and leave them on the device.
+        """Compute the gradients that `gradient` returns, except the background's, and leave them on the device.
 
-        The arguments must not change before the device has finished.
+        The arguments, as for `gradient`, must not change before the device has finished.
         """
         session, gaussians, listed = self._session, self._gaussians, self._listed
         n, depth = gaussians.count, gaussians.width
@@ -220,13 +221,13 @@ class PixelPass(ListedPixels):
 def screen_gaussians(
     device: Device, means2d: Array, conics: Array, opacities: Array, colours: Array, depths: Array, radii: Array
 ) -> ScreenGaussians:
-    """Projected Gaussians on the device, from device or host arrays. The caller must hold the session's lock.
+    """Put projected Gaussians on the device, from device or host arrays. The caller must hold the session's lock.
 
     means2d: (n, 2), pixels; the first pixel's centre is at 0.5.
     conics: (n, 3), a, b, c of the inverse covariance.
     opacities: (n,), 0 to 1.
     colours: (n, D), D at least 1.
-    depths: (n,), by which Gaussians are sorted, ties by index.
+    depths: (n,). Gaussians are blended in order of depth, and those of equal depth in order of their index.
     radii: (n, 2) int32; a radius of 0 culls the Gaussian.
 
     If the device shares the host's memory, C-contiguous float32 host arrays are not copied.
@@ -236,12 +237,12 @@ def screen_gaussians(
 
 
 def placed(device: Device, array: Array, dtype: DTypeLike = np.float32) -> DeviceArray:
-    """The array on the device. A device array is returned as it is; a host array is not copied if that is possible."""
+    """Return an array on the device. A device array is returned as it is. A host array is copied only if necessary."""
     return array if isinstance(array, DeviceArray) else from_host(device, np.asarray(array, dtype))
 
 
 def listed_by_depth(device: Device, work: Workspace, gaussians: ScreenGaussians, width: int, height: int) -> Listed:
-    """Make the tile lists of an image, each front to back. Waits for the device. Raises CapacityError."""
+    """List each tile's Gaussians for an image, front to back. Waits for the device. Raises CapacityError."""
     projected = splats(device, work, gaussians, width, height)
     counted = count(device, work, projected)
     most = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS_PER_BAND)

@@ -30,7 +30,8 @@ from clsplat.stages.ewa import (
 )
 
 _PROJECTED_ARRAY_WIDTHS = {"means2d": 2, "depths": None, "conics": 3, "compensations": None}
-"""Outputs of the projection that have gradients, with the length of the last axis; None for one number per Gaussian."""
+"""Outputs of the projection that have gradients, with the length of their last axis; None if they have one number per
+Gaussian."""
 
 
 class ProjectedView:
@@ -56,14 +57,16 @@ class ProjectedView:
         ewa(device, gaussians, self._camera, self.arrays)
 
     def get(self, name: str) -> NDArray[Any]:
-        """A result on the host, by its name in `Ewa`; not a copy. Waits for the device."""
+        """Return an array of the projection on the host, by its name in `Ewa`; not a copy. Waits for the device."""
         return self._hosted[name].get()
 
     def gradient(
         self, given: EwaImageGradients, gradients: EwaGradients, *, add: bool = False, by_camera: bool = False
     ) -> DeviceArray | None:
-        """Fill `gradients` like `stages.ewa.ewa_grad`.
+        """Compute gradients with respect to the Gaussians into the arrays `gradients`.
 
+        given: gradients with respect to the projected arrays.
+        add: True adds to the values in the arrays; False replaces them.
         by_camera: also return the gradient (16,) with respect to the camera.
         """
         session, view = self._session, (self._gaussians, self._camera, self.arrays)
@@ -71,7 +74,7 @@ class ProjectedView:
 
 
 def image_gradients(device: Device, by: Mapping[str, Float32]) -> EwaImageGradients:
-    """Upload gradients with respect to the arrays of `Ewa`, given by name."""
+    """Upload gradients with respect to the arrays of `Ewa`. by: some or all of them, by the arrays' names."""
 
     def at(name: str) -> DeviceArray | None:
         return from_host(device, by[name]) if name in by else None
@@ -80,14 +83,14 @@ def image_gradients(device: Device, by: Mapping[str, Float32]) -> EwaImageGradie
 
 
 class HostedGradients(NamedTuple):
-    """Gradients with respect to Gaussians: the device arrays, and their host copies by argument name."""
+    """Gradients with respect to Gaussians: arrays on the device, and the same by argument name, to read on the host."""
 
     arrays: EwaGradients
     hosted: dict[str, Hosted]
 
 
 def hosted_gradients(device: Device, count: int, *, covariances: bool) -> HostedGradients:
-    """Allocate gradients with respect to `count` Gaussians.
+    """Allocate the arrays for gradients with respect to `count` Gaussians.
 
     covariances: True for gradients with respect to covariances instead of quaternions and scales.
     """
@@ -108,7 +111,7 @@ class Projection:
     Attributes
     ----------
     radii : (C, N, 2) int32
-        Half sides of the bounding box in whole pixels; 0 if culled.
+        Half sides of a Gaussian's bounding box in whole pixels; 0 if it is culled.
     means2d : (C, N, 2) float32
         Pixels; the first pixel's centre is at 0.5.
     depths : (C, N) float32
@@ -291,9 +294,10 @@ def checked_cameras(
     height: int | Sequence[int],
     planes: CameraPlanes,
 ) -> list[EwaCamera]:
-    """The cameras of viewmats (C, 4, 4) and intrinsics (C, 3, 3), or the camera of (4, 4) and (3, 3).
+    """Return the cameras of viewmats (C, 4, 4) and intrinsics (C, 3, 3), or the camera of (4, 4) and (3, 3).
 
-    width, height: pixels; a number for all cameras, or one for each.
+    width, height: in pixels; a number for all cameras, or one for each.
+    planes: the settings that all cameras share.
     Raises InputError, which names the argument.
     """
     poses = matrices("viewmats", viewmats, 4, "C")
@@ -343,7 +347,7 @@ def check_given(covars: object, quaternions: object, scales: object) -> None:
 class GivenShapes:
     """Checked quaternions (n, 4) and scales (n, 3) of Gaussians, or covariances (n, 6).
 
-    covariance_layout: layout of the caller's covariances: "upper" for (n, 6), "full" for (n, 3, 3), or empty.
+    covariance_layout: "upper" if the caller gave covariances (n, 6), "full" for (n, 3, 3), empty for none.
     """
 
     quaternions: Float32 | None = None
@@ -369,7 +373,7 @@ class GivenShapes:
         return cls(covariances=np.ascontiguousarray(upper, np.float32), covariance_layout="full")
 
     def inputs(self, means: DeviceArray, opacities: DeviceArray | None) -> EwaInputs:
-        """The Gaussians as arrays on the device that holds `means`."""
+        """Return the Gaussians as arrays on the device that holds `means`."""
         quaternions, scales, covariances = (
             None if array is None else from_host(means.device, array)
             for array in (self.quaternions, self.scales, self.covariances)
@@ -378,15 +382,15 @@ class GivenShapes:
 
 
 def full_gradient(upper: Float32) -> Float32:
-    """Gradients with respect to all nine entries of symmetric matrices, from gradients of their upper triangles."""
+    """Convert gradients of upper triangles (n, 6) to gradients (n, 3, 3) of all entries of symmetric matrices."""
     halves = upper * np.array([1, 0.5, 0.5, 1, 0.5, 1], np.float32)
     return np.asarray(halves[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3), np.float32)
 
 
 def stacked(arrays: list[NDArray[Any]], each: NDArray[Any] | None = None) -> NDArray[Any]:
-    """Stack arrays, one for each camera. The array of a single camera is not copied.
+    """Stack the arrays of cameras on a new first axis. The array of a single camera is not copied.
 
-    each: an example of a camera's array, whose shape and dtype are used if there are no cameras.
+    each: array with the shape and dtype of a camera's, for the empty result if there are no cameras.
     """
     if len(arrays) == 1:
         return arrays[0][None]

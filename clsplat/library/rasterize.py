@@ -20,7 +20,7 @@ from clsplat.library.session import session_of
 from clsplat.rendering.build_flags import DEFAULT_ALPHA_MAX
 
 RASTERIZE_RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-"""Render modes: colour, depth, expected depth, and colour followed by one of the depths."""
+"""Render modes: colour, depth, expected depth (divided by alpha), and colour followed by either depth."""
 RASTERIZE_FILTER_MODES = ("classic", "antialiased")
 
 
@@ -294,7 +294,8 @@ def rasterize(
     backgrounds : (C, D) or (D,) array_like, optional
         Black if None.
     render_mode : str
-        "RGB", "D" (depth), "ED" (expected depth), "RGB+D" or "RGB+ED". Depths are along the camera's axis.
+        "RGB", "D" (depth), "ED" (expected depth: depth divided by alpha), "RGB+D" or "RGB+ED". Depths are along the
+        camera's axis.
     rasterize_mode : str
         "classic", or "antialiased": lower opacities to compensate for eps2d.
     camera_model : str
@@ -345,7 +346,7 @@ def rasterize(
 
 
 def _backgrounds(given: ArrayLike | None, count: int, channels: int) -> list[Float32 | None]:
-    """The background (D,) of each camera, from one background for all or one for each. Raises InputError."""
+    """Return the background (D,) of each camera, given one for all or one for each. Raises InputError."""
     if given is None:
         return [None] * count
     rows = floats("backgrounds", given, (count, channels), (channels,))

@@ -26,7 +26,7 @@ MAX_IDLE_WORKSPACES = 4
 
 
 class PassWorkspace(Workspace):
-    """Workspace of a pass, for the arrays that its gradient reads. Other arrays are in the session's workspace."""
+    """Workspace of a forward pass, for arrays that its gradient reads. Other arrays are in the session's workspace."""
 
     def __init__(self, device: Device, scratch: Workspace) -> None:
         super().__init__(device)
@@ -35,7 +35,7 @@ class PassWorkspace(Workspace):
     def array(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
     ) -> DeviceArray:
-        """The array of this name: from this workspace for BACKWARD_ARRAY_NAMES, otherwise from the shared one."""
+        """Return the array of this name: from this workspace for BACKWARD_ARRAY_NAMES, otherwise from the session's."""
         if name in BACKWARD_ARRAY_NAMES:
             return super().array(name, shape, dtype, kept=kept)
         return self._scratch.array(name, shape, dtype, kept=kept)
@@ -54,18 +54,18 @@ class LibrarySession:
         self._idle: list[PassWorkspace] = []
 
     def workspace(self, owner: object) -> PassWorkspace:
-        """A workspace for a pass. When `owner` is deleted, later passes may use the workspace."""
+        """Return a workspace for a forward pass. When `owner` is deleted, later passes may use the workspace."""
         with self.lock:
             work = self._idle.pop() if self._idle else PassWorkspace(self.device, self.scratch)
         finalize(owner, self._take_back, work).atexit = False
         return work
 
     def _take_back(self, work: PassWorkspace) -> None:
-        if len(self._idle) < MAX_IDLE_WORKSPACES:  # no lock: append is atomic, and a finalizer may run in any thread
+        if len(self._idle) < MAX_IDLE_WORKSPACES:  # needs no lock, though any thread may call it: append is atomic
             self._idle.append(work)
 
     def capped(self, alpha_max: float) -> Device:
-        """The device with kernels in which a Gaussian's alpha at a pixel is at most `alpha_max`."""
+        """Return the device, with kernels that limit a Gaussian's alpha at a pixel to `alpha_max`."""
         defines = kernel_defines(RasterizerConfig(), alpha_max=alpha_max)
         return self.device.with_switches(defines) if defines else self.device
 
@@ -85,12 +85,12 @@ def _named(selector: str | None, _variables: tuple[str | None, ...]) -> LibraryS
 
 
 def session_of(device: Device | str | None = None) -> LibrarySession:
-    """The session of an open device, or of the device that a string selects (see `clsplat devices`).
+    """Return the session of an open device, or of the device that a string selects (see `clsplat devices`).
 
     Each device has one session. Raises DeviceError.
     """
     if isinstance(device, Device):
         return _session(device)
-    # Cached, because a list of the devices takes as long as a projection of 500,000 Gaussians. The environment
-    # variables are part of the key, because they may change the list.
+    # Cached, because listing the devices takes as long as projecting 500,000 Gaussians.
+    # The environment variables are part of the key, because they may change the list.
     return _named(device, tuple(os.environ.get(name) for name in _DEVICE_CHOICE_VARIABLES))

@@ -26,7 +26,7 @@ from clsplat.stages.splats import ScreenGaussians, splats
 
 @dataclass(frozen=True, eq=False)
 class RasterizedPixels:
-    """Blended images, one for each set of tile lists.
+    """Images blended by `rasterize_to_pixels`.
 
     Attributes
     ----------
@@ -108,7 +108,8 @@ def rasterize_to_pixels(
     Parameters
     ----------
     means2d : (..., N, 2) array_like
-        Pixels; the first pixel's centre is at 0.5. In packed arrays, here and below, M replaces "..., N".
+        Pixels; the first pixel's centre is at 0.5. In packed arrays, here and below, M replaces "..., N": they list the
+        Gaussians of all images one after the other.
     conics : (..., N, 3) array_like
         a, b, c of the inverse covariance, 1 / px^2.
     colors : (..., N, D) array_like
@@ -174,7 +175,7 @@ def rasterize_to_pixels(
 class _GivenSplats:
     """Checked splats of all images, with the leading axes of each array flattened to one axis of rows.
 
-    batch: the sizes of the leading axes; the last is N.
+    batch: the sizes of these axes, (..., N), or (M,) for packed arrays.
     """
 
     batch: tuple[int, ...]
@@ -197,11 +198,11 @@ class _GivenSplats:
 
     @property
     def depth(self) -> int:
-        """Number D of values that each splat has."""
+        """Number D of values that each splat has for a pixel."""
         return int(self.colors.shape[1])
 
     def rows(self, own: slice) -> _GivenSplats:
-        """Return the splats of one image."""
+        """Return the splats of one image, which are the rows `own`."""
         arrays = (self.means2d[own], self.conics[own], self.colors[own], self.opacities[own])
         return _GivenSplats((len(arrays[0]),), *arrays)
 
@@ -219,13 +220,17 @@ class _ImageLists:
     gaussians: Int64
 
     def from_row(self, first: int) -> _ImageLists:
-        """A copy of the lists with `first` subtracted from the rows of all Gaussians."""
+        """Return a copy of the lists with `first` subtracted from the row numbers of Gaussians."""
         return _ImageLists(self.begins, self.counts, self.gaussians - first)
 
 
 @dataclass(frozen=True, eq=False)
 class _GivenLists:
-    """Checked tile lists of all images: where each list (..., tile_height, tile_width) starts in `ids` (pairs,)."""
+    """Checked tile lists of all images.
+
+    offsets: (..., tile_height, tile_width), where each tile's list starts in `ids`.
+    ids: (pairs,), rows of the listed Gaussians.
+    """
 
     offsets: Int64
     ids: Int64
@@ -243,11 +248,11 @@ class _GivenLists:
 
     @property
     def images(self) -> tuple[int, ...]:
-        """The sizes of the offsets' leading axes. Their product is the number of images."""
+        """Sizes of the offsets' axes before the tiles' two. Their product is the number of images."""
         return self.offsets.shape[:-2]
 
     def of_image(self, image: int, shown: NDArray[np.bool_]) -> _ImageLists:
-        """The lists of one image; the list of a masked tile is empty."""
+        """Return the lists of the image with this index. shown: (tiles,), False for tiles whose list is to be empty."""
         tiles = prod(self.offsets.shape[-2:])
         flat, end = self.offsets.reshape(-1), (image + 1) * tiles
         starts = np.append(flat[end - tiles : end], flat[end] if end < len(flat) else len(self.ids))
@@ -280,7 +285,7 @@ def _pixels(
 ) -> ListedPixels:
     """Blend the splats `given` into one image, in the order of its tiles' lists.
 
-    size: (width, height) in pixels.
+    size: (width, height) in pixels. background: (D,), or None for black.
     """
     with session.lock:
         device, n = session.device, len(given.means2d)
@@ -297,7 +302,7 @@ def _pixels(
 def _listed(
     device: Device, work: Workspace, gaussians: ScreenGaussians, lists: _ImageLists, size: tuple[int, int]
 ) -> Listed:
-    """Convert the caller's lists to the result of `library.pixels.listed_by_depth`."""
+    """Convert the caller's tile lists to a `Listed`, as `library.pixels.listed_by_depth` returns."""
     drawn, listed = splats(device, work, gaussians, *size, listed=True), lists.gaussians
     by_gaussian = np.bincount(listed, minlength=gaussians.count)
     slots = np.empty(len(listed), np.uint32)
@@ -311,12 +316,15 @@ def _listed(
 
 
 def _shapes_of(values: ArrayLike, last: int) -> list[tuple[int | str, ...]]:
-    """The expected shape (..., N, last), with the same number of axes as the array."""
+    """Return the shape (..., N, last) that `floats` is to check, with as many axes as `values`."""
     return [(*(f"axis {axis}" for axis in range(max(np.ndim(values) - 1, 1))), last)]
 
 
 def _lists(isect_offsets: ArrayLike, flatten_ids: ArrayLike, tiles: tuple[int, int], count: int) -> tuple[Int64, Int64]:
-    """Offsets and ids as int64. Raises InputError if they do not match the numbers of tiles and Gaussians."""
+    """Return offsets and ids as int64. Raises InputError if they do not fit `tiles` (down, across) and `count`.
+
+    count: number of Gaussians.
+    """
     offsets, ids = np.asarray(isect_offsets), np.asarray(flatten_ids)
     if offsets.ndim < 2 or offsets.shape[-2:] != tiles or offsets.dtype.kind not in "iu":
         wanted = f"integers (..., {tiles[0]}, {tiles[1]})"
@@ -332,7 +340,7 @@ def _lists(isect_offsets: ArrayLike, flatten_ids: ArrayLike, tiles: tuple[int, i
 
 
 def _masks(masks: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Masks as an array (images, tiles), True for tiles that are drawn. Raises InputError."""
+    """Return masks as an array (images, tiles), True for tiles that are drawn. shape: the shape that they must have."""
     tiles = prod(shape[-2:])
     if masks is None:
         return np.ones((prod(shape[:-2]), tiles), np.bool_)
@@ -343,7 +351,10 @@ def _masks(masks: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.bool_]
 
 
 def _own_of(listed: Int64, batch: tuple[int, ...], image: int) -> slice:
-    """The rows of an image's Gaussians: in packed arrays, from the first to the last row in the image's lists."""
+    """Return the rows of an image's Gaussians: in packed arrays, from the lowest to the highest in its lists.
+
+    listed: rows in the image's lists. batch: as in `_GivenSplats`. image: index of the image.
+    """
     if len(batch) > 1:
         return slice(image * batch[-1], (image + 1) * batch[-1])
     return slice(int(listed.min()), int(listed.max()) + 1) if len(listed) else slice(0, 0)

@@ -33,9 +33,9 @@ def isect_tiles(
     Parameters
     ----------
     means2d, radii : (..., N, 2) array_like
-        Pixels. Packed: (M, 2).
+        Pixels. Packed arrays, with one axis for the Gaussians of all images, are (M, 2).
     depths : (..., N) array_like
-        Packed: (M,).
+        Depths by which pairs are sorted. Packed: (M,).
     tile_size : int
         Side of a tile in pixels.
     tile_width, tile_height : int
@@ -92,8 +92,9 @@ def isect_tiles(
 def _tiles_of_boxes(
     means: Float32, reach: Float32, tile_size: int, tiles: tuple[int, int]
 ) -> tuple[Int64, Int64, Int64]:
-    """The number of tiles in each Gaussian's bounding box (n,), then the Gaussian and the tile of each pair (pairs,).
+    """Return the number of tiles in each Gaussian's bounding box (n,), then Gaussian and tile of each pair (pairs,).
 
+    means, reach: (n, 2), middles and half sides of the boxes, in pixels.
     tiles: number of tiles across and down.
     """
     middle, side = means / np.float32(tile_size), reach / np.float32(tile_size)
@@ -146,7 +147,7 @@ def isect_offset_encode(isect_ids: ArrayLike, n_images: int, tile_width: int, ti
 
 
 def _lengths(**given: int) -> list[int]:
-    """The arguments as integers. Raises InputError unless all are integers of at least 1."""
+    """Return the arguments' values as integers. Raises InputError unless all are integers of at least 1."""
     found = [whole(value) for value in given.values()]
     lengths = [length for length in found if length is not None and length >= 1]
     if len(lengths) < len(found):
@@ -155,13 +156,16 @@ def _lengths(**given: int) -> list[int]:
 
 
 def _batched(*row: int | str, of: ArrayLike) -> list[tuple[int | str, ...]]:
-    """The expected shape: the leading axes of the array, in any size, and then `row`."""
+    """Return the shape that `floats` is to check: the leading axes of the array `of`, of any size, and then `row`."""
     more = max(np.ndim(of) - len(row), 0)
     return [(*(f"axis {axis}" for axis in range(more)), *row)]
 
 
 def _images(count: tuple[int, ...], image_ids: ArrayLike | None, n_images: int | None) -> tuple[int, NDArray[np.int64]]:
-    """The number of images, and the image of each Gaussian. Raises InputError."""
+    """Return the number of images, and the image of each Gaussian. Raises InputError.
+
+    count: leading sizes of the arrays: (..., N), or (M,) for packed arrays.
+    """
     if image_ids is None:
         images = prod(count[:-1])
         return images, np.repeat(np.arange(images), count[-1])

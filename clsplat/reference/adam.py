@@ -27,7 +27,7 @@ def adam(
 ) -> tuple[Float64, Float64, Float64]:
     """Return parameters and both moments after step number `step` of Adam, counted from 1: eq. (42).
 
-    All arrays have the same shape.
+    All arrays have the same shape. rate: learning rate.
     """
     first = beta1 * first + (1 - beta1) * gradients
     second = beta2 * second + (1 - beta2) * gradients**2
@@ -39,10 +39,10 @@ def adam(
 def missed_steps(
     parameters: Float64, first: Float64, second: Float64, step: int, rates: Sequence[float]
 ) -> tuple[Float64, Float64, Float64]:
-    """Return parameters and both moments after Adam steps with a zero gradient, one for each learning rate: eq. (42).
+    """Return parameters and both moments after Adam steps with a zero gradient, one for each of `rates`: eq. (42).
 
-    The first of these steps has the number `step` + 1. kernels/settle.cl computes the same by the closed form (190) to
-    (192).
+    rates: learning rates of the steps, which have the numbers `step` + 1, `step` + 2 and so on.
+    kernels/settle.cl computes the same by the closed form (190) to (192).
     """
     none = np.zeros_like(parameters)
     for number, rate in enumerate(rates, step + 1):
@@ -51,7 +51,7 @@ def missed_steps(
 
 
 def add_views(gradients: Sequence[Float64], seen: Sequence[NDArray[np.bool_]]) -> Float64:
-    """Sum the gradients (n, ...) of several views. Each view adds the rows of its visible Gaussians (`seen`, (n,))."""
+    """Sum the gradients (n, ...) of several views. Only rows where a view's `seen` (n,) is True are added."""
     total = np.zeros_like(gradients[0])
     for gradient, rows in zip(gradients, seen, strict=True):
         total[rows] += gradient[rows]

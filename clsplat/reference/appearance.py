@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Entries of colour models: a vignette's distances, the pull of gains to initial values, and the update by Adam.
+"""Colour models: a vignette's distances, the pull of gains to initial values, and Adam's update of the entries.
 
 Float64 twin of kernels/appearance.cl and kernels/shared/develop.h.
 """
@@ -12,7 +12,7 @@ from clsplat.arrays import Float64
 
 
 def spread(width: int, height: int, centre: tuple[float, float]) -> Float64:
-    """Return the squared distance of each pixel (H, W) from the principal point, in half diagonals of the picture.
+    """Return each pixel's squared distance (H, W) from the principal point, in units of half the picture's diagonal.
 
     centre: the principal point, in pixels.
     """
@@ -24,8 +24,8 @@ def spread(width: int, height: int, centre: tuple[float, float]) -> Float64:
 def pull(logs: Float64, start: Float64, weights: Float64) -> Float64:
     """Return the gradient (photographs, 3) that pulls log2 gains `logs` towards their initial values `start`.
 
-    The gradient is `weights` (photographs, photographs) times the differences logs - start, less their mean over the
-    photographs with a nonzero weight.
+    It is W (d - m). Here W is the matrix `weights` (photographs, photographs), d is logs - start, and m is the mean of
+    the rows of d that belong to nonzero rows of W.
     """
     told, apart = weights.any(axis=1), logs - start
     mean = apart[told].mean(axis=0) if told.any() else 0.0
@@ -48,7 +48,7 @@ def step(
     logs: the entries before the step; the first three of a photograph are log2 gains.
     number: counts from 1.
     rate: learning rate of all entries, or of each entry.
-    centred: after the step, subtract each entry's mean over the photographs.
+    centred: True subtracts each entry's mean over the photographs after the step.
     """
     first, second = 0.9 * first + 0.1 * by_logs, 0.999 * second + 0.001 * by_logs**2
     change = rate * (first / (1 - 0.9**number)) / (np.sqrt(second / (1 - 0.999**number)) + 1e-15)

@@ -16,7 +16,7 @@ from clsplat.arrays import Int64
 class ListsTwin:
     """The Gaussian lists of all tiles, concatenated, and the first slot of each Gaussian.
 
-    first_slots: (N,), each Gaussian's first slot, which is the number of pairs of the Gaussians before it.
+    first_slots: (N,), each Gaussian's first slot: the number of pairs of all Gaussians with lower indices.
     ranges: (tiles, 2), begin and end of each tile's list; 0 and 0 for an empty list.
     gaussian_from_sorted, slot_from_sorted: (pairs,), Gaussian and slot of each entry of the lists.
     """

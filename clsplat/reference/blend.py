@@ -16,7 +16,7 @@ from clsplat.arrays import Float64, Int64
 from clsplat.reference.project import ALPHA_MIN, BOX_SLACK, Footprint, Seen
 
 BLEND_ALPHA_MAX = float(np.float32(0.99))
-"""Largest alpha of a Gaussian in a pixel."""
+"""Largest alpha of a Gaussian at a pixel."""
 TRANSMITTANCE_MIN = float(np.float32(1e-4))
 """A pixel ends before the Gaussian that would leave it this transmittance or less.
 
@@ -30,8 +30,8 @@ class BlendedTwin:
 
     image: (H, W, 3).
     transmittance: (H, W), the fraction of the background's light that reaches the camera.
-    last: (H, W), position in `Seen.order` of the last Gaussian added; -1 if none is added.
-    count: (H, W), number of Gaussians added.
+    last: (H, W), position in `Seen.order` of the last Gaussian added to a pixel; -1 if none is added.
+    count: (H, W), number of Gaussians added to a pixel.
     nearness: (H, W), the sum over Gaussians of blending weight / depth.
     margin: (H, W), the smallest relative distance of an alpha to 1/255 or 0.99, or of a transmittance to 1e-4; at most
     0.05. Where the margin is small, rounding may change the pixel.
@@ -143,8 +143,8 @@ def blend_grad(
     """Return the gradients of blending, computed back to front: eqs. (22) to (29) and (55).
 
     d_image: (H, W, 3), gradient of the loss with respect to the image.
-    d_transmittance: (H, W), the same for the final transmittance: eq. (82).
-    d_nearness: (H, W), the same for the nearness: eq. (122).
+    d_transmittance: (H, W), gradient with respect to the transmittance behind all Gaussians: eq. (82); None for 0.
+    d_nearness: (H, W), gradient with respect to the nearness: eq. (122); None for 0.
     """
     forward, order = blend(projected, width, height, background), projected.order
     transmittance = forward.transmittance.copy()
@@ -186,7 +186,7 @@ def blend_grad(
         gradients.colors[gaussian] = (weight[:, :, None] * d_image[box]).sum(axis=(0, 1))
         behind[box] += alpha[:, :, None] * (color - behind[box])
 
-        free = added & (splat.raw <= BLEND_ALPHA_MAX)  # an alpha at the cap does not depend on the Gaussian
+        free = added & (splat.raw <= BLEND_ALPHA_MAX)  # an alpha at its limit passes no gradient on
         _set_shape_gradients(gradients, projected, gaussian, splat, np.where(free, d_alpha, 0.0), alpha)
     return gradients
 
@@ -194,7 +194,10 @@ def blend_grad(
 def _set_shape_gradients(
     gradients: BlendGradients, projected: Seen, gaussian: int, splat: Footprint, d_alpha: Float64, alpha: Float64
 ) -> None:
-    """Set the gradients of a Gaussian's mean, conic and opacity from d_alpha (h, w) on its box: eqs. (25) to (29)."""
+    """Set the gradients of a Gaussian's mean, conic and opacity: eqs. (25) to (29).
+
+    splat: the Gaussian's footprint. d_alpha, alpha: (h, w), gradient with respect to its alpha, and alpha, on its box.
+    """
     g = d_alpha * alpha
     dx, dy = splat.dx, splat.dy
     by_x, by_y = (g * along for along in projected.by_mean(gaussian, splat))

@@ -9,7 +9,7 @@ from clsplat.arrays import Float64
 from clsplat.reference.adam import missed_steps
 
 State = tuple[Float64, Float64, Float64]
-"""Values of a parameter group, and Adam's first and second moments; arrays of the same shape."""
+"""Values of a parameter group, and their first and second moments in Adam. The arrays have the same shape."""
 
 
 def catch_up(
@@ -23,10 +23,10 @@ def catch_up(
 
     The step is eq. (42) of docs/gradients.md.
 
-    groups: arrays (n, ...) of each parameter group.
+    groups: by parameter group, its values and moments (n, ...).
     chunk_rows: number of rows of a chunk.
-    last_by_chunk: number of the last step that each chunk has taken; other chunks are not changed.
-    rates: learning rates of the groups, by number of the step. The largest number is the last step to take.
+    last_by_chunk: by chunk, the number of the last step that it has taken. Other chunks are not changed.
+    rates: learning rates by number of the step, then by group. The largest number is the last step to take.
     sh_rest_every: the group `sh_rest` takes only steps whose number is a multiple of this.
     """
     caught: dict[str, State] = {}

@@ -23,13 +23,13 @@ from clsplat.reference.render import parameters
 class ChannelsTwin:
     """Channels of a frame: eqs. (60) to (67). In pixels without Gaussians, index is -1 and the others are 0.
 
-    features: by channel, the blended features, (H, W) or (H, W, 2 to 3).
+    features: the blended features by channel, (H, W) or (H, W, 2 to 3).
     median: (H, W), depth at which the transmittance falls to one half.
     first: (H, W), depth of the first Gaussian.
     count: (H, W), number of Gaussians.
-    index: (H, W), index of the Gaussian with the largest weight.
-    doubt: (H, W), the distance of the transmittance to one half, or of the largest weight to the second largest,
-    whichever is smaller. Where it is small, rounding may change median or index.
+    index: (H, W), index of the Gaussian with the largest blending weight.
+    doubt: (H, W), the smallest distance of a transmittance from one half, or of the largest weight from the second
+        largest, if that is smaller. Where it is small, rounding may change median or index.
     """
 
     features: dict[str, Float64]
@@ -43,7 +43,7 @@ class ChannelsTwin:
 def normals(means: Float64, quaternions: Float64, log_scales: Float64, camera: Camera) -> Float64:
     """Return each Gaussian's normal (N, 3), its axis of smallest scale, pointing towards the camera: eq. (62).
 
-    Of axes with equal scales the first counts.
+    Of axes with equal scales the first is taken.
     """
     axes = rotation_matrices(quaternions)[np.arange(len(means)), :, np.argmin(log_scales, axis=1)]
     away = (view_directions(means, camera)[0] * axes).sum(axis=1)
@@ -53,7 +53,7 @@ def normals(means: Float64, quaternions: Float64, log_scales: Float64, camera: C
 def motions(means: Float64, camera: Camera, after: Camera, moved: Float64 | None = None) -> Float64:
     """Return the motion (N, 2) in pixels of means from one camera to another, of any projection: eq. (64).
 
-    In a panorama it is the shorter way around.
+    In a panorama the motion is the shorter way around.
 
     after: the camera after the motion.
     moved: the means after the motion; None if only the camera moves.
@@ -73,7 +73,7 @@ def motions(means: Float64, camera: Camera, after: Camera, moved: Float64 | None
 def features(
     projected: Seen, gaussians: Gaussians, camera: Camera, after: Camera, before: Camera | None = None
 ) -> dict[str, Float64]:
-    """Return the values that each Gaussian brings to blended channels: arrays (N, 1 to 3), keyed by channel.
+    """Return the values of Gaussians that are blended to channels: arrays (N, 1 to 3), keyed by channel.
 
     after: the camera at the end of the forward motion.
     before: the camera at the end of the backward motion; None for `after`.
@@ -92,7 +92,7 @@ def features(
 def channels(
     projected: Seen, gaussians: Gaussians, camera: Camera, after: Camera, earlier: Camera | None = None
 ) -> ChannelsTwin:
-    """Blend the channels front to back.
+    """Blend a frame's channels front to back.
 
     after: the camera at the end of the forward motion.
     earlier: the camera at the end of the backward motion; None for `after`.

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Copies between packed records of chunks and a pool, which has a slot per chunk: twin of kernels/chunk_records.cl."""
+"""Copies of chunks between records and the slots of a pool: twin of kernels/chunk_records.cl.
+
+A record has all fields of a chunk one after the other. A pool has an array for each field, with a row for each slot.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ def to_slots(slots: NDArray[np.integer[Any]], records: Words, before: Mapping[st
 
     slots: (k,), the slot of each record.
     records: (k, words), the 32-bit words of all fields, one field after the other.
-    before: the fields before the copy, each (slots of the pool, words), in the same order.
+    before: the pool's fields before the copy by name, each (slots of the pool, words), in the order of a record.
     """
     after, begin = {}, 0
     for name, words in before.items():
@@ -31,6 +34,6 @@ def to_records(slots: NDArray[np.integer[Any]], fields: Mapping[str, Words]) -> 
     """Return the records (k, words) of k slots of a pool.
 
     slots: (k,), numbers of the slots.
-    fields: the pool's fields, each (slots of the pool, words), in the order in which a record concatenates them.
+    fields: the pool's fields by name, each (slots of the pool, words), in the order of a record.
     """
     return np.concatenate([words[slots] for words in fields.values()], axis=1)

@@ -18,7 +18,7 @@ from clsplat.reference.blend import Layer, layers
 from clsplat.reference.project import ProjectedTwin
 
 SLACKS_PER_WALK = 8
-"""Number of intervals of the coarse search for a pixel's slack, and of the fine search within one of them."""
+"""Number of intervals of the coarse search for a pixel's `Deep.slack`, and of the fine search in one of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +26,8 @@ class Deep:
     """A deep picture.
 
     slices: (bins, H, W, 5), red, green, blue, alpha and depth of each slice: eqs. (70) to (72).
-    slack: (H, W), how far a pixel's transmittance may deviate from the Gaussians' own: s of eq. (74).
-    margin: (H, W), the smallest distance of a transmittance to the threshold that it is compared with.
+    slack: (H, W), the most by which a pixel's transmittance may deviate from that of the Gaussians: s of eq. (74).
+    margin: (H, W), the smallest distance of a transmittance from the threshold that it is compared with.
     """
 
     slices: Float64
@@ -52,7 +52,7 @@ class _Cut:
         self.margin = np.full(slack.shape, np.inf)
 
     def begins(self, layer: Layer, may: NDArray[np.bool_] | bool = True) -> NDArray[np.bool_]:
-        """Return the mask of pixels in which the next layer begins a slice. may: False where it must not."""
+        """Return True for the pixels of the layer's box in which it begins a new slice. may: mask of allowed pixels."""
         box = layer.box
         opened, placed, slack, added = self.open[box], self.placed[box], self.slack[box], layer.added
         in_front = opened - layer.before - slack
@@ -70,13 +70,13 @@ class _Cut:
 
 
 def slacks(taken: Sequence[Layer], whole: Float64, total: Float64, bins: int) -> tuple[Float64, Float64]:
-    """Return the smallest of DEEP_LEVELS slacks (H, W) that gives a pixel at most `bins` slices, and the margin.
+    """Return the slack (H, W) of each pixel, and the margin (H, W), as in `Deep`: eq. (74).
 
-    Eq. (74); the margin is that of `Deep`.
+    The slack is the smallest of DEEP_LEVELS values with which the pixel has at most `bins` slices.
 
     taken: the layers, front to back.
-    whole: (H, W), the light in front of the layers.
-    total: (H, W), the light that the layers absorb.
+    whole: (H, W), transmittance in front of the layers.
+    total: (H, W), transmittance that the layers take away.
     """
     unit, level, margin = total / (DEEP_LEVELS * bins), np.zeros(total.shape), np.full(total.shape, np.inf)
     for step in (DEEP_LEVELS // SLACKS_PER_WALK, 1):
@@ -93,12 +93,12 @@ def slacks(taken: Sequence[Layer], whole: Float64, total: Float64, bins: int) ->
 def sliced(
     taken: Sequence[Layer], colours: Sequence[Float64], depths: Sequence[Float64], whole: Float64, bins: int
 ) -> Deep:
-    """Cut layers into slices: eqs. (70) to (74).
+    """Divide each pixel's layers into slices: eqs. (70) to (74).
 
     taken: the layers, front to back.
-    colours: for each layer, its colour on its box (h, w, 3), times the light that it absorbs.
+    colours: for each layer, its colour times its blending weight, on its box (h, w, 3).
     depths: for each layer, its depth on its box (h, w).
-    whole: (H, W), the light in front of all layers.
+    whole: (H, W), transmittance in front of all layers.
     bins: maximum number of slices per pixel.
     """
     height, width = whole.shape

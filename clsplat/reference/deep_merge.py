@@ -17,7 +17,7 @@ def deep_merge(pictures: Float64, weights: Float64) -> Deep:
     """Return the weighted mean of deep pictures, cut into slices again: eqs. (187), (73) and (74).
 
     pictures: (P, bins, H, W, 5), the slices of P pictures as in `Deep.slices`.
-    weights: (P, H, W).
+    weights: (P, H, W), weight of each picture in each pixel.
     """
     count, bins, height, width, _ = pictures.shape
     whole = weights.sum(axis=0)
@@ -36,7 +36,7 @@ def deep_merge(pictures: Float64, weights: Float64) -> Deep:
         left[picture, rows, columns] = np.where(there[at], light * (1 - values[..., 3]), light)
         behind[at + 1], colours[at] = left.sum(axis=0), light[:, :, None] * values[..., :3]
     before, after = behind[:-1].copy(), behind[1:]
-    for at in range(len(order) - 1, 0, -1):  # slices of equal depth count as one
+    for at in range(len(order) - 1, 0, -1):  # merges slices of equal depth
         again = there[at] & (depths[at] == depths[at - 1])
         after[at - 1] = np.where(again, after[at], after[at - 1])
         colours[at - 1] += np.where(again[:, :, None], colours[at], 0)

@@ -16,7 +16,7 @@ from clsplat.optimisation.density_rules import FRESH, UNWANTED, USELESS, MarkRul
 
 
 def scores(rules: MarkRules, statistics: Mapping[str, Float32]) -> Float32:
-    """Return scores (n,): the mean gradient norm of Gaussians to densify, UNWANTED or USELESS for the others.
+    """Return scores (n,): the mean gradient norm of Gaussians that may be densified; UNWANTED or USELESS for others.
 
     statistics: the statistics of density control, arrays (n,) by their names in a checkpoint.
     """
@@ -39,8 +39,8 @@ def rows(
 ) -> tuple[NDArray[np.uint32], int]:
     """Return the old row that each Gaussian of the new model comes from, and the number of halves of split Gaussians.
 
-    The order is: remaining Gaussians, clones, first halves, second halves. Rows of clones and halves have the bit
-    FRESH.
+    The Gaussians are in this order: remaining ones, clones, first halves, second halves. The rows of clones and halves
+    have the bit FRESH. statistics: as for `scores`.
     """
     found, largest = scores(rules, statistics), log_scales.max(axis=1)
     value, row = rules.cut_off

@@ -15,7 +15,7 @@ from clsplat.camera import Camera
 def depth_loss(nearness: Float64, aims: Float64, weights: Float64, factor: float) -> tuple[float, Float64]:
     """Return the depth loss and its gradient with respect to nearness: eq. (121) of docs/gradients.md.
 
-    The loss is `factor` times the weighted sum of |nearness - aims|. Arrays are (H, W).
+    The loss is `factor` times the sum over pixels of weights * |nearness - aims|. All arrays are (H, W).
     """
     difference = weights * (nearness - aims)
     return float(factor * np.abs(difference).sum()), factor * weights * np.sign(difference)
@@ -26,7 +26,7 @@ def nearness_grad(means: Float64, camera: Camera, d_nearness: Float64) -> Float6
 
     Equation (122) of docs/gradients.md.
 
-    d_nearness: (N,), the gradient with respect to 1 / depth, or to 1 / distance for camera models along rays.
+    d_nearness: (N,), gradient with respect to each Gaussian's 1 / depth; for camera models along rays, 1 / distance.
     """
     local = means @ camera.rotation.T + camera.translation
     if not camera.model.along_rays:

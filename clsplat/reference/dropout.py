@@ -14,9 +14,9 @@ from clsplat.reference.noise import mixed
 
 
 def factors(thinning: Thinning, count: int, first_row: int = 0) -> Float64:
-    """Return the factor (n,) of each Gaussian's opacity, 0 for a dropped Gaussian: eq. (101).
+    """Return the factor (count,) of each Gaussian's opacity, 0 for a dropped Gaussian: eq. (101).
 
-    first_row: row of the first of the `count` Gaussians in the model.
+    first_row: row in the model of the first of the `count` Gaussians.
     """
     rows = (first_row + np.arange(count)).astype(np.uint32)
     key0, key1 = (np.uint32(word) for word in thinning.key)
@@ -25,7 +25,7 @@ def factors(thinning: Thinning, count: int, first_row: int = 0) -> Float64:
 
 
 def thinned_logits(opacity_logits: Float64, by: Float64) -> Float64:
-    """Return the logits of opacities multiplied by `by` (n,). Products must be below 1; a product of 0 gives -700."""
+    """Return the logits (n,) of products of opacities and `by` (n,), all below 1; -700 for a product of 0."""
     opacities = by / (1 + np.exp(-opacity_logits))
     logits: Float64 = np.where(by > 0, np.log(np.maximum(opacities, 1e-300)) - np.log1p(-opacities), -700.0)
     return logits
@@ -34,7 +34,7 @@ def thinned_logits(opacity_logits: Float64, by: Float64) -> Float64:
 def logit_grad(opacity_logits: Float64, by: Float64, gradient: Float64) -> Float64:
     """Return the gradient with respect to the original logits: eq. (101).
 
-    gradient: (n,), the gradient with respect to `thinned_logits`.
+    by: (n,), factors of the opacities. gradient: (n,), gradient with respect to the logits after multiplication.
     """
     opacities = 1 / (1 + np.exp(-opacity_logits))
     return np.where(by > 0, gradient * (1 - opacities) / (1 - by * opacities), 0.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of any camera projection in float64, with every Gaussian evaluated at every pixel, without tiles.
+"""Pictures by cameras of any projection in float64. Every Gaussian is evaluated at every pixel, without tiles.
 
 Equation numbers refer to docs/gradients.md (14 to 16) and docs/channels.md (60 to 64).
 """
@@ -25,8 +25,9 @@ from clsplat.reference.render import BLACK_BACKGROUND, GradientsTwin, parameters
 
 @dataclass(frozen=True, eq=False)
 class Picture(ChannelsTwin):
-    """A picture with its channels: image (H, W, 3), alpha (H, W).
+    """A picture and its channels.
 
+    image, alpha: (H, W, 3) and (H, W).
     margin, nearness: (H, W), as in `reference.blend.BlendedTwin`.
     """
 
@@ -55,7 +56,7 @@ def render(
     background: Sequence[float] | Float64 = BLACK_BACKGROUND,
     after: Camera | None = None,
 ) -> Picture:
-    """Render a picture with its channels, blended front to back. A pixel without a ray shows the background.
+    """Render a picture and its channels. A pixel without a ray shows the background.
 
     after: the camera after the motion, for the channel `motion`; None for no motion.
     """
@@ -80,12 +81,12 @@ def render_grad(
     background: Sequence[float] | Float64 = BLACK_BACKGROUND,
     d_nearness: Float64 | None = None,
 ) -> GradientsTwin:
-    """Return the gradients of a loss for a camera of any projection.
+    """Return the gradients of a loss with respect to the Gaussians, for a camera of any projection.
 
     For camera models along rays, `means2d` holds gradients per pixel along the axes of the tangent plane.
 
     d_image: (H, W, 3), gradient of the loss with respect to the image.
-    d_nearness: (H, W), the same for the nearness.
+    d_nearness: (H, W), gradient with respect to the nearness; None for 0.
     """
     if not camera.model.along_rays:
         return on_plane.render_grad(gaussians, camera, d_image, background, d_nearness=d_nearness)

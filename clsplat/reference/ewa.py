@@ -71,7 +71,7 @@ class EwaProjectedTwin:
     points: (N, 3), the means in the camera's axes.
     jacobians: (N, 2, 3), of the projection.
     clamped: (N, 2), True where x/z or y/z is clamped in the Jacobian.
-    covariances: (N, 2, 2), with the low-pass.
+    covariances: (N, 2, 2), on the image, with the low-pass.
     determinants: (N,), of the covariances without the low-pass.
     """
 
@@ -141,7 +141,7 @@ def full_covariances(upper: Float64) -> Float64:
 
 
 def upper_gradients(full: Float64) -> Float64:
-    """Return gradients (N, 6) with respect to upper triangles, whose off-diagonals count twice.
+    """Return gradients (N, 6) with respect to upper triangles, whose off-diagonal entries stand for two entries each.
 
     full: (N, 3, 3), the symmetric gradients with respect to full matrices.
     """
@@ -176,8 +176,7 @@ def project(
 ) -> EwaProjectedTwin:
     """Project means (N, 3) and covariances (N, 3, 3): equations (150) to (156).
 
-    opacities: (N,), 0 to 1, multiplied by the compensations if these are used. With opacities, boxes end where alpha
-    is 1/255.
+    opacities: (N,), 0 to 1, after compensation if the caller compensates. With them boxes end where alpha is 1/255.
     """
     rotation, translation = view.viewmat[:3, :3], view.viewmat[:3, 3]
     fx, fy = view.focal
@@ -230,9 +229,9 @@ def project(
 
 
 def _fisheye_grad(view: EwaViewTwin, points: Float64, d_means2d: Float64, d_j: Float64) -> tuple[Float64, Float64]:
-    """Return a fisheye's gradients with respect to points (N, 3) in the camera's axes and focal lengths (2,).
+    """Return a fisheye's gradients with respect to points (N, 3) in the camera's axes and to focal lengths (2,).
 
-    The gradient of the focal lengths is only the part through the means on the image.
+    The second includes only the part through the means on the image, not the part through the Jacobians.
 
     d_means2d: (N, 2), the gradient with respect to the means on the image.
     d_j: (N, 2, 3), the gradient with respect to the Jacobians.
@@ -262,9 +261,9 @@ def _pinhole_grad(
     d_means2d: Float64,
     d_j: Float64,
 ) -> tuple[Float64, Float64, Float64]:
-    """Return a pinhole camera's gradients as `_fisheye_grad`, and a correction (2,) of the principal point's gradient.
+    """Return a pinhole camera's gradients with respect to points (N, 3), focal lengths (2,) and principal point (2,).
 
-    The correction is to be subtracted. It comes from means that are clamped in the Jacobian.
+    The last is only the part through means that are clamped in the Jacobian, with the sign reversed.
 
     points, jacobians, clamped: rows of `EwaProjectedTwin`.
     d_means2d, d_j: gradients (N, 2) and (N, 2, 3) with respect to the means on the image and the Jacobians.

@@ -12,7 +12,7 @@ LUMINANCE_WEIGHTS = np.array([0.299, 0.587, 0.114])
 
 
 def identity(shape: tuple[int, int, int]) -> Float64:
-    """Return the identity: a grid (levels, rows, columns, 3, 4) that changes no colour.
+    """Return a grid (levels, rows, columns, 3, 4) that changes no colour.
 
     shape: number of levels, rows and columns.
     """
@@ -20,15 +20,15 @@ def identity(shape: tuple[int, int, int]) -> Float64:
 
 
 def _hats(places: Float64, count: int) -> Float64:
-    """Return weights (..., count) of a grid's vertices along an axis, for linear interpolation at coordinates (...)."""
+    """Return weights (..., count) of the vertices on an axis of a grid, to interpolate at coordinates (...)."""
     weights: Float64 = np.maximum(1 - np.abs(places[..., None] - np.arange(count)), 0)
     return weights
 
 
 def _weights(image: Float64, shape: tuple[int, ...]) -> tuple[Float64, Float64, Float64, Float64]:
-    """Return interpolation weights of rows (H, rows), columns (W, columns) and levels (H, W, levels) for all pixels.
+    """Return interpolation weights of a grid's rows (H, rows), columns (W, columns) and levels (H, W, levels).
 
-    The fourth result is the derivative of the level weights with respect to luminance.
+    The fourth result is the derivative of the level weights with respect to luminance. shape: as for `identity`.
     """
     (height, width, _), (levels, rows, columns) = image.shape, shape
     down = _hats((np.arange(height) + 0.5) / height * (rows - 1), rows)
@@ -42,7 +42,7 @@ def _weights(image: Float64, shape: tuple[int, ...]) -> tuple[Float64, Float64, 
 
 
 def apply(image: Float64, grid: Float64) -> Float64:
-    """Transform the colours of an image (H, W, 3) by a grid."""
+    """Transform the colours of an image (H, W, 3) by the affine maps that a grid interpolates at its pixels."""
     down, along, levels, _ = _weights(image, grid.shape[:3])
     maps = np.einsum("yj,xi,yxl,ljiab->yxab", down, along, levels, grid, optimize=True)
     seen: Float64 = np.einsum("yxab,yxb->yxa", maps[..., :3], image) + maps[..., 3]
@@ -89,7 +89,7 @@ def centre(grids: Float64) -> Float64:
 def step(
     grid: Float64, first: Float64, second: Float64, by_grid: Float64, visit: int, rate: float
 ) -> tuple[Float64, Float64, Float64]:
-    """Return a grid and both moments after a step of Adam with the gradient by_grid.
+    """Return a grid and both moments after a step of Adam with the gradient `by_grid`. rate: learning rate.
 
     visit: number of the grid's steps so far, including this step.
     """

@@ -15,11 +15,11 @@ from clsplat.reference.blend import layers
 from clsplat.reference.project import ProjectedTwin
 
 Surface = tuple[Float64, Float64, Float64]
-"""Depths (H, W) at which a surface begins and ends, and its alpha (H, W). Depths are infinite where it is absent."""
+"""Depths (H, W) at which a surface begins and ends, and its alpha (H, W). Depths are infinite in pixels without it."""
 
 
 def let_through(surfaces: Sequence[Surface], depth: float) -> Float64:
-    """Return the fraction of light (H, W) that passes all surfaces up to a depth: eq. (75)."""
+    """Return the fraction (H, W) of light from this depth that passes all surfaces in front of it: eq. (75)."""
     left = np.ones(surfaces[0][0].shape)
     for begin, end, alpha in surfaces:
         with np.errstate(invalid="ignore", divide="ignore"):

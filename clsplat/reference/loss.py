@@ -52,7 +52,7 @@ def ssim(x: Float64, y: Float64) -> tuple[Float64, Float64]:
     d_covariance = 2 * luminance / (luminance_norm * structure_norm)
     d_var = -values / structure_norm
     d_mean = 2 * mean_y * structure / (luminance_norm * structure_norm) - 2 * mean_x * values / luminance_norm
-    # The variances and the covariance depend on the mean too.
+    # add the parts through variances and covariance, which depend on the mean too
     d_mean = d_mean - 2 * mean_x * d_var - mean_y * d_covariance
     gradient = blur(d_mean) + 2 * x * blur(d_var) + y * blur(d_covariance)
     return values, gradient
@@ -71,7 +71,7 @@ def l1_dssim(x: Float64, y: Float64, weight: float = 0.2) -> tuple[float, Float6
 
 
 def masked_l1_dssim(x: Float64, y: Float64, counts: Float64, weight: float = 0.2) -> tuple[float, Float64]:
-    """Return `l1_dssim` over the pixels whose mask `counts` (H, W) is 1, not 0: eq. (80)."""
+    """Return `l1_dssim` over some pixels only: eq. (80). counts: (H, W), 1 for these pixels and 0 for the others."""
     mask = counts[:, :, None]
     samples = max(3 * counts.sum(), 1)
     difference = (x - y) * mask
@@ -84,7 +84,7 @@ def masked_l1_dssim(x: Float64, y: Float64, counts: Float64, weight: float = 0.2
 def alpha_loss(transmittance: Float64, alpha: Float64, counts: Float64, weight: float) -> tuple[float, Float64]:
     """Return the alpha loss and its gradient with respect to transmittance: eq. (81). Arrays are (H, W).
 
-    The loss is weight * mean |1 - transmittance - alpha| over the pixels whose mask `counts` is 1, not 0.
+    The loss is weight * mean |1 - transmittance - alpha|, over the pixels where `counts` is 1 and not 0.
     """
     difference = counts * (1 - transmittance - alpha)
     scale = weight / max(counts.sum(), 1)

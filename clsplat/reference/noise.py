@@ -18,14 +18,14 @@ HALF_WORDS_PER_NORMAL = 8
 
 
 def mixed(words: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Map words to pseudorandom words by a permutation of all 32-bit words, as in kernels/shared/random.h."""
+    """Hash 32-bit words to pseudorandom words, different words to different ones, as in kernels/shared/random.h."""
     words = (words ^ (words >> np.uint32(16))) * np.uint32(0x7FEB352D)
     words = (words ^ (words >> np.uint32(15))) * np.uint32(0x846CA68B)
     return words ^ (words >> np.uint32(16))
 
 
 def normal_numbers(key: tuple[int, int], rows: NDArray[np.integer]) -> Float64:
-    """Return three normally distributed numbers (n, 3) for each row (n,) of a model: eq. (93)."""
+    """Return three normally distributed numbers for each row of a model, (n, 3): eq. (93). key: the step's key."""
     of_row = mixed(rows.astype(np.uint32) ^ np.uint32(key[0])) + np.uint32(key[1])
     counters = np.arange(3 * HALF_WORDS_PER_NORMAL // 2, dtype=np.uint32) * np.uint32(0x9E3779B9)
     words = mixed(of_row[:, None] + counters)
@@ -38,7 +38,7 @@ def normal_numbers(key: tuple[int, int], rows: NDArray[np.integer]) -> Float64:
 def displacements(
     explore: Exploration, quaternions: Float64, log_scales: Float64, opacity_logits: Float64, first_row: int = 0
 ) -> Float64:
-    """Return the random displacements (n, 3) of the means: eq. (92). first_row: row of the first Gaussian."""
+    """Return the random displacements (n, 3) of the means of n consecutive rows: eq. (92). first_row: the first row."""
     eta = normal_numbers(explore.key, first_row + np.arange(len(opacity_logits)))
     opacities = 1 / (1 + np.exp(-opacity_logits))
     weights = explore.amount / (1 + np.exp(100 * (opacities - explore.dead)))
@@ -49,7 +49,7 @@ def displacements(
 
 
 def penalty(explore: Exploration, log_scales: Float64, opacity_logits: Float64) -> float:
-    """Return the penalty on opacities and scales, summed over all Gaussians as if all were visible."""
+    """Return the penalty on opacities and scales, summed over all Gaussians, visible or not."""
     opacities = 1 / (1 + np.exp(-opacity_logits))
     return float(explore.opacity * opacities.sum() + explore.scale * np.exp(log_scales).sum())
 

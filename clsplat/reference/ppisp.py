@@ -12,9 +12,9 @@ from clsplat.arrays import Float64
 
 
 def unmixing(mixes: Float64) -> Float64:
-    """Return the colour matrix (3, 3) that removes the mixes (6,).
+    """Return the colour matrix (3, 3) that removes the mixes of channels.
 
-    For each channel c, mixes has the fractions of channels c + 1 and c + 2, modulo 3.
+    mixes: (6,), for each channel c, the fractions of channels c + 1 and c + 2 (modulo 3) that are mixed into it.
     """
     matrix = np.eye(3)
     for c in range(3):
@@ -34,16 +34,21 @@ def light(vignette: Float64, squared: Float64) -> Float64:
 
 
 def developed(photograph: Float64, entries: Float64, vignette: Float64, squared: Float64) -> Float64:
-    """Convert the photograph (H, W, 3) to the model's colours: remove gains, vignette and mixes."""
+    """Convert the photograph (H, W, 3) to the model's colours: remove gains, vignette and mixes.
+
+    entries: (9,), three log2 gains, then six mixes. vignette, squared: as for `light`.
+    """
     even = photograph / np.exp2(entries[:3]) / light(vignette, squared)[:, :, None]
     result: Float64 = even @ unmixing(entries[3:]).T
     return result
 
 
 def terms(image: Float64, by_image: Float64, squared: Float64) -> Float64:
-    """Return each pixel's terms (H, W, 12) of a loss's gradient with respect to entries and vignette that are 0.
+    """Return each pixel's terms (H, W, 12) of the gradient of a loss with respect to entries (9) and vignette (3).
 
-    by_image: (H, W, 3), the gradient of the loss with respect to the image with entries and vignette applied.
+    The gradient is at entries and vignette of 0.
+
+    by_image: (H, W, 3), gradient of the loss with respect to the image after entries and vignette are applied.
     """
     each = image * by_image
     others = [image[:, :, (c + 1 + k) % 3] - image[:, :, c] for c in range(3) for k in range(2)]

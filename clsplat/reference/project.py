@@ -35,14 +35,14 @@ BOX_SLACK = 0.1
 1/255, and margins between alphas and 1/255 are correct up to 5 %."""
 
 PARAMETER_NAMES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
-"""The arrays of `Gaussians` that `project` takes, in its order."""
+"""The arrays of `Gaussians` that `project` takes, in the order of its arguments."""
 
 
 @dataclass(frozen=True, eq=False)
 class Footprint:
-    """A Gaussian's falloff on a box of pixels, outside of which it has no effect.
+    """A Gaussian's falloff on a box of pixels. It has no effect on other pixels.
 
-    box: rows and columns of the picture.
+    box: slices of the picture's rows and columns.
     dx, dy: broadcastable to (h, w), pixel centre minus mean; for camera models along rays, on the tangent plane.
     falloff: (h, w), exp(-q / 2).
     raw: (h, w), opacity times falloff: alpha before it is limited to 0.99.
@@ -84,7 +84,7 @@ class Seen(ABC):
         """Return the conic a, b, c of a Gaussian: q = a dx^2 + 2 b dx dy + c dy^2."""
 
     def by_mean(self, gaussian: int, splat: Footprint) -> tuple[Float64, Float64]:
-        """Return derivatives of -q / 2 at each pixel with respect to the mean, along dx and dy: eq. (25)."""
+        """Return derivatives of -q / 2 at each pixel of a footprint with respect to the mean's x and y: eq. (25)."""
         a, b, c = self.conic(gaussian)
         return a * splat.dx + b * splat.dy, b * splat.dx + c * splat.dy
 
@@ -98,7 +98,7 @@ class ProjectedTwin(Seen):
     conics: (N, 3), a, b, c of the inverse, q = a dx^2 + 2 b dx dy + c dy^2.
     whitening: (N, 3), l11, l12, l22 of eq. (8).
     half_extents: (N, 2), in pixels, of the box in which alpha reaches 1/255.
-    visible: True if eq. (13) holds. A visible Gaussian may still lie entirely outside the image.
+    visible: (N,), True if eq. (13) holds. A visible Gaussian may still lie entirely outside the image.
     """
 
     means2d: Float64
@@ -135,7 +135,7 @@ class _Geometry:
     """Intermediate values that projection and its gradient share.
 
     p: (N, 3), the means in the camera's axes.
-    plane: the linearised projection of p.
+    plane: the projection of p, linearised at p.
     rotations, scales: (N, 3, 3) and (N, 3), of the Gaussians.
     half: (N, 2, 3), M of eq. (5); the projected covariance without low-pass is M M^T.
     """
@@ -299,8 +299,8 @@ def compensation_grad(plain: Float64, filtered: Float64, d_logs: Float64) -> tup
 def covariance_grad(conics: Float64, d_conics: Float64) -> Float64:
     """Return the gradient (N, 3) with respect to covariances: xx, xy, yy of dL/dSigma. Eq. (30).
 
-    dL/dSigma = -A G A, where A is the conic matrix and G the gradient with respect to it. As the matrix is symmetric,
-    the derivative with respect to the variable sxy is 2 xy.
+    dL/dSigma = -A G A, where A is the conic matrix and G the gradient with respect to it. As Sigma is symmetric, the
+    derivative with respect to its off-diagonal number sxy is twice the entry xy.
 
     conics, d_conics: (N, 3), a, b, c, and the derivatives with respect to them. b occurs twice in A.
     """
@@ -374,7 +374,8 @@ def _jacobian_grad(
 ) -> tuple[Float64, Float64, Float64]:
     """Return dL/dM (N, 2, 3), the matrices R S (N, 3, 3) of the Gaussians, and dL/dJ (N, 2, 3): eqs. (31), (32).
 
-    by_log_opacity: (N,), gradient with respect to ln(opacity) for compensated opacities; None for others.
+    d_covariances: (N, 3), gradient with respect to the covariances, as from `covariance_grad`.
+    by_log_opacity: (N,), gradient with respect to ln(opacity) if opacities are compensated, otherwise None.
     """
     gxx, gxy, gyy = d_covariances.T
     d_covariance = np.stack([np.stack([gxx, gxy], axis=1), np.stack([gxy, gyy], axis=1)], axis=1)

@@ -40,7 +40,7 @@ class Tangents(Seen):
 
     directions: (N, 3), unit directions of the means in the camera's axes.
     right, down: (N, 3), the axes of the tangent planes.
-    covariances: (N, 2, 2), on the tangent planes, with the low-pass.
+    covariances: (N, 2, 2), covariances on the tangent planes, with the low-pass.
     rays: (P, 3), unit directions of the camera's pixels; 0 for a pixel without a ray.
     """
 
@@ -66,14 +66,14 @@ class Tangents(Seen):
         return np.array([a, b, c])
 
     def by_mean(self, gaussian: int, splat: Footprint) -> tuple[Float64, Float64]:
-        """Return the derivatives of -q / 2 as `Seen.by_mean`, for a tangent plane that rotates with the mean: (21)."""
+        """Return what `Seen.by_mean` returns, for a tangent plane that rotates with the mean: eq. (21)."""
         by_x, by_y = super().by_mean(gaussian, splat)
         q = splat.dx * by_x + splat.dy * by_y
         return by_x + q * splat.dx, by_y + q * splat.dy
 
 
 def tangents(gaussians: Gaussians, camera: Camera) -> Tangents:
-    """Project Gaussians to tangent planes: eqs. (8) to (13), and (30)."""
+    """Project Gaussians to tangent planes of the unit sphere around the camera: eqs. (8) to (13), and (30)."""
     arrays = parameters(gaussians)
     means = arrays["means"]
     p = means @ camera.rotation.T + camera.translation
@@ -112,7 +112,7 @@ def tangents_grad(gaussians: Gaussians, camera: Camera, seen: Tangents, screen: 
     """Return gradients with respect to the five parameter arrays, by name; zero where culled: eqs. (22) to (29).
 
     seen: the result of `tangents`.
-    screen: the gradients of blending.
+    screen: gradients with respect to the projected Gaussians, from blending.
     """
     rows = np.flatnonzero(seen.visible)
     arrays = parameters(gaussians)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendering of a model (projection, sorting, blending) and its gradient in float64, to check the kernels with."""
+"""Rendering of a model (projection, sorting, blending) and its gradient in float64, to which kernels are compared."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BLACK_BACKGROUND = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Forward:
-    """The forward pass's projected Gaussians and blended picture."""
+    """Results of the forward pass: the projected Gaussians and the blended picture."""
 
     projected: ProjectedTwin
     blended: BlendedTwin
@@ -100,11 +100,11 @@ def render_grad(
     d_transmittance: Float64 | None = None,
     d_nearness: Float64 | None = None,
 ) -> GradientsTwin:
-    """Return the gradients of a loss of a rendered picture.
+    """Return the gradients of a loss with respect to the Gaussians of a rendered picture.
 
     d_image: (H, W, 3), gradient of the loss with respect to the image.
-    d_transmittance: (H, W), the same for the transmittance behind all Gaussians.
-    d_nearness: (H, W), the same for the nearness.
+    d_transmittance: (H, W), gradient with respect to the transmittance behind all Gaussians; None for 0.
+    d_nearness: (H, W), gradient with respect to the nearness; None for 0.
     """
     degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
     projected = project_model(gaussians, camera, degree)

@@ -14,7 +14,7 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 
 SAMPLING_WIDTH_FACTOR = np.sqrt(0.2)
-"""Lower limit of a standard deviation, in widths of a pixel."""
+"""Smallest standard deviation of a Gaussian, as a multiple of a pixel's width at its mean."""
 
 
 def sampling_limits(means: Float64, cameras: Sequence[Camera]) -> Float64:
@@ -30,5 +30,5 @@ def sampling_limits(means: Float64, cameras: Sequence[Camera]) -> Float64:
 
 
 def pixel_widths(means: Float64, camera: Camera) -> Float64:
-    """Return a pixel's width (N,) at each mean (N, 3), in world units; infinite where the camera sees no mean."""
+    """Return a pixel's width (N,) at means (N, 3), in world units; infinite for means that the camera does not see."""
     return camera.model.pixel_widths(camera, means @ camera.rotation.T + camera.translation)

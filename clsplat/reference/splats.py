@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splats, ready for blending, from arrays of projected Gaussians as in gsplat; and their gradient.
+"""Splats for blending from arrays of projected Gaussians as in gsplat, and their gradient.
 
 Float64 twin of kernels/splats.cl and splats_grad.cl. Equation numbers refer to docs/gradients.md.
 """
@@ -50,10 +50,10 @@ class SplatGradients:
 
 
 def splats_grad(conics: Float64, opacities: Float64, moments: Float64) -> SplatGradients:
-    """Compute the gradients of splats from sums over their pixels: eqs. (173) to (175).
+    """Compute the gradients of a loss with respect to projected Gaussians: eqs. (173) to (175).
 
-    moments: (n, 6), sums of g, g u, g v, g u^2, g u v, g v^2 over a Gaussian's pixels. g is alpha dL/dalpha; (u, v) is
-    W d, where d points from the pixel to the mean.
+    moments: (n, 6), sums of g, g u, g v, g u^2, g u v, g v^2 over a Gaussian's pixels. Here g is alpha dL/dalpha, and
+        (u, v) is W d, with W the whitening and d the vector from the pixel to the mean.
     """
     a, b, c = conics.T
     l11, l12, l22 = np.sqrt(a), b / np.sqrt(a), np.sqrt((a * c - b * b) / a)

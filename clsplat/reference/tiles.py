@@ -16,9 +16,9 @@ def touched_tiles(
     """Return, for each Gaussian, the ascending indices of tiles with a pixel centre where alpha >= threshold.
 
     Tiles are numbered row by row. The kernels must find all tiles of the result: a missing tile is a hole in the image,
-    an additional tile only costs time. The kernels find more, because they test the ellipse against the rectangle of
-    a tile's pixel centres, which it may cross between two centres. Their float32 test may err within 1e-5 of the
-    threshold, so compare with threshold = ALPHA_MIN * (1 + 1e-5).
+    an additional tile only costs time. They find additional tiles, because they test whether the ellipse crosses the
+    rectangle around a tile's pixel centres, which it may do between two centres. Their float32 test may err within 1e-5
+    of the threshold, so compare with threshold = ALPHA_MIN * (1 + 1e-5).
     """
     tiles_x = -(-width // tile)
     result = []

@@ -28,7 +28,7 @@ class FlatGaussians:
     conics: (n, 3), a, b, c of the inverse covariance.
     opacities: (n,).
     values: (n, D).
-    depths: (n,).
+    depths: (n,), by which Gaussians are blended front to back.
     drawn: (n,), False for culled Gaussians.
     """
 
@@ -77,7 +77,7 @@ class ValueGradients:
 
 @dataclass(frozen=True, eq=False)
 class _Layer:
-    """A Gaussian's alpha in all pixels; arrays are (H, W).
+    """A Gaussian's alpha at all pixels of a picture. Arrays are (H, W).
 
     dx, dy: the mean minus the pixel centre.
     raw: alpha before it is limited to `alpha_max`.
@@ -140,7 +140,7 @@ def blend_values_grad(
     """Return the gradients of blending, computed back to front: eqs. (178) to (180).
 
     d_image: (H, W, D), gradient of the loss with respect to the image.
-    d_alpha: (H, W), the same for the alpha, 1 - transmittance.
+    d_alpha: (H, W), gradient with respect to the image's alpha, 1 - transmittance.
     """
     layers = list(_layers(gaussians, width, height, alpha_max))
     n, depth = gaussians.values.shape

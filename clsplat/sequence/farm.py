@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendering of frames on a Dask cluster: an existing one, or one of processes on this machine. Needs `distributed`.
+"""Rendering of frames on a Dask cluster, which exists already or is started on this machine. Needs `distributed`.
 
 A frame is a Dask task. Every worker loads the model once and keeps it. Files must have the same paths on all workers.
 """
@@ -31,7 +31,7 @@ from clsplat.version import package_version
 LOCAL_WORKER_THREADS = 2
 """Number of threads of a local worker: one frame is encoded while the next is rendered."""
 MAX_FRAMES_PER_WORKER = 3
-"""Largest number of frames that a worker has in memory at once, also if it has more threads."""
+"""Largest number of frames that a worker has in memory at once, even if it has more threads."""
 SCHEDULER_TIMEOUT_SECONDS = 20
 """Seconds within which a scheduler has to answer."""
 NO_WORKERS_WARNING_SECONDS = 10.0
@@ -40,13 +40,13 @@ NO_WORKERS_WARNING_SECONDS = 10.0
 
 @dataclass(frozen=True)
 class WorkerJob:
-    """Settings of a job, by which a worker opens its renderer.
+    """Settings of a job, with which a worker opens its renderer.
 
     model: absolute path of the model, or of the shot file.
     digest: SHA-256 of the model's content (`JobModels.digest`).
     device: name of the device, as for --device.
     memory_limit: limit of device memory in bytes; None for no limit.
-    placed: True if the tasks contain placements of the models.
+    placed: True if the tasks contain placements of the models, False for a single model used as it is.
     version: version of clsplat.
     """
 
@@ -62,9 +62,9 @@ class WorkerJob:
 
 @dataclass(frozen=True)
 class Failure:
-    """An error in a worker, as data, because not all of clsplat's exceptions can be sent between processes.
+    """An error in a worker, as its result, because not all of clsplat's exceptions can be sent between processes.
 
-    wrong_input: True for an InputError.
+    message: the error's text. wrong_input: True for an InputError.
     """
 
     message: str
@@ -74,7 +74,7 @@ class Failure:
 class _Held:
     """The renderer that a worker holds open for one job.
 
-    rendering: lock of the thread that renders.
+    rendering: lock that a thread holds while it renders.
     room: semaphore that limits the number of frames in memory.
     """
 
@@ -85,7 +85,7 @@ class _Held:
 
     def renderer_for(self, job: WorkerJob) -> FrameRenderer:
         if self.renderer is None or repr(job) != self.key:
-            self.key = self.renderer = None  # free the old renderer's memory before the new one takes some
+            self.key = self.renderer = None  # free the old renderer's memory first
             job_models = load_job_models(Path(job.model))
             if job_models.digest != job.digest:
                 raise InputError(
@@ -94,7 +94,7 @@ class _Held:
             model = job_models.models if job.placed else job_models.one
             mattes = job_models.mattes(job.options.channels, job.options.ids_from)
             if names_of(mattes) != job.options.mattes:
-                raise InputError(f"{job.model}: has other Cryptomatte objects on a worker than when the job began")
+                raise InputError(f"{job.model}: its Cryptomatte objects on a worker differ from those of the job")
             self.renderer = open_frame_renderer(
                 model,
                 job.options,
@@ -111,13 +111,13 @@ _WORKER_RENDERER = _Held()
 
 
 def render_frame(task: Task, job: WorkerJob) -> Result | Failure:
-    """Render a frame in a worker and write its file, unless another worker, now lost, has finished it already.
+    """Render a frame in a worker and write its file, unless a worker that was lost since has finished it already.
 
-    A frame of a video is returned to the process that encodes the video.
+    A frame of a video is not written but returned, to the process that encodes the video.
     """
     try:
         if job.version != package_version():
-            raise InputError(f"a worker has clsplat {package_version()}, expected {job.version}")
+            raise InputError(f"a worker has clsplat {package_version()}, expected {job.version} like the job")
         with _WORKER_RENDERER.room:
             with _WORKER_RENDERER.rendering:
                 if not task.is_video and stamp(task.path) != task.before and is_complete(task, job.options):
@@ -140,10 +140,10 @@ def render_on_farm(
 ) -> None:
     """Render the frames on a Dask cluster. Frames of a video are encoded in this process.
 
-    on_done: as in `workers.run_tasks`.
-    scheduler: address of the scheduler of an existing cluster.
-    workers: without a scheduler, the number of processes of a new cluster on this machine.
-    Frames of a lost worker are rendered again by others. Raises InputError if there is no such cluster. Raises
+    on_done: function that is called with the record of each finished frame, as in `workers.run_tasks`.
+    scheduler: address of the scheduler of an existing cluster; None starts a cluster on this machine.
+    workers: number of processes of a cluster on this machine.
+    Frames of a lost worker are rendered again by others. Raises InputError if no scheduler answers. Raises
     ClsplatError for a frame that cannot be rendered, or whose workers were lost more often than Dask allows.
     """
     if not tasks:
@@ -156,15 +156,15 @@ def render_on_farm(
         results = _results(client, placed, job, video)
         for record in encoded(placed, results, video):
             on_done(replace(record, path=names[record.key]))
-    # A worker that was killed while writing may have left a temporary file. No worker writes now.
+    # no worker writes now, but killed workers may have left temporary files
     remove_temporaries(tasks)
 
 
 def _results(client: Any, tasks: Sequence[Task], job: WorkerJob, video: VideoWriter | None = None) -> Iterator[Result]:
     """Yield the results of `render_frame` in the order in which frames finish.
 
-    Only a window of tasks is submitted at a time, because a job may have a million. For a video the window begins with
-    the frame to encode next, which limits the number of finished frames that wait for it in memory.
+    Only some tasks are submitted at a time, because a job may have a million. For a video they begin with the frame to
+    encode next, which limits the number of finished frames that wait for that frame in memory.
     """
     from distributed import CancelledError, KilledWorker, as_completed
 
@@ -188,8 +188,8 @@ def _results(client: Any, tasks: Sequence[Task], job: WorkerJob, video: VideoWri
             result = future.result()
         except KilledWorker:
             raise ClsplatError(
-                f"frame {future.key.rpartition('-')[2]}: every worker that took it was lost; render it alone, to "
-                "see why"
+                f"frame {future.key.rpartition('-')[2]}: every worker that rendered it was lost; render this frame "
+                "without --scheduler and --workers, to see why"
             ) from None
         except (CancelledError, OSError):
             advice = "go on with --skip-existing" if video is None else "begin again"
@@ -215,7 +215,7 @@ def _telling_of_no_workers(client: Any, scheduler: str | None) -> Iterator[None]
         while not stop.is_set():
             try:
                 there = bool(client.nthreads())
-            except (OSError, RuntimeError, TimeoutError):  # the loop over frames reports a lost scheduler
+            except (OSError, RuntimeError, TimeoutError):  # `_results` reports a lost scheduler
                 return
             now = time.monotonic()
             since = None if there else since or now
@@ -237,7 +237,7 @@ def _telling_of_no_workers(client: Any, scheduler: str | None) -> Iterator[None]
 
 
 def dask_setup(_: Any) -> None:
-    """Ignore Ctrl-C in a local worker, because the terminal also sends it to the job. Dask calls this in the worker."""
+    """Ignore Ctrl-C in a worker on this machine: the job reacts to it. Dask calls this when a worker starts."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -251,7 +251,7 @@ def _client(scheduler: str | None, workers: int | None) -> Iterator[Any]:
         raise InputError(
             f"{flag}: needs the package distributed, install it with: pip install 'clsplat[farm]'"
         ) from None
-    # Dask logs every lost worker in many lines. Errors that matter are raised.
+    # silence Dask, which logs every lost worker in many lines; errors that matter are raised
     for name in ("distributed", "distributed.nanny", "distributed.worker", "distributed.scheduler", "distributed.core"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     if scheduler is not None:
@@ -269,7 +269,7 @@ def _client(scheduler: str | None, workers: int | None) -> Iterator[Any]:
             n_workers=workers,
             threads_per_worker=LOCAL_WORKER_THREADS,
             processes=True,
-            memory_limit=None,  # Dask's own limit would end workers with a large model
+            memory_limit=None,  # by default Dask would kill workers with a large model
             dashboard_address=None,
             preload=[__name__],
             silence_logs=logging.CRITICAL,

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Existing files of a job: finished frames (--skip-existing), files of other programs, folders, temporary files."""
+"""Existing files where a render job writes: finished frames (--skip-existing), files of other programs, folders,
+temporary files."""
 
 from __future__ import annotations
 
@@ -35,7 +36,7 @@ IDENTITY_ATTRIBUTES = (MODEL_DIGEST_ATTRIBUTE, "clsplat:colorspace")
 def check_folders(tasks: Sequence[Task]) -> None:
     """Raise InputError if frames cannot be written to their folders, or if a frame's file is a folder.
 
-    Nothing is created.
+    It creates nothing.
     """
     for folder in sorted({task.path.parent for task in tasks}):
         nearest = next(path for path in (folder, *folder.parents) if path.exists())
@@ -58,20 +59,20 @@ def make_folders(tasks: Sequence[Task]) -> None:
 
 
 def remove_temporaries(tasks: Sequence[Task]) -> None:
-    """Remove temporary files that a killed job has left for these frames, but none that is still being written."""
+    """Remove temporary files of these frames that killed jobs have left, but not files that are still being written."""
     for path in abandoned(task.path for task in tasks):
         with suppress(OSError):
             path.unlink()
 
 
 def _identity(task: Task, options: RenderOptions) -> dict[str, str | int | float]:
-    """Attributes that distinguish a frame's file from files of other models and settings."""
+    """Return the attributes that distinguish a frame's file from files of other models and settings."""
     known = {name: value for name, value in options.attributes.items() if name in IDENTITY_ATTRIBUTES}
     return {**known, SETTINGS_DIGEST_ATTRIBUTE: settings_digest(task, options)}
 
 
 def is_complete(task: Task, options: RenderOptions) -> bool:
-    """True if the frame's file is there, with the right size, channels, model and settings, and readable to its end."""
+    """True if the frame's file exists, is readable to its end, and has the right size, channels, model and settings."""
     return _is_whole(task, options, _identity(task, options))
 
 
@@ -90,7 +91,7 @@ def _is_whole(task: Task, options: RenderOptions, identity: Mapping[str, str | i
 
 
 def made_of(tasks: Sequence[Task], options: RenderOptions, config: VideoConfig) -> dict[str, Any]:
-    """Return the record that a video of these frames holds: digests of the model, the settings and the encoding."""
+    """Return the record that a video of these frames contains: digests of the model, the settings and the encoding."""
     frames = [(task.number, settings_digest(task, options)) for task in tasks]
     return {
         MODEL_DIGEST_ATTRIBUTE: options.attributes.get(MODEL_DIGEST_ATTRIBUTE),
@@ -120,11 +121,11 @@ def frames_there(tasks: Sequence[Task], options: RenderOptions, video: VideoConf
 
 
 def _state(task: Task, options: RenderOptions) -> Literal["recorded", "unrecorded", "changed", "missing"]:
-    """Compare a frame's file with its task. Returns the file's state.
+    """Compare a frame's file with its task. Returns one of four words:
 
-    recorded, unrecorded: complete, with or without a record of the settings.
-    changed: rendered from another model, or with other cameras or settings.
-    missing: not there, damaged, or with another size or other channels.
+    recorded, unrecorded: the file is complete, with or without a record of its settings.
+    changed: the file was rendered from another model, or with other cameras or settings.
+    missing: the file does not exist, is damaged, or has another size or other channels.
     """
     wanted = _identity(task, options)
     if _is_whole(task, options, wanted):
@@ -134,7 +135,7 @@ def _state(task: Task, options: RenderOptions) -> Literal["recorded", "unrecorde
 
 
 def _video_there(tasks: Sequence[Task], options: RenderOptions, video: VideoConfig) -> set[str]:
-    """Return the keys of all frames if their video is complete, otherwise of none."""
+    """Return the keys of all frames if their video is complete, otherwise an empty set."""
     path = tasks[0].path
     if video_record(path, len(tasks)) == made_of(tasks, options, video):
         return {task.key for task in tasks}
@@ -163,7 +164,7 @@ def _at_once(tasks: Sequence[Task], look: Callable[[Task], T]) -> list[T]:
 
 
 def stamp(path: Path) -> tuple[int, ...] | None:
-    """Inode, modification time and size of a file, which differ after a replacement; None if there is no file."""
+    """Return inode, modification time and size of a file, by which a replaced file is noticed; None without a file."""
     try:
         status = path.stat()
     except OSError:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames shared by jobs that run at the same time. Before a job renders a frame, it checks the frame's file again, and
-claims the frame by a file next to it.
+claims the frame by a claim file next to it.
 
-`clsplat.files.locks` decides when the claim of a job that was killed is taken over: at once on the same machine, and
-after ABANDONED_FILE_SECONDS without an update if the job ran on another machine.
+`clsplat.files.locks` decides when another job takes over the claim of a killed job: at once on the same machine, and
+after ABANDONED_FILE_SECONDS without an update on another machine.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from clsplat.sequence.finished_frames import is_complete
 from clsplat.sequence.task import RenderOptions, Task
 
 CLAIM_HEARTBEAT_SECONDS = 60.0
-"""Seconds between updates of a claim's modification time, which is to stay younger than ABANDONED_FILE_SECONDS."""
+"""Seconds between updates of a claim file's modification time, so that it stays younger than ABANDONED_FILE_SECONDS."""
 CLAIM_POLL_SECONDS = 0.25
 """Seconds between checks of frames that other jobs have claimed."""
 CLAIM_WARNING_SECONDS = 10.0
-"""Seconds of waiting for other jobs before a warning."""
+"""Seconds that a thread waits for other jobs before it warns."""
 State = Literal["ours", "done", "theirs"]
 
 
@@ -43,7 +43,7 @@ class Sharing:
     def begin(self, task: Task) -> State:
         """Claim a frame if possible. Returns one of three words:
 
-        ours: this job now has the claim, and must render the frame.
+        ours: this job has the claim now, and must render the frame.
         done: the frame's file is complete already.
         theirs: another process has the claim, and is rendering the frame.
         """
@@ -51,7 +51,7 @@ class Sharing:
             return "done"
         if (claimed := claim(task.path)) is None:
             return "theirs"
-        if is_complete(task, self.options):  # another job has completed the frame just before the claim
+        if is_complete(task, self.options):  # completed by another job just before the claim
             give_back(claimed)
             return "done"
         with self._changing:
@@ -59,12 +59,12 @@ class Sharing:
         return "ours"
 
     def _hold(self) -> None:
-        """Update the claims' modification times while the job runs, because a frame may take hours."""
+        """Update the claim files' modification times while the job runs, because a frame may take hours."""
         while not self._closed.wait(CLAIM_HEARTBEAT_SECONDS):
             with self._changing:
                 for claimed in self._claims.values():
                     with suppress(OSError):
-                        os.utime(claimed)  # Path.touch would create a missing file again
+                        os.utime(claimed)  # unlike Path.touch, does not create a missing file
 
     def end(self, task: Task) -> None:
         """Give up the claim of a frame, whether the frame's file has been completed or not."""
@@ -86,9 +86,10 @@ class Sharing:
 class FrameQueue:
     """The frames of a job, which the job's threads take one by one.
 
-    Frames that no other job has claimed come first. The others follow when the other job has completed or released
-    them.
-    stop: set when no more frames are wanted.
+    Frames that no other job has claimed come first. Claimed frames follow when the other jobs have completed or
+    released them.
+
+    stop: event that ends the queue when it is set.
     """
 
     def __init__(self, tasks: Iterable[Task], sharing: Sharing | None = None) -> None:
@@ -100,7 +101,7 @@ class FrameQueue:
     def take(self, skip: Callable[[Task], None]) -> Task | None:
         """Return the next frame to render, or None if none is left. Waits for frames that other jobs have claimed.
 
-        skip: function that is called with each frame whose file is complete already.
+        skip: function that is called for each frame whose file is complete already.
         """
         began = time.monotonic()
         while not self.stop.is_set():
@@ -118,7 +119,7 @@ class FrameQueue:
         return None
 
     def _next(self) -> tuple[Task | None, bool]:
-        """Return the next frame, and True if only frames are left that another job had claimed."""
+        """Return the next frame or None, and True if only frames that other jobs had claimed are left."""
         with self._turn:
             if (task := next(self._left, None)) is not None:
                 return task, False
@@ -127,7 +128,7 @@ class FrameQueue:
     def _tell(self, task: Task, seconds: float) -> None:
         if seconds > CLAIM_WARNING_SECONDS and not self._told:
             self._told = True
-            warn(f"--skip-existing: another process renders {task.path}, which is still missing; waiting for it")
+            warn(f"--skip-existing: {task.path} is missing; waiting for another process, which has begun to render it")
 
     def end(self, task: Task) -> None:
         """Give up the claim of a frame, whether the frame's file has been completed or not."""

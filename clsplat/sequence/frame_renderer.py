@@ -51,14 +51,14 @@ from clsplat.stages.deep import DEEP_FLOATS
 from clsplat.stages.holdout import HELD_PIXEL_BYTES, held_bytes
 
 TRANSFER_COMMANDS = ("read", "write", "fill")
-"""Names of transfers in a device's timing record; other names are kernels."""
+"""Names of transfers in a device's timing record. All other names are kernels."""
 
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """A frame before it is encoded.
+    """A rendered frame before it is encoded.
 
-    planes: None for a frame that was written strip by strip.
+    planes: the frame's channels; None if the frame has been written already, strip by strip or as a deep picture.
     seconds: rendering time.
     finish: function that the encoding thread applies to the planes before it writes them.
     right: planes of the right eye, if one file has both eyes.
@@ -73,10 +73,10 @@ class RenderedFrame:
 
 @dataclass(frozen=True)
 class DevicePlan:
-    """Memory plan of a device for the frame that needs most memory.
+    """Memory plan of a device for the frame of a job that needs most memory.
 
     device: name of the device.
-    strips: number of strips in which this frame is rendered.
+    strips: number of strips in which the frame is rendered.
     """
 
     device: str
@@ -88,7 +88,7 @@ RenderFrame = Callable[[Task], RenderedFrame]
 
 
 class FrameRenderer:
-    """Renders frames of one or several models on one device. Frames too large for memory are also written here."""
+    """Renders frames of one or several models on one device. It also writes frames that are too large for memory."""
 
     def __init__(
         self,
@@ -99,7 +99,7 @@ class FrameRenderer:
     ) -> None:
         """Prepare the models and the pipeline of a job.
 
-        renderer: a `Renderer`.
+        renderer: the `Renderer` of the device.
         models: a single model used as it is, or models that each task places in its world.
         mattes: Cryptomattes by the names of their channels.
         Raises InputError for settings and colour spaces that do not fit together.
@@ -132,7 +132,7 @@ class FrameRenderer:
                     check_parts(camera, self.options.encoding, views=len(task.views))
 
     def memory_plan(self, tasks: Sequence[Task]) -> DevicePlan:
-        """Plan the device's memory for these frames. Raises CapacityError if a frame does not fit."""
+        """Return the memory plan of the frame that needs most memory. Raises CapacityError if a frame does not fit."""
         device, options, config = self._renderer.device, self.options, self._renderer.config
         framing, names = options.pictures.framing, set(options.channels)
         models, _ = self._placed(tasks[0])
@@ -202,7 +202,8 @@ class FrameRenderer:
         draw, finish = pipeline.draw(frame)
         rows = self._rows(camera, held_bytes(cut(camera)) if cut else 0)
         if rows < camera.height and not task.is_video:
-            check_parts(camera, encoding, views)  # check again: a deep holdout's memory depends on its surfaces
+            # again, because the memory of a deep holdout depends on its surfaces
+            check_parts(camera, encoding, views)
             blanks: list[bool | None] = []
 
             def finished(strip: Camera, names: Collection[str]) -> Planes:
@@ -218,10 +219,10 @@ class FrameRenderer:
         return RenderedFrame(planes, time.monotonic() - start, finish, Measured(blank))
 
     def _placed(self, task: Task) -> tuple[Callable[[float], Gaussians], tuple[Gaussians | None, Gaussians | None]]:
-        """Return a function that merges the models at a time, and the merged models one frame later and earlier.
+        """Return a function from a time to the merged models, and the merged models one frame later and one earlier.
 
-        The function takes the time in frames relative to the task's frame. The later and earlier models serve the
-        channels motion and backward. They are None if nothing moves or the channel is not requested.
+        Times are in frames relative to the task's frame. The later and the earlier models are for the channels motion
+        and backward. They are None if no model is placed, or the channel is not requested.
         """
         ensemble, middle = self._ensemble, sampling_of(task, self.options.pictures).middle
         if (placed := task.placed) is None:
@@ -233,12 +234,12 @@ class FrameRenderer:
         return lambda time: ensemble.at(placed[time]), (moved("motion", middle + 1), moved("backward", middle - 1))
 
     def _trust(self, camera: Camera) -> None:
-        """Before the first frame of a panorama or fisheye, run the self-test of projection along rays."""
+        """Run the self-test of projection along rays before the first frame of a camera model along rays."""
         if not camera.model.along_rays or self._rays_tested:
             return
 
         device = self._renderer.device
-        if require(device, RAY_STAGES) is not device:  # the job cannot change the kernel shape
+        if require(device, RAY_STAGES) is not device:  # another shape works, but the job keeps its shape
             raise DriverError(
                 f"{device.name}: the driver failed in the kernel shape {device.shape.label}, but another shape works; "
                 "run the command again"
@@ -248,19 +249,20 @@ class FrameRenderer:
     def _rows(self, camera: Camera, planes: int) -> int:
         """Return the number of rows of a strip of the camera's picture, or its height if it needs no strips.
 
-        planes: bytes per pixel that a holdout takes.
+        planes: bytes of device memory per pixel that a holdout takes.
         """
         framing = self.options.pictures.framing
         rows = strip_rows(self._renderer.device, camera, self.options.channels, framing, planes)
-        floats = self._objects * camera.width * framing.supersample**2  # floats in a row of all Cryptomatte planes
+        # a row of pixels takes a float per pixel and Cryptomatte object
+        floats = self._objects * camera.width * framing.supersample**2
         most = DEEP_STRIP_FLOATS // max(floats, 1)
         return rows if most >= camera.height else min(rows, max(most // TILE, 1) * TILE)
 
 
 def cut_of(task: Task, options: RenderOptions) -> Cut | None:
-    """Read the surfaces of a frame's holdout; None if the frame has no holdout. Raises InputError.
+    """Read a frame's holdout; None if the frame has no holdout. Raises InputError for an unreadable file.
 
-    Warns if the picture extends beyond the frame, but the surfaces end at the frame's edge.
+    Warns if the rendered picture extends beyond the frame, but the holdout's surfaces end at the frame's edge.
     """
     if task.holdout is None or options.holdout is None:
         return None
@@ -273,7 +275,7 @@ def cut_of(task: Task, options: RenderOptions) -> Cut | None:
     cut, bent = Cut(holdout), warp_of(task, pictures) is not None
     if _reaches_out(straight_camera(task, pictures), INTERPOLATION_MARGIN_PX + 1 if bent else 0) and cut.goes_on:
         where = "where the warped picture extends beyond it" if bent else "in the overscan"
-        warn(f"{task.holdout}: ends at the frame's edge; nothing is held out {where}; render the CG with overscan")
+        warn(f"{task.holdout}: ends at the frame's edge, so nothing is held out {where}; render the CG with overscan")
     return cut
 
 
@@ -299,8 +301,8 @@ def open_frame_renderer(
 ) -> FrameRenderer:
     """Open a renderer for the models on the device that `device` names. Raises DeviceError.
 
-    profile: add the device's busy times to each frame's record.
-    tested: False to leave out the self-test of the driver, for a renderer that only plans.
+    profile: add the times of kernels and transfers on the device to each frame's record.
+    tested: False leaves out the self-test of the driver, for a renderer that only plans memory.
     """
     opened = open_device(device, memory_limit, profile=profile)
     kernels = (

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models of a render job: one file, one file per frame, the models of a shot file, or the models that a USD stage
-places. Needs no device."""
+"""Models of a render job: one model file, one file per frame, the models of a shot file, or those of a USD stage. Needs
+no device."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from clsplat.shots.shot_file import KeyedTrack, Volume, Within, is_layout, read_
 from clsplat.shots.usd_models import read_stage
 
 Known = dict[Placement | State, Placement | State]
-"""Cache of placements, each under itself as the key, so that equal placements are stored once."""
+"""Cache that maps each placement to itself, so that equal placements are stored once."""
 MAX_MATTE_OBJECTS = 256
-"""Maximum number of objects in a Cryptomatte. Each takes a plane of floats while a frame is rendered."""
+"""Maximum number of objects in a Cryptomatte. Each object takes a float per pixel while a frame is rendered."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +43,12 @@ class JobModels:
     path: the model file, shot file, USD stage or pattern of files that defines the models.
     models: the models, each in its own world.
     names: name of each model, for Cryptomattes.
-    digest: SHA-256 of the model file, or of the digests of several sources.
-    space: the colour space that all models have.
+    digest: SHA-256 of the model file, or of the digests of several files.
+    space: the colour space of all models.
     tracks: placements of the models over time; None for a single model that is not placed.
     files: files of the models; empty for a USD stage.
-    volumes: for each model, regions that are Cryptomatte objects of their own.
-    numbered: files by frame number for each model, empty for a model that does not change.
+    volumes: for each model, regions of it that are separate Cryptomatte objects.
+    numbered: for each model, its files by frame number; empty for a model that does not change.
     """
 
     path: Path
@@ -68,7 +68,7 @@ class JobModels:
 
     @property
     def one(self) -> Gaussians:
-        """The single model of a job whose model is not placed."""
+        """The model of a job with a single model that is not placed."""
         return self.still[0]
 
     @property
@@ -78,7 +78,7 @@ class JobModels:
 
     @property
     def count(self) -> int:
-        """Number of Gaussians in all models; for a model that changes, in its first sample."""
+        """Number of Gaussians in all models. For a model that changes over time, those of its first file count."""
         return sum(model.count if isinstance(model, ModelSeries) else len(model) for model in self.models)
 
     @property
@@ -104,15 +104,14 @@ class JobModels:
         return self.one if state is None else Ensemble(self.models).at(state)
 
     def mattes(self, channels: Collection[str], ids_from: str = "") -> dict[str, Matte]:
-        """Make the Cryptomattes among the channels, by the channel's name.
+        """Make the Cryptomattes that are among the channels. Returns them by channel. Raises InputError.
 
         ids_from: property of the model files that holds semantic ids.
-        Raises InputError.
         """
         made = {}
         if self.changing and (asked := [name for name in CRYPTOMATTE_CHANNELS if name in channels]):
             raise InputError(
-                f"--channels {asked[0]}: {self.path} changes over time, expected models whose Gaussians stay the same"
+                f"--channels {asked[0]}: {self.path} changes over time, expected models whose Gaussians do not change"
             )
         if "objects" in channels:
             made["objects"] = self._objects()
@@ -128,7 +127,7 @@ class JobModels:
     def _objects(self) -> Matte:
         """Make a Cryptomatte with one object for each model, and one for each volume of a model.
 
-        A Gaussian in a volume belongs to the volume and not to the model; in several volumes, to the first.
+        A Gaussian in a volume belongs to the volume's object, not to the model's; in several volumes, to the first's.
         """
         names, owners = list(self.names), []
         for index, model in enumerate(self.still):
@@ -155,7 +154,10 @@ class JobModels:
         return Matte(tuple(str(number) for number in numbers.tolist()), owners.astype(np.int32))
 
     def seen(self, tasks: Sequence[Task], pictures: PictureConfig, channels: Collection[str]) -> list[Task]:
-        """Return the tasks with the models' placements, near planes and ray settings. Raises InputError."""
+        """Return the tasks with the models' placements and near planes, and cameras along rays if the models need them.
+
+        Raises InputError for frames without a file and for invalid placements.
+        """
         known: Known = {}
         self._check_numbers([task.number for task in tasks])
         placed = []
@@ -187,7 +189,7 @@ class JobModels:
         return replace(seen, placed=states, files=self._files_of(states.values()))
 
     def _files_of(self, states: Iterable[State]) -> tuple[Path, ...]:
-        """Return the files of changing models that these states need, and tell the models which samples to expect."""
+        """Return the files of changing models for these placements, and tell the models which files will be needed."""
         found: dict[Path, None] = {}
         for state in states:
             for index, placement in enumerate(state):
@@ -202,18 +204,18 @@ class JobModels:
         for path, files in zip(self.files, self.numbered, strict=False):
             if not files:
                 continue
-            first, last, have = min(files), max(files), f"there are the frames {ranges(list(files))}"
+            first, last, have = min(files), max(files), f"there are files for {ranges(list(files))}"
             if beyond := [number for number in numbers if not first <= number <= last]:
                 raise InputError(
-                    f"{path}: has no file of the frame(s) {ranges(sorted(set(beyond)))}; {have}; give --frames "
+                    f"{path}: has no file for frame(s) {ranges(sorted(set(beyond)))}; {have}; give --frames "
                     f"{first}-{last}, or cameras of these frames"
                 )
             if missing := sorted({number for number in numbers if number not in files}):
-                warn(f"{path}: has no file of the frame(s) {ranges(missing)}, so neighbouring files are used; {have}")
+                warn(f"{path}: has no file for frame(s) {ranges(missing)}, so neighbouring files are used; {have}")
 
 
 def names_of(mattes: Mapping[str, Matte]) -> tuple[MatteNames, ...]:
-    """Return the object names and a digest of each Cryptomatte, for the options of a job."""
+    """Return channel, object names and a digest of each Cryptomatte, for the options of a job."""
     return tuple(
         MatteNames(name, mattes[name].names, hashlib.sha256(mattes[name].owners.tobytes()).hexdigest()[:32])
         for name in CRYPTOMATTE_CHANNELS
@@ -222,9 +224,9 @@ def names_of(mattes: Mapping[str, Matte]) -> tuple[MatteNames, ...]:
 
 
 def load_job_models(path: Path, transform: KeyedTrack | None = None) -> JobModels:
-    """Load the models that MODEL names: a run, a model file, one file per frame, a shot file or a USD stage.
+    """Load the models at a path: a run folder, a model file, a pattern of files by frame, a shot file or a USD stage.
 
-    transform: transform over time to apply to all models; None leaves them in place.
+    transform: transform, over time, of all models; None leaves them in place.
     Raises InputError for an unreadable file, and for models that differ in colour space or rendering method.
     """
     if is_layout(path):
@@ -277,7 +279,7 @@ def _opened(path: Path) -> _Opened:
 
 
 def _of_layout(path: Path) -> JobModels:
-    """Load the models of a shot file. A file that several models share is read once."""
+    """Load the models of a shot file. A model file that several of them share is read once."""
     entries = read_layout(path)
     known: dict[Path, _Opened] = {}
     sums = hashlib.sha256()
@@ -296,12 +298,12 @@ def _of_layout(path: Path) -> JobModels:
         where, kind = f"{path}: model '{entry.name}'", kind_of(opened.model)
         if opened.space != space:
             raise InputError(
-                f"{where}: is of the colour space {opened.space}, expected {space} as '{entries[0].name}' is"
+                f"{where}: has the colour space {opened.space}, expected {space} like model '{entries[0].name}'"
             )
         if kind.antialiased != first.antialiased:
-            raise InputError(f"{where}: is {_not(kind.antialiased)}antialiased, unlike '{entries[0].name}'")
+            raise InputError(f"{where}: is {_not(kind.antialiased)}antialiased, unlike model '{entries[0].name}'")
         if kind.by_rays != first.by_rays:
-            raise InputError(f"{where}: is {_not(kind.by_rays)}drawn along rays, unlike '{entries[0].name}'")
+            raise InputError(f"{where}: is {_not(kind.by_rays)}rendered along rays, unlike model '{entries[0].name}'")
         if entry.volumes and isinstance(opened.model, ModelSeries):
             raise InputError(f"{where}: has 'mattes' and changes over time, expected one model for all frames")
     tracks = tuple(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A model with one file per frame, such as `capture.####.ply`."""
+"""Models with one file per frame, such as `capture.####.ply`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from clsplat.shots.frame_numbers import has_number, numbered_files, path_of
 
 
 def is_sequence(path: Path) -> bool:
-    """True if a path has a field for the frame's number, such as ####, and no file has the path itself as its name."""
+    """True if a path has a field for the frame's number, such as ####, and there is no file with just this name."""
     return has_number(str(path)) and not path.exists()
 
 
@@ -27,18 +27,18 @@ def open_sequence(pattern: Path) -> tuple[ModelSeries, dict[int, Path]]:
     found = {number: model_file(path).absolute() for number, path in numbered_files(str(pattern)).items()}
     if not found:
         first = path_of(str(pattern), 1, "")
-        raise InputError(f"{pattern}: no file has such a name, expected one per frame, such as {first}")
+        raise InputError(f"{pattern}: no file matches, expected one file per frame, such as {first}")
     files, space = list(found.values()), colour_space(next(iter(found.values())))
 
     def read(index: int) -> Gaussians:
         own = colour_space(files[index])
         if own != space:
-            raise InputError(f"{files[index]}: is of the colour space {own}, expected {space} as {files[0]} is")
-        return load(files[index], check_encoding=index == 0)  # warn of the first file only
+            raise InputError(f"{files[index]}: has the colour space {own}, expected {space} like {files[0]}")
+        return load(files[index], check_encoding=index == 0)  # warnings about the first file suffice
 
     return ModelSeries([float(number) for number in found], read, str(pattern)), found
 
 
 def digest_of_name(pattern: Path) -> str:
-    """SHA-256 of the pattern's text. Each frame's digest (`task.settings_digest`) includes the content of the files."""
+    """Return the SHA-256 of the pattern's text. The content of the files is in each frame's `task.settings_digest`."""
     return hashlib.sha256(str(pattern).encode()).hexdigest()

@@ -29,12 +29,12 @@ def make_views(
     channels: Sequence[str],
     sampling: SamplingConfig | None = None,
 ) -> tuple[list[Task], Shot]:
-    """Make the tasks of all eyes by `make_tasks`. Returns them, and the chosen frames of the first shot.
+    """Make the tasks of both eyes, or of one camera, by `make_tasks`. Returns them, and the first shot's chosen frames.
 
-    shots: shots by eye; without stereo a single shot, under "".
+    shots: shots by eye, "left" and "right"; without stereo a single shot with the key "".
     frames: numbers of the frames to render, as in --frames; None for all.
     pattern: pattern of the file names.
-    resize: function that resizes a camera.
+    resize: function that returns a camera at the size to render.
     The tasks of the two eyes alternate. If the pattern has no field for the eye, they become views of one file. Raises
     InputError like `make_tasks` and `Shot.only`.
     """
@@ -47,8 +47,8 @@ def make_views(
     one_file = len(shots) == 2 and not EYE_FIELD_PATTERN.search(pattern)
     if one_file and Path(pattern).suffix.lower() != ".exr":
         raise InputError(
-            f"{pattern}: has no {{eye}} in it, expected {{eye}} to tell left from right, the name of an .exr file, "
-            "which holds both, or --eye left or right"
+            f"{pattern}: has no {{eye}} in it; expected a name with {{eye}}, the name of an .exr file, which holds "
+            "both eyes, or --eye left or right"
         )
     made = [
         [
@@ -71,10 +71,11 @@ def make_tasks(
     channels: Sequence[str],
     sampling: SamplingConfig | None = None,
 ) -> list[Task]:
-    """Make the tasks for the frames of `chosen`, which are part of the shot `whole`.
+    """Make the tasks for the frames of `chosen`, which are some or all frames of the shot `whole`.
 
-    Raises InputError if two frames share a file that is not a video, and if the channels or the lens are not defined
-    for a camera.
+    pattern, resize: as for `make_views`.
+    Raises InputError if two frames share a file that is not a video, or if a camera does not support the channels or
+    depth of field.
     """
     sampling = sampling or SamplingConfig()
     motion, backward = "motion" in channels, "backward" in channels
@@ -107,8 +108,10 @@ def make_tasks(
 def settled(flags: SamplingConfig, optics: Optics | None, camera: Camera) -> SamplingConfig:
     """Return the shutter and lens of a frame: the flags' settings, or the USD stage's settings where no flag is given.
 
-    The f-stop is converted to an aperture radius by the stage's lens and unit. If a flag gives the sensor width or the
-    metres per unit, the f-stop is kept.
+    The f-stop is converted to an aperture radius by the stage's focal length and unit, unless a flag gives the sensor
+    width or the metres per unit.
+
+    optics: shutter and lens in the USD stage; None without a stage.
     """
     if optics is None:
         return flags
@@ -134,9 +137,9 @@ def settled(flags: SamplingConfig, optics: Optics | None, camera: Camera) -> Sam
 def held_out(tasks: Sequence[Task], pattern: str, config: HoldoutConfig) -> list[Task]:
     """Return the tasks with the paths of their holdout files.
 
-    pattern: pattern of --holdout. Without a field for the number, a file serves all frames; without a field for the
-      eye, both eyes.
-    Warns of depths in half floats. Raises InputError for a missing file, and for a file that is no holdout.
+    pattern: pattern of --holdout. Without a field for the number, all frames use one file; without a field for the eye,
+        both eyes.
+    Warns of depths in half floats. Raises InputError for a missing file, and for a file that is not a holdout.
     """
     check_pattern(for_eye(pattern, tasks[0].eye))
     coarse: dict[Path, bool] = {}
@@ -150,7 +153,7 @@ def held_out(tasks: Sequence[Task], pattern: str, config: HoldoutConfig) -> list
     made = [held(task) for task in tasks]
     if coarse:
         warn(
-            f"{examples(coarse)}: has depths of half floats, with errors of up to 1/2000, so that Gaussians near a "
-            "surface may fall on its wrong side; write the depths as floats"
+            f"{examples(coarse)}: depths are half floats, with errors of up to 1/2000, so that Gaussians near a "
+            "surface may be on the wrong side of it; write depths as 32-bit floats"
         )
     return made

@@ -46,19 +46,19 @@ from clsplat.shots.motion import Moments
 from clsplat.shots.optics import Optics, headers
 
 LATLONG_ATTRIBUTES: dict[str, str | int] = {"textureformat": "LatLong Environment", "openexr:levelmode": 0}
-"""OpenImageIO's attributes for EXR's envmap. Level mode 0 is a file without mipmap levels. OpenImageIO would keep the
-file open for more levels."""
+"""Attributes with which OpenImageIO marks an EXR file as a panorama (envmap). Level mode 0 is a file without mipmap
+levels: otherwise OpenImageIO would keep the file open for more levels."""
 _ENCODING_FIELDS_BY_SUFFIX = {
     ".exr": ("depth", "parts", "compression"),
     **dict.fromkeys((".png", ".tif", ".tiff", ".dpx"), ("bits",)),
     **dict.fromkeys((".jpg", ".jpeg"), ("quality",)),
     ".mov": ("prores",),
 }
-"""Encoding settings that affect files of each extension."""
+"""For each extension, the encoding settings that change such a file."""
 
 
 def key_of(number: int, eye: str) -> str:
-    """Key of a frame within its job: the frame's number, and the eye if frames of both eyes have files of their own."""
+    """Return the key of a frame in its job: its number, and its eye if the eyes have separate files."""
     return f"{number} {eye}" if eye else str(number)
 
 
@@ -66,8 +66,8 @@ def key_of(number: int, eye: str) -> str:
 class Measured:
     """Values that are measured while a frame is rendered.
 
-    blank: True if nothing of the model is visible, None if this was not checked.
-    kernel_ms, transfer_ms: times on the device, None unless it was profiled.
+    blank: True if nothing of the model is visible; None if this was not checked.
+    kernel_ms, transfer_ms: times of kernels and transfers on the device; None without profiling.
     """
 
     blank: bool | None = None
@@ -83,8 +83,8 @@ class Record:
     """Record of a finished frame.
 
     seconds: time for rendering and writing, without waiting.
-    skipped: True if the file was there already.
-    eye: left or right, if the eyes of a stereo pair have files of their own.
+    skipped: True if the file existed already.
+    eye: left or right if the eyes of a stereo pair have separate files, otherwise None.
     blank, kernel_ms, transfer_ms: as in `Measured`.
     """
 
@@ -102,7 +102,7 @@ class Record:
 
     @property
     def key(self) -> str:
-        """Key of the frame's task."""
+        """Key of the frame in its job."""
         return key_of(self.frame, self.eye or "")
 
     def document(self) -> dict[str, Any]:
@@ -116,21 +116,21 @@ class Task:
 
     number, name: as in `shots.Frame`.
     camera: camera of the whole frame, in its final size.
-    path: path of the file.
+    path: path of the file to write.
     after, earlier: cameras of the next and the previous frame, for motion channels, of the same size; None if
         these channels are not requested.
-    stretch: cameras while the shutter is open; None for a static camera.
+    stretch: cameras by time while the shutter is open; None for a static camera.
     before: state of the file when the job began, by `finished_frames.stamp`.
     sampling: shutter and lens of this frame; None means the job's.
-    optics: shutter and lens in a USD stage.
-    eye: left or right of a stereo pair.
+    optics: shutter and lens in the USD stage; None without a stage.
+    eye: left or right of a stereo pair; empty without stereo.
     right: task of the right eye, if one file holds both.
     lens: the photograph's lens, by which the picture is distorted; None for no distortion by a lens.
     holdout: absolute path of the holdout's file; None without a holdout.
-    placed: placements of the models at each of the `model_times`, in frames from the frame; None for a single model
-      used as it is.
-    nears: the models' near plane at these times, empty if the camera has its own.
-    ends: numbers of the first and the last frame of the shot, None for a shot of one frame.
+    placed: placements of the models by time (`model_times`), in frames relative to this frame; None for a single
+        model used as it is.
+    nears: the models' near plane by time; empty if the camera has a near plane of its own.
+    ends: numbers of the first and the last frame of the shot; None for a shot of one frame.
     files: absolute paths of the files of models that have one file per frame.
     """
 
@@ -155,7 +155,7 @@ class Task:
 
     @property
     def key(self) -> str:
-        """Key of the frame within its job."""
+        """Key of the frame in its job."""
         return key_of(self.number, "" if self.right else self.eye)
 
     @property
@@ -164,7 +164,7 @@ class Task:
         return (self,) if self.right is None else (self, self.right)
 
     def at(self, time: float) -> Camera:
-        """Return the camera of the whole frame at a time, with the models' near plane and ray setting.
+        """Return the camera of the whole frame at a time, with the models' near plane.
 
         time: in frames relative to this frame.
         """
@@ -175,7 +175,7 @@ class Task:
         return camera if near is None else camera.before(near)
 
     def seen_by(self, gaussians: Gaussians, nears: Mapping[float, float]) -> Task:
-        """Return the task with cameras that have the model's near plane, and its setting to project along rays.
+        """Return the task with cameras that have the model's near plane, and project along rays if the model needs it.
 
         nears: near planes by time in frames relative to this frame.
         """
@@ -194,13 +194,13 @@ class Task:
 
 
 def sampling_of(task: Task, pictures: PictureConfig) -> SamplingConfig:
-    """Shutter and lens of a frame: the task's own, else the job's."""
+    """Return the settings of shutter and lens of a frame: the task's if it has them, otherwise the job's."""
     return task.sampling or pictures.sampling
 
 
 @dataclass(frozen=True)
 class MatteNames:
-    """A Cryptomatte channel: names of its objects, and a digest of the array with each Gaussian's object."""
+    """A Cryptomatte channel with the names of its objects, and a digest of the array of each Gaussian's object."""
 
     channel: str
     names: tuple[str, ...]
@@ -215,7 +215,7 @@ class RenderOptions:
     attributes: attributes for the file's header.
     pictures: framing, motion blur, depth of field, distortion and colour space.
     recorded: the model's colour space.
-    deep: settings of deep pictures, None for flat ones.
+    deep: settings of deep pictures; None for flat pictures.
     drawn: digest of the rasterizer's settings.
     gains: three factors of the model's colours, or nine entries of a matrix; empty for unchanged colours.
     holdout: settings for reading holdouts; None without holdouts.
@@ -240,7 +240,7 @@ class RenderOptions:
 def picture_camera(task: Task, pictures: PictureConfig) -> Camera:
     """Return the camera of the written picture, with its size and window, at the middle of the shutter.
 
-    For a distorted picture, only the camera's size and window have a meaning. Raises InputError for a region outside
+    For a distorted picture, only size and window of the result have a meaning. Raises InputError for a region outside
     the frame.
     """
     warp = warp_of(task, pictures)
@@ -273,7 +273,7 @@ def framed(camera: Camera, config: FramingConfig) -> Camera:
 
 
 def lens_of(task: Task, pictures: PictureConfig) -> Places | None:
-    """Return the lens or STMap that distorts the picture; None without one. Raises InputError for an unreadable map."""
+    """Return the lens or STMap that distorts the picture; None without distortion. Raises InputError for a bad map."""
     if stmap := pictures.warp.stmap:
         return ByMap(read_stmap(Path(stmap)))
     return ByLens(task.lens) if task.lens is not None else None
@@ -293,25 +293,25 @@ def straight_camera(task: Task, pictures: PictureConfig) -> Camera:
 
 
 def camera_after(task: Task, pictures: PictureConfig) -> Camera | None:
-    """Camera of the whole frame for the channel motion: one frame after the middle of the shutter."""
+    """Return the whole frame's camera one frame after the shutter's middle, for motion; None if not requested."""
     middle = sampling_of(task, pictures).middle
     still = middle == 0 or task.after is None or isinstance(task.stretch, Moments)
     return task.after if still else task.at(middle + 1)
 
 
 def camera_before(task: Task, pictures: PictureConfig) -> Camera | None:
-    """Camera of the whole frame for the channel backward: one frame before the middle of the shutter."""
+    """Return the whole frame's camera one frame before the shutter's middle, for backward; None if not requested."""
     middle = sampling_of(task, pictures).middle
     still = middle == 0 or task.earlier is None or isinstance(task.stretch, Moments)
     return task.earlier if still else task.at(middle - 1)
 
 
 def end_before(task: Task, time: float, pictures: PictureConfig) -> float | None:
-    """Return the time from which the camera at `time` is extrapolated, or None if it is not.
+    """Return the time from which motion is extrapolated to `time`; None if `time` needs no extrapolation.
 
-    time: in frames relative to the task's frame, like the result.
-    Times between the first and the last frame, and those of a shot of one frame, are not extrapolated. A USD stage
-    defines its camera while the shutter is open; motion is extrapolated from the shutter's middle.
+    Both times are in frames relative to the task's frame. Only times before the first or after the last frame of a shot
+    of several frames are extrapolated, from that frame; in a USD stage, whose camera is defined while the shutter is
+    open, from the shutter's middle.
     """
     if task.ends is None or task.ends[0] <= task.number + time <= task.ends[1]:
         return None
@@ -324,7 +324,8 @@ def end_before(task: Task, time: float, pictures: PictureConfig) -> float | None
 def model_times(task: Task, pictures: PictureConfig, channels: Collection[str]) -> list[float]:
     """Return the times at which the models of a frame are needed, in frames relative to the frame.
 
-    These are the shutter's middle, the samples, and one frame later or earlier for motion channels.
+    These are the shutter's middle, the samples of motion blur, and one frame after or before the middle for motion
+    channels.
     """
     sampling = sampling_of(task, pictures)
     times = [sampling.middle, *(sampling.sample_times if sampling.moves else ())]
@@ -335,8 +336,8 @@ def model_times(task: Task, pictures: PictureConfig, channels: Collection[str]) 
 def plain(value: Any) -> Any:
     """Convert a value to JSON types, for a digest.
 
-    A dataclass becomes its differences from the defaults, so that a new setting does not change digests. Floats are
-    rounded to 12 digits, because processors differ in the last ones.
+    A dataclass becomes the fields that differ from their defaults, so that a new setting does not change digests.
+    Floats are rounded to 12 digits, because processors differ in the last digits.
     """
     if is_dataclass(value) and not isinstance(value, type):
         changes = {}
@@ -356,15 +357,15 @@ def plain(value: Any) -> Any:
 
 
 def digest_of(*parts: Any) -> str:
-    """128 bits of SHA-256, in hexadecimal, of values that `plain` accepts."""
+    """Return 128 bits of SHA-256, in hexadecimal, of values that `plain` accepts."""
     return hashlib.sha256(json.dumps(plain(parts), sort_keys=True).encode()).hexdigest()[:32]
 
 
 def settings_digest(task: Task, options: RenderOptions) -> str:
-    """Digest of everything that a frame depends on, except the model files.
+    """Return a digest of everything that a frame depends on, except the model file.
 
-    These are cameras, channels, encoding, picture settings, rasterizer, the content of the holdout's file, and the
-    models' placements. For models with one file per frame, the content of these files is included.
+    It includes cameras, channels, encoding, picture settings, rasterizer settings, the content of the holdout's file,
+    and the models' placements; for models with one file per frame also the content of these files.
     """
     pictures, sampling = options.pictures, sampling_of(task, options.pictures)
     encoding = {
@@ -383,7 +384,7 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     used = sampling if sampling.on else None
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
-    # A far plane changes the digest, so that frames of versions that did not clip at it are rendered again.
+    # render frames again that versions without clipping at the far plane have rendered
     made += ("far",) if task.camera.far < inf else ()
     colour = replace(pictures.colour, ocio_config=configuration_digest(pictures.colour.ocio_config))
     if task.holdout is not None:
@@ -404,12 +405,13 @@ def header(task: Task, options: RenderOptions, whole: Task | None = None) -> Fra
     """Make the header of a frame's file: frame, model, version, settings, colour space, and matrices of the camera.
 
     An EXR file also gets its window, and an attribute that marks a whole panorama.
-    whole: task of the whole file, if the file has both eyes.
+
+    task: the frame of one eye. whole: task of the file, if the file has both eyes.
     """
     camera = picture_camera(task, options.pictures)
     matrices = camera_matrices(camera)
     if warp_of(task, options.pictures) is not None:
-        matrices.pop("worldToNDC", None)  # no matrix describes a distorted picture
+        matrices.pop("worldToNDC", None)  # a matrix cannot describe a distorted picture
     attributes = {
         **options.attributes,
         "clsplat:frame": task.number,

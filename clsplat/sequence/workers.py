@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Threads of a render job, which render, encode and write its frames. No OpenCL here.
+"""Threads of a render job, which render, encode and write its frames.
 
-Each device has one thread that renders; up to MAX_FILE_THREADS of `finished_frames` encode and write. A frame is
+One thread for each device renders, and up to `finished_frames.MAX_FILE_THREADS` threads encode and write. A frame is
 written under a temporary name and then renamed, so that a file is complete even if the job is killed. Frames of a video
-are prepared by these threads and encoded in order by the thread that waits for them.
+are converted by these threads, and encoded in order by the thread that called `run_tasks`.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ from clsplat.sequence.task import (
 )
 
 Result = tuple[Record, VideoPlanes | None]
-"""Record of a frame, and for a frame of a video the planes to encode."""
+"""Record of a frame, and the planes to encode if the frame belongs to a video."""
 WRITE_QUEUE_BYTES = 1 << 30
-"""Target for the main memory of frames that wait to be written. At least three frames may wait."""
+"""Main memory in bytes that frames in progress may take. Two frames more than devices are always allowed."""
 ENCODING_COPIES = 3
-"""Number of copies of a frame in memory while it is encoded: rendered, assembled, converted."""
+"""Number of copies of a frame in memory while it is encoded: the rendered, the assembled and the converted frame."""
 
 
 def encode_frame(task: Task, frame: RenderedFrame, options: RenderOptions) -> Result:
     """Encode a frame and write it atomically, unless it was written in strips already. Raises ClsplatError.
 
-    A frame of a video is not written: the result has its planes.
+    A frame of a video is not written: its planes are in the result.
     """
     start, yuv = time.monotonic(), None
     if task.is_video:
@@ -77,7 +77,7 @@ def record_of(
     *,
     skipped: bool = False,
 ) -> Record:
-    """Make the record of a task's finished frame. seconds: time for rendering and writing."""
+    """Make the record of a finished frame. seconds: time for rendering and writing."""
     camera = picture_camera(task, options.pictures)
     return Record(
         task.name,
@@ -95,7 +95,7 @@ def record_of(
 
 
 def frame_bytes(task: Task, options: RenderOptions) -> int:
-    """Estimate the bytes of main memory that a frame takes until it is written; if it is in strips, of one strip."""
+    """Estimate the bytes of main memory that a frame, or one of its strips, takes until it is written."""
     camera, framing = picture_camera(task, options.pictures), options.pictures.framing
     pixels, finer = camera.width * camera.height * len(task.views), framing.supersample**2
     if not task.is_video:
@@ -112,7 +112,7 @@ def frame_bytes(task: Task, options: RenderOptions) -> int:
 
 
 def frames_ahead(tasks: Sequence[Task], options: RenderOptions, devices: int) -> tuple[int, int]:
-    """Choose the number of threads that write, and the number of frames in main memory at once. Returns both."""
+    """Return the number of threads that are to write, and the maximum number of frames in main memory at once."""
     largest = max((frame_bytes(task, options) for task in tasks), default=1)
     writers = max(1, min(MAX_FILE_THREADS, os.cpu_count() or 1))
     held = max(devices + 2, min(WRITE_QUEUE_BYTES // max(largest, 1), devices + writers + 1))
@@ -130,10 +130,11 @@ def run_tasks(
 ) -> None:
     """Render the frames, and at the same time write them or add them to the video.
 
-    A thread for each renderer takes the next free frame. The first error of a thread is raised when all have ended.
+    Each renderer has a thread, which takes frame after frame. The first error is raised when all threads have ended.
+
+    on_done: function that is called in this thread with the record of each frame whose file is complete, in any order.
+        For a video it is called in the frames' order, when the frame has been encoded.
     shared: True if other jobs may render some of these frames. Each frame is then claimed before it is rendered.
-    on_done: function that is called in this thread for each frame whose file is complete, in any order. For a video it
-    is called in order, when the frame has been encoded.
     """
     if not tasks:
         return
@@ -144,7 +145,7 @@ def run_tasks(
     devices = ThreadPoolExecutor(len(renderers), "clsplat-render")
 
     def render(renderer: RenderFrame) -> None:
-        while True:  # until no frames are left
+        while True:
             room.acquire()
             if (task := frames.take(lambda task: finished.put(_skipped(task, options)))) is None:
                 return
@@ -167,10 +168,10 @@ def run_tasks(
             devices.submit(render, renderer).add_done_callback(tell_failure)
         for record in encoded(tasks, (finished.get().result() for _ in tasks), video):
             if video is not None:
-                room.release()  # cannot deadlock: frames start in order, so the video's next frame is in memory already
+                room.release()  # no deadlock: frames start in order, so the next to encode is in memory already
             on_done(record)
     except KeyboardInterrupt:
-        abandon()  # end the trial of a driver that hangs, which a thread may wait for
+        abandon()  # a thread may wait for the trial of a driver that hangs
         raise
     finally:
         frames.stop.set()
@@ -182,7 +183,7 @@ def run_tasks(
 
 
 def _skipped(task: Task, options: RenderOptions) -> Future[Result]:
-    """Return the result of a frame that another job has finished, as a completed future."""
+    """Return a completed future with the record of a frame that another job has finished."""
     outcome: Future[Result] = Future()
     outcome.set_result((record_of(task, options, skipped=True), None))
     return outcome
@@ -190,7 +191,7 @@ def _skipped(task: Task, options: RenderOptions) -> Future[Result]:
 
 def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter | None) -> Iterator[Record]:
     """Yield the record of each frame when its file is complete; for a video, in the order of the tasks, when the frame
-    has been encoded."""
+    has been encoded. results: records and planes, in any order."""
     if video is None:
         for record, _ in results:
             yield record
@@ -210,9 +211,9 @@ def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter
 def open_video(
     tasks: Sequence[Task], config: VideoConfig, options: RenderOptions
 ) -> AbstractContextManager[VideoWriter | None]:
-    """Open the video that the tasks' frames belong to. The context is None if frames have files of their own.
+    """Open the video that the tasks' frames belong to, as a context. It yields None if frames have separate files.
 
-    The file gets its final name at the end of the context, unless an error is raised.
+    The video file gets its final name at the end of the context, unless an error is raised.
     """
     if not (tasks and tasks[0].is_video):
         return nullcontext()

@@ -434,7 +434,7 @@ def test_a_manifest_that_was_never_written_is_refused(store: ChunkStore, name: s
 
 def test_slots_far_behind_the_end_are_refused(store: ChunkStore) -> None:
     written(store)
-    with pytest.raises(ScratchError, match="has been cut to 20 chunks"):
+    with pytest.raises(ScratchError, match="has been cut to 20 slots"):
         ChunkStore.opened(replace(store.manifest(), slots=store.slots.current + (1 << 60)), writable=False)
 
 

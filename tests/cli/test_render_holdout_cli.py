@@ -167,7 +167,7 @@ def test_cg_that_ends_with_the_frame_is_told_with_overscan(folder: Path, tmp_pat
     flags = f"--frames 2 --overscan 4 --holdout {tmp_path}/z.exr"
     write_flat(tmp_path / "z.exr", {"Z": np.full((HEIGHT, WIDTH), 4.0)})
     assert render(folder, tmp_path, flags) == 0
-    assert "z.exr: ends at the frame's edge; nothing is held out in the overscan" in capsys.readouterr().err
+    assert "z.exr: ends at the frame's edge, so nothing is held out in the overscan" in capsys.readouterr().err
     larger = {"Z": np.full((HEIGHT + 8, WIDTH + 8), 4.0)}
     write_flat(tmp_path / "z.exr", larger, size=(WIDTH, HEIGHT), window=(-4, -4, WIDTH + 8, HEIGHT + 8))
     assert "overscan" not in ran(capsys, render, folder, tmp_path, flags).err
@@ -191,7 +191,7 @@ def test_a_bent_picture_is_held_out_straight(folder: Path, tmp_path: Path, capsy
     write_flat(tmp_path / "all.exr", {"Z": np.full((HEIGHT, WIDTH), 4.0)})
     call = f"--frames 2 --holdout {tmp_path}/all.exr --stmap {tmp_path}/shift.exr"
     assert (
-        "all.exr: ends at the frame's edge; nothing is held out where the warped picture extends"
+        "all.exr: ends at the frame's edge, so nothing is held out where the warped picture extends"
         in ran(capsys, render, folder, tmp_path / "told", call).err
     )
 
@@ -222,7 +222,7 @@ def test_depths_of_half_floats_are_told(folder: Path, tmp_path: Path, capsys: Ca
         pixels = np.stack([np.ones_like(depth), depth], axis=2).astype(np.float32)
         write_pixels(tmp_path / f"{name}.exr", pixels, **channels)
         assert render(folder, tmp_path / name, f"--holdout {tmp_path}/{name}.exr --dry-run") == 0
-        told = "coarse.exr: has depths of half floats" in capsys.readouterr().err
+        told = "coarse.exr: depths are half floats" in capsys.readouterr().err
         assert told == (name == "coarse")
 
 

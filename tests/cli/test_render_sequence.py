@@ -139,7 +139,7 @@ def test_motion_blur_is_the_mean_over_the_shutter(folder: Path) -> None:
 
 def test_gaps_are_filled_and_told(folder: Path, capsys: Capture) -> None:
     (folder / "capture.0003.ply").unlink()
-    assert "has no file of the frame(s) 3, so neighbouring files are used; there are the frames 1-2,4-5" in (
+    assert "has no file for frame(s) 3, so neighbouring files are used; there are files for 1-2,4-5" in (
         ran(capsys, render, folder, "capture.####.ply", "all", "--channels alpha --exr float").err
     )
     means = (at(2).means.astype(float) + at(4).means) / 2
@@ -181,8 +181,8 @@ def test_placed_as_one(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("model", "flags", "words"),
     [
-        ("none.####.ply", "", "none.####.ply: no file has such a name, expected one per frame, such as "),
-        ("late.####.ply", "", "has no file of the frame(s) 1-2,5; there are the frames 3-4; give --frames 3-4"),
+        ("none.####.ply", "", "none.####.ply: no file matches, expected one file per frame, such as "),
+        ("late.####.ply", "", "has no file for frame(s) 1-2,5; there are files for 3-4; give --frames 3-4"),
         ("capture.####.ply", "--channels objects", "--channels objects: "),
         ("capture.####.ply", "--appearance a.png", "--appearance a.png: is for one run's model"),
         ("odd.####.ply", "", "odd.####.ply: frame 2 is antialiased, frame 1 is not antialiased"),

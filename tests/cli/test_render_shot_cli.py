@@ -350,10 +350,10 @@ def test_wrong_transforms_are_one_line(text: str, message: str, folder: Path, tm
 def test_models_that_are_not_drawn_alike(folder: Path, tmp_path: Path, capsys: Capture) -> None:
     replace(B, antialiased=True).save(folder / "soft.ply")
     assert render(folder, layout(folder, "unlike", path="soft.ply"), tmp_path / "none") == 2
-    assert "model 'b': is antialiased, unlike 'a'" in error_line(capsys)
+    assert "model 'b': is antialiased, unlike model 'a'" in error_line(capsys)
     B.save(folder / "linear.ply", comments=("clsplat colorspace lin_rec709",))
     assert render(folder, layout(folder, "unlike", path="linear.ply"), tmp_path / "none") == 2
-    assert "model 'b': is of the colour space lin_rec709, expected sRGB as 'a' is" in error_line(capsys)
+    assert "model 'b': has the colour space lin_rec709, expected sRGB like model 'a'" in error_line(capsys)
     assert render(folder, layout(folder, "shot"), tmp_path / "none", "", "--appearance", "x.jpg") == 2
     assert "--appearance x.jpg: is for one run's model" in error_line(capsys)
 

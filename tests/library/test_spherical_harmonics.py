@@ -60,9 +60,9 @@ def test_no_directions_and_a_single_one(default_device: Device) -> None:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        ((5, DIRECTIONS, COEFFICIENTS), "degree is 5, expected 0 to 4"),
-        ((1.5, DIRECTIONS, COEFFICIENTS), "degree is 1.5, expected 0 to 4"),
-        ((2, DIRECTIONS, COEFFICIENTS[:, :, :4]), "coefficients: got 4, expected 9 or more for degree 2"),
+        ((5, DIRECTIONS, COEFFICIENTS), "degree is 5, expected a whole number from 0 to 4"),
+        ((1.5, DIRECTIONS, COEFFICIENTS), "degree is 1.5, expected a whole number from 0 to 4"),
+        ((2, DIRECTIONS, COEFFICIENTS[:, :, :4]), "coefficients: got K = 4, expected 9 or more for degree 2"),
         ((1, DIRECTIONS[:2], COEFFICIENTS), r"coefficients: got shape \(3, 70, 25, 3\), expected \(2, 70, K, 3\)"),
         ((1, DIRECTIONS[..., :2], COEFFICIENTS), r"directions: got shape \(3, 70, 2\), expected \(3, 70, 3\)"),
         ((1, np.full((1, 3), np.inf), np.zeros((1, 4, 3))), r"directions: \[0, 0\] is inf, expected finite numbers"),

@@ -259,7 +259,10 @@ def test_a_frame_whose_workers_are_always_lost(shot: list[str], tmp_path: Path, 
     path = Shot(numbered(cameras()))
     tasks = make_tasks(path, path, str(tmp_path / "#.exr"), lambda camera: camera, ("rgb",))
     killed = distributed.KilledWorker("clsplat-abc-7", None, 3)
-    for error, message in ((killed, "frame 7: every worker that took it was lost"), (OSError(), "scheduler was lost")):
+    for error, message in (
+        (killed, "frame 7: every worker that rendered it"),
+        (OSError(), "scheduler was lost"),
+    ):
         monkeypatch.setattr(distributed, "as_completed", lambda _, error=error: iter([Future(error)]))
         with pytest.raises(farm.ClsplatError, match=message) as caught:
             list(farm._results(Client(), tasks, job_of(shot)))

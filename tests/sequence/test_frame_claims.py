@@ -163,7 +163,7 @@ def test_a_frame_of_another_job_is_waited_for(
     job.join(30)
     assert sorted(made) == [1, 3, 4]
     assert {record.frame: record.skipped for record in records} == {1: False, 2: True, 3: False, 4: False}
-    assert len(told) == 1 and "another process renders" in told[0]
+    assert len(told) == 1 and "waiting for another process" in told[0]
     assert len(recwarn) == 0
     assert not [path for path in tmp_path.iterdir() if path.suffix != ".exr"]
 

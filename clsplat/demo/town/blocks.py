@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """City blocks of the demo's town: houses, flats or a park, trees, cars, and points on the surfaces.
 
-The town is an endless grid of blocks. A block depends on the seed and its two indices alone.
-
-A block's corner is at the crossing of two streets. x and y are along the streets, and the ground is z = 0.
+The town is an endless grid of blocks. A block depends on the seed and its two indices alone. Its corner, at low x and
+y, is the crossing of two streets, which run along x and y. The ground is z = 0.
 """
 
 from __future__ import annotations
@@ -21,18 +20,18 @@ from clsplat.demo.town.solids import SOLID_BALL, SOLID_ROOF, Builder, Cover, Sol
 
 BLOCK_METRES = 60.0
 CARRIAGEWAY_METRES, PAVEMENT_METRES = 5.0, 7.5
-"""Distances from the middle of a street to the edges of its carriageway and of its pavement."""
+"""Distances from the middle of a street to the edge of its carriageway and to the outer edge of its pavement."""
 LOT_METRES = (BLOCK_METRES - 2 * PAVEMENT_METRES) / 3
 PARKED_METRES, DRIVEN_METRES = 4.0, 1.7
-"""Distances from the middle of a street to the lines of parked and of moving cars."""
+"""Distances from the middle of a street at which cars park and at which they drive."""
 STOREY_METRES, WINDOW_METRES = 3.0, 3.0
 POINTS_PER_BLOCK = 1200
 GROUND_POINTS = 400
 """Number of a block's points that lie on the ground."""
 MAX_HEIGHT_METRES, BLOCK_REACH_METRES = 20.0, 12.0
-"""Maximum height of a block, and maximum reach of trees and cars beyond a block's edges."""
+"""Maximum height of a block's solids, and the most by which they (trees, cars) extend beyond the block's edges."""
 GROUND_FACE, SKY_FACE = -1, -2
-"""Surface numbers of the ground and the sky, which belong to no solid."""
+"""Numbers that stand for the ground and the sky, which are not faces of a solid."""
 CAR_PAINTS: Final = np.array(
     [[0.8, 0.8, 0.8], [0.08, 0.08, 0.09], [0.5, 0.06, 0.05], [0.08, 0.16, 0.42], [0.4, 0.4, 0.4]]
 )
@@ -70,7 +69,7 @@ class CityBlock:
 
 @lru_cache(maxsize=_BLOCKS_KEPT)
 def city_block(seed: int, i: int, j: int) -> CityBlock:
-    """Build block (i, j) of the town with this seed."""
+    """Build block (i, j) of the town with this seed, or return it from a cache."""
     generator = block_generator(seed, 0, i, j)
     builder = Builder()
     kind = generator.choice(("houses", "flats", "park"), p=(0.6, 0.28, 0.12))
@@ -84,15 +83,16 @@ def city_block(seed: int, i: int, j: int) -> CityBlock:
 
 
 def block_generator(seed: int, purpose: int, i: int, j: int, *more: int) -> np.random.Generator:
-    """Return the random generator of block (i, j) for one purpose. The indices may be negative.
+    """Return a random generator for block (i, j) of the town with this seed. The indices may be negative.
 
-    purpose: number that tells the block's random generators apart.
+    purpose: number that gives each use (solids, photographs, cars ...) random numbers of its own.
+    more: further numbers that the random numbers depend on.
     """
     return np.random.default_rng([seed, purpose, i & 0xFFFFFFFF, j & 0xFFFFFFFF, *more])
 
 
 def car(builder: Builder, x: float, y: float, turn: float, paint_of_car: Float64) -> None:
-    """Add a car, 4.2 metres long, that faces in the direction at the angle `turn` from x, in radians."""
+    """Add a car, 4.2 metres long, at x, y in metres. turn: its direction, as an angle from x in radians."""
     tint = (float(paint_of_car[0]), float(paint_of_car[1]), float(paint_of_car[2]))
     body, glass = Cover(paint.PLAIN, 4.0, tint), Cover(paint.PLAIN, 4.0, (0.07, 0.09, 0.11))
     back = np.array([np.cos(turn), np.sin(turn)]) * 0.25
@@ -126,7 +126,7 @@ def _tree(builder: Builder, generator: np.random.Generator, x: float, y: float, 
 
 
 def _house(builder: Builder, generator: np.random.Generator, x: float, y: float, turn: float) -> None:
-    """Add a detached house with a chimney and a gabled roof, whose ridge is at the angle `turn` from x."""
+    """Add a detached house at x, y in metres, with a chimney and a gabled roof. turn: angle of its ridge from x."""
     half = [float(generator.integers(least, least + 2)) * WINDOW_METRES / 2 for least in (3, 2)]
     eaves = STOREY_METRES * float(generator.integers(1, 3)) + 0.15
     shift = (float(generator.integers(4)) / 4, 0.0)
@@ -234,9 +234,9 @@ def _parked_cars(builder: Builder, generator: np.random.Generator) -> None:
 def _points(
     solids: Solids, generator: np.random.Generator
 ) -> tuple[Float64, NDArray[np.int64], NDArray[np.int64], Float64]:
-    """Draw random points on the surfaces of a block. Returns the points, their solids, faces and normals.
+    """Draw random points on the ground and the solids of a block, but on no underside.
 
-    Undersides have no points.
+    Returns the points and, for each point, its solid, face and normal, as in `CityBlock`.
     """
     ground = np.zeros((GROUND_POINTS, 3))
     ground[:, :2] = generator.uniform(0, BLOCK_METRES, (GROUND_POINTS, 2))
@@ -249,7 +249,7 @@ def _points(
     areas[:, 5] = 4 * x * y
     areas[roofs] = np.stack([y * z, y * z, 0 * x, 0 * x, 0 * x, 0 * x, 2 * x * steep, 2 * x * steep], axis=1)[roofs]
     areas[balls] = 0
-    areas[balls, 0] = 2 * np.pi * x[balls] ** 2  # half of the area, as foliage would get too many points
+    areas[balls, 0] = 2 * np.pi * x[balls] ** 2  # half of a ball's area: foliage would get too many points
     chosen = generator.choice(areas.size, count, p=(areas / areas.sum()).ravel())
     solid, face = chosen // 8, chosen % 8
     a, b = generator.uniform(-1, 1, (2, count))
@@ -280,15 +280,16 @@ def _on_roofs(
     local: Float64,
     normals: Float64,
 ) -> None:
-    """Move points of roofs to the roofs' gables and slopes, in place.
+    """Move points that lie on roofs to the roofs' gables and slopes, in place.
 
     roof: (n,), True for points on roofs.
-    a: (n,), random numbers in [-1, 1], the position along the ridge for a slope, and across for a gable.
-    b: (n,), random numbers in [-1, 1], the position from the lower edge to the ridge.
+    face: (n,), index of the face of each point, as in `solids.FACES_PER_SOLID`.
+    a: (n,), random numbers in [-1, 1]: the position along the ridge on a slope, across the ridge on a gable.
+    b: (n,), random numbers in [-1, 1]: the position from the lower edge to the ridge.
     half: (n, 3), half sizes of each point's solid.
     local, normals: (n, 3), points and normals in the solid's own axes, to be changed.
     """
-    share = (b + 1) / 2  # height of each point, as a fraction of the roof's
+    share = (b + 1) / 2  # height of each point, as a fraction of the roof's height
     gable = roof & (face < 2)
     local[gable, 1] = (a * (1 - share) * half[:, 1])[gable]
     local[gable, 2] = (share * half[:, 2])[gable]
@@ -299,6 +300,6 @@ def _on_roofs(
 
 
 def _on_sphere(a: Float64, b: Float64) -> Float64:
-    """Uniformly distributed directions (n, 3), from two uniform random numbers in [-1, 1] for each."""
+    """Return uniformly distributed unit vectors (n, 3), from uniform random numbers a and b (n,) in [-1, 1]."""
     level, angle = np.sqrt(1 - b**2), np.pi * a
     return np.stack([level * np.cos(angle), level * np.sin(angle), b], axis=1)

@@ -17,9 +17,9 @@ from clsplat.rotations import quaternion_of
 from clsplat.scenes.dataset import Lens, colmap_camera_models
 
 UNKNOWN_POINT = np.uint64(2**64 - 1)
-"""Point number of an observation that belongs to no track."""
+"""Number that COLMAP writes in place of the point's for an observation without a point."""
 _OBSERVATION = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
-"""Observation in images.bin: its position in pixels, and its point's number."""
+"""Layout of an observation in images.bin: its position in pixels, and the number of its point."""
 _COUNT = struct.Struct("<Q")
 
 
@@ -30,7 +30,7 @@ class ModelImage:
     camera: number of the image's camera, from 1.
     rotation, translation: (3, 3) and (3,) float64, `cam_from_world`.
     pixels: (n, 2) float64, position of each observation in pixels.
-    points: (n,) uint64, number of each observation's point; UNKNOWN_POINT for none.
+    points: (n,) uint64, number of each observation's point; UNKNOWN_POINT without a point.
     """
 
     name: str
@@ -47,9 +47,9 @@ class ModelPoints:
 
     places: (n, 3) float64, world coordinates.
     colours: (n, 3) uint8.
-    tracks: (n + 1,), index of each point's first observation in the next two arrays; last, the length of these arrays.
-    images: for each observation, the number of its image, from 1.
-    observations: for each observation, its index in that image.
+    tracks: (n + 1,). The observations of point k are elements tracks[k] to tracks[k + 1] - 1 of the next two arrays.
+    images: (m,), the number of each observation's image, from 1.
+    observations: (m,), the index of each observation in its image.
     """
 
     places: Float64
@@ -60,7 +60,7 @@ class ModelPoints:
 
 
 def write_cameras(path: Path, lenses: Sequence[Lens]) -> None:
-    """Write cameras.bin. The cameras are numbered from 1."""
+    """Write cameras.bin, with a camera for each lens, numbered from 1."""
     numbers = {name: number for number, (name, _) in colmap_camera_models().items()}
     with atomic_writer(path) as file:
         file.write(_COUNT.pack(len(lenses)))
@@ -70,7 +70,7 @@ def write_cameras(path: Path, lenses: Sequence[Lens]) -> None:
 
 
 def write_images(path: Path, count: int, images: Iterable[ModelImage]) -> None:
-    """Write images.bin. The images, `count` of them, are numbered from 1."""
+    """Write images.bin with `count` images, which are numbered from 1."""
     with atomic_writer(path) as file:
         file.write(_COUNT.pack(count))
         for index, image in enumerate(images, 1):

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of the demo town's photographs, block by block: flights that look straight down or at a slant, and drives
-along the block's two streets.
+"""Cameras of the photographs of the demo's town, block by block: from flights that look straight down or obliquely, and
+from a car in the block's two streets.
 
 The cameras depend on the seed, the block's indices and the number of photographs of a block, but not on the size of the
 town.
@@ -28,24 +28,24 @@ STRAIGHT_FLIGHT_METRES, SLANTED_FLIGHT_METRES, CAR_CAMERA_METRES = 55.0, 48.0, 2
 SLANT_RADIANS = math.radians(40.0)
 """Angle of the oblique cameras' axes below the horizon."""
 TOWN_FISHEYE_COEFFICIENTS = (-0.02, 0.0005, 0.0, 0.0)
-"""k1 to k4 of the OPENCV_FISHEYE lens in the streets."""
+"""Distortion k1 to k4 of the OPENCV_FISHEYE lens, with which street cameras of the rig "fisheye" photograph."""
 STRAIGHT_SHARE, STREET_SHARE = 0.3, 0.3
-"""Fractions of a block's photographs that look straight down, and that are taken in streets. The rest is slanted."""
+"""Fractions of a block's photographs that look straight down, and that are taken in streets. The rest is oblique."""
 DIRECTIONS: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]])
 """Directions of view of the four oblique flights: north, east, south, west."""
 _YAWS = (0.38, -0.38)
-"""Angles in radians by which street cameras look to the right of the driving direction, in turn."""
+"""Angles in radians from the driving direction to the right, at which street cameras look alternately."""
 
 
 @dataclass(frozen=True, eq=False)
 class TownPhotograph:
-    """A photograph to be taken.
+    """Plan of a photograph: its name, camera and exposure.
 
     name: path below the folder of pictures.
     i, j, index: the two indices of the photograph's block, and its index among the block's photographs.
     camera: the camera with its exact pose, in the town's coordinates.
     lens: the camera's intrinsics, as in a COLMAP model.
-    gain: exposure, as a factor of the light.
+    gain: exposure, as a factor of the linear colours.
     """
 
     name: str
@@ -66,7 +66,7 @@ def lenses(config: TownConfig) -> tuple[Lens, Lens]:
         focal = 0.5 * max(width, height) / math.tan(0.5 * angle)
         return Lens("PINHOLE", width, height, (focal, focal, *centre))
 
-    if config.is_fisheye:  # the lens covers 180 degrees across the longer side
+    if config.is_fisheye:  # a lens with an angle of view of 180 degrees across the longer side
         k1, k2, *_ = TOWN_FISHEYE_COEFFICIENTS
         angle = math.pi / 2
         focal = 0.5 * max(width, height) / (angle * (1 + k1 * angle**2 + k2 * angle**4))
@@ -102,11 +102,11 @@ def photographs(config: TownConfig, i: int, j: int) -> list[TownPhotograph]:
 
 
 Row = tuple[str, int, Float64, Float64, Float64]
-"""Name, number of the flight, position, direction of view and up direction of a photograph."""
+"""Plan of a photograph: its name, number of the flight, camera position, direction of view and up direction."""
 
 
 def _straight(count: int, generator: np.random.Generator) -> list[Row]:
-    """Plan photographs that look straight down, along lines in x that are flown back and forth."""
+    """Plan `count` photographs of a flight that looks straight down, back and forth along lines parallel to x."""
     lines, rows = max(1, round(math.sqrt(count))), []
     for index, (x, y, line) in enumerate(_over_block(count, lines)):
         place = np.array([x, y, STRAIGHT_FLIGHT_METRES]) + generator.normal(0, 0.6, 3)
@@ -117,7 +117,7 @@ def _straight(count: int, generator: np.random.Generator) -> list[Row]:
 
 
 def _slanted(count: int, generator: np.random.Generator) -> list[Row]:
-    """Plan the photographs of four oblique flights, one for each of DIRECTIONS."""
+    """Plan `count` photographs of four oblique flights, one for each of DIRECTIONS."""
     rows, down = [], math.tan(SLANT_RADIANS)
     for side, forward in enumerate(DIRECTIONS):
         some = len(range(side, count, 4))
@@ -133,9 +133,9 @@ def _slanted(count: int, generator: np.random.Generator) -> list[Row]:
 
 
 def _street(count: int, generator: np.random.Generator) -> list[Row]:
-    """Plan photographs along the block's two streets, both ways, on the right-hand side.
+    """Plan `count` photographs from a car that drives on the right, both ways along the block's two streets.
 
-    The cameras look to the right and to the left in turn.
+    The cameras look alternately to the right and to the left of the driving direction.
     """
     rows: list[Row] = []
     for street, begin in enumerate((0, count // 2)):
@@ -154,7 +154,7 @@ def _street(count: int, generator: np.random.Generator) -> list[Row]:
 
 
 def _over_block(count: int, lines: int) -> list[tuple[float, float, int]]:
-    """Return positions x, y over a block, evenly spaced along lines, each with the index of its line."""
+    """Return `count` positions (x, y, line) over a block, in metres, evenly spaced along lines parallel to x."""
     places = []
     for line in range(lines):
         some = len(range(line, count, lines))
@@ -169,7 +169,10 @@ def _upright(generator: np.random.Generator) -> Float64:
 
 
 def _gain(config: TownConfig, flight: int, i: int, j: int, index: int) -> float:
-    """Exposure factor of a photograph. Each flight along a row of blocks has its own, which drifts along the flight."""
+    """Return the exposure factor of a photograph. It differs between flights, and drifts along each flight.
+
+    flight: number of the flight over the row of blocks j. i, index: the photograph's block and index in the block.
+    """
     if config.exposure == 0:
         return 1.0
     level, phase, speed = block_generator(config.seed, 4, 0, j, flight).uniform(-1, 1, 3)

@@ -31,23 +31,23 @@ from clsplat.demo.town.view_rays import SAMPLES, world_rays
 from clsplat.demo.town.visibility import Caster, Sight, blocks_in_sight
 
 BAND_PIXELS = 1 << 16
-"""Number of pixels whose rays are cast at once, which limits the memory."""
+"""Number of pixels whose rays are cast at a time. It limits the memory."""
 POINT_METRES = 130.0
 """Largest distance in metres between a camera and a point that it observes."""
 FREE_METRES = 9.0
 """Smallest distance of moving cars from the camera, in metres."""
 TONE = np.float32(1 / 1.6)
-"""Exponent of the tone curve."""
+"""Exponent of the tone curve, which maps linear colours in [0, 1] to the pixels of a photograph."""
 
 
 @dataclass(eq=False)
 class Observations:
-    """Points that a photograph shows.
+    """Points of the town's surfaces that a photograph shows.
 
     blocks: (n, 2) int32, indices of the points' blocks.
     points: (n,) int32, indices of the points in their blocks.
-    pixels: (n, 2) float64, exact positions in the photograph.
-    colours: (n, 3) uint8, of the pixels.
+    pixels: (n, 2) float64, exact positions of the points in the photograph, in pixels.
+    colours: (n, 3) uint8, colours of the pixels there.
     """
 
     blocks: NDArray[np.int32]
@@ -61,8 +61,8 @@ class TakenPhotograph:
     """A photograph of the town.
 
     pixels: (height, width, 3) float32 in [0, 1].
-    mask: (height, width), False for pixels of moving cars; None without moving cars.
-    seen: the observed points.
+    mask: (height, width), False for pixels of moving cars and their neighbours; None without moving cars.
+    seen: points that the photograph shows.
     """
 
     pixels: Float32
@@ -71,7 +71,7 @@ class TakenPhotograph:
 
 
 def take(config: TownConfig, photograph: TownPhotograph) -> TakenPhotograph:
-    """Take a photograph. A pixel is the mean of four rays, but is shaded once if all four meet the same surface."""
+    """Take a planned photograph. A pixel is the mean of four rays, or is shaded once if all meet the same surface."""
     camera = photograph.camera
     blocks = blocks_in_sight(config.seed, camera)
     moving = len(blocks)
@@ -96,7 +96,7 @@ def take(config: TownConfig, photograph: TownPhotograph) -> TakenPhotograph:
 
 
 def _shaded(camera: Camera, shader: Shader, sight: Sight, first: int, last: int) -> Float32:
-    """Shade the picture's rows from `first` up to but without `last`. Returns linear colours (rows, width, 3)."""
+    """Return the linear colours (rows, width, 3) of the picture's rows [first, last). sight: what their rays meet."""
     centres = world_rays(camera, first, last, ((0.0, 0.0),))
     directions = np.stack([np.broadcast_to(axis, (1, last - first, camera.width)).ravel() for axis in centres], axis=1)
     flat = sight.surfaces.reshape(len(SAMPLES), -1)
@@ -116,9 +116,9 @@ def _shaded(camera: Camera, shader: Shader, sight: Sight, first: int, last: int)
 
 
 def _moving_cars(config: TownConfig, photograph: TownPhotograph) -> CityBlock:
-    """Place the moving cars of a photograph in the streets of its block and of the eight blocks around this block.
+    """Place the moving cars of a photograph in the streets of its block and of the eight blocks around it.
 
-    The result is a block that holds nothing but these cars.
+    Returns a block whose only solids are these cars.
     """
     generator = block_generator(config.seed, 5, photograph.i, photograph.j, photograph.index)
     builder = Builder()
@@ -141,9 +141,9 @@ def _moving_cars(config: TownConfig, photograph: TownPhotograph) -> CityBlock:
 
 
 class _Candidates:
-    """Points in front of a photograph's camera. `see` marks the points that no solid hides from the camera.
+    """Points that a photograph's camera may see. `see` marks those that no solid hides.
 
-    blocks: number of the caster's first blocks, which have points. The last block, of moving cars, has none.
+    blocks: number of the caster's blocks that have points. A block of moving cars comes after them.
     """
 
     def __init__(self, caster: Caster, blocks: int) -> None:
@@ -176,7 +176,7 @@ class _Candidates:
         self._seen = np.zeros(len(rows), np.bool_)
 
     def see(self, surfaces: NDArray[np.int32], first: int, last: int) -> None:
-        """Mark points in the rows from `first` to `last` as visible if their pixel's ray meets the surface they lie on.
+        """Mark points in the picture's rows [first, last) as visible if the ray nearest to them meets their surface.
 
         surfaces: (4, rows, columns), the surfaces that the rays meet, as in `Sight`.
         """
@@ -188,7 +188,7 @@ class _Candidates:
         self._seen[rows] = surfaces[sample, row - first, column] == self._surfaces[rows]
 
     def observations(self, pixels: Float32, mask: Bool | None) -> Observations:
-        """Return the visible points, except where `mask` is False."""
+        """Return the visible points where `mask` is True. pixels, mask: as in `TakenPhotograph`."""
         column, row = np.floor(self._pixels).astype(np.int64).T
         seen = self._seen if mask is None else self._seen & mask[row, column]
         colours = np.rint(pixels[row[seen], column[seen]] * 255).astype(np.uint8)
@@ -196,6 +196,6 @@ class _Candidates:
 
 
 def _away(block: CityBlock, position: Float64) -> Float64:
-    """Horizontal vector (2,) from the nearest point of a block's ground to a position."""
+    """Return the horizontal vector (2,) from the nearest point of a block's ground to a position, in metres."""
     low = block.corner[:2]
     return np.asarray(position[:2] - np.clip(position[:2], low, low + BLOCK_METRES))

@@ -17,7 +17,7 @@ MAX_PHOTOS_PER_BLOCK = 1000
 MIN_TOWN_PHOTO_SIDE, MAX_TOWN_PHOTO_SIDE = 16, 8192
 """Limits of a photograph's width and height in pixels."""
 CAR_SLOTS = 28
-"""Number of places for moving cars in a block: seven in each direction of its two streets."""
+"""Maximum number of moving cars in a block: seven in each direction of its two streets."""
 MAX_TOWN_ORIGIN_METRES = 1e8
 """Largest coordinate of the town's corner. At this distance, float64 has steps of 15 nanometres."""
 
@@ -30,11 +30,11 @@ class TownConfig:
     photos: number of photographs of each block.
     width, height: size of a photograph in pixels. A panorama has half its width as height.
     seed: seed of the town, of the cameras and of all noise.
-    rig: kind of the cameras in the streets.
-    exposure: largest change of exposure between flights, in stops.
+    rig: kind of camera in the streets, a `TownRig`.
+    exposure: largest deviation of a photograph's exposure from the mean, in stops.
     cars: number of moving cars in each block.
     origin: world coordinates of the corner of block (0, 0), in metres.
-    pose_noise: standard deviation of the error of written camera positions, along each axis, in metres.
+    pose_noise: standard deviation of the random error of written camera positions, per axis, in metres.
     """
 
     columns: int
@@ -92,7 +92,7 @@ class TownConfig:
 
 
 def two_numbers(flag: str, text: str, example: str) -> tuple[int, int]:
-    """Parse two numbers from a text such as 3x2. Raises InputError naming the flag."""
+    """Parse two numbers from the text of a flag, such as 3x2. Raises InputError, which names flag and example."""
     match = re.fullmatch(r"\s*(\d{1,9})\s*[xX]\s*(\d{1,9})\s*", text)
     if match is None:
         raise InputError(f"--{flag} {text}: expected two whole numbers, such as {example}")
@@ -100,7 +100,7 @@ def two_numbers(flag: str, text: str, example: str) -> tuple[int, int]:
 
 
 def three_numbers(flag: str, text: str) -> tuple[float, float, float]:
-    """Parse coordinates from a text such as 500000,4650000,0. Raises InputError naming the flag."""
+    """Parse three coordinates from the text of a flag, such as 500000,4650000,0. Raises InputError naming the flag."""
     try:
         x, y, z = map(float, text.split(","))
     except ValueError:

@@ -29,17 +29,17 @@ from clsplat.demo.town.visibility import SIGHT_METRES
 HAZE_METRES = 150.0
 """Distance from the camera at which haze begins, in metres."""
 SLANT_BLUR = np.float32(0.7)
-"""Blur of surfaces seen at a slant: this times log2(1 / cosine of the slant) is added to their mip level."""
+"""Blurs surfaces seen at a slant: this times log2(1 / cosine of the slant) is added to their mip level."""
 LOT_COVERS: Final = np.array([paint.GRASS] * 9 + [paint.SOIL] * 3 + [paint.GRAVEL] * 2 + [paint.PAVING] * 2, np.int32)
-"""Textures from which the ground of a lot is drawn."""
+"""Textures from which each lot's ground gets one at random. Repeated ones are more probable."""
 GROUND_DENSITY = np.float32(np.log2(TEXTURE_SIDE / GROUND_METRES))
-"""log2 of the texels per metre of ground."""
+"""log2 of the number of texels per metre of ground."""
 
 
 class Shader:
     """Shades the rays of one photograph.
 
-    blocks, starts: the photograph's blocks, and the number of each block's first solid, as in `Caster`.
+    blocks, starts: blocks in sight of the camera, and the number of each block's first solid, as in `Caster`.
     """
 
     def __init__(
@@ -50,10 +50,10 @@ class Shader:
         self.pixel = np.float32(1 / max(camera.fx, camera.fy))
 
     def colours(self, directions: Float32, surfaces: NDArray[np.int32]) -> Float32:
-        """Shade rays. Returns linear colours (n, 3).
+        """Return the linear colours (n, 3) that rays see.
 
-        directions: (n, 3), as from `world_rays`.
-        surfaces: (n,), as in `Sight`.
+        directions: (n, 3), directions of the rays, as from `world_rays`.
+        surfaces: (n,), numbers of the surfaces that the rays meet, as in `Sight`.
         """
         result = np.empty((len(surfaces), 3), np.float32)
         for surface, shade in ((SKY_FACE, self.textures.sky), (GROUND_FACE, self._ground)):
@@ -72,10 +72,10 @@ class Shader:
         return result
 
     def _faces(self, surfaces: NDArray[np.int32]) -> tuple[NDArray[np.int64], Float32, Bool]:
-        """Collect the rows of `Solids.faces` for all faces that the rays meet, in metres relative to the camera.
+        """Collect the rows of `Solids.faces` of all faces among `surfaces` (n,), in metres relative to the camera.
 
         Returns the index (n,) of each surface's row, the rows, and a mask of the rows of balls. The row of a ball has
-        centre and radius in place of the plane.
+        the ball's centre and radius in place of the plane.
         """
         seen = np.zeros(self.starts[-1] * FACES_PER_SOLID, np.bool_)
         seen[surfaces] = True
@@ -150,13 +150,13 @@ class Shader:
         return _hazy(colours * light_on(np.array([[0, 0, 1]], np.float32)), depth * length)
 
     def _ground_cover(self, px: Float32, py: Float32, first: NDArray[np.int64]) -> tuple[NDArray[np.int32], Float32]:
-        """Choose texture (n,) and tint (n, 3) of the ground at px, py (n,), in metres from block `first`'s corner."""
+        """Choose textures (n,) and tints (n, 3) of the ground at px, py (n,), in metres from block `first`'s corner."""
         column, row = np.floor(px / BLOCK_METRES), np.floor(py / BLOCK_METRES)
         fx, fy = px - column * BLOCK_METRES, py - row * BLOCK_METRES
         inner = np.minimum(_to_street(fx), _to_street(fy))
         lot_x, lot_y = ((place - PAVEMENT_METRES) * np.float32(1 / LOT_METRES) for place in (fx, fy))
         lot = np.clip(lot_x, 0, 2.5).astype(np.int64) + 3 * np.clip(lot_y, 0, 2.5).astype(np.int64)
-        far = np.abs(column) + np.abs(row) > 1e6  # ground near the horizon, which haze hides
+        far = np.abs(column) + np.abs(row) > 1e6  # near the horizon, haze hides the ground
         column, row = (
             np.where(far, 0, column).astype(np.int64) + first[0],
             np.where(far, 0, row).astype(np.int64) + first[1],
@@ -174,7 +174,7 @@ class Shader:
         return texture.astype(np.int32), tint
 
     def near_ground_seam(self, directions: Float32) -> Bool:
-        """Find the rays that meet the ground within a pixel of a seam between two materials. Returns a mask (n,)."""
+        """Return True (n,) for rays that meet the ground within a pixel's width of a seam between two materials."""
         x, y, z = directions.T
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             depth = np.float32(-self.position[2]) / z
@@ -192,9 +192,9 @@ class Shader:
     def _level(self, depth: Float32, density: Float32 | np.float32, slant: Float32) -> Float32:
         """Compute the mip level (n,) at the points that rays meet.
 
-        depth: (n,), factor from a ray's direction to the point.
+        depth: (n,), factor by which a ray's direction is multiplied to reach the point.
         density: log2 of the texture's texels per metre.
-        slant: (n,), cosine of the angle between ray and normal.
+        slant: (n,), cosine of the angle between the ray and the surface's normal.
         """
         return np.asarray(
             np.log2(np.maximum(depth * self.pixel, 1e-6)) + density - SLANT_BLUR * np.log2(np.maximum(slant, 0.03))
@@ -211,15 +211,15 @@ def _hazy(colours: Float32, distance: Float32) -> Float32:
 
 
 def _to_street(place: Float32) -> Float32:
-    """Distance in metres from the middle of the nearest street, along one axis.
+    """Return distances (n,) in metres to the middle of the nearest street that crosses an axis.
 
-    place: coordinate in the block, in [0, BLOCK_METRES).
+    place: (n,), coordinates along the axis, relative to the block, in [0, BLOCK_METRES).
     """
     return np.asarray(np.minimum(place, np.float32(BLOCK_METRES) - place))
 
 
 def _cube_coordinates(normals: Float32, radius: Float32) -> tuple[Float32, Float32]:
-    """Texture coordinates u and v (n,), in metres, on balls: the two smaller components of the normal, times radius."""
+    """Return texture coordinates u and v (n,) on balls, in metres: the smaller components of normals times radius."""
     x, y, z = normals.T
     ax, ay, az = np.abs(normals).T
     along_z, along_x = (az >= ax) & (az >= ay), ax > ay
@@ -231,8 +231,8 @@ def _cube_coordinates(normals: Float32, radius: Float32) -> tuple[Float32, Float
 def _mark_streets(colours: Float32, fx: Float32, fy: Float32, width: Float32) -> None:
     """Paint kerbs, dashes and zebra crossings over the ground's colours, in place.
 
-    colours: (n, 3).
-    fx, fy: (n,), coordinates in the block, in metres.
+    colours: (n, 3), the ground's colours.
+    fx, fy: (n,), the pixels' coordinates x and y relative to the block, in metres.
     width: (n,), width of a pixel on the ground, in metres.
     """
     away_x, away_y = _to_street(fx), _to_street(fy)
@@ -248,9 +248,9 @@ def _mark_streets(colours: Float32, fx: Float32, fy: Float32, width: Float32) ->
 
 
 def _band(place: Float32, middle: float, half: float, width: Float32) -> Float32:
-    """Fraction (n,) of a pixel that a band from `middle` - `half` to `middle` + `half` covers.
+    """Return the fraction (n,) of each pixel that a band from `middle` - `half` to `middle` + `half` covers.
 
-    place, width: (n,), centre and width of the pixel, in the same unit.
+    place, width: (n,), centre and width of the pixels. All arguments have the same unit.
     """
     away = np.abs(place - np.float32(middle))
     low = np.maximum(away - width / 2, -half)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Solids of the demo town's blocks: boxes, gabled roofs and balls, with textured faces.
 
-A face is a row of numbers. Its texture coordinates are a linear function of a point, so that a pixel needs one texture
-look-up.
+Each face is a row in a table of numbers. Texture coordinates are a linear function of the position on the face, so that
+a pixel needs one texture look-up.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from clsplat.demo.town.textures import TEXTURE_SIDE
 
 SOLID_BOX, SOLID_ROOF, SOLID_BALL = range(3)
 FACES_PER_SOLID = 8
-"""Rows of a solid in the table of faces. A box has the faces -x, +x, -y, +y, -z and +z. A roof has -x, +x and -z, and
-its two slopes in the last two rows. A ball has only the first row."""
+"""Number of rows of a solid in the table of faces. A box uses the first six, for the faces -x, +x, -y, +y, -z and +z. A
+roof has the faces -x, +x and -z, and its two slopes in the last two rows. A ball uses only the first row."""
 FACE_VALUES = 18
 """Number of values in the row of a face, with plane n p = d and texture coordinates u = U p + u0 and v = V p + v0.
 
@@ -27,14 +27,14 @@ The values are n (3), d, U (3), u0, V (3), v0, red, green and blue of its light,
 texels per metre, and darkness at the ground.
 """
 PLANE_AT, U_AT, V_AT, LIGHT_AT, TEXTURE_AT, DENSITY_AT, DARKNESS_AT = 0, 4, 8, 12, 15, 16, 17
-"""Index of these values in the row of a face."""
+"""Indices of values in the row of a face (FACE_VALUES)."""
 BOUNCED_LIGHT = np.float32(0.11)
 """Light that the ground reflects to a surface that faces down."""
 Triple = tuple[float, float, float]
 
 
 def light_on(normals: Float32) -> Float32:
-    """Light of sky, sun and ground (n, 3) on surfaces with unit normals (n, 3), without shadows."""
+    """Return the light (n, 3) of sky, sun and ground on surfaces with unit normals (n, 3), without shadows."""
     rise = normals[:, 2:]
     sun = np.maximum(normals @ SUN_DIRECTION, 0)[:, None]
     return np.asarray(
@@ -48,9 +48,9 @@ class Cover:
 
     texture: index of the texture.
     metres: length of a side of the texture, in metres.
-    tint: factors of red, green and blue.
-    shift: offset of the texture, as a fraction of its side.
-    darkness: fraction of the light that is missing at the ground.
+    tint: factors of the texture's red, green and blue.
+    shift: offset of the texture to the right and up, as a fraction of its side.
+    darkness: fraction of the light that is missing near the ground, at z = 0.
     """
 
     texture: int
@@ -60,20 +60,20 @@ class Cover:
     darkness: float = 0.35
 
     def numbers(self) -> tuple[float, ...]:
-        """Return the fields as one row of numbers: texture, metres, tint, shift, darkness."""
+        """Return the cover as a row of 8 numbers: texture, metres, tint (3), shift (2), darkness."""
         return (self.texture, self.metres, *self.tint, *self.shift, self.darkness)
 
 
 @dataclass(eq=False)
 class Solids:
-    """Solids in coordinates of their block, in metres, z up.
+    """Solids of a block. Lengths are in metres, positions relative to the block's corner, and z is up.
 
     kinds: (n,), SOLID_BOX, SOLID_ROOF or SOLID_BALL.
     centres: (n, 3) float64. A roof's centre is in the middle of its base.
     halves: (n, 3) float64, half sizes along the solid's own axes. A roof's third value is its height. The ridge is
     along x.
-    turns: (n, 2) float64, cosine and sine of the turn about z.
-    faces: (n, FACES_PER_SOLID, FACE_VALUES) float64.
+    turns: (n, 2) float64, cosine and sine of each solid's rotation about z.
+    faces: (n, FACES_PER_SOLID, FACE_VALUES) float64, the table of faces.
     """
 
     kinds: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
@@ -86,7 +86,7 @@ class Solids:
         return len(self.kinds)
 
     def bounds(self) -> tuple[Float64, Float64]:
-        """Lowest and highest corner (n, 3) of a box around each solid, along the block's axes."""
+        """Return the lowest and highest corners, (n, 3) each, of boxes around the solids, along the block's axes."""
         c, s = np.abs(self.turns).T
         x, y, z = self.halves.T
         reach = np.stack([c * x + s * y, s * x + c * y, z], axis=1)
@@ -98,7 +98,7 @@ class Solids:
 
 @dataclass(frozen=True)
 class _Row:
-    """A solid for `Builder.build`, with a cover for its sides and another for its top."""
+    """A solid in a `Builder`, with a cover for its sides and another for its top."""
 
     kind: int
     centre: tuple[float, float, float]
@@ -109,29 +109,29 @@ class _Row:
 
 
 class Builder:
-    """Collects solids one by one, for `Solids`. Centres and half sizes are in metres, turns in radians about z."""
+    """Collects solids one by one, to make `Solids`. Lengths are in metres; `turn` is a rotation about z in radians."""
 
     def __init__(self) -> None:
         self._rows: list[_Row] = []
 
     def box(self, centre: Triple, half: Triple, side: Cover, top: Cover, turn: float = 0.0) -> None:
-        """Add a box. The undersides of boxes are covered like the sides."""
+        """Add a box with covers for its sides and its top. The underside has the cover of the sides."""
         self._rows.append(_Row(SOLID_BOX, centre, half, turn, side, top))
 
     def roof(self, base: Triple, half: Triple, slope: Cover, gable: Cover, turn: float = 0.0) -> None:
-        """Add a roof with a ridge along x.
+        """Add a gabled roof. Its ridge is along x before the rotation by `turn`.
 
-        base: middle of its base.
-        half: half of its length, half of its width, and its height.
+        base: middle of the roof's base.
+        half: half of the roof's length, half of its width, and its height.
         """
         self._rows.append(_Row(SOLID_ROOF, base, half, turn, gable, slope))
 
     def ball(self, centre: Triple, radius: float, cover: Cover) -> None:
-        """Add a ball. Its normals and texture coordinates are computed where a ray meets it."""
+        """Add a ball. Shading computes its normals and texture coordinates where rays meet it."""
         self._rows.append(_Row(SOLID_BALL, centre, (radius, radius, radius), 0.0, cover, cover))
 
     def build(self) -> Solids:
-        """Return all solids that were added, with their faces."""
+        """Return all solids that were added, with their table of faces."""
         if not self._rows:
             return Solids()
         angles = np.array([row.turn for row in self._rows])
@@ -146,14 +146,14 @@ class Builder:
 
 
 def about_z(vectors: Float64, turns: Float64) -> Float64:
-    """Rotate vectors (n, 3) about z. turns: (n, 2), cosines and sines."""
+    """Rotate vectors (n, 3) about z. turns: (n, 2), cosines and sines of the angles."""
     x, y, z = vectors.T
     c, s = turns.T
     return np.stack([c * x - s * y, s * x + c * y, z], axis=1)
 
 
 def slopes(halves: Float64, sign: float) -> tuple[Float64, Float64]:
-    """Return the normals of one slope of each roof, and the directions up this slope, (n, 3) each.
+    """Return the normals of one slope of each roof, and the directions in this slope to the ridge, (n, 3) each.
 
     halves: (n, 3), half sizes of the roofs, as in `Solids`.
     sign: 1 or -1, the sign of the normals' y. It chooses the slope.
@@ -166,7 +166,7 @@ def slopes(halves: Float64, sign: float) -> tuple[Float64, Float64]:
 def _faces(solids: Solids, sides: list[Cover], tops: list[Cover]) -> Float64:
     """Compute the table of faces of solids, (n, FACES_PER_SOLID, FACE_VALUES).
 
-    sides, tops: cover of each solid's sides and of its top.
+    sides, tops: covers (n,) of the solids' sides and of their tops.
     """
     table = np.zeros((len(solids), FACES_PER_SOLID, FACE_VALUES))
     of_side, of_top = (np.array([cover.numbers() for cover in covers]) for covers in (sides, tops))
@@ -199,11 +199,11 @@ def _faces(solids: Solids, sides: list[Cover], tops: list[Cover]) -> Float64:
 def _fill(
     rows: Float64, place: tuple[Float64, Float64, Float64], along: tuple[Float64, Float64], covers: Float64
 ) -> None:
-    """Fill one face of all solids in the table of faces, in place.
+    """Fill `rows` (n, FACE_VALUES) of the table of faces, which are the same face of n solids.
 
-    place: normals, points on the planes, and origins of the textures, (n, 3) each.
+    place: the faces' normals, points on their planes, and origins of their textures, (n, 3) each.
     along: directions to the right and up in the textures, (n, 3) each.
-    covers: (n, 8), rows of `Cover.numbers`.
+    covers: (n, 8), the faces' covers as from `Cover.numbers`.
     """
     normals, at, begin = place
     metres, shifts = covers[:, 1], covers[:, 5:7]

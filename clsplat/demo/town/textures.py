@@ -25,11 +25,11 @@ LEAVES, BARK, PLAIN = range(20, 22), 22, 23
 """Indices of the textures of each material."""
 TEXTURE_COUNT = 24
 FACADE_METRES, ROOF_METRES, GROUND_METRES, LEAF_METRES = 12.0, 6.0, 8.0, 3.0
-"""Lengths of a texture's side on facades, roofs, ground and leaves. A facade has four windows and four storeys."""
+"""Length of a texture's side in the town, for facades (four storeys of four windows), roofs, ground and leaves."""
 SKY_ROWS, SKY_COLUMNS = 512, 2048
-"""Size of the sky's texture: elevations and azimuths."""
+"""Size of the sky's texture in texels. Rows are elevations, and columns are azimuths."""
 HAZE_COLOUR: Final = np.array([0.50, 0.56, 0.63], np.float32)
-"""Colour of the horizon, and of everything far away."""
+"""Linear colour of the haze: of the horizon, and of everything far away."""
 Colour = tuple[float, float, float]
 Pixels = NDArray[np.float32]
 
@@ -38,10 +38,10 @@ _LEVEL_STARTS = np.concatenate([[0], np.cumsum(_LEVEL_SIDES**2)]).astype(np.int3
 
 
 class Brush:
-    """Random numbers and noise for one texture. Textures of a town share noise fields, each at its own offset.
+    """Random numbers and noise for one texture. All textures share the noise images, each with its own offset.
 
-    white: Fourier transform of the white noise that the fields are filtered from.
-    fields: the shared noise fields by the parameters of `rough`, computed as needed.
+    white: Fourier transform of white noise, from which `rough` makes noise images.
+    fields: cache of the noise images, keyed by the arguments of `rough`.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Brush:
         self.generator, self._white, self._fields = generator, white, fields
 
     def rough(self, wavelength: float, falloff: float = 1.2, stretch: float = 1.0) -> Pixels:
-        """Periodic noise with a mean of 0 and a standard deviation of 1: white noise, filtered by frequency.
+        """Return periodic noise (h, w) with mean 0 and standard deviation 1: white noise, filtered by frequency.
 
         wavelength: longest wavelength, as a fraction of the texture's side.
         falloff: exponent of the amplitude's decline with the frequency.
@@ -77,17 +77,18 @@ def mixed(colours: tuple[Colour, ...], value: Pixels) -> Pixels:
 def _grid(period: float, width: float, offset: float = 0.0) -> Pixels:
     """Return a row of texels (TEXTURE_SIDE,) with a soft line every `period` texels: 1 on a line, 0 elsewhere.
 
-    width, offset: width of a line, and position of the first, in texels.
+    width, offset: width of a line, and position of the first line's middle, in texels.
     """
     place = (np.arange(TEXTURE_SIDE) + 0.5 - offset) % period
     return np.asarray(np.clip(width / 2 + 0.5 - np.minimum(place, period - place), 0, 1), np.float32)
 
 
 def _bricks(rows: int, columns: int, joint: float, generator: np.random.Generator) -> tuple[Pixels, Pixels]:
-    """Lay bricks in staggered rows. Returns the joints, 1 on a joint, and a random value of each brick, (h, w) each.
+    """Lay bricks in staggered rows. Returns two images (h, w).
 
-    joint: width of a joint in texels.
-    The values are from -1 to 1.
+    The first is 1 on joints and 0 elsewhere. The second has a random value from -1 to 1 for each brick.
+
+    rows, columns: number of bricks. joint: width of a joint in texels.
     """
     y, x = np.mgrid[0:TEXTURE_SIDE, 0:TEXTURE_SIDE].astype(np.float32) + np.float32(0.5)
     row = (y * rows / TEXTURE_SIDE).astype(int)
@@ -100,7 +101,7 @@ def _bricks(rows: int, columns: int, joint: float, generator: np.random.Generato
 
 
 def _wall(kind: int, brush: Brush) -> Pixels:
-    """Paint the wall of a facade without windows: brick, plaster or panels."""
+    """Paint a wall without windows (h, w, 3). kind: number of the facade, which chooses brick, plaster or panels."""
     stain, grain = brush.rough(0.5, 1.2), brush.rough(0.05, 0.6)
     if kind % 3 == 0:  # brick
         joints, brick = _bricks(120, 40, 1.0, brush.generator)
@@ -116,7 +117,10 @@ def _wall(kind: int, brush: Brush) -> Pixels:
 
 
 def _paint(image: Pixels, box: tuple[float, float, float, float], colour: Any) -> None:
-    """Fill a rectangle (left, top, right, bottom) in texels, with soft edges, in place."""
+    """Fill a rectangle of an image with a colour, or with the same part of another image. Its edges are soft.
+
+    box: left, top, right and bottom of the rectangle, in texels.
+    """
     left, top, right, bottom = box
     first, last = (max(int(edge) - 1, 0) for edge in (left, top)), (int(edge) + 2 for edge in (right, bottom))
     columns, rows = (np.arange(begin, min(end, TEXTURE_SIDE)) for begin, end in zip(first, last, strict=True))
@@ -129,7 +133,7 @@ def _paint(image: Pixels, box: tuple[float, float, float, float], colour: Any) -
 
 
 def _facade(kind: int, brush: Brush) -> Pixels:
-    """Paint a facade of four storeys with four windows each. The ground floor, at the bottom, may have a door."""
+    """Paint a facade (h, w, 3) of four storeys with four windows each. The first five kinds have a door."""
     image = _wall(kind, brush)
     cell = TEXTURE_SIDE / 4
     wide, tall = ((0.40, 0.48), (0.52, 0.56), (0.84, 0.58))[kind // 3]
@@ -148,7 +152,7 @@ def _facade(kind: int, brush: Brush) -> Pixels:
                 _paint(image, (left, top + 12, right, bottom), generator.uniform(0.12, 0.45, 3))
                 _paint(image, (right - 12, top + 60, right - 7, top + 66), (0.8, 0.7, 0.4))
                 continue
-            drawn = generator.uniform(0.0, 0.7)  # height of a curtain, as a fraction of the window's
+            drawn = generator.uniform(0.0, 0.7)  # height of a curtain, as a fraction of the window's height
             _paint(
                 image,
                 (left, top, right, top + drawn * tall * cell),
@@ -173,7 +177,7 @@ def _roof(kind: int, brush: Brush) -> Pixels:
         joints, tile = _bricks(24, 20, 2.5, brush.generator)
         colour = mixed(palettes[kind], 0.8 * tile + 0.4 * stain + 0.3 * grain)
         return colour * (1 - 0.6 * joints[..., None])
-    if kind == 3:  # gravel of a flat roof, with seams of the felt
+    if kind == 3:  # gravel on a flat roof, with seams of roofing felt
         colour = mixed(((0.26, 0.25, 0.24), (0.46, 0.45, 0.43), (0.66, 0.64, 0.61)), 0.7 * grain + 0.7 * stain)
         return np.asarray(colour * (1 - 0.4 * _grid(TEXTURE_SIDE / 3, 4)[None, :, None]))
     colour = mixed(((0.30, 0.38, 0.36), (0.46, 0.55, 0.52), (0.62, 0.70, 0.66)), 0.8 * stain + 0.25 * grain)  # metal
@@ -219,14 +223,17 @@ def _plain(_: int, brush: Brush) -> Pixels:
 
 
 def _packed(image: Pixels) -> NDArray[np.uint32]:
-    """Pack red, green and blue in [0, 1] into the bytes of one integer per texel, (h, w)."""
+    """Pack an image (h, w, 3) in [0, 1] into one integer per texel, (h, w), with a byte for each colour."""
     levels = np.zeros((*image.shape[:2], 4), np.uint8)
     levels[..., :3] = np.rint(np.clip(image, 0, 1) * 255)
     return levels.view(np.uint32)[..., 0]
 
 
 def _levels(image: Pixels) -> NDArray[np.uint32]:
-    """Return all mip levels of a texture in one row, the finest first. A texel is the mean of four finer texels."""
+    """Return the packed texels of all mip levels of a texture, the finest first, as one array.
+
+    A texel of a level is the mean of four texels of the finer level.
+    """
     rows = [_packed(image).ravel()]
     while len(image) > 1:
         image = 0.25 * (image[::2, ::2] + image[1::2, ::2] + image[::2, 1::2] + image[1::2, 1::2])
@@ -257,7 +264,7 @@ class Textures:
 
         texture: (n,), index of the texture.
         u, v: (n,), texture coordinates to the right and up, in sides of the texture; they may have any value.
-        level: (n,), mip level: the base 2 logarithm of texels per pixel.
+        level: (n,), mip level: log2 of the texels per pixel.
         """
         level = np.clip(level, 0, TEXTURE_LEVELS - 1.001)
         coarse = level.astype(np.int32)
@@ -290,7 +297,7 @@ class Textures:
         return packed.view(np.uint8).reshape(-1, 4).astype(np.float32)
 
     def sky(self, direction: Float32) -> Float32:
-        """Colours (n, 3) of the sky and the hills in directions (n, 3), of any length."""
+        """Return linear colours (n, 3) of the sky and the hills in directions (n, 3), which may have any length."""
         x, y, z = direction.T
         elevation = np.clip(np.arctan2(z, np.hypot(x, y)) / np.float32(np.pi / 2), 0, 1)
         row = (1 - elevation) * np.float32(SKY_ROWS - 1.001)
@@ -332,5 +339,5 @@ def _baked_sky(brush: Brush) -> Pixels:
 
 @lru_cache(maxsize=2)
 def textures(seed: int) -> Textures:
-    """Return the textures of the town with this seed, from a cache if possible."""
+    """Return the textures of the town with this seed. They are cached."""
     return Textures(seed)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rays of the pixels of the demo town's photographs, and screen rectangles of boxes, for each projection."""
+"""Rays through the pixels of the demo town's photographs, and rectangles of the picture that contain boxes."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from clsplat.camera import Camera
 from clsplat.cameras.model import CameraModel
 
 SAMPLES = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
-"""Offsets x, y of a pixel's rays from its centre, in pixels."""
+"""Offsets x, y of a pixel's four rays from the pixel's centre, in pixels."""
 NEAR_METRES = 0.05
 """Distance of a perspective camera's near plane in metres."""
 _ANGLES = 1 << 16
-"""Number of angles in the table that inverts the fisheye's radius."""
+"""Number of angles in the table by which a fisheye's image radius is converted to an angle from the axis."""
 _CIRCLE = 32
-"""Number of directions on the edge of the cone around a box. They bound the box's part of a fisheye picture."""
+"""Number of directions on the edge of the cone around a box. Their pixels bound the box in a fisheye picture."""
 Planes = tuple[Float32, Float32, Float32]
 LensKey = tuple[CameraModel, int, int, float, float, float, float, tuple[float, ...]]
 
@@ -34,7 +34,8 @@ def lens_key(camera: Camera) -> LensKey:
 def _local_rays(key: LensKey, first: int, last: int, places: tuple[tuple[float, float], ...]) -> Planes:
     """Compute ray directions in the camera's axes, as three arrays that broadcast to (places, rows, columns).
 
-    places: offsets x, y of a pixel's rays from its centre, in pixels.
+    key: the camera, as from `lens_key`. first, last: the rays are of the pixels in rows [first, last).
+    places: offsets x, y of each pixel's rays from its centre, in pixels.
     """
     model, width, _, fx, fy, cx, cy, radial = key
     across, down = np.array(places).T
@@ -57,9 +58,9 @@ def _local_rays(key: LensKey, first: int, last: int, places: tuple[tuple[float, 
 def world_rays(
     camera: Camera, first: int, last: int, places: tuple[tuple[float, float], ...] = SAMPLES
 ) -> tuple[Float32, Float32, Float32]:
-    """Return the x, y and z of ray directions in the world, (places, rows, columns) each, of rows `first` to `last`.
+    """Return x, y and z of ray directions in the world, (places, rows, columns) each, of pixels in rows [first, last).
 
-    Directions of a perspective camera have a depth of 1, other directions a length of 1.
+    Directions of a perspective camera have a depth of 1, other directions a length of 1. places: as in `SAMPLES`.
     """
     local = _local_rays(lens_key(camera), first, last, places)
     rotation = camera.rotation.astype(np.float32)
@@ -70,9 +71,10 @@ def world_rays(
 def rectangles(camera: Camera, low: Float64, high: Float64) -> NDArray[np.int32]:
     """Return rectangles (n, 4) of the picture that contain boxes: first row, end row, first column, end column.
 
-    The ends are exclusive. The rectangle of a box that is not seen is empty. In a panorama columns may lie beyond the
-    edges, where the picture repeats.
-    low, high: (n, 3), corners of the boxes, from the camera's centre along the world's axes.
+    The ends are exclusive. The rectangle of a box outside the picture is empty. In a panorama columns may lie beyond
+    the edges, where the picture repeats.
+
+    low, high: (n, 3), lowest and highest corners of the boxes, relative to the camera's centre, along the world's axes.
     """
     if camera.is_pinhole:
         bounds = _flat_bounds(camera, low, high)
@@ -96,9 +98,9 @@ _EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).
 
 
 def _flat_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
-    """Screen bounds (n, 4) of boxes in a perspective picture, in pixels: left, right, top, bottom.
+    """Return bounds (n, 4) of boxes in a perspective picture, in pixels: left, right, top, bottom.
 
-    Boxes are cut off at the near plane.
+    The parts of boxes before the near plane do not count. low, high: as for `rectangles`.
     """
     corners = np.where(_CORNERS, high[:, None], low[:, None]) @ camera.rotation.T
     begins, ends = corners[:, _EDGES[:, 0]], corners[:, _EDGES[:, 1]]
@@ -121,7 +123,7 @@ def _flat_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
 
 
 def _cones(low: Float64, high: Float64) -> tuple[Float64, Float64]:
-    """Cones from the origin around boxes: axis (n, 3), to the box's middle, and angle (n,) between axis and edge."""
+    """Return cones from the origin around boxes: vectors (n, 3) to the boxes' middles, and half angles (n,)."""
     middle, radius = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2
     distance = np.linalg.norm(middle, axis=1)
     inside = distance <= radius * 1.001
@@ -168,15 +170,15 @@ def _fisheye_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
     x = camera.cx + camera.fx * radius * edge[..., 0] / level
     y = camera.cy + camera.fy * radius * edge[..., 1] / level
     bounds = np.stack([x.min(axis=1), x.max(axis=1), y.min(axis=1), y.max(axis=1)], axis=1)
-    whole = theta + angle >= np.pi  # the backward direction is the whole edge of the picture
+    whole = theta + angle >= np.pi  # the backward direction is imaged on the whole edge of the picture
     bounds[whole] = (-1e9, 1e9, -1e9, 1e9)
     return bounds
 
 
 def _fisheye_radius(radial: tuple[float, ...], theta: Float64) -> Float64:
-    """Image radii, in focal lengths, at angles `theta` from the axis: eq. (18) of docs/cameras.md.
+    """Return image radii, in focal lengths, at angles `theta` from the axis: eq. (18) of docs/cameras.md.
 
-    With the town's coefficients, radii increase up to 180 degrees, so every direction has a position in the picture.
+    radial: k1 to k4. With the town's values, radii increase up to 180 degrees, so that every direction has a pixel.
     """
     square, series = theta * theta, np.zeros_like(theta)
     for coefficient in reversed(radial):

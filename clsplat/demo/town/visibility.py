@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ray casting of the demo's town: the nearest surface of each ray. Solids around a camera are cast from near to far.
+"""Ray casting of the demo's town: finds the surface that each ray meets first. Near solids are tested before far ones.
 
-Only the rays of a solid's screen rectangle are cast. A solid, or a whole block, is skipped if all rays of its rectangle
-have met something nearer.
+A solid is tested only against the rays in a rectangle of the picture that contains it. A solid, or a whole block, is
+skipped if all rays of its rectangle have met nearer surfaces.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from clsplat.demo.town.solids import FACES_PER_SOLID, SOLID_BALL, SOLID_BOX
 from clsplat.demo.town.view_rays import rectangles, world_rays
 
 SIGHT_METRES = 300.0
-"""Distance beyond which blocks are not cast, because haze hides them."""
+"""Distance from the camera beyond which blocks are left out, because haze hides them."""
 
 
 def blocks_in_sight(seed: int, camera: Camera) -> list[CityBlock]:
-    """Blocks within SIGHT_METRES of a camera that may be in its picture, nearest first."""
+    """Return the blocks within SIGHT_METRES of a camera that its picture may show, nearest first."""
     position, reach = camera.position, int(np.ceil(SIGHT_METRES / BLOCK_METRES))
     i, j = (int(np.floor(value / BLOCK_METRES)) for value in position[:2])
     around = np.arange(-reach, reach + 1)
@@ -53,9 +53,9 @@ def blocks_in_sight(seed: int, camera: Camera) -> list[CityBlock]:
 class Sight:
     """The surfaces that the rays of some rows of a picture meet.
 
-    directions: three arrays (4, rows, columns), as from `world_rays`.
-    surfaces: (4, rows, columns) int32, FACES_PER_SOLID times the number of the solid plus the face, GROUND_FACE or
-    SKY_FACE. Solids are numbered across all blocks.
+    directions: x, y and z of the rays' directions, (4, rows, columns) each, as from `world_rays`.
+    surfaces: (4, rows, columns) int32, the surface of each ray: FACES_PER_SOLID times the number of the solid, plus the
+        face; or GROUND_FACE or SKY_FACE. Solids are numbered through all blocks.
     """
 
     directions: tuple[Float32, Float32, Float32]
@@ -66,11 +66,11 @@ Slices = tuple[slice, slice, slice]
 
 
 class _Part(NamedTuple):
-    """A screen rectangle of a box. A box that crosses the edge of a panorama has two.
+    """A rectangle of the picture that contains a box. If a panorama's edge divides the box, it has two such parts.
 
     box: index of the box.
     near: distance of the box from the camera, in metres.
-    top, bottom, left, right: rows from `top` and columns from `left`, up to but without `bottom` and `right`.
+    top, bottom, left, right: the rectangle has the rows [top, bottom) and the columns [left, right).
     """
 
     box: int
@@ -82,9 +82,9 @@ class _Part(NamedTuple):
 
 
 class Caster:
-    """Casts the rays of one photograph against blocks.
+    """Casts the rays of one photograph against the solids of blocks.
 
-    starts: number of each block's first solid. Solids are numbered across all blocks.
+    starts: number of each block's first solid, then the number of all solids. Solids are numbered through all blocks.
     """
 
     def __init__(self, camera: Camera, blocks: Sequence[CityBlock]) -> None:
@@ -98,7 +98,7 @@ class Caster:
         self._inner: dict[int, list[_Part]] = {}
 
     def sight(self, first: int, last: int) -> Sight:
-        """Find the surfaces that the rays of the picture's rows from `first` up to but without `last` meet."""
+        """Find the surfaces that the rays of the picture's rows [first, last) meet."""
         directions = world_rays(self.camera, first, last)
         rays = _Rays(directions, self.position, first)
         done = set()
@@ -112,7 +112,7 @@ class Caster:
         return Sight(directions, rays.surfaces)
 
     def _solids_of(self, index: int) -> list[_Part]:
-        """Return the screen rectangles of a block's solids, from near to far."""
+        """Return rectangles of the picture that contain the solids of block `index`, from near to far."""
         if index not in self._inner:
             block = self.blocks[index]
             low, high = (corner + (block.corner - self.position) for corner in block.solids.bounds())
@@ -121,7 +121,7 @@ class Caster:
 
 
 def _placed(camera: Camera, low: Float64, high: Float64) -> list[_Part]:
-    """Return the screen rectangles of boxes, from near to far. low, high: corners of the boxes, as for `rectangles`."""
+    """Return rectangles of the picture that contain boxes, from near to far. low, high: as for `rectangles`."""
     bounds, near = rectangles(camera, low, high), _nearest(low, high)
     width, wraps = camera.width, camera.model.wraps
     order = np.argsort(near, kind="stable")
@@ -137,12 +137,12 @@ def _placed(camera: Camera, low: Float64, high: Float64) -> list[_Part]:
 
 
 def _nearest(low: Float64, high: Float64) -> Float64:
-    """Distances (n,) of boxes from the origin."""
+    """Return the distances (n,) of boxes from the origin. low, high: (n, 3), corners of the boxes."""
     return np.asarray(np.linalg.norm(np.maximum(np.maximum(low, -high), 0), axis=1))
 
 
 class _Rays:
-    """Rays of a picture's rows from `first` on, with the distance and number of the nearest surface found so far."""
+    """Rays of a picture's rows from `first` on, with the nearest surface that each ray has met so far."""
 
     def __init__(self, directions: tuple[Float32, Float32, Float32], position: Float64, first: int) -> None:
         self.position, self.first = position, first
@@ -154,15 +154,15 @@ class _Rays:
         self.distance = np.where(falls, ground, np.float32(np.inf))
         self.surfaces = np.where(falls, np.int32(GROUND_FACE), np.int32(SKY_FACE))
         x, y, z = (axis[:, :: max(axis.shape[1] - 1, 1), :: max(axis.shape[2] - 1, 1)] for axis in directions)
-        self._longest = float(np.sqrt((x**2 + y**2 + z**2).max()))  # a corner has the longest direction
+        self._longest = float(np.sqrt((x**2 + y**2 + z**2).max()))  # directions are longest in the corners
 
     def slices(self, part: _Part) -> Slices:
-        """Index (samples, rows, columns) of the rays that fall into a part of the picture."""
+        """Return slices of samples, rows and columns, which select the rays in a part of the picture."""
         rows = slice(max(part.top - self.first, 0), max(part.bottom - self.first, 0))
         return slice(None), rows, slice(part.left, part.right)
 
     def is_open(self, part: _Part) -> bool:
-        """True if a ray of a part of the picture has met nothing nearer than the part's box."""
+        """Return False if all rays in a part of the picture have met surfaces nearer than the part's box."""
         if part.bottom <= self.first or part.top >= self.first + self.distance.shape[1]:
             return False
         return bool(self.distance[self.slices(part)].max() * self._longest > part.near)
@@ -171,8 +171,8 @@ class _Rays:
         """Cast the rays of a part of the picture against a solid, and keep the hits that are nearest so far.
 
         solid: index of the solid in its block.
-        number: number of the solid across all blocks.
-        part: index of the part's rays, as from `slices`.
+        number: number of the solid among those of all blocks.
+        part: slices of the part's rays, as from `slices`.
         """
         solids = block.solids
         centre = (self.position - block.corner - solids.centres[solid]).astype(np.float32)
@@ -239,7 +239,10 @@ class _Rays:
             self._meet(part, hit, enter, face)
 
     def _turned(self, part: Slices, turn: Float32) -> tuple[Float32, Float32, Float32]:
-        """For rays in a solid's own axes: reciprocals of the directions' x and y, and the directions' y."""
+        """Return 1 / x, 1 / y and y of rays' directions in a solid's own axes.
+
+        part: slices of the rays, as from `slices`. turn: (2,), cosine and sine of the solid's rotation about z.
+        """
         x, y = self.x[part], self.y[part]
         if turn[1] == 0:
             return self.over_x[part], self.over_y[part], y
@@ -256,10 +259,10 @@ class _Rays:
 
 
 def _slab(over: Float32, start: np.float32, half: np.float32) -> tuple[Float32, Float32]:
-    """Return the distances at which rays enter and leave the slab between two planes at +-half from the origin.
+    """Return the distances at which rays enter and leave the space between two planes, at -half and +half on an axis.
 
-    over: reciprocals of the rays' directions along the planes' normal.
-    start: position of the rays' origin along this normal.
+    over: reciprocals of the rays' directions along this axis.
+    start: coordinate of the rays' origin on this axis.
     """
     middle = over * -start
     reach = np.abs(over)

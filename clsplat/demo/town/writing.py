@@ -41,11 +41,11 @@ from clsplat.scenes.dataset import Lens
 TOWN_RECORD_FILE = "town.json"
 """File in a town's folder with the town's settings and counts. A folder with this file may be replaced."""
 EXACT_POSES_FOLDER = "exact"
-"""Folder with the exact cameras, a COLMAP model without points. It is written if the scene's cameras are noisy."""
+"""Folder with the exact cameras as a COLMAP model without points. It is written if `TownConfig.pose_noise` is not 0."""
 MAX_TOWN_WORKERS = 8
-"""Largest default number of threads. More would wait for the interpreter's lock, and take more memory."""
+"""Largest default number of threads. More threads would wait for the interpreter lock, and take more memory."""
 MIN_TRACK_LENGTH = 2
-"""Smallest number of photographs that must show a point, so that the COLMAP model has it."""
+"""Smallest number of photographs that must show a point for the COLMAP model to contain it."""
 
 
 def write_town(
@@ -86,7 +86,7 @@ def write_town(
         points = _write_model(result, config, planned, seen)
         record = {"town": config.record(), "photographs": len(planned), "points": points}
         atomic_write(result / TOWN_RECORD_FILE, (json.dumps(record, indent=2) + "\n").encode())
-        check_folder(output, overwrite=overwrite)  # check again, since another process may have written there meanwhile
+        check_folder(output, overwrite=overwrite)  # another process may have written there
         move_into_place(work, place)
     except KeyboardInterrupt as error:
         error.args = ("before the town was complete: no file of it is left, and the same command starts anew",)
@@ -97,7 +97,7 @@ def write_town(
 
 
 def check_folder(output: Path, *, overwrite: bool) -> None:
-    """Raise InputError if a town must not be written at `output`."""
+    """Raise InputError if `output` is not free for a town: not missing, not empty, and not an old town to replace."""
     if not (output.exists() or output.is_symlink()):
         return
     if not output.is_dir():
@@ -105,7 +105,7 @@ def check_folder(output: Path, *, overwrite: bool) -> None:
     if not any(output.iterdir()):
         return
     if not is_file(output / TOWN_RECORD_FILE):
-        raise InputError(f"{output}: is neither empty nor a town of clsplat demo, expected a new folder")
+        raise InputError(f"{output}: is neither empty nor a town of clsplat demo, expected a new or an empty folder")
     if not overwrite:
         raise InputError(f"{output}: exists already; name another folder, or give --overwrite to replace it")
 
@@ -120,11 +120,11 @@ def _take_all(
     progress("painting the town", 0.0)
     textures(config.seed)
     seen: list[Observations] = []
-    pool = ThreadPoolExecutor(workers, "clsplat-town")  # parallel, as NumPy releases the interpreter lock
+    pool = ThreadPoolExecutor(workers, "clsplat-town")  # threads, because NumPy releases the interpreter lock
     try:
         for done, observations in enumerate(pool.map(partial(_take_and_write, result, config), planned), 1):
             seen.append(observations)
-            os.utime(result.parent)  # a folder that does not change counts as abandoned (`files.atomic.is_abandoned`)
+            os.utime(result.parent)  # so that no other machine takes the folder as abandoned
             progress("taking photographs", CountedFraction(done, len(planned), "taken"))
     finally:
         pool.shutdown(cancel_futures=True)
@@ -144,7 +144,7 @@ def _write_model(
 ) -> int:
     """Write the COLMAP model: cameras, images and points. Returns the number of points.
 
-    seen: the points that each photograph shows.
+    planned, seen: the photographs, and the points that each of them shows.
     """
     sparse = result / "sparse" / "0"
     sparse.mkdir(parents=True)
@@ -170,9 +170,9 @@ def _noise(config: TownConfig, shot: TownPhotograph) -> Float64:
 
 
 def _image(config: TownConfig, shot: TownPhotograph, air: Lens, error: Float64) -> ModelImage:
-    """Make the COLMAP image of a photograph, with empty lists of observations.
+    """Return a photograph's entry in the COLMAP model, without observations.
 
-    air: lens of the photographs from the air.
+    air: lens of the photographs from the air, which is camera 1 of the model.
     error: (3,), metres to add to the camera's position.
     """
     rotation = shot.camera.rotation
@@ -182,9 +182,9 @@ def _image(config: TownConfig, shot: TownPhotograph, air: Lens, error: Float64) 
 
 
 def _tracks(config: TownConfig, seen: Sequence[Observations]) -> tuple[ModelPoints, list[NDArray[np.uint64]]]:
-    """Collect the observations of all photographs to points with tracks.
+    """Collect the observations of all photographs into points with tracks.
 
-    Returns the points, and for each photograph the point numbers (k,) of its observations.
+    Returns the points of the COLMAP model, and for each photograph the point numbers (k,) of its observations.
     """
     lengths = np.array([len(each.points) for each in seen])
     rows = np.concatenate([np.column_stack([each.blocks, each.points]) for each in seen])
