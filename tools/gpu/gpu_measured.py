@@ -150,7 +150,8 @@ def read(rows: Sequence[Mapping[str, Any]], now: Works) -> tuple[list[Measured],
                 part = of_stage.get(stage if colon else stage_of.get(name, ""), "")
                 parts[part] = parts.get(part, 0) + ms
             parts = {part: parts[part] for part in PARTS if part in parts}
-            parts |= dict(zip(WALLS, (scene["frame_ms"], scene["step_ms"]), strict=True))
+            walls = zip(WALLS, ("frame_ms", "step_ms"), strict=True)
+            parts |= {wall: scene[key] for wall, key in walls if key in scene}
             today = (now.get((gpu.name, scene["frame"] + suffix), ()) for suffix in ("", DRAWN))
             found.append(Measured(gpu, scene["frame"], code, parts, works, *today))
     return found, unused

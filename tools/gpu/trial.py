@@ -29,6 +29,7 @@ import hashlib
 import json
 import os
 import shutil
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -54,7 +55,7 @@ from trial_limits import FULL, TINY, Limits
 from trial_table import table
 from trial_variants import DRY, USUAL, USUAL_SHAPE, VARIANTS, TrialScene, VariedDevice
 
-from clsplat.bench.stages import bench
+from clsplat.bench.stages import bench, trainer_of
 from clsplat.bench.workload import Subject, synthetic
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device, all_devices
@@ -80,6 +81,8 @@ TINY_SCENES: dict[str, Callable[[], Subject]] = {
 SHAPES = (USUAL_SHAPE, "1x32", "1x128", "1x256")
 STEPS, MORE_STEPS = 15, 5
 """Numbers of timed steps in the usual shape, also for variants, and in other shapes."""
+WARM_UP = 3
+"""Number of frames or steps before the first that is timed."""
 ENDS = {"limits": 0.15, "stages": 0.35, "variants": 0.75, "counters": 0.85, "peers": 1.0}
 """Fraction of the minutes after which each part stops. Time that a part does not need is left to the next ones."""
 NO_PEAKS = Peaks(1.0, 1.0, 1.0, 1, 1)
@@ -191,6 +194,25 @@ def measure_stages(trial: Trial) -> None:
             trial.attempt(f"stages: {name}, {shape}", partial(_measure_stages, trial, name, subject, shape))
 
 
+def plain_times(subject: Subject, device: Device, repeat: int) -> dict[str, float]:
+    """Milliseconds of a frame, of a step, and of each of `repeat` steps that are not waited for one by one."""
+    trainer = trainer_of(subject, device, RasterizerConfig())
+
+    def draw() -> None:
+        trainer.rasterizer.forward(trainer.parameters, subject.camera, trainer.background, backward=False)
+
+    def steps() -> None:
+        for _ in range(repeat):
+            trainer.train_step()
+
+    found = {}
+    for name, work in (("frame_ms", draw), ("step_ms", trainer.train_step)):
+        for _ in range(WARM_UP):
+            work()
+        found[name] = statistics.median(device.timed(work)[1] for _ in range(repeat))
+    return {name: round(ms, 4) for name, ms in (found | {"step_in_a_row_ms": device.timed(steps)[1] / repeat}).items()}
+
+
 def _measure_stages(trial: Trial, name: str, subject: Subject, shape: str) -> None:
     device = Device(trial.device.cl_device, trial.device.shape.relabelled(shape), profile=True)
     repeat = 1 if trial.options.dry_run else STEPS if shape == USUAL_SHAPE else MORE_STEPS
@@ -202,8 +224,7 @@ def _measure_stages(trial: Trial, name: str, subject: Subject, shape: str) -> No
         "frame": name,
         "shape": shape,
         **{key: found[key] for key in ("gaussians", "visible", "pairs")},
-        "frame_ms": round(found["frame_ms"], 4),
-        "step_ms": round(found["iteration_ms"], 4),
+        **plain_times(subject, Device(trial.device.cl_device, device.shape), repeat),
         "host_ms": round(found["iteration_host_ms"], 4),
         "kernels_ms": {
             f"{stage}: {kernel}" if kernel in twice or kernel in ("write", "read", "fill") else kernel: round(ms, 5)

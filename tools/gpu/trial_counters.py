@@ -57,7 +57,7 @@ def measure(subject: Any, device: Any, twins: Path, seconds: float) -> list[dict
 
 
 def dump(subject: Any, device: Any, kernels: Sequence[str], folder: Path) -> None:
-    """Write the arguments of the first launch of each kernel in a step."""
+    """Write the arguments of the first launch of each kernel in a step by capacity."""
     import pyopencl as cl
     from trial_variants import TrialScene
 
@@ -81,9 +81,12 @@ def dump(subject: Any, device: Any, kernels: Sequence[str], folder: Path) -> Non
             np.savez(folder / f"{kernel.name}.npz", allow_pickle=False, launch=json.dumps(launch), **arrays)
         return enqueue(kernel, size, local, values, wait=wait)
 
-    device.enqueue = first
+    device.enqueue = first  # before there is a trainer, as it makes copies of the device
     try:
-        TrialScene(subject, device).trainer.train_step()
+        trainer = TrialScene(subject, device).trainer
+        trainer.train_step()  # counts its pairs; the twins are of steps by capacity, whose kernels have other arguments
+        dumped.clear()
+        trainer.train_step()
     finally:
         del device.enqueue
 

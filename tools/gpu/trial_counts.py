@@ -90,9 +90,16 @@ def _frames(names: Iterator[str] | Mapping[str, Any]) -> list[Mapping[str, Any]]
 
 
 def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
-    """The trial's row of calibration.json, without the model's inputs."""
+    """The trial's row of calibration.json, without the model's inputs.
+
+    Times of kernels are those of the usual form among the variants, which are all of a step: the stages of `bench` mix
+    a frame's lists with a step's.
+    """
+    left_out = ("shape", "host_ms", "frame_ms")  # a frame has other launches than the step of the inputs
+    usual = [each for each in record["variants"] if each["variant"] == USUAL_SHAPE]
     scenes = [
-        {name: value for name, value in scene.items() if name not in ("shape", "host_ms")}
+        {name: value for name, value in scene.items() if name not in left_out}
+        | {"kernels_ms": {f"{k['stage']}: {k['kernel']}": k["ms"] for k in usual if k["scene"] == scene["frame"]}}
         for scene in record["scenes"]
         if scene["shape"] == USUAL_SHAPE
     ]

@@ -22,9 +22,13 @@ def table(record: Mapping[str, Any]) -> list[str]:
     lines += record.get("nvidia_smi", [])
     limits: list[tuple[str, ...]] = [("limit", "value")]
     limits += ((name, f"{value:.4g}") for name, value in record["limits"].items())
-    steps: list[tuple[str, ...]] = [("scene", "shape", "frame, ms", "step, ms", "host, ms")]
+    steps: list[tuple[str, ...]] = [("scene", "shape", "frame, ms", "step, ms", "step in a row, ms", "host, ms")]
     steps += [
-        (row["frame"], row["shape"], *(f"{row[key]:.3f}" for key in ("frame_ms", "step_ms", "host_ms")))
+        (
+            row["frame"],
+            row["shape"],
+            *(f"{row[key]:.3f}" for key in ("frame_ms", "step_ms", "step_in_a_row_ms", "host_ms")),
+        )
         for row in record["scenes"]
     ]
     counters: list[tuple[str, ...]] = [("scene", "kernel", "counter", "value")]
