@@ -187,6 +187,10 @@ def _measure(device: Device, work: Callable[[], object], repeat: int) -> _Cost:
     return _Cost(statistics.median(walls), statistics.median(hosts), calls_of(device, work), medians, by_wall)
 
 
+_VIEWS = 8
+"""Number of times that the view is in the scene: few steps begin an epoch, in which the next view is not known."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Picture(View):
     """View that returns the photograph `pixels`, which is in memory, for every size."""
@@ -207,7 +211,7 @@ def trainer_of(subject: Subject, device: Device, config: RasterizerConfig) -> Tr
     lens = Lens("PINHOLE", camera.width, camera.height, (camera.fx, camera.fy, camera.cx, camera.cy))
     pixels = photograph * np.float32(1 / 255)
     view = _Picture("bench", camera, Path("bench"), "train", lens, pixels=pixels)
-    scene = Scene("bench", [view], np.zeros((0, 3)), np.zeros((0, 3), np.float32), (np.zeros(3), np.ones(3)))
+    scene = Scene("bench", [view] * _VIEWS, np.zeros((0, 3)), np.zeros((0, 3), np.float32), (np.zeros(3), np.ones(3)))
     still = {group.rate: 0.0 for group in PARAMETER_GROUPS.values()}
     settings = TrainConfig(
         sh_degree=subject.gaussians.sh_degree,

@@ -62,9 +62,8 @@ class ChunkBounds:
     @cached_property
     def finite(self) -> Bool:
         """True (B,) for chunks with finite bounds."""
-        sums = (array[:, axis] for array in (self.lowest, self.highest) for axis in range(3))
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.asarray(np.isfinite(sum(sums, self.largest)))
+            return np.asarray(np.isfinite(self.lowest.sum(axis=1) + self.highest.sum(axis=1) + self.largest))
 
     @cached_property
     def terms(self) -> Float64:

@@ -105,9 +105,8 @@ class Trainer:
         self.tried: set[tuple[object, ...]] = set()
         self.strategy = self._new_strategy(self.config)
         self._looks_at_steps = type(self.strategy).after_gradient is not Strategy.after_gradient
-        initial = self.given
-        if initial is None:
-            initial = from_scene(self.scene, self.config.random_points, self.position.rng)
+        make = partial(from_scene, self.scene, self.config.random_points, self.position.rng)
+        initial = make() if self.given is None else self.given
         self.appearance = appearance_of(self.config, self.device, self.scene)
         self.cameras = Cameras(self.config, self.scene, self.rasterizer.work)
         self.origin, self.near = initial.origin, self.scene.near
@@ -117,7 +116,8 @@ class Trainer:
         cameras = [self.local(view.camera) for view in self.views]
         mip_filter = MipFilter(self.config, self.device, self.rasterizer.work, cameras)
         late = [LateAdam(self.config.optimiser, self.rasterizer, len(initial))] if self.config.optimiser.late else []
-        chunks = VisibleChunks(self.config, self.rasterizer, self.scene.length_unit, len(initial))
+        next_camera = partial(self.loader.next_camera, self.position)
+        chunks = VisibleChunks(self.config, self.rasterizer, self.scene.length_unit, len(initial), next_camera)
         self.components: tuple[Component, ...] = (*late, mip_filter, self.appearance, self.cameras, self.depths, chunks)
         self._active = [component for component in self.components if component.on]
         of, files = (self.device, self.rasterizer.work), (self.planner.scratch_file, self.planner.scratch_files)

@@ -57,16 +57,17 @@ def _small_models_have_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The share of the chunks in view, of each step that looks at its chunks."""
+    """The share of the chunks that may be in view, of each step that looks at its chunks."""
     found: list[float] = []
-    real = visible_chunks.visible
+    real = VisibleChunks.join
 
-    def visible(*arguments: Any) -> Any:
-        shown = real(*arguments)
-        found.append(float(shown.mean()))
-        return shown
+    def join(component: VisibleChunks, *arguments: Any) -> Any:
+        inputs = real(component, *arguments)
+        if (chunks := inputs[0].chunks) is not None:
+            found.append(len(chunks.numbers) / len(component._last))
+        return inputs
 
-    monkeypatch.setattr(visible_chunks, "visible", visible)
+    monkeypatch.setattr(VisibleChunks, "join", join)
     return found
 
 

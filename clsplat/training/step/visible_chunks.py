@@ -4,9 +4,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from math import isfinite
 
 import numpy as np
@@ -48,6 +48,8 @@ _ROWS_AT_ONCE = 1 << 16
 """Number of rows of a checkpoint that are read at a time."""
 MOST_MISSED_STEPS = 1024
 """Number of missed steps after which a chunk is caught up even if no view shows it."""
+_KEPT_BORDERS = 4096
+"""Number of cameras whose picture's borders are kept, because making them takes as long as culling 500 chunks."""
 
 
 def settings_of_whole_steps(config: TrainConfig) -> list[str]:
@@ -111,10 +113,21 @@ class VisibleChunks(Component):
     depends on the bounds.
 
     unit: the scene's length unit.
+    count: number of Gaussians.
+    next_camera: function that returns the camera of the next step's view; None if it is not known yet.
     """
 
-    def __init__(self, config: TrainConfig, rasterizer: Rasterizer, unit: float, count: int) -> None:
-        self._config, self._rasterizer, self._unit = config, rasterizer, unit
+    def __init__(
+        self,
+        config: TrainConfig,
+        rasterizer: Rasterizer,
+        unit: float,
+        count: int,
+        next_camera: Callable[[], Camera | None],
+    ) -> None:
+        self._config, self._rasterizer, self._unit, self._next_camera = config, rasterizer, unit, next_camera
+        self._borders = lru_cache(_KEPT_BORDERS)(PictureBorders.of)
+        self._ahead: _ShownAhead | None = None
         self._limit_movement(largest_step(config.optimiser))
         self._begin(count, 0)
 
@@ -212,7 +225,12 @@ class VisibleChunks(Component):
         if self.step < step - 1:  # the steps in between ran over all rows, as the model was small or streamed
             self._begin_table(step - 1, len(self._last))
         hidden, most_hidden = self._hidden_movement(step)
-        numbers = self._shown(of_view, step, hidden, most_hidden)
+        ahead, culled = self._ahead, (of_view.camera, step, self._found)
+        numbers = (
+            ahead.numbers
+            if ahead is not None and ahead.is_of(*culled)
+            else self._shown(of_view.camera, step, hidden, most_hidden)
+        )
         if self._before_view is not None:
             self._before_view(len(numbers))
         whole = self._before_view is None and len(numbers) > MAX_SHARE_IN_VIEW * len(self._last)
@@ -224,18 +242,30 @@ class VisibleChunks(Component):
         missed = self._missed(numbers, step - 1)
         return [replace(of_view, chunks=_ChunksInView(self, numbers, missed, self._found, whole=whole))]
 
+    def after_adam(self, gaussians: AnyGaussians) -> None:  # noqa: ARG002
+        """Cull the chunks for the next step, as the host has time while the device computes the step just launched.
+
+        A chunk may have moved less until then, or its bounds may be measured, so a later culling may find fewer chunks.
+        The bits are the same.
+        """
+        camera, step = self._next_camera(), self.step + 1
+        self._ahead = None
+        if camera is not None and self._count > ORDERED_ROWS and self._since is not None:
+            numbers = self._shown(camera, step, *self._hidden_movement(step))
+            self._ahead = _ShownAhead(camera, step, self._found, numbers)
+
     def in_view(self, camera: Camera) -> NDArray[np.uint32]:
         """Numbers of the chunks that a camera may show after the last step."""
         return self._shown_by(camera, 1.0, *self._hidden_movement(self.step + 1))
 
-    def _shown(self, of_view: ViewInputs, step: int, hidden: Movement, most: Float64) -> NDArray[np.uint32]:
-        """Chunks that the view may show, in rising order. hidden, most: results of `_hidden_movement`."""
+    def _shown(self, camera: Camera, step: int, hidden: Movement, most: Float64) -> NDArray[np.uint32]:
+        """Chunks that a step's view may show, in rising order. hidden, most: results of `_hidden_movement`."""
         thinning = thinning_of(self._config, step)
-        return self._shown_by(of_view.camera, 1.0 if thinning is None else thinning.factor, hidden, most)
+        return self._shown_by(camera, 1.0 if thinning is None else thinning.factor, hidden, most)
 
     def _shown_by(self, camera: Camera, factor: float, hidden: Movement, most: Float64) -> NDArray[np.uint32]:
         """Chunks that a camera may show if opacities are multiplied by `factor`. Other arguments as for `_shown`."""
-        picture = PictureBorders.of(camera, self._config.rasterizer, factor)
+        picture = self._borders(camera, self._config.rasterizer, factor)
         return self._found.seen(partial(visible, picture), hidden, most, MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
 
     def _hidden_movement(self, step: int) -> tuple[Movement, Float64]:
@@ -388,6 +418,24 @@ class VisibleChunks(Component):
         """Bytes per Gaussian on the device: the bytes of a chunk's bounds and missed steps, divided by its rows,
         rounded up."""
         return 1 if self.on else 0
+
+
+@dataclass(frozen=True, eq=False)
+class _ShownAhead:
+    """Chunks that the next step's view may show.
+
+    camera, step, bounds: the view's camera, the step's number, and the bounds by which they were found.
+    numbers: (n,) numbers of the chunks, rising.
+    """
+
+    camera: Camera
+    step: int
+    bounds: BoundsTable
+    numbers: NDArray[np.uint32]
+
+    def is_of(self, camera: Camera, step: int, bounds: BoundsTable) -> bool:
+        """True if the chunks were found for this view and step, and no Gaussian has moved since but by Adam."""
+        return self.camera is camera and self.step == step and self.bounds is bounds
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,6 +51,15 @@ class ViewLoader:
             self._cameras[view] = now, camera
         return camera
 
+    def next_camera(self, position: Position) -> Camera | None:
+        """Camera of the next step's view, the object that `inputs` will give it.
+
+        It is another object if the photographs' size or the refined camera changes before that step. None if an epoch
+        begins with the next view, or if this is the first epoch, in which sizes are not known yet.
+        """
+        _, camera = self._cameras.get(position.queue[-1], (None, None)) if position.queue else (None, None)
+        return camera
+
     def inputs(self, view: int, position: Position, place: int, *, begins: bool) -> ViewInputs:
         """Inputs of a view, at the size of the current step.
 
