@@ -95,9 +95,11 @@ class SlotFile:
         sync_folder(self.path.parent)
 
     def grow(self, slots: int, more: int, least: int) -> int:
-        """Reserve disk space behind the first `slots` slots, so that a full disk is found before rows are written.
+        """Add slots behind the first `slots` slots, and reserve disk space for them, so that later writes have room.
 
-        Returns the number of new slots: `more`, or `least` if the disk has too little room. Raises WriteError.
+        more: number of slots to add.
+        least: number of slots to add if the disk has too little room for `more`.
+        Returns the number of added slots. Raises WriteError if there is too little room for `least` slots.
         """
         try:
             self._reserve(slots * self.slot_bytes, more * self.slot_bytes)

@@ -34,7 +34,7 @@ class SlotTable:
 
     @property
     def most(self) -> int:
-        """Maximum number of slots. Before the file gets more, old checkpoints are removed."""
+        """Maximum number of slots. Before the file gets more slots, old checkpoints are removed."""
         return max(MAX_TENTHS * len(self.current) // 10, 1)
 
     @property
@@ -48,7 +48,10 @@ class SlotTable:
         return _end(self._used)
 
     def hold(self, kept: Sequence[NDArray[np.int64]]) -> None:
-        """Protect only the slots `kept` from being overwritten. They are an array for each kept checkpoint."""
+        """Protect the slots of the kept checkpoints, and no other slots, from being overwritten.
+
+        kept: for each kept checkpoint, an array of its slots.
+        """
         self._held, self._named_end = np.zeros(self.size, np.bool_), 0
         for slots in kept:
             self._held[slots[(slots >= 0) & (slots < self.size)]] = True
@@ -65,7 +68,8 @@ class SlotTable:
         return max(_end(self._held), self._named_end)
 
     def name_current(self) -> None:
-        """Include the model's present slots in `end_of_held` until `hold`, because a new checkpoint will name them."""
+        """Include the model's present slots in `end_of_held`, because a new checkpoint will name them. This lasts until
+        `hold` is called."""
         self._named_end = int(self.current.max(initial=NO_SLOT)) + 1
 
     def in_place(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
@@ -80,13 +84,14 @@ class SlotTable:
         return int(np.count_nonzero(~self.in_place(numbers)))
 
     def growth(self, lacking: int) -> int:
-        """Return the number of slots to add to the file if `lacking` are missing; 0 if it would exceed `most`."""
+        """Return the number of slots to add if `lacking` slots are missing; 0 if the file would exceed `most` slots."""
         if self.size + lacking > self.most:
             return 0
         return min(self.least_growth(lacking), self.most - self.size)
 
     def least_growth(self, lacking: int) -> int:
-        """Return the smallest number of slots to add if `lacking` are missing, so large that the file seldom grows."""
+        """Return the smallest number of slots by which the file grows if `lacking` slots are missing. It is at least a
+        share of the number of chunks (_GROWTH_SHARE), so that the file seldom grows."""
         return max(lacking, len(self.current) // _GROWTH_SHARE)
 
     def grow(self, slots: int) -> None:
@@ -99,7 +104,7 @@ class SlotTable:
         self.size, self._held, self._used = size, self._held[:size], self._used[:size]
 
     def take(self, count: int) -> NDArray[np.int64]:
-        """Reserve `count` free slots for new chunks, until `become` or `give_up`. Returns the slots."""
+        """Reserve `count` free slots for new chunks, until `become` or `give_up` is called. Returns the slots."""
         slots = np.flatnonzero(~self._used)[:count]
         self._taken = np.append(self._taken, slots)
         self._used[slots] = True

@@ -226,7 +226,7 @@ def histograms(numbers: RunNumbers) -> list[Markup]:
     if "contribution" in bars:
         record = numbers.histograms["contribution"]
         views = f"{record['views']} of {record['of']} training views"
-        note = f"largest contribution to any of {views}; {record['none']:,} contribute to none"
+        note = f"largest contribution to any of {views}; {record['none']:,} Gaussians contribute to none of them"
         series = [ChartSeries("contribution", bars["contribution"], "bars", 3)]
         made.append(chart("Contribution", series, "pixels", "Gaussians", powers=True, note=note))
     return made
