@@ -189,7 +189,7 @@ class Forecast:
 
 
 def _course(density: DensityConfig, step: int, peak: int = 0) -> float:
-    """Growth of the model by the densification at step `step`, as a fraction of the peak growth (the paper's rule).
+    """Growth of the model by the densification at step `step`, as a fraction of the peak growth, by the paper's rule.
 
     peak: step of the largest growth so far. Before it, growth does not decay, whatever the density settings say.
     """

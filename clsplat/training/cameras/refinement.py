@@ -56,7 +56,7 @@ class CameraSums(ViewPart):
 
     The step calls `add_rows` for all rows of the model, in order.
     pose, lens: True to sum the gradient with respect to the pose, and to the lens.
-    move: function that moves the camera after Adam's step. Its argument is this object.
+    move: function that changes the camera after Adam has changed the Gaussians. Its argument is this object.
     """
 
     wants_gradients = True

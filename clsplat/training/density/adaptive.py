@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adaptive density control (Kerbl et al. 2023, section 5): clone, split and prune. Policy only: no device."""
+"""Adaptive density control (Kerbl et al. 2023, section 5): clone, split and prune. Uses no OpenCL."""
 
 from __future__ import annotations
 
@@ -219,7 +219,7 @@ def long_halves(split: Mapping[str, Float32], second: bool) -> dict[str, Float32
     turned = rotated(split["quaternions"], offsets)
     log_scales += np.log(SHORT_AXIS_HALF_RATIO)
     log_scales[rows, longest] += np.log(LONG_AXIS_HALF_RATIO) - np.log(SHORT_AXIS_HALF_RATIO)
-    # If an opacity has the logit o', the fraction p of it has the logit ln p - ln(e^-o' + 1 - p).
+    # If an opacity has the logit o', p times this opacity has the logit ln p - ln(e^-o' + 1 - p).
     part, logits = HALF_OPACITY_RATIO, split["opacity_logits"].astype(np.float64)
     opacities = np.log(part) - np.logaddexp(-logits, np.log(1 - part))
     means = split["means"] - turned if second else split["means"] + turned

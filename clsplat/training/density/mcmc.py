@@ -3,7 +3,7 @@
 
 Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". Unlike there, the model grows by halving
 the Gaussians with the largest gradients (docs/decisions/0029-mcmc-grows-by-halves.md). `optimisation.step_noise` has
-the noise of each step. Policy only: no device.
+the noise of each step. Uses no OpenCL.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ def shared(opacities: Float64, numbers: NDArray[np.int64], least: float) -> tupl
     Equation (94) of docs/gradients.md, equation (9) of Kheradmand et al. 2024. All arrays are (n,).
 
     opacities: opacities of the replaced Gaussians.
-    numbers: number of Gaussians that replace each of them.
+    numbers: for each replaced Gaussian, the number of Gaussians that replace it.
     least: lower limit of the new opacities.
     """
     whole = np.minimum(opacities, MAX_SHARED_OPACITY)

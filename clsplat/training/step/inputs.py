@@ -37,7 +37,7 @@ class ChunksInView(Protocol):
     """Chunks of the model that a step runs over."""
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> PlacedChunks | None:
-        """Make the chunks ready for Adam's step `step`. Returns None if it runs over the whole model instead."""
+        """Make the chunks ready for Adam's step `step`. Returns None if the step runs over the whole model instead."""
 
 
 @dataclass(eq=False)
@@ -107,7 +107,7 @@ class StepRows(ViewRows):
 
     @property
     def parameters(self) -> DeviceGaussians:
-        """Parameters of these rows, the first of `model`."""
+        """Parameters of these rows: the first element of `model`."""
         return self.model[0]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Order of the views in an epoch, a pass through the training photographs (--view-order). Policy only: no device.
+"""Order of the views in an epoch, a pass through the training photographs (--view-order). Uses no OpenCL.
 
 A pass shows each view once. Its order is random, or alternates between four clusters of views that look at near points.
 """
@@ -66,8 +66,10 @@ def gaze_points(cameras: Sequence[Camera], unit: float) -> Int64:
 
 
 def clusters_of(points: Int64) -> list[Int64]:
-    """Divide views into clusters by their points (n, d): each of at most `CLUSTER_VIEWS` views with near points, and
-    all of nearly the same size. Returns the indices of each cluster's views.
+    """Divide views into clusters of nearly equal size, each of at most `CLUSTER_VIEWS` views whose points are near each
+    other. Returns the indices of each cluster's views.
+
+    points: (n, d), the point that each view looks at.
 
     The clusters are the leaves of a k-d tree, which divides along the coordinate of the widest range. Views with equal
     coordinates are divided by their index.
