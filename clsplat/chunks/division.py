@@ -57,8 +57,8 @@ def divided(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> Division:
     """Divide rows into chunks after density control.
 
     An old chunk is kept if all its rows stay and no row was added. The rows of consecutive other chunks are divided
-    into as few new chunks as possible, of equal lengths. If the chunk before or behind them could be kept, but its rows
-    fit into the new chunks too, its rows are included.
+    into as few new chunks as possible, of equal lengths. A chunk directly before or behind these is divided with them,
+    although it could be kept, if its rows fit into the new chunks too.
 
     entries: source row of each row after density control, in rising order, with the bit FRESH set if the row is new.
     starts: first rows of the old chunks, as in `Division`.

@@ -260,7 +260,7 @@ class ChunkStore:
         return rows
 
     def set_records(self, start: int, stop: int, rows: NDArray[Any]) -> None:
-        """Replace the rows [start, stop) by records as from `get_records`. Raises WriteError and ScratchError."""
+        """Replace the rows [start, stop). rows: records as of `get_records`. Raises WriteError and ScratchError."""
         numbers, mine, evenly = self._covering(start, stop)
         records = rows
         if not evenly:
@@ -425,7 +425,7 @@ class ChunkStore:
         return rows
 
     def _set_field(self, number: int, field: str, rows: NDArray[np.float32]) -> None:
-        """Replace a field of a chunk in the file by `rows`. In main memory, `rows` is the field itself: do nothing."""
+        """Replace a field of a chunk in the file by `rows`. In main memory do nothing: `rows` is the field itself."""
         if self.path is None:
             return
         numbers = np.array([number])
@@ -488,7 +488,7 @@ def _packed(record: NDArray[Any], rows: int) -> NDArray[np.uint8]:
 
 
 def _unpack(packed: NDArray[np.uint8], rows: int, record: NDArray[Any]) -> None:
-    """Copy the bytes of `rows` rows, as from `_packed`, to a record (1,)."""
+    """Copy `packed`, the bytes of `rows` rows of each field, one field after the other, to a record (1,)."""
     if rows == CHUNK_ROWS:
         record.view(np.uint8)[:] = packed
         return

@@ -127,8 +127,7 @@ def atomic_writer(path: str | os.PathLike[str], needs: int | None = None) -> Ite
 
 
 def write_error(path: str | os.PathLike[str], error: OSError, written: int = 0, needs: int | None = None) -> WriteError:
-    """WriteError that says why the file `path` could not be written. If the disk is full, it names the free and the
-    needed bytes.
+    """WriteError that says why the file `path` could not be written. For a full disk, it has the free and needed bytes.
 
     error: the system's error.
     written: bytes written so far, which the message gives as a lower limit if `needs` is None.

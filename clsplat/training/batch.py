@@ -212,7 +212,7 @@ class Replica:
 
         place: the view's position among this device's views of the batch.
         factor: divisor of the photographs' resolution.
-        step: the first device's step of a view, with the settings to use.
+        step: step of a view on the first device. The view on this device is computed with its settings.
         values: parameters of each of `inputs.parts`, as `ViewPart.values` returned them.
         splats: True to return splats and screen-space gradients too, which density control uses.
         """

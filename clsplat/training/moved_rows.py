@@ -46,7 +46,7 @@ class Move:
 
 @dataclass(frozen=True, eq=False)
 class MovedRows:
-    """The rows of a model after a plan is carried out. Each entry of the plan's list of rows becomes one of them.
+    """The rows of a model after a plan is carried out. Each entry of the plan's list of rows becomes a row.
 
     rows: (m,) uint32, the source row of each row, with the bit FRESH set if the row is new.
     halves: number of halves of split Gaussians, two of each.

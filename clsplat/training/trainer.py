@@ -62,7 +62,7 @@ class Trainer:
     position: step, random state and views left in the epoch.
     monitor: monitor of non-finite values in the model.
     pending: launched steps that may have to be repeated, because their counts are not read yet.
-    mark: position that `step_back` returns to; None once the model has changed since.
+    mark: position that `step_back` returns to; None after the model has changed.
     further: devices in addition to the model's.
     loader: loader of the steps' photographs and cameras.
     order: order of the views in each pass.
@@ -264,7 +264,7 @@ class Trainer:
             component.complete(*self.model.with_moments)
 
     def catch_up_exactly(self) -> None:
-        """Wait for all launched steps. Then make the postponed changes that give the same bits now as at a later step."""
+        """Wait for all launched steps. Then make the postponed changes that give the same bits now as later."""
         self.settle()
         for component in self.components:
             component.complete_exactly(*self.model.with_moments)
@@ -393,7 +393,7 @@ class Trainer:
             self.model.widen(coefficients, self._unmark)
 
     def _control_density(self) -> None:
-        """Run the density control that is due after each of the last step's views."""
+        """Run density control for each view of the last step after which it is due."""
         last = range(self.step - self.position.last_views + 1, self.step + 1)
         steps = list(filter(self.strategy.is_due, last))
         for step in steps if self.step > 0 else ():

@@ -213,7 +213,8 @@ class Cameras(Component):
         refined poses. The better result counts. The given poses are right if only some training poses were wrong, and
         the moved poses are right if the whole world has drifted.
 
-        draw, look: as for `ValidationViews.psnr`.
+        draw: function that renders with a camera (`Draw`).
+        look: function of a view's name and a render, which gives the render the view's appearance if that is known.
         """
         seen = [self.lenses.seen(view.lens, view.camera) for view in views.views]
         psnr = views.psnr(draw, look, seen)

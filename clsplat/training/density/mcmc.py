@@ -98,7 +98,8 @@ class Mcmc(Strategy):
         """Relocate the dead Gaussians in rows `left` to live ones, drawn in proportion to opacity (Kheradmand et al.
         2024).
 
-        groups, rows: values by parameter group, and source rows, of the new model; both are updated in place.
+        groups: values of the new model by parameter group, updated in place.
+        rows: source rows of the new model's rows, updated in place.
         Returns the rows whose values change.
         """
         if len(left) == 0:

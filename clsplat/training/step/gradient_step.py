@@ -79,8 +79,8 @@ class GradientStep:
 
     step: number of the step, for learning rates and Adam.
     fields: values that the step computes for each pair in addition to the plain gradients.
-    turn: index of the array that receives the sums of the loss (`stages.loss.loss`). Consecutive steps use different
-        arrays, so that an earlier step's sums can still be read.
+    turn: index of the array that receives the sums of the loss (`stages.loss.loss`). Steps use several arrays in turn
+        if the host may still have to read an earlier step's sums.
     room: number of pairs that there is memory for, if the step is launched by capacity; None counts the pairs first.
     explore: noise and penalties of the step.
     """
@@ -190,10 +190,10 @@ class GradientStep:
         terms: Sequence[LossTerm],
         chunks: ChunkList | ChunkNumbers | None,
     ) -> tuple[object, ...] | None:
-        """Key of the command buffer with all launches of the view's gradient; None if they need several buffers.
+        """Key of the command buffer with all launches of the view's gradient; None if no buffer can have them all.
 
-        They need several if pairs are counted exactly, if components have parts in the view, or with a depth loss. They
-        also need several with a mask, because each photograph then has its own divisor of the loss.
+        No buffer can have them all if pairs are counted exactly, if components have parts in the view, or if the view
+        has a depth loss or a mask. With masks, each photograph has its own divisor of the loss.
         """
         keys, camera, room, fields = tuple(term.key for term in terms), inputs.camera, self.room, self.fields
         if room is None or inputs.parts or inputs.kept is not None or None in keys:

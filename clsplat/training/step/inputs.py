@@ -122,7 +122,10 @@ class ViewPart:
     """True if `compare` changes the photograph."""
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewPart:  # noqa: ARG002
-        """Return a copy of the part on another device, for `compare` and `gradient` there. values: from `values()`."""
+        """Return a copy of the part on another device, for `compare` and `gradient` there.
+
+        values: the part's parameters on the host, as the method `values` returned them.
+        """
         return self
 
     def values(self) -> NDArray[np.float32]:

@@ -53,7 +53,7 @@ MOST_MISSED_STEPS = 1024
 
 def settings_of_whole_steps(config: TrainConfig) -> list[str]:
     """Return the options in use, such as "--batch", that make each step run over the whole model. With them, a step
-    reads the gradients of Gaussians that the view does not show, or changes such Gaussians not only by Adam."""
+    reads the gradients of Gaussians that the view does not show, or changes such Gaussians in addition to Adam."""
     wanted = {
         "--density.growth mcmc": config.density.growth == "mcmc",
         "--antialiased": config.antialiased,
@@ -140,7 +140,7 @@ class VisibleChunks(Component):
         """The steps from `_first_step` on, of which chunks may have missed some (`stages.catch_up.step_table`)."""
         self._begin_table(step, chunks)
         self._before: dict[int, NDArray[np.uint32]] = {}
-        """By number, `_last` as it was before the latest steps, which may be repeated."""
+        """For each of the latest steps, by number, the value of `_last` before it, because the step may be repeated."""
         self._caught: DeviceArray | None = None
 
     def _divide(self, pool: ChunkPool | None) -> None:
