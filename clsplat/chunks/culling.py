@@ -318,9 +318,9 @@ def _beyond_fisheye(cones: _Cones, picture: PictureBorders) -> Bool:
     theta = np.arctan2(across, z)
     sine, spread_sine = across / cones.distance, cones.radius / cones.distance
     spread_cosine = np.sqrt(1 - spread_sine * spread_sine)
-    least_sine = sine * spread_cosine - np.abs(z / cones.distance) * spread_sine  # the smaller sine of theta +- spread
+    least_sine = sine * spread_cosine - np.abs(z / cones.distance) * spread_sine  # min of sin(theta +- spread)
     ratio = np.sin(cap) / least_sine
-    # means cover an angle around the axis; this is the sine of half of it
+    # sine of half of the angle that the means of a chunk cover around the axis
     turn_sine = spread_sine / sine + _ANGLE_SLACK
     turn_cosine = np.sqrt(1 - turn_sine * turn_sine)
     ring = (least_sine > 0) & (ratio < _POLE) & (turn_sine < 1)

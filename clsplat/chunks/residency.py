@@ -58,7 +58,7 @@ class Residency:
             raise ValueError(f"numbers: {len(numbers)} chunks, expected at most {self.slots}, the number of slots")
         slots, used = self._slot_of[numbers], self._used.copy()
         missing = slots == _NOTHING
-        used[slots[~missing]] = self._uses + 1  # counts as used last, so that no chunk of this step is evicted
+        used[slots[~missing]] = self._uses + 1  # chunks of this step count as used last, and are not evicted
         to = np.sort(np.argsort(used, kind="stable")[: np.count_nonzero(missing)])
         slots[missing] = to
         leaving = to[self._chunk_in[to] != _NOTHING]

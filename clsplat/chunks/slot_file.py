@@ -142,7 +142,8 @@ class SlotFile:
     def read_ahead(self, slots: NDArray[np.int64]) -> None:
         """Ask the system to read slots from the disk while other work goes on.
 
-        A thread makes the request, because it may block until the disk has read. Until then further calls do nothing.
+        A thread makes the request, which may block until the disk has read the slots. Until then, further calls do
+        nothing.
         """
         if hasattr(os, "posix_fadvise") and (self.request is None or self.request.done()):
             self.request = _reader().submit(self._request, list(runs(slots)))

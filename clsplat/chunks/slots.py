@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 NO_SLOT = -1
-"""Slot number of a chunk that has not been written. All elements of a field are then equal (`manifest.CONSTANTS`)."""
+"""Slot number of a chunk that has not been written. Each field of this chunk has one value in all its elements
+(`manifest.CONSTANTS`)."""
 MAX_TENTHS = 22
 """Maximum number of slots of a file, in tenths of the number of chunks. 22 allow two copies of each chunk, one for the
 latest checkpoint and one that later steps change, and a tenth more."""
@@ -73,7 +74,7 @@ class SlotTable:
         self._named_end = int(self.current.max(initial=NO_SLOT)) + 1
 
     def in_place(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
-        """Return True (k,) for those of the chunks `numbers` (k,) whose own slot may be overwritten."""
+        """Return True (k,) for chunks whose own slot may be overwritten. numbers: (k,), the chunks to look up."""
         slots: NDArray[np.int64] = self.current[numbers]
         writable: NDArray[np.bool_] = slots != NO_SLOT
         writable[writable] = ~self._held[slots[writable]]

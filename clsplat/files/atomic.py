@@ -107,7 +107,7 @@ def atomic_name(path: str | os.PathLike[str], needs: int | None = None) -> Itera
         written = 0
         with suppress(OSError):
             written = temporary.stat().st_size
-            temporary.unlink()  # removed before `write_error` measures the free space
+            temporary.unlink()  # the file must not take disk space while `write_error` measures the free space
         names = (None, str(temporary), str(path))
         if isinstance(error, OSError) and error.errno and not isinstance(error, WriteError) and error.filename in names:
             # The system's error names the temporary file, or no file if the disk is full. Users know only `path`.

@@ -170,7 +170,7 @@ class Forecast:
     def _cost(self) -> tuple[Float64, float]:
         """Fit the time of a step. Returns its parts in seconds (4,): constant, per pixel, per Gaussian, and per read
         photograph. Also returns the factor by which recent steps took longer than the parts predict."""
-        spans = self.spans[1:] or self.spans  # in the first span, kernels were built too
+        spans = self.spans[1:] or self.spans  # without the first span, in which kernels were built
         parts = np.array(self.amounts[-len(spans) :])
         steps, seconds = np.array([(span.steps, span.seconds) for span in spans]).T
         rates = seconds / np.maximum(steps * (parts @ PRIOR_COSTS), 1e-12)

@@ -96,7 +96,7 @@ def _interruption() -> Iterator[Callable[[], int]]:
 
     def asked() -> int:
         if not first:
-            for number in before:  # installed again, because kernel compilers have installed their own handlers
+            for number in before:  # kernel compilers may have replaced these handlers by their own
                 signal.signal(number, ask)
         return first
 
@@ -280,7 +280,7 @@ class TrainingSession:
     def record(
         self, report: StepReport, *, evaluating: bool, stages: dict[str, float] | None, validated: bool = False
     ) -> None:
-        """Pass a step's report to `on_step`, and append it to metrics.jsonl, with what report.html needs.
+        """Pass a step's report to `on_step`, and append it to metrics.jsonl, with other values that report.html shows.
 
         evaluating: True to evaluate the held-out views.
         stages: milliseconds by stage, if the step was timed.

@@ -289,7 +289,7 @@ class MemoryPlanner:
         device, rows = self._rasterizer.device, CHUNK_ROWS * chunks
         if rows <= max(self.rows_in_view, made.rows):
             return made
-        try:  # with room for a few more chunks, so that slightly larger views need no new plan
+        try:  # plan for a few more chunks, so that slightly larger views need no new plan
             padded = CHUNK_ROWS * listed_chunks(chunks)
             wider, rows = plan_view(device, made, padded), padded
         except CapacityError:
@@ -327,7 +327,7 @@ class MemoryPlanner:
         if need.pool is not None:
             taken = need.record * plan.rows
         elif plan.streamed and need.held is not None and self.scratch_files is not None:
-            taken *= not self._memory.is_exceeded(taken, photographs)  # all chunks go to a scratch file
+            taken *= not self._memory.is_exceeded(taken, photographs)  # if so, all chunks go to a scratch file
         enough = self._memory.share(photographs, count, taken, begins=self.begins)
         if not enough and not self._warned:
             self._warned = True

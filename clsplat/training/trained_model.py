@@ -214,7 +214,7 @@ class TrainedModel:
         return True
 
     def marker(self) -> DeviceMarker:
-        """Return an object that marks the Gaussians by density rules."""
+        """Return an object that applies density rules to the Gaussians, and lists the resulting rows."""
         return DeviceMarker(self._device, self._work, self.parameters, self.statistics)
 
     def widen(self, coefficients: int, changes: Callable[[], None]) -> None:

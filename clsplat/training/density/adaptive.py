@@ -20,8 +20,9 @@ from clsplat.training.density import SPLIT_GROUPS, ModelState, RowPlan, Statisti
 HALF_OFFSET_DEVIATIONS, LONG_AXIS_HALF_RATIO, SHORT_AXIS_HALF_RATIO, HALF_OPACITY_RATIO = 1.35, 0.55, 0.893, 0.6
 """Constants of halves along the longest axis (Improved-GS, Deng et al. 2025).
 
-They are the distance of the halves' means from the original mean, in standard deviations, and the factors on the scale
-of that axis, on the scales of the other axes, and on the opacity.
+HALF_OFFSET_DEVIATIONS: distance of the halves' means from the original mean, in standard deviations.
+LONG_AXIS_HALF_RATIO, SHORT_AXIS_HALF_RATIO: factor on the scale of the longest axis, and on the two other scales.
+HALF_OPACITY_RATIO: factor on the opacity.
 """
 SCORED_ROWS = 1 << 16
 """Number of scores that are compared with a given score at a time, which limits the size of copies."""

@@ -198,7 +198,7 @@ class GradientStep:
         keys, camera, room, fields = tuple(term.key for term in terms), inputs.camera, self.room, self.fields
         if room is None or inputs.parts or inputs.kept is not None or None in keys:
             return None
-        of_view = (self.rasterizer.device_of(camera), source.shape, source.dtype)  # the camera has the source's size
+        of_view = (self.rasterizer.device_of(camera), source.shape, source.dtype)  # the camera has the size of `source`
         of_step = (room.pairs, room.turn, room.appends, fields.absolute, fields.contributions, fields.nearness)
         assert not isinstance(chunks, ChunkNumbers), "such a step has exact counts"
         rows = None if chunks is None else chunks.key
@@ -239,7 +239,7 @@ class GradientStep:
         if None in keys:
             return compared()
         key = (frame.listed, image.buffer, inputs.kept, keys, self.turn)
-        if is_photograph(planes):  # each photograph has its own array, so it is passed to the replay
+        if is_photograph(planes):  # each photograph has its own array, which the replay must be given
             return self.replayed(of, (*key, planes.shape, planes.dtype), compared, given=(planes,))
         return self.replayed(of, key, compared)
 

@@ -24,9 +24,9 @@ class PlacedChunks:
     """Chunks that a step runs over, ready for its kernels.
 
     model: arrays for the kernels: of the whole model, or of the pool of a streamed model.
-    in_model: the chunks. Usually a `ChunkList`: their numbers in the whole model, or their slots in the pool. If the
-        pool has too few slots for all of them, their `ChunkNumbers`; `model` is then the streamed model, whose chunks
-        come to the pool in parts.
+    in_model: usually a `ChunkList`: the chunks' numbers in the whole model, or their slots in the pool. If the pool has
+        too few slots for all chunks, it is a `ChunkNumbers`. Then `model` is the streamed model, whose chunks come to
+        the pool in parts.
     """
 
     model: tuple[AnyGaussians, ...]

@@ -84,7 +84,7 @@ class SpeculativeSteps:
 
     @property
     def turns(self) -> int:
-        """Number of arrays for the sums of the loss. Consecutive steps use different ones."""
+        """Number of arrays for the sums of the loss, which the steps use in turn."""
         return MAX_COUNTED_PASSES if self.on else 1
 
     def forget(self) -> None:
@@ -119,7 +119,7 @@ class SpeculativeSteps:
         if self._most is None:
             return 0
         wanted = max(self._most + self._most // 4, 1024)
-        step = 1 << (wanted.bit_length() - 4)  # rounded up to few sizes, so that arrays are seldom resized
+        step = 1 << (wanted.bit_length() - 4)  # round up to a multiple of this, so that arrays are seldom resized
         wanted = -(-wanted // step) * step
         return wanted if wanted <= rasterizer.capacity else 0
 
