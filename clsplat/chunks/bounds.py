@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bounding boxes of chunks for culling, and how far Adam may have moved the Gaussians since they were measured.
 
-Noise, density control and repairs move Gaussians too. After them a chunk is measured again.
+Noise, density control and repairs move Gaussians too. Chunks are measured again after each of these.
 """
 
 from __future__ import annotations

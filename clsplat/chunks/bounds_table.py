@@ -49,7 +49,7 @@ class BoundsTable:
         changed = numbers.astype(np.int64)
         for below, level in pairwise(self._levels):
             changed = np.unique(changed // GROUP)
-            members = below[np.minimum(_members(changed), len(below) - 1)]  # pads the last group with its last member
+            members = below[np.minimum(_members(changed), len(below) - 1)]  # the last group repeats its last member
             sides = np.hstack([members[:, :, :3].min(axis=1), members[:, :, 3:].max(axis=1)])
             with np.errstate(invalid="ignore"):
                 finite = np.isfinite(members.sum(axis=(1, 2)))

@@ -248,7 +248,8 @@ def _half_turn(sine: Float64, level: Float64) -> Float64:
     Let w be a cone's half angle, and a > w the angle between its middle and the axis. Then the cones of the chunk's
     Gaussians do not contain the axis either, as sin(w - spread) / sin(a - spread) falls with the spread.
 
-    sine, level: (B,), sin w and sin a.
+    sine: (B,), sin w.
+    level: (B,), sin a.
     """
     ratio = sine / level
     return np.where(ratio < _POLE, np.arcsin(ratio), np.nan) + _ANGLE_SLACK

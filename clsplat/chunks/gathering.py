@@ -53,7 +53,7 @@ class SourceList:
         return np.argsort(kinds, kind="stable").astype(np.uint32)
 
     def entries(self) -> NDArray[np.uint32]:
-        """Return `rows`, sorted by kind as in `by_kind`."""
+        """Return `rows`, sorted by kind: remaining rows, clones, first halves, second halves."""
         return self.rows[self.by_kind()]
 
 

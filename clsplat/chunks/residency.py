@@ -71,7 +71,7 @@ class Residency:
         self._slot_of[moves.evicted] = self._chunk_in[moves.evicted_from] = _NOTHING
 
     def use(self, moves: Moves) -> None:
-        """Record that the fetched chunks of a plan are on the device, and that all its chunks are used now."""
+        """Record that the fetched chunks of a plan are on the device, and that all chunks of the plan are used now."""
         self._uses += 1
         self._slot_of[moves.fetched], self._chunk_in[moves.fetched_to] = moves.fetched_to, moves.fetched
         self._used[moves.slots] = self._uses

@@ -102,7 +102,7 @@ class _AddedView(GradientStep):
     noise: Exploration
 
     def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
-        """Keep the gradients of the view's parts until the batch ends: all its views use the same parameters."""
+        """Keep the gradients of the view's parts until the batch ends, as all its views use the same parameters."""
         self.own[inputs.place] = own
 
     def update(self, rows: StepRows) -> None:

@@ -461,7 +461,7 @@ class Trainer:
 
     def checkpoint(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """All state that the remaining steps depend on: arrays by name, and JSON values. The whole model is finite,
-        unless `monitor.retries.lost`."""
+        unless `monitor.retries.lost` is True."""
         self.repair(look=True)
         arrays, state = self._arrays()
         if not self.model.changes_are_finite():  # examine also Gaussians that no step has updated

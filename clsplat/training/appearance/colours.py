@@ -64,8 +64,8 @@ steps change a photograph's gain by 0.25 %.
 """
 
 GAIN_CHECKPOINT_ARRAYS = ("logs", "start", "first", "second", "gains")
-"""Fields of the photographs' `Gains` in a checkpoint. It also has `told`: 1 for photographs with gains from points,
-else 0."""
+"""Fields of the photographs' `Gains` in a checkpoint. The checkpoint also has `told`: 1 for photographs with gains from
+points, else 0."""
 LENS_CHECKPOINT_ARRAYS = ("logs", "first", "second")
 """Fields of the lenses' `Gains` in a checkpoint."""
 

@@ -162,7 +162,7 @@ def _cut_off(config: DensityConfig, model: ModelState, rules: MarkRules) -> tupl
 
 
 def weakest(scores: Float32, count: int) -> tuple[float, int]:
-    """Score and row of the weakest of the `count` Gaussians with the largest scores.
+    """Score and row of the Gaussian with the smallest score among the `count` Gaussians with the largest scores.
 
     Gaussians with equal scores are taken in the order of their rows. Makes one copy of the scores.
     """

@@ -118,8 +118,8 @@ class GradientStep:
         """Update the model (parameters, first and second moments) with a view. Returns the loss.
 
         gradients: arrays for the gradients of rows, as `view_gradients` makes them; None if neither the probe nor a
-            part of the view reads gradients. They contain zeros before and after. The model gets the same bits with and
-            without them.
+            part of the view reads gradients. The arrays contain zeros before and after the step. The model gets the
+            same bits with and without them.
         reads_loss: True if the loss will be read. Reading then does not wait for the rest of the step.
         """
         camera = inputs.camera

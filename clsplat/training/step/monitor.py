@@ -41,7 +41,7 @@ class StepMonitor(StepProbe):
     changes: Callable[[], None]
 
     def forward(self, frame: ForwardPass) -> None:
-        """Record how many elements `adam` refused in the previous step. This forward pass has read the number back."""
+        """Record how many elements `adam` refused in the previous step. The forward pass has read this number back."""
         self.monitor.notice(frame.refused)
         self.pending.seen(frame)
 
