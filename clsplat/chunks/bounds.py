@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bounding boxes of chunks for culling, and how far Adam may have moved the Gaussians since they were measured.
 
-Noise, density control and repairs move Gaussians too. After them a chunk is measured again.
+Noise, density control and repairs move Gaussians too. Chunks are measured again after each of these.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class ChunkBounds:
 
     lowest, highest: (B, 3), the smallest and largest coordinates of the means, in world units.
     largest: (B,), the largest log scale.
-    factor: factor on the radii of spheres around the boxes, and on rounding. It is GROUP_FACTOR for bounds of groups,
-        so that a group is visible wherever one of its chunks is.
+    factor: factor on the radii of spheres around the boxes, and on the magnitudes in `terms`. It is GROUP_FACTOR for
+        bounds of groups, so that a group is visible wherever one of its chunks is.
     """
 
     lowest: Float64
@@ -69,7 +69,8 @@ class ChunkBounds:
     def terms(self) -> Float64:
         """Array (8, B) whose rows are the boxes' middles (3), half sides (3), largest standard deviations, magnitudes.
 
-        A magnitude is the sum of the absolute coordinates of the box's farthest corner; rounding is relative to it.
+        A magnitude, which rounding errors are relative to, is `factor` times the sum of the absolute coordinates of the
+        box's farthest corner.
         """
         with np.errstate(over="ignore", invalid="ignore"):
             middle, half = 0.5 * (self.lowest + self.highest).T, 0.5 * (self.highest - self.lowest).T
@@ -137,7 +138,7 @@ def largest_step(config: OptimiserConfig) -> float:
     if root >= 1 or beta2 >= 1 or config.epsilon < _LEAST_EPSILON:
         return math.inf
     limit = (1 - beta1) / math.sqrt((1 - beta2) * (1 - root**2))
-    # kernels round decays for moments, but not for corrections, which matters most at the first step
+    # the moments have float32 decays and the corrections float64 decays, which matters most at the first step
     first = (1 - beta1) / (1 - config.beta1)
     second = math.sqrt((1 - config.beta2) / (1 - beta2))
     return limit * max(first, 1.0) * max(second, 1.0) * (1 + _SLACK)

@@ -31,7 +31,7 @@ class BoundsTable:
 
     The bounds of a group enclose the bounds of its chunks. They are NaN if a chunk's bounds are not finite.
 
-    chunks: number of chunks. Until they are measured their bounds are NaN, and they count as in view.
+    chunks: number of chunks. A chunk that has not been measured has bounds of NaN, and counts as in view.
     """
 
     def __init__(self, chunks: int) -> None:
@@ -49,7 +49,7 @@ class BoundsTable:
         changed = numbers.astype(np.int64)
         for below, level in pairwise(self._levels):
             changed = np.unique(changed // GROUP)
-            members = below[np.minimum(_members(changed), len(below) - 1)]  # pads the last group with its last member
+            members = below[np.minimum(_members(changed), len(below) - 1)]  # the last group repeats its last member
             sides = np.hstack([members[:, :, :3].min(axis=1), members[:, :, 3:].max(axis=1)])
             with np.errstate(invalid="ignore"):
                 finite = np.isfinite(members.sum(axis=(1, 2)))
@@ -58,7 +58,7 @@ class BoundsTable:
     def move(self, numbers: NDArray[np.uint32], steps: Float64) -> None:
         """Record that a training step has moved the Gaussians of the chunks `numbers` (n,).
 
-        steps: (2, n or 1), the largest change of a mean's coordinate, and of a log scale.
+        steps: (2, n or 1), the largest change of a mean's coordinate in the step, and of a log scale.
         """
         self._moved[:, numbers] += steps
         self._most_moved = np.maximum(self._most_moved, self._moved[:, numbers].max(axis=1, initial=0.0, keepdims=True))
@@ -66,6 +66,7 @@ class BoundsTable:
     def seen(self, sees: Sees, hidden: Movement, most_hidden: Float64, updates: int) -> NDArray[np.uint32]:
         """Return the numbers of the chunks for which `sees` is True, rising. Only chunks of groups in view are tested.
 
+        sees: function that tells which bounds are in view.
         hidden: function that returns the changes of chunks that `move` has not recorded.
         most_hidden: (2, 1), the largest of these changes in any chunk.
         updates: number of updates of a parameter since the oldest measurement (`ChunkBounds.widened`).

@@ -72,7 +72,8 @@ class PictureBorders:
         This axis is at most the root of the sum of the squared half width and half height.
     reach: number of standard deviations at which a Gaussian ends.
     stretch: largest factor by which the camera's matrix changes a length; 1 for an exact rotation.
-    low, high: (2,), left and upper, right and lower border of the tiles, in pixels from the principal point.
+    low: (2,), left and upper border of the tiles, in pixels from the principal point.
+    high: (2,), right and lower border of the tiles.
     slack: (2,), rounding error in pixels of image positions near the picture.
     depths: depths of the near and the far plane.
     """
@@ -217,7 +218,7 @@ def _cones(bounds: ChunkBounds, picture: PictureBorders) -> _Cones:
 
 
 def _out_of_depth(cones: _Cones, picture: PictureBorders) -> Bool:
-    """Return True (B,) for chunks before the near plane or beyond the far plane, for camera models along rays."""
+    """Return True (B,) for chunks nearer than the near plane or beyond the far plane, for camera models along rays."""
     flat = picture.camera.model.flat
     depth, half = (cones.middle[2], cones.half[2]) if flat else (cones.distance, cones.radius)
     slack = half + _ROUNDING * (np.abs(depth) + half)
@@ -247,7 +248,8 @@ def _half_turn(sine: Float64, level: Float64) -> Float64:
     Let w be a cone's half angle, and a > w the angle between its middle and the axis. Then the cones of the chunk's
     Gaussians do not contain the axis either, as sin(w - spread) / sin(a - spread) falls with the spread.
 
-    sine, level: (B,), sin w and sin a.
+    sine: (B,), sin w.
+    level: (B,), sin a.
     """
     ratio = sine / level
     return np.where(ratio < _POLE, np.arcsin(ratio), np.nan) + _ANGLE_SLACK
@@ -308,7 +310,7 @@ def _beyond_fisheye(cones: _Cones, picture: PictureBorders) -> Bool:
     axis to the mean. The rectangle reaches from radius `inner` to `outer`, and `aside` to both sides. If a Gaussian may
     contain the axis, or reach the largest angle, the kernels take a square around the axis. The bound here is then
     1.5 `outer` on all sides, which no corner of a Gaussian's rectangle exceeds. A rectangle never reaches beyond 2
-    `outer`, which is less than the square of a group.
+    `outer`, which is less than the bound of a group of chunks, 2.25 `outer`.
     """
     camera, (x, y, z), fold = picture.camera, cones.middle, picture.camera.fold[0]
     widest = 1.5 / MIN_FISHEYE_SLOPE if any(camera.radial) else max(1.0, 0.5 / (math.pi * camera.fx))
@@ -317,9 +319,9 @@ def _beyond_fisheye(cones: _Cones, picture: PictureBorders) -> Bool:
     theta = np.arctan2(across, z)
     sine, spread_sine = across / cones.distance, cones.radius / cones.distance
     spread_cosine = np.sqrt(1 - spread_sine * spread_sine)
-    least_sine = sine * spread_cosine - np.abs(z / cones.distance) * spread_sine  # the smaller sine of theta +- spread
+    least_sine = sine * spread_cosine - np.abs(z / cones.distance) * spread_sine  # min of sin(theta +- spread)
     ratio = np.sin(cap) / least_sine
-    # means cover an angle around the axis; this is the sine of half of it
+    # sine of half of the angle that the means of a chunk cover around the axis
     turn_sine = spread_sine / sine + _ANGLE_SLACK
     turn_cosine = np.sqrt(1 - turn_sine * turn_sine)
     ring = (least_sine > 0) & (ratio < _POLE) & (turn_sine < 1)

@@ -56,9 +56,9 @@ class Division:
 def divided(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> Division:
     """Divide rows into chunks after density control.
 
-    An old chunk is kept if all its rows stay and none was added. The rows of consecutive chunks that are not kept are
-    divided into as few chunks as possible, of equal lengths. If the rows of a kept chunk beside them fit into these
-    chunks too, they are divided together with them.
+    An old chunk is kept if all its rows stay and no row was added. The rows of consecutive other chunks are divided
+    into as few new chunks as possible, of equal lengths. A chunk directly before or behind these is divided with them,
+    although it could be kept, if its rows fit into the new chunks too.
 
     entries: source row of each row after density control, in rising order, with the bit FRESH set if the row is new.
     starts: first rows of the old chunks, as in `Division`.
@@ -84,8 +84,8 @@ def divided(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> Division:
 
 
 def _changes(entries: NDArray[np.uint32], starts: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return two arrays with an element for each old chunk: the number of rows after density control whose source is in
-    the chunk, and True if they differ from the chunk's old rows. entries, starts: as in `divided`."""
+    """Return two arrays with an element for each old chunk: the number of new rows whose source is in the chunk, and
+    True if these rows differ from the chunk's old rows. entries, starts: as in `divided`."""
     lengths = np.diff(starts)
     counts, stay, before = np.zeros_like(lengths), np.zeros_like(lengths), -1
     for begin in range(0, len(entries), _COUNTED_ROWS):

@@ -53,7 +53,7 @@ class SourceList:
         return np.argsort(kinds, kind="stable").astype(np.uint32)
 
     def entries(self) -> NDArray[np.uint32]:
-        """Return `rows`, sorted by kind as in `by_kind`."""
+        """Return `rows`, sorted by kind: remaining rows, clones, first halves, second halves."""
         return self.rows[self.by_kind()]
 
 
@@ -134,11 +134,11 @@ def gathered(
 
     rows: for each row of the new model, the old row that it is a copy of, with the bit FRESH set if it is new; None for
         the same rows as before.
-    to: the new chunks. Only records of chunks that are NEW are made.
-    record: type of the new records. Old fields that it lacks are left out, and SH coefficients that it adds are zero.
+    to: division of the new rows into chunks. Records are made only for chunks that are NEW in `to.kept`.
+    record: type of the new records. It may lack fields of the old records. SH coefficients that it adds are zero.
     passed: function that is called after each yield with the number of the first old chunk that may still be read. The
         number is valid only if the sources in `rows` rise.
-    values: values that are not copied.
+    values: values that rows get in place of copies.
     """
     new = np.flatnonzero(to.kept == NEW)
     for begin in range(0, len(new), BLOCK_CHUNKS):
@@ -165,7 +165,10 @@ def _entries(
 ) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
     """Return the sources (m,) of all rows of the new chunks `numbers` (k,), and the position (m,) of each row.
 
-    A position is CHUNK_ROWS i + j for row j of chunk numbers[i]. rows: as for `gathered`. starts: as in `Division`.
+    A position is CHUNK_ROWS i + j for row j of chunk numbers[i].
+
+    rows: source of each row of the new model; None if each row is its own source.
+    starts: first rows of the new chunks, as in `Division`.
     """
     entries, places = [], []
     for place, number in enumerate(numbers.tolist()):
@@ -185,7 +188,10 @@ def _copy(
 ) -> None:
     """Copy the rows at positions `at` (m,) of the records `old` to positions `places` (m,) of `records`.
 
-    Row r of record k has the position CHUNK_ROWS k + r. fresh: (m,), True for new rows. values: as for `gathered`.
+    Row r of record k has the position CHUNK_ROWS k + r.
+
+    fresh: (m,), True for new rows.
+    values: values that new rows, or all rows, get in place of copies.
     """
     parts, wanted = list(_by_chunk(places)), set(records.dtype.names or ()) - values.anew
     for name in (name for name in old.dtype.names or () if name in wanted):
@@ -200,7 +206,8 @@ def _copy(
 
 
 def _by_chunk(places: NDArray[np.int64]) -> Iterator[tuple[int, Any, slice]]:
-    """Split rising positions (m,) by record. Yields a record's index, its rows, and their slice of `places`."""
+    """Split `places` (m,), the rising positions of rows, by record. Yields a record's index, its rows at these
+    positions, and the slice of `places` for the record."""
     chunks = places // CHUNK_ROWS
     ends = np.flatnonzero(np.diff(chunks, append=-1)) + 1
     begin = 0

@@ -58,7 +58,7 @@ class Residency:
             raise ValueError(f"numbers: {len(numbers)} chunks, expected at most {self.slots}, the number of slots")
         slots, used = self._slot_of[numbers], self._used.copy()
         missing = slots == _NOTHING
-        used[slots[~missing]] = self._uses + 1  # counts as used last, so that no chunk of this step is evicted
+        used[slots[~missing]] = self._uses + 1  # chunks of this step count as used last, and are not evicted
         to = np.sort(np.argsort(used, kind="stable")[: np.count_nonzero(missing)])
         slots[missing] = to
         leaving = to[self._chunk_in[to] != _NOTHING]
@@ -71,7 +71,7 @@ class Residency:
         self._slot_of[moves.evicted] = self._chunk_in[moves.evicted_from] = _NOTHING
 
     def use(self, moves: Moves) -> None:
-        """Record that the fetched chunks of a plan are on the device, and that all its chunks are used now."""
+        """Record that the fetched chunks of a plan are on the device, and that all chunks of the plan are used now."""
         self._uses += 1
         self._slot_of[moves.fetched], self._chunk_in[moves.fetched_to] = moves.fetched_to, moves.fetched
         self._used[moves.slots] = self._uses

@@ -95,9 +95,11 @@ class SlotFile:
         sync_folder(self.path.parent)
 
     def grow(self, slots: int, more: int, least: int) -> int:
-        """Reserve disk space behind the first `slots` slots, so that a full disk is found before rows are written.
+        """Add slots behind the first `slots` slots, and reserve disk space for them, so that later writes have room.
 
-        Returns the number of new slots: `more`, or `least` if the disk has too little room. Raises WriteError.
+        more: number of slots to add.
+        least: number of slots to add if the disk has too little room for `more`.
+        Returns the number of added slots. Raises WriteError if there is too little room for `least` slots.
         """
         try:
             self._reserve(slots * self.slot_bytes, more * self.slot_bytes)
@@ -140,7 +142,8 @@ class SlotFile:
     def read_ahead(self, slots: NDArray[np.int64]) -> None:
         """Ask the system to read slots from the disk while other work goes on.
 
-        A thread makes the request, because it may block until the disk has read. Until then further calls do nothing.
+        A thread makes the request, which may block until the disk has read the slots. Until then, further calls do
+        nothing.
         """
         if hasattr(os, "posix_fadvise") and (self.request is None or self.request.done()):
             self.request = _reader().submit(self._request, list(runs(slots)))

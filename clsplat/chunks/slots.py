@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 NO_SLOT = -1
-"""Slot number of a chunk that has not been written. All elements of a field are then equal (`manifest.CONSTANTS`)."""
+"""Slot number of a chunk that has not been written. Each field of this chunk has one value in all its elements
+(`manifest.CONSTANTS`)."""
 MAX_TENTHS = 22
 """Maximum number of slots of a file, in tenths of the number of chunks. 22 allow two copies of each chunk, one for the
 latest checkpoint and one that later steps change, and a tenth more."""
@@ -34,7 +35,7 @@ class SlotTable:
 
     @property
     def most(self) -> int:
-        """Maximum number of slots. Before the file gets more, old checkpoints are removed."""
+        """Maximum number of slots. Before the file gets more slots, old checkpoints are removed."""
         return max(MAX_TENTHS * len(self.current) // 10, 1)
 
     @property
@@ -48,7 +49,10 @@ class SlotTable:
         return _end(self._used)
 
     def hold(self, kept: Sequence[NDArray[np.int64]]) -> None:
-        """Protect only the slots `kept` from being overwritten. They are an array for each kept checkpoint."""
+        """Protect the slots of the kept checkpoints, and no other slots, from being overwritten.
+
+        kept: for each kept checkpoint, an array of its slots.
+        """
         self._held, self._named_end = np.zeros(self.size, np.bool_), 0
         for slots in kept:
             self._held[slots[(slots >= 0) & (slots < self.size)]] = True
@@ -65,11 +69,12 @@ class SlotTable:
         return max(_end(self._held), self._named_end)
 
     def name_current(self) -> None:
-        """Include the model's present slots in `end_of_held` until `hold`, because a new checkpoint will name them."""
+        """Include the model's present slots in `end_of_held`, because a new checkpoint will name them. This lasts until
+        `hold` is called."""
         self._named_end = int(self.current.max(initial=NO_SLOT)) + 1
 
     def in_place(self, numbers: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
-        """Return True (k,) for those of the chunks `numbers` (k,) whose own slot may be overwritten."""
+        """Return True (k,) for chunks whose own slot may be overwritten. numbers: (k,), the chunks to look up."""
         slots: NDArray[np.int64] = self.current[numbers]
         writable: NDArray[np.bool_] = slots != NO_SLOT
         writable[writable] = ~self._held[slots[writable]]
@@ -80,13 +85,14 @@ class SlotTable:
         return int(np.count_nonzero(~self.in_place(numbers)))
 
     def growth(self, lacking: int) -> int:
-        """Return the number of slots to add to the file if `lacking` are missing; 0 if it would exceed `most`."""
+        """Return the number of slots to add if `lacking` slots are missing; 0 if the file would exceed `most` slots."""
         if self.size + lacking > self.most:
             return 0
         return min(self.least_growth(lacking), self.most - self.size)
 
     def least_growth(self, lacking: int) -> int:
-        """Return the smallest number of slots to add if `lacking` are missing, so large that the file seldom grows."""
+        """Return the smallest number of slots by which the file grows if `lacking` slots are missing. It is at least a
+        share of the number of chunks (_GROWTH_SHARE), so that the file seldom grows."""
         return max(lacking, len(self.current) // _GROWTH_SHARE)
 
     def grow(self, slots: int) -> None:
@@ -99,7 +105,7 @@ class SlotTable:
         self.size, self._held, self._used = size, self._held[:size], self._used[:size]
 
     def take(self, count: int) -> NDArray[np.int64]:
-        """Reserve `count` free slots for new chunks, until `become` or `give_up`. Returns the slots."""
+        """Reserve `count` free slots for new chunks, until `become` or `give_up` is called. Returns the slots."""
         slots = np.flatnonzero(~self._used)[:count]
         self._taken = np.append(self._taken, slots)
         self._used[slots] = True

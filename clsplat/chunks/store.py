@@ -192,7 +192,7 @@ class ChunkStore:
 
         rows: the old row that each row becomes a copy of, in rising order, with the bit FRESH set for new rows. None
             leaves all rows in place.
-        values: values that are not copied.
+        values: values that rows get in place of copies.
         changes: function that is called before the first row changes. With a scratch file, all new chunks have then
             been written to free slots, so that an error changes nothing.
         fields: new shapes of the fields, for more SH coefficients. Then all rows stay, and all chunks are written.
@@ -260,7 +260,7 @@ class ChunkStore:
         return rows
 
     def set_records(self, start: int, stop: int, rows: NDArray[Any]) -> None:
-        """Replace the rows [start, stop) by records as from `get_records`. Raises WriteError and ScratchError."""
+        """Replace the rows [start, stop). rows: records as of `get_records`. Raises WriteError and ScratchError."""
         numbers, mine, evenly = self._covering(start, stop)
         records = rows
         if not evenly:
@@ -329,7 +329,7 @@ class ChunkStore:
     def rows_of(
         self, numbers: NDArray[np.integer[Any]], kinds: Sequence[str], names: Iterable[str]
     ) -> dict[str, dict[str, NDArray[np.float32]]]:
-        """Read all rows of chunks, for each field named kind/name. Returns {kind: {name: rows}}."""
+        """Read all rows of the chunks `numbers`, of the fields named kind/name. Returns {kind: {name: rows}}."""
         records, mine = self.read(numbers), np.arange(CHUNK_ROWS) < self.lengths(numbers)[:, None]
 
         def rows(field: str) -> NDArray[np.float32]:
@@ -425,7 +425,7 @@ class ChunkStore:
         return rows
 
     def _set_field(self, number: int, field: str, rows: NDArray[np.float32]) -> None:
-        """Write a changed field from `_field` to the file. A field in main memory has been changed in place."""
+        """Replace a field of a chunk in the file by `rows`. In main memory do nothing: `rows` is the field itself."""
         if self.path is None:
             return
         numbers = np.array([number])
@@ -439,7 +439,7 @@ class ChunkStore:
         self._checksums[of_field], self._constants[of_field] = zlib.crc32(rows.data), WRITTEN
 
     def _make_room(self, needed: Callable[[], int]) -> None:
-        """Grow the file to `needed()` free slots, or else remove checkpoints to free slots. Raises WriteError."""
+        """Grow the file, or remove old checkpoints, until `needed()` slots are free. Raises WriteError."""
         assert self.path is not None
         while (lacking := needed() - self.slots.free) > 0:
             more = self.slots.growth(lacking)
@@ -462,7 +462,7 @@ class ChunkStore:
 
 
 def _filled(records: NDArray[Any], rows: int) -> NDArray[np.bool_]:
-    """Return a mask (k, CHUNK_ROWS) of the first `rows` rows of records (k,)."""
+    """Return a mask (k, CHUNK_ROWS) of k records: True for the first `rows` rows, counted through all records."""
     return np.arange(len(records) * CHUNK_ROWS).reshape(-1, CHUNK_ROWS) < rows
 
 
@@ -473,7 +473,7 @@ def _checksums(records: NDArray[Any]) -> NDArray[np.uint32]:
 
 
 def _carried(values: NDArray[Any], to: Division, shape: tuple[int, int]) -> NDArray[Any]:
-    """Return `values` (old chunks, fields) in the order of the new chunks of `to`, with zeros for NEW chunks."""
+    """Return an array of this shape: for each chunk that `to` keeps its row of `values`, for other chunks zeros."""
     carried, stays = np.zeros(shape, values.dtype), to.kept != NEW
     if stays.any():
         carried[stays] = values[to.kept[stays]]
@@ -488,7 +488,7 @@ def _packed(record: NDArray[Any], rows: int) -> NDArray[np.uint8]:
 
 
 def _unpack(packed: NDArray[np.uint8], rows: int, record: NDArray[Any]) -> None:
-    """Copy the bytes of `rows` rows, as from `_packed`, to a record (1,)."""
+    """Copy `packed`, the bytes of `rows` rows of each field, one field after the other, to a record (1,)."""
     if rows == CHUNK_ROWS:
         record.view(np.uint8)[:] = packed
         return

@@ -107,7 +107,7 @@ def atomic_name(path: str | os.PathLike[str], needs: int | None = None) -> Itera
         written = 0
         with suppress(OSError):
             written = temporary.stat().st_size
-            temporary.unlink()  # removed before `write_error` measures the free space
+            temporary.unlink()  # the file must not take disk space while `write_error` measures the free space
         names = (None, str(temporary), str(path))
         if isinstance(error, OSError) and error.errno and not isinstance(error, WriteError) and error.filename in names:
             # The system's error names the temporary file, or no file if the disk is full. Users know only `path`.
@@ -127,7 +127,7 @@ def atomic_writer(path: str | os.PathLike[str], needs: int | None = None) -> Ite
 
 
 def write_error(path: str | os.PathLike[str], error: OSError, written: int = 0, needs: int | None = None) -> WriteError:
-    """WriteError that says why the file `path` could not be written; for a full disk, with the free and needed bytes.
+    """WriteError that says why the file `path` could not be written. For a full disk, it has the free and needed bytes.
 
     error: the system's error.
     written: bytes written so far, which the message gives as a lower limit if `needs` is None.

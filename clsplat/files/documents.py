@@ -82,7 +82,7 @@ def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
         file = open(path, "rb")  # noqa: SIM115  # closed below
     except FileNotFoundError:
         raise InputError(f"{path}: no such file, expected {expected}") from None
-    except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
+    except (OSError, ValueError) as error:  # ValueError is raised for a zero byte in the name
         raise InputError(
             f"{path}: cannot be read ({reason_of(error) if isinstance(error, OSError) else error}), expected {expected}"
         ) from None

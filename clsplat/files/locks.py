@@ -81,7 +81,8 @@ def _is_given_up(claimed: Path) -> bool:
     token = claimed.read_text(encoding="ascii", errors="replace")
     if not token:  # the marker is being written now, or its process was killed while it wrote
         return age > EMPTY_CLAIM_SECONDS
-    if token[:12] == f"{machine_mark()}{os.getpid():08x}":  # this process, or in a container an earlier one with its id
+    # the marker is from this process, or (in a container) from an earlier process with the same id
+    if token[:12] == f"{machine_mark()}{os.getpid():08x}":
         return token[12:] != _PROCESS_TOKEN
     return is_abandoned(claimed, token)
 

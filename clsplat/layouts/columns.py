@@ -19,21 +19,21 @@ TILE = 16
 LOSS_ROWS, LOSS_COLUMNS, LOSS_GROUP_ROWS, LOSS_GROUP_COLUMNS = 2, 640, 7, 54
 """Sizes of the blocks of pixels that work-groups of the loss kernel process (`kernels/loss.cl`).
 
-LOSS_ROWS: rows that a work-group of one item processes together, as their windows share pixels.
-LOSS_COLUMNS: maximum columns in a block of a work-group of one item.
-LOSS_GROUP_ROWS, LOSS_GROUP_COLUMNS: rows and columns of a block for a work-group of several items.
+LOSS_ROWS: number of rows that a work-group of one work-item processes together, as their windows share pixels.
+LOSS_COLUMNS: maximum number of columns in a block of a work-group of one work-item.
+LOSS_GROUP_ROWS, LOSS_GROUP_COLUMNS: rows and columns of a block for a work-group of several work-items.
 
-Five arrays with a value for each pixel of a block must fit in 32 KiB of local memory. Several items share a block's
-LOSS_PARTS parts. For vertical windows, the parts are the 64 columns of the block and its margins; for horizontal
-windows, 63 runs of six pixels. So nearly every part has work in both directions.
+Five arrays with a value for each pixel of a block must fit in 32 KiB of local memory. Several work-items share the work
+on a block in LOSS_PARTS parts. For vertical windows, the parts are the 64 columns of the block and its margins. For
+horizontal windows, they are 63 runs of six pixels. So nearly every part has work in both directions.
 """
 
 LOSS_PARTS = 64
-"""Number of parts into which a work-group of several items divides a block of the loss, and the maximum number of these
-items. It is LOSS_GROUP_COLUMNS plus margins of five columns on each side."""
+"""Number of parts into which a work-group of several work-items divides a block of the loss, and the maximum number of
+these work-items. It is LOSS_GROUP_COLUMNS plus margins of five columns on each side."""
 
 LOSS_RING = 16
-"""Number of rows of SSIM's partial derivatives that a work-group of one item stores at a time.
+"""Number of rows of SSIM's partial derivatives that a work-group of one work-item stores at a time.
 
 It is a power of two and a multiple of LOSS_ROWS, and at least the window's 11 rows plus LOSS_ROWS - 1.
 """

@@ -64,11 +64,12 @@ def edge(holds: Callable[[Float32], Any]) -> float:
 
 
 def _ordered(value: float) -> int:
-    """Position of a float32 number in the order of all float32 numbers; that of 0 is 0."""
+    """Position of a float32 number in the order of all float32 numbers. The number 0 has position 0."""
     bits = int(np.float32(value).view(np.uint32))
     return -(bits & 0x7FFFFFFF) if bits >> 31 else bits
 
 
 def _number(order: int) -> Float32:
-    """Return the float32 at position `order` (see `_ordered`), as an array (1,), so that NumPy compares in float32."""
+    """Return the float32 at position `order` among all float32 numbers, counted from 0.0. The result is an array (1,),
+    so that NumPy compares in float32."""
     return np.array([order if order >= 0 else -order | 0x80000000], np.uint32).view(np.float32)

@@ -29,7 +29,8 @@ class MissedSteps:
             factors = np.zeros((MOST_MISSED + 1, len(groups), 3))
             factors[:, :, 1:] = 1.0
         self.groups, self.factors = tuple(groups), factors
-        # rounded to float32, as in Adam's kernels: with 0.999 in float64, moments would differ by 3e-6 over 256 steps
+        # Decays are rounded to float32, as in Adam's kernels. With a float64 decay of 0.999, moments would differ by
+        # 3e-6 after 256 steps.
         self._decays = np.array([config.beta1, config.beta2], np.float32).astype(np.float64)
 
     def add(self, scales: Mapping[str, float]) -> None:

@@ -146,7 +146,7 @@ def short(value: float) -> str:
 
 
 def thinned(points: Points, limit: int = MAX_LINE_POINTS) -> Points:
-    """Reduce points to about `limit`: the lowest and highest of each interval, so that peaks are kept."""
+    """Reduce points to about `limit`. The lowest and highest point of each interval stay, so that peaks are kept."""
     if len(points) <= limit:
         return points
     stretch = math.ceil(2 * len(points) / limit)

@@ -80,7 +80,11 @@ def write_last(run: Run, scene: Scene, model: Gaussians) -> None:
 
 
 def report_page(numbers: RunNumbers, scene: Scene | str | None = None, views: int = MAX_PICTURED_VIEWS) -> str:
-    """Build the HTML of a run's report. scene, views: as for `write_report`."""
+    """Build the HTML of a run's report.
+
+    scene: the run's scene, or the reason why there is none. None loads the scene if it is needed.
+    views: maximum number of held-out views with pictures.
+    """
     evaluation = numbers.evaluation
     listed = evaluation["views"] if evaluation else []
     shown: list[thumbnails.Shown] = []
@@ -226,7 +230,7 @@ def histograms(numbers: RunNumbers) -> list[Markup]:
     if "contribution" in bars:
         record = numbers.histograms["contribution"]
         views = f"{record['views']} of {record['of']} training views"
-        note = f"largest contribution to any of {views}; {record['none']:,} contribute to none"
+        note = f"largest contribution to any of {views}; {record['none']:,} Gaussians contribute to none of them"
         series = [ChartSeries("contribution", bars["contribution"], "bars", 3)]
         made.append(chart("Contribution", series, "pixels", "Gaussians", powers=True, note=note))
     return made

@@ -27,8 +27,8 @@ CURVE_KEYS = ("step", "loss", "psnr", "gaussians", "seconds")
 MAX_NAME_CHARACTERS = 200
 """Maximum number of characters of a displayed name of a view, stage or device."""
 MAX_EVALUATED_VIEWS, MAX_STAGES, MAX_SESSIONS, MAX_SAMPLES = 10_000, 40, 100, 2000
-"""Maximum numbers that are read of views in an evaluation, stages of a step, training sessions, and records of
-stages or evaluations. clsplat writes fewer; the limits protect from files of other programs."""
+"""Maximum numbers of views in an evaluation, of stages of a step, of training sessions, and of records of stages or
+evaluations that are read from files. clsplat writes fewer; the limits protect from files of other programs."""
 MAX_DRAWN_VALUE = 1e30
 """Largest magnitude of a number in a chart."""
 

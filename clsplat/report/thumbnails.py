@@ -98,7 +98,10 @@ def scene_of(run: Run) -> Scene | str:
 
 
 def chosen(scores: Sequence[float | None], limit: int) -> list[int]:
-    """Choose at most `limit` views to show: the worst, the best, and others at even ranks between. Returns indices."""
+    """Choose at most `limit` views to show: the worst, the best, and others at even ranks between. Returns indices.
+
+    scores: PSNR of each view in dB; None if it is unknown.
+    """
     if len(scores) <= limit:
         return list(range(len(scores)))
     order = sorted(range(len(scores)), key=lambda index: (scores[index] is None, scores[index] or 0.0, index))

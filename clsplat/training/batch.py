@@ -102,7 +102,7 @@ class _AddedView(GradientStep):
     noise: Exploration
 
     def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
-        """Keep the gradients of the view's parts until the batch ends: all its views use the same parameters."""
+        """Keep the gradients of the view's parts until the batch ends, as all its views use the same parameters."""
         self.own[inputs.place] = own
 
     def update(self, rows: StepRows) -> None:
@@ -212,8 +212,8 @@ class Replica:
 
         place: the view's position among this device's views of the batch.
         factor: divisor of the photographs' resolution.
-        step: step of a view on the first device, whose settings this one shares.
-        values: parameters of each of `inputs.parts`, from `ViewPart.values`.
+        step: step of a view on the first device. The view on this device is computed with its settings.
+        values: parameters of each of `inputs.parts`, as `ViewPart.values` returned them.
         splats: True to return splats and screen-space gradients too, which density control uses.
         """
         parameters, photograph = self.parameters, self.photographs.bring(inputs.view, factor)
@@ -296,7 +296,7 @@ class Batch:
     ) -> Losses:
         """Update the model (parameters, first and second moments) with the views of a step.
 
-        step: template for the steps of the single views; its number counts views.
+        step: settings of the step. Its step number counts views.
         factor: divisor of the photographs' resolution.
         probes: function that makes the `StepProbe` of a view from the view's inputs and its step.
         statistics: True if density control uses the views' gradients.
@@ -382,7 +382,7 @@ class Batch:
         """Run the step of a view on the first device, and return its loss.
 
         model: parameters, and sums of gradients.
-        probes: as in `run`.
+        probes: function that makes the view's `StepProbe` from the view's inputs and its step.
         """
         gradients = view_gradients(self.rasterizer.work, model[0])
         inputs = replace(inputs, photograph=self.photographs.bring(inputs.view, factor))
@@ -394,8 +394,8 @@ class Batch:
         """Add the gradients of a view that a further device computed to the sums, and its other results to the density
         statistics, by way of scratch arrays on the first device. Returns the view's loss.
 
-        parameters: the model's parameters. If they are streamed from a pool, each of its parts brings the density
-            statistics of its rows to the device.
+        parameters: the model's parameters. A streamed model comes to the device in parts, each with the density
+            statistics of its rows.
         """
         device, work = step.device, self.rasterizer.work
         probe.loss(outcome.loss)

@@ -32,8 +32,8 @@ RECENT_DENSIFICATIONS = 4
 PRIOR_GROWTH_WEIGHT = 0.5
 """Weight of the prior of the peak growth: it counts as much as this many measured densifications at the peak."""
 PRIOR_COSTS = np.array([8000.0, 0.6, 1.2, 80_000.0])
-"""Prior times, relative to each other, as on CPUs: of a step, and for each pixel, Gaussian, and photograph that is
-read."""
+"""Prior of the parts of a step's time, relative to each other, as on CPUs: the constant part, then the time per pixel,
+per Gaussian, and per photograph that is read."""
 PRIOR_COST_WEIGHT_SECONDS = 0.03
 """Weight of the prior costs: they count as much as this many measured seconds."""
 OUTLIER_FACTOR = 4.0
@@ -141,9 +141,10 @@ class Forecast:
         return spans
 
     def _grown(self, density: DensityConfig, step: int, number: float, height: float, peak: int) -> float:
-        """Number of Gaussians after the densification at step `step`, with `number` before it.
+        """Predict the number of Gaussians after the densification at step `step`, from their `number` before it.
 
-        height, peak: results of `_height`.
+        height: peak growth of a densification by the paper's rule, in Gaussians.
+        peak: step of the densification that has added most so far.
         """
         most = max(density.max_gaussians, number)
         if density.growth == "mcmc":
@@ -153,7 +154,8 @@ class Forecast:
         return min(max(number + height * _course(density, step, peak), 1.0), most)
 
     def _height(self) -> tuple[float, int]:
-        """Peak growth of a densification by the paper's rule, in Gaussians, and the step that has added most so far."""
+        """Return the peak growth of a densification by the paper's rule, in Gaussians, and the step that has added most
+        Gaussians so far."""
         assert self.begun is not None
         taken = self.added[-RECENT_DENSIFICATIONS:]
         peak = max(self.added, key=lambda one: one[1])[0] if self.added else 0
@@ -166,9 +168,9 @@ class Forecast:
         return 1.0, self.pixels / span.factor**2, span.gaussians, span.reads / span.steps
 
     def _cost(self) -> tuple[Float64, float]:
-        """Fit the time of a step. Returns the seconds that a unit of each of the `_amounts` takes (4,), and the factor
-        by which recent steps took longer than these seconds predict."""
-        spans = self.spans[1:] or self.spans  # in the first span, kernels were built too
+        """Fit the time of a step. Returns its parts in seconds (4,): constant, per pixel, per Gaussian, and per read
+        photograph. Also returns the factor by which recent steps took longer than the parts predict."""
+        spans = self.spans[1:] or self.spans  # without the first span, in which kernels were built
         parts = np.array(self.amounts[-len(spans) :])
         steps, seconds = np.array([(span.steps, span.seconds) for span in spans]).T
         rates = seconds / np.maximum(steps * (parts @ PRIOR_COSTS), 1e-12)
@@ -189,7 +191,7 @@ class Forecast:
 
 
 def _course(density: DensityConfig, step: int, peak: int = 0) -> float:
-    """Growth of the model by the densification at step `step`, as a fraction of the peak growth (the paper's rule).
+    """Growth of the model by the densification at step `step`, as a fraction of the peak growth, by the paper's rule.
 
     peak: step of the largest growth so far. Before it, growth does not decay, whatever the density settings say.
     """

@@ -96,7 +96,7 @@ def _interruption() -> Iterator[Callable[[], int]]:
 
     def asked() -> int:
         if not first:
-            for number in before:  # installed again, because kernel compilers have installed their own handlers
+            for number in before:  # kernel compilers may have replaced these handlers by their own
                 signal.signal(number, ask)
         return first
 
@@ -280,7 +280,7 @@ class TrainingSession:
     def record(
         self, report: StepReport, *, evaluating: bool, stages: dict[str, float] | None, validated: bool = False
     ) -> None:
-        """Pass a step's report to `on_step`, and append it to metrics.jsonl, with what report.html needs.
+        """Pass a step's report to `on_step`, and append it to metrics.jsonl, with other values that report.html shows.
 
         evaluating: True to evaluate the held-out views.
         stages: milliseconds by stage, if the step was timed.
@@ -314,18 +314,18 @@ class TrainingSession:
                 warnings.warn(f"step {self.trainer.step}: {text}")
 
     def times_stages(self, steps: range) -> bool:
-        """True if each stage of these steps, which run together, has to be timed for the report."""
+        """True if the stages of a training step have to be timed for the report. steps: numbers of the step's views."""
         config = self.trainer.config
         if config.stages_every == 0:
             return False
         return config.iterations in steps or (_reached(config.stages_every, steps) and _reached(REPORT_EVERY, steps))
 
     def evaluates(self, steps: range) -> bool:
-        """True if the held-out views are rendered after these steps."""
+        """True if held-out views are rendered after a training step. steps: numbers of the step's views."""
         return any(step in steps for step in self.trainer.config.eval_at) and bool(self.trainer.scene.test_views)
 
     def reports(self, steps: range) -> bool:
-        """True if the loss of these steps, which run together, is read."""
+        """True if the loss of a training step is read. steps: numbers of the step's views."""
         asked = self.evaluates(steps) or self.trainer.cameras.gate.is_due(steps[-1])
         return _reached(REPORT_EVERY, steps) or self.trainer.config.iterations in steps or asked
 

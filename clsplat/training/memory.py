@@ -39,7 +39,7 @@ from clsplat.training.supervision.resolution import by_doubling
 NO_CACHE = "none"
 """Value of --cache that switches off the cache of decoded photographs."""
 POOL_QUARTERS = 3
-"""Share of the model's chunks, in quarters, in the main memory beyond the minimum for photographs. The other quarter
+"""Number of quarters of the main memory beyond the photographs' minimum that a pool of chunks gets. The other quarter
 goes to more photographs."""
 
 MOST_VIEWS_LOOKED_AT = 200
@@ -110,7 +110,7 @@ class HostMemory:
         return cls(limit) if str(cache) == NO_CACHE else cls(limit, Path(cache), keeps_cache=True)
 
     def photographs(self, scene: Scene, config: TrainConfig) -> HostPhotographs:
-        """Make the store of a scene's training photographs."""
+        """Make the `HostPhotographs`, which keep a scene's training photographs in main memory."""
         store = DecodedStore(self.cache) if self.cache is not None else None
         views, factors = scene.require_training_views(), by_doubling(config.warmup).factors
         return HostPhotographs(Decoder(views, config.rounds_photos(len(views)), factors, store), config.batch)
@@ -123,7 +123,7 @@ class HostMemory:
             if streams_by_chunk(config, device, count):
                 taken = _least_pool(record_bytes(config, contributions=config.density.min_contribution > 0))
             taken *= device.shares_memory
-            photographs = replace(self, cache=None).photographs(scene, config)  # no cache: it would create its folder
+            photographs = replace(self, cache=None).photographs(scene, config)  # a cache would create its folder
             self.share(photographs, count, taken, begins=True)
 
     def pool(self, photographs: HostPhotographs, count: int, record: int, *, begins: bool) -> int | None:
@@ -164,7 +164,7 @@ class HostMemory:
             self.files.remove_unnamed()
 
     def share(self, photographs: HostPhotographs, count: int, taken: int, *, begins: bool) -> bool:
-        """Limit photographs to the memory that the Gaussians leave. Returns False if that is too little for them.
+        """Limit photographs to the memory that the Gaussians leave. Returns False if the photographs need more.
 
         count, taken: number of Gaussians, and their bytes on the host.
         begins: True to raise InputError instead. The message names the smallest limit that is enough.
@@ -200,7 +200,7 @@ def record_bytes(config: TrainConfig, *, contributions: bool) -> int:
 
 def _least_pool(record: int) -> int:
     """Return the bytes of main memory that a pool of one chunk needs. A pool gets only a share (POOL_QUARTERS) of the
-    memory beyond the minimum for photographs, so they are more than the chunk's bytes.
+    memory beyond the minimum for photographs, so the result is more than the bytes of a chunk.
 
     record: bytes of a Gaussian in a chunk.
     """
@@ -281,15 +281,15 @@ class MemoryPlanner:
         return made
 
     def plan_view(self, made: Plan, chunks: int) -> Plan:
-        """Plan for views of up to `chunks` chunks. Returns `made` if it has room for as many, or an earlier view had as
-        many.
+        """Plan the device's memory for views that show up to `chunks` chunks.
 
-        made: the present plan, by which the model is streamed by chunk. It stays valid after a CapacityError.
+        made: the present plan, by which the model is streamed by chunk. It is returned if it has room for so many
+            chunks, or if an earlier view has shown as many. It stays valid after a CapacityError.
         """
         device, rows = self._rasterizer.device, CHUNK_ROWS * chunks
         if rows <= max(self.rows_in_view, made.rows):
             return made
-        try:  # with room for a few more chunks, so that slightly larger views need no new plan
+        try:  # plan for a few more chunks, so that slightly larger views need no new plan
             padded = CHUNK_ROWS * listed_chunks(chunks)
             wider, rows = plan_view(device, made, padded), padded
         except CapacityError:
@@ -327,7 +327,7 @@ class MemoryPlanner:
         if need.pool is not None:
             taken = need.record * plan.rows
         elif plan.streamed and need.held is not None and self.scratch_files is not None:
-            taken *= not self._memory.is_exceeded(taken, photographs)  # all chunks go to a scratch file
+            taken *= not self._memory.is_exceeded(taken, photographs)  # if so, all chunks go to a scratch file
         enough = self._memory.share(photographs, count, taken, begins=self.begins)
         if not enough and not self._warned:
             self._warned = True

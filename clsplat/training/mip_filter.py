@@ -43,7 +43,11 @@ class MipFilter(Component):
         return SAMPLING_GAUSSIAN_BYTES if self.on else 0
 
     def is_due(self, step: int, views: int) -> bool:
-        """True if the limits have to be computed before a step of `views` views that ends with view number `step`."""
+        """True if the limits have to be computed before a step of the training.
+
+        step: number of the last view of this step, counted from the start of the training.
+        views: number of views of this step.
+        """
         return self.on and (self._least is None or (step - 1) % SAMPLING_LIMIT_INTERVAL_STEPS < views)
 
     def before_step(self, gaussians: AnyGaussians) -> None:
@@ -66,8 +70,8 @@ class MipFilter(Component):
         return {} if self._least is None else {"sampling/least": self._least.get()}
 
     def load(self, named: Named, step: int, count: int) -> None:  # noqa: ARG002
-        """Load the scales' lower limits from a checkpoint. Raises ValueError if they are not those of `count`
-        Gaussians."""
+        """Load the scales' lower limits from a checkpoint. Raises ValueError unless it has one limit for each of the
+        `count` Gaussians."""
         least = named("sampling/").get("least") if self.on else None
         if least is not None and least.shape != (count,):
             raise ValueError(f"sampling/least has shape {least.shape}, expected ({count},)")

@@ -29,7 +29,7 @@ class Move:
 
     rows: for each new row, the old row that it copies, with the bit FRESH set if its Gaussian is new. None keeps all
         rows.
-    coefficients: number of SH coefficients; 0 for as many as there are.
+    coefficients: number of SH coefficients after the move; 0 leaves their number unchanged.
     changes: function that is called before the first change of the model.
     values: initial values of new Gaussians, and of arrays that the old chunks do not have.
     """
@@ -46,7 +46,7 @@ class Move:
 
 @dataclass(frozen=True, eq=False)
 class MovedRows:
-    """The rows of a model after a plan is carried out. Each entry of the plan's list of rows becomes one of them.
+    """The rows of a model after a plan is carried out. Each entry of the plan's list of rows becomes a row.
 
     rows: (m,) uint32, the source row of each row, with the bit FRESH set if the row is new.
     halves: number of halves of split Gaussians, two of each.

@@ -49,7 +49,8 @@ def _length_unit(scene: Scene, resumed: Run | None, *, is_prepared: bool) -> flo
     """Length unit in world units; None if it is the extent, which in some scenes depends on the start points.
 
     resumed: the run that continues, or None. It keeps its unit, which is the extent if scene.json is missing.
-    is_prepared: True if the scene already has its unit, and points from which none can be computed, such as a sky's.
+    is_prepared: True if the scene already has its unit. Its points may then be unfit to compute a unit from, such as
+        points of a sky.
     """
     record = None if resumed is None else scene_record.read(resumed)
     if record is not None:
@@ -70,7 +71,10 @@ def _length_unit(scene: Scene, resumed: Run | None, *, is_prepared: bool) -> flo
 
 
 def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:
-    """Raise InputError if a run has a checkpoint after the last step of `config`. name: the setting in the message."""
+    """Raise InputError if a run has a checkpoint after the last step of `config`.
+
+    name: name of the setting that the message asks to change, such as "--iterations".
+    """
     if (done := max((step for step, _ in run.checkpoints()), default=0)) > config.iterations:
         raise InputError(f"{name} {config.iterations}: {run.path} is already at step {done}; expected more steps")
 

@@ -190,7 +190,7 @@ def read_bundle(path: Path) -> Bundle:
     """Read a bundle. Raises InputError for a file that is not an intact bundle."""
     try:
         return _bundle_of(read_checkpoint(path), path)
-    except Exception as error:  # zipfile raises nearly any exception for a flipped bit
+    except Exception as error:  # zipfile may raise nearly any exception for a damaged file
         if isinstance(error, InputError) and str(path) in str(error):
             raise
         why = f"{type(error).__name__}: {error}"[:300]

@@ -74,9 +74,11 @@ def contributions(trainer: Trainer, seconds: float = CONTRIBUTION_SECONDS) -> di
     """Return a histogram of the Gaussians' largest contributions to a training view (`largest_contributions`), for the
     report. Returns None if device memory is limited, because the memory plan reserves none for this measurement.
 
-    Keys of the result: `views`, number of training views that were sampled, and `of`, the number of all; `none`, number
-    of Gaussians that no sampled view shows; `edges` of the bins, base-10 logarithms of pixels; `counts`, the number of
-    Gaussians in each bin. The outer bins include all values beyond their outer edge.
+    The result has these keys:
+    views, of: number of training views that were sampled, and number of all training views.
+    none: number of Gaussians that no sampled view shows.
+    edges: edges of the bins, as base-10 logarithms of pixels.
+    counts: number of Gaussians in each bin. The outer bins include all values beyond their outer edge.
     """
     if trainer.device.memory.limit is not None or isinstance(trainer.parameters, HostGaussians):
         return None

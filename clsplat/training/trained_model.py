@@ -160,7 +160,7 @@ class TrainedModel:
 
     @property
     def with_moments(self) -> tuple[AnyGaussians, AnyGaussians, AnyGaussians]:
-        """Parameters, first and second moments."""
+        """Parameters, first moments and second moments of all Gaussians."""
         return self.parameters, self.first, self.second
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -214,7 +214,7 @@ class TrainedModel:
         return True
 
     def marker(self) -> DeviceMarker:
-        """Return an object that marks the Gaussians by density rules."""
+        """Return an object that applies density rules to the Gaussians, and lists the resulting rows."""
         return DeviceMarker(self._device, self._work, self.parameters, self.statistics)
 
     def widen(self, coefficients: int, changes: Callable[[], None]) -> None:
@@ -269,7 +269,7 @@ class TrainedModel:
 
         models: new parameters and moments, not in a store. None keeps the Gaussians of this model, which are in a store
             now or will be.
-        statistics: statistics of new models by name; others get their initial values. None keeps this model's.
+        statistics: statistics of new models by name. Missing ones get their initial values; None keeps the old ones.
         move: the new rows and number of coefficients, if the Gaussians are in a store now or will be.
         """
         parameters = self.parameters if models is None else models[0]
@@ -293,7 +293,11 @@ class TrainedModel:
     def _to_store(
         self, models: Models | None, statistics: Mapping[str, ReadableArray] | None, count: int, move: Move
     ) -> None:
-        """Put `count` Gaussians into a new store of chunks, and make its pool. Other arguments as for `_place`."""
+        """Put `count` Gaussians into a new store of chunks, and make its pool.
+
+        models, statistics: the Gaussians and their statistics by name; None takes this model's Gaussians or statistics.
+        move: the new rows and number of coefficients.
+        """
         source, old = self.with_moments if models is None else models, self._pool if models is None else None
         named = self.statistics.named() if statistics is None else statistics
         arrays = by_field(source) | {f"{KIND}/{name}": array for name, array in named.items()}
@@ -340,11 +344,11 @@ class TrainedModel:
 
     @property
     def _widest(self) -> dict[str, tuple[int, ...]]:
-        """Shapes of `_fields` with the final SH degree."""
+        """Shape of a row of each array in a chunk's record, by name, with the final SH degree."""
         return self._fields((self._sh_degree + 1) ** 2)
 
     def _record_bytes(self, coefficients: int) -> int:
-        """Return the bytes of a Gaussian in a store."""
+        """Return the bytes of a Gaussian in a store. coefficients: number of SH coefficients."""
         return MODELS * 4 * floats_of(coefficients) + gaussian_bytes(contributions=self._counts_contributions)
 
     def _from_store(self, count: int, move: Move) -> None:
@@ -373,7 +377,7 @@ class TrainedModel:
             vars(self).pop(name, None)
 
     def _go_on_in(self, manifest: Manifest | None, coefficients: int) -> bool:
-        """Continue in the scratch file of a checkpoint. Returns False if there is none that this model can use."""
+        """Continue in the scratch file of a checkpoint. Returns False if this model can use no such file."""
         if (
             manifest is None
             or dict(manifest.fields) != self._fields(coefficients)

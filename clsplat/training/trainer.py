@@ -62,7 +62,7 @@ class Trainer:
     position: step, random state and views left in the epoch.
     monitor: monitor of non-finite values in the model.
     pending: launched steps that may have to be repeated, because their counts are not read yet.
-    mark: position that `step_back` returns to; None once the model has changed since.
+    mark: position that `step_back` returns to; None after the model has changed.
     further: devices in addition to the model's.
     loader: loader of the steps' photographs and cameras.
     order: order of the views in each pass.
@@ -238,7 +238,7 @@ class Trainer:
 
         make: function that makes the `GradientStep` from `turn` and `room` (`_gradient_step`).
         needs: statistics that the step gathers for density control.
-        turn, room: which array gets the loss's sums, and the capacity in pairs; None counts the pairs first.
+        turn: index of the array for the sums of the loss. room: capacity in pairs; None counts the pairs first.
         """
         step = make(turn=turn, room=room)
         model, probe = self.model.with_moments, self._watched(needs, inputs, step, step.step)
@@ -264,7 +264,7 @@ class Trainer:
             component.complete(*self.model.with_moments)
 
     def catch_up_exactly(self) -> None:
-        """Wait for all launched steps. Then make the postponed changes that give the same bits at any time."""
+        """Wait for all launched steps. Then make the postponed changes that give the same bits now as later."""
         self.settle()
         for component in self.components:
             component.complete_exactly(*self.model.with_moments)
@@ -300,7 +300,7 @@ class Trainer:
             component.after_adam(self.parameters)
 
     def _watched(self, needs: StatisticsNeeds, inputs: ViewInputs, step: GradientStep, number: int) -> StepMonitor:
-        """Return the probe of a view's step. number: number of views used so far, this one included."""
+        """Return the probe of a view's step. number: number of views used so far, including this step's views."""
         return StepMonitor(
             step, number, inputs, needs, self.statistics.on_device, self.monitor, self.pending, self.tried, self._unmark
         )
@@ -309,7 +309,7 @@ class Trainer:
         self.mark = None
 
     def _watched_in_batch(self, needs: StatisticsNeeds, inputs: ViewInputs, step: GradientStep) -> StepProbe:
-        """Return the probe of a batch's view. Call it in the order of views: an epoch's first view resets totals."""
+        """Return the probe of a batch's view. Call it in view order: an epoch's first view resets contributions."""
         if inputs.begins:
             self._turn_epoch()
         return self._watched(needs, inputs, step, self.step)
@@ -370,7 +370,7 @@ class Trainer:
     def _next_view(self) -> int:
         if not self.position.queue:
             self.position.queue = self.order.next_pass(self.position.rng)
-            if self.batch is None:  # a batch counts the last epoch's views later
+            if self.batch is None:  # a batch has views of the last epoch whose contributions are not added yet
                 self._turn_epoch()
                 self._note(begun=True)
         return self.position.queue.pop()
@@ -393,7 +393,7 @@ class Trainer:
             self.model.widen(coefficients, self._unmark)
 
     def _control_density(self) -> None:
-        """Run the density control that is due after each of the last step's views."""
+        """Run density control for each view of the last step after which it is due."""
         last = range(self.step - self.position.last_views + 1, self.step + 1)
         steps = list(filter(self.strategy.is_due, last))
         for step in steps if self.step > 0 else ():
@@ -461,7 +461,7 @@ class Trainer:
 
     def checkpoint(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """All state that the remaining steps depend on: arrays by name, and JSON values. The whole model is finite,
-        unless `monitor.retries.lost`."""
+        unless `monitor.retries.lost` is True."""
         self.repair(look=True)
         arrays, state = self._arrays()
         if not self.model.changes_are_finite():  # examine also Gaussians that no step has updated

@@ -56,7 +56,7 @@ class Look:
     crop: Box | None = None
 
     def changes(self, degree: int) -> Look | None:
-        """Return the settings that edit a model of this SH degree, or None if they do not change it.
+        """Return the settings that edit a model of this SH degree; None if no setting changes the model.
 
         The mode of the result is always "colour", as the displayed channel does not edit the model.
         """

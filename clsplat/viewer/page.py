@@ -87,7 +87,10 @@ class ViserPage:
         self.viewer = viewing.join(self)
 
     def show(self, image: Image, level: Level, text: str) -> None:
-        """Show a picture (H, W, 3) of this exactness, with the remark `text`."""
+        """Show a picture (H, W, 3), and as text its size, its exactness and the remark `text`.
+
+        level: exactness of the picture.
+        """
         self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=level.quality)
         self._shown += 1
         if self._shown == 2:  # create controls only after the first picture, because they keep a browser busy

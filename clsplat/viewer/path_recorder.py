@@ -64,7 +64,7 @@ def path_document(
 
     size: width and height of the frames in pixels.
     apart: seconds between keys, rounded to whole frames.
-    loop: return to the first key after the last one.
+    loop: True to return to the first key frame after the last one.
     Raises InputError if there are no keys, and for numbers out of range.
     """
     width, height = size

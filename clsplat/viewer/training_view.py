@@ -38,7 +38,7 @@ class TrainingView:
     def __call__(self, trainer: Trainer, interrupted: Callable[[], bool]) -> None:
         """Render a picture if it is due, and wait while training is paused.
 
-        interrupted: function that is True when training must end.
+        interrupted: function that returns True when training must end.
         """
         viewing = self.viewing
         if viewing.model is None:

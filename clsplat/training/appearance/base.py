@@ -26,7 +26,7 @@ class Appearance(Component):
         """Return the part (`ViewPart`) that learns the appearance of each view of a step; () if nothing is learnt.
 
         views: indices of the step's views among the training views.
-        step: number of the last of these views: how many views training has used, this one included.
+        step: number of views that training has used, including the views of this step.
         """
         return ()
 
@@ -53,7 +53,7 @@ class Appearance(Component):
         self.take(named("appearance/"))
 
     def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load the appearance from a checkpoint's arrays, by name without the prefix "appearance/"."""
+        """Load the appearance from a checkpoint. arrays: arrays by name, without the prefix "appearance/"."""
 
     def write(self, run: Run) -> None:
         """Write `record` as appearance.json and `tables` as appearance.npz into the run's folder; nothing if `record`

@@ -34,7 +34,7 @@ class ViewGrid(ViewPart):
     """Bilateral grid of one view's photograph, as a part of one training step.
 
     grids, view: the grids of all photographs with their moments, and the row of this view's grid.
-    visit: number of steps that have shown this view, this one included.
+    visit: number of steps that have shown this view, including this step.
     rate: learning rate of the grid in this step.
     ends: True if a pass through all training views ends with this view.
     place: the view's position in the batch.
@@ -83,7 +83,7 @@ class ViewGrid(ViewPart):
         """Take Adam's step for the grid. After a pass through all views, also shift all grids so that their mean is the
         identity: a colour change that all photographs share belongs to the model.
 
-        own: gradient of the grid, from `gradient`.
+        own: gradient with respect to the grid, as the method `gradient` returned it.
         """
         assert own is not None, "made by `gradient`"
         step_grid(self.device, self.grids, self.view, own, self.visit, self.rate, readback)
@@ -109,7 +109,7 @@ class GridsOfAll(Appearance):
     def of_views(self, views: Sequence[int], step: int) -> list[ViewGrid]:
         """Return the part of each view of a step that learns and applies its grid. Each pass shows every view once.
 
-        step: number of the last view: how many views training has used, this one included.
+        step: number of views that training has used, including the views of this step.
         """
         count = self._count
         numbers = range(step - len(views) + 1, step + 1)

@@ -64,8 +64,8 @@ steps change a photograph's gain by 0.25 %.
 """
 
 GAIN_CHECKPOINT_ARRAYS = ("logs", "start", "first", "second", "gains")
-"""Fields of the photographs' `Gains` in a checkpoint. It also has `told`: 1 for photographs with gains from points,
-else 0."""
+"""Fields of the photographs' `Gains` in a checkpoint. The checkpoint also has `told`: 1 for photographs with gains from
+points, else 0."""
 LENS_CHECKPOINT_ARRAYS = ("logs", "first", "second")
 """Fields of the lenses' `Gains` in a checkpoint."""
 
@@ -135,7 +135,10 @@ class ViewColours(ViewPart):
         return columns
 
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
-        """Take Adam's step for the entries of the photograph and of its lens. own: result of `gradient`."""
+        """Take Adam's step for the entries of the photograph and of its lens.
+
+        own: gradient with respect to the entries, as the method `gradient` returned it.
+        """
         assert own is not None, "made by `gradient`"
         row, lens, step = self.taken.photograph, self.taken.lens, self.step
         step_gains(self.device, self.colours, row, own, step, self.rate, readback, _COLOUR_UPDATE)
@@ -221,7 +224,7 @@ class ColoursOfAll(Appearance):
     def of_views(self, views: Sequence[int], step: int) -> list[ViewColours]:
         """Return the part of each view of a step that learns and applies its entries.
 
-        step: number of the last view: how many views training has used, this one included.
+        step: number of views that training has used, including the views of this step.
         """
         numbers = range(step - len(views) + 1, step + 1)
         return [

@@ -19,9 +19,9 @@ from clsplat.camera import Camera
 NEIGHBOUR_DISTANCE_LIMIT = 2.5
 """Distance at which cameras stop being neighbours.
 
-The distance combines two: between centres, relative to their median distance from the middle, and between unit viewing
-directions. A neighbour at a quarter of the limit has about half of the weight. Over about this quarter, a colour of SH
-degree 3 can vary with the direction.
+It combines two distances: between the cameras' centres, relative to their median distance from the middle, and between
+the unit viewing directions. A neighbour at a quarter of the limit has about half of the weight. Over
+about this quarter, a colour of SH degree 3 can vary with the direction.
 """
 MAX_MEAN_NEIGHBOURS = 256
 """Maximum mean number of neighbours of a camera, itself included. With more, the distance limit is reduced."""

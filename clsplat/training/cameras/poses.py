@@ -93,7 +93,7 @@ def descend(first: Float64, second: Float64, by: Float64, visit: int) -> Float64
 
     first, second: moments (6,) and (6, 6), updated in place.
     by: the gradient (6,).
-    visit: number of steps that the camera has taken, this one included.
+    visit: number of steps that the camera has taken, including this step.
     """
     first += (1 - POSE_BETA1) * (by - first)
     second += (1 - POSE_BETA2) * (by[:, None] * by - second)

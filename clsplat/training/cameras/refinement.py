@@ -56,7 +56,7 @@ class CameraSums(ViewPart):
 
     The step calls `add_rows` for all rows of the model, in order.
     pose, lens: True to sum the gradient with respect to the pose, and to the lens.
-    move: function that moves the camera after Adam's step. Its argument is this object.
+    move: function that changes the camera after Adam has changed the Gaussians. Its argument is this object.
     """
 
     wants_gradients = True
@@ -213,7 +213,8 @@ class Cameras(Component):
         refined poses. The better result counts. The given poses are right if only some training poses were wrong, and
         the moved poses are right if the whole world has drifted.
 
-        draw, look: as for `ValidationViews.psnr`.
+        draw: function that renders with a camera (`Draw`).
+        look: function of a view's name and a render, which gives the render the view's appearance if that is known.
         """
         seen = [self.lenses.seen(view.lens, view.camera) for view in views.views]
         psnr = views.psnr(draw, look, seen)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Validation gate of refined cameras: return to earlier cameras if held-out views get worse. Policy only, no OpenCL."""
+"""Validation gate of refined cameras: return to earlier cameras if held-out views get worse. Uses no OpenCL."""
 
 from __future__ import annotations
 

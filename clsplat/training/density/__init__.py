@@ -53,7 +53,7 @@ class HostCopy(Protocol):
     """An array, on the device or the host, that can be copied to the host."""
 
     def get(self) -> NDArray[Any]:
-        """Return a copy on the host."""
+        """Return a copy of the array in main memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,12 +116,12 @@ class Strategy:
     optional."""
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
-        """Return the statistics that step number `step` gathers; for step 0, those that any step gathers."""
+        """Return the statistics that step number `step` gathers; for step 0, all statistics that any step gathers."""
         raise NotImplementedError
 
     def is_due(self, step: int) -> bool:
-        """True if `before_step` may return a plan after `step` steps. Before the call, non-finite values are
-        repaired."""
+        """True if `before_step` may return a plan after `step` steps. Non-finite values are then repaired before
+        `before_step` is called."""
         raise NotImplementedError
 
     def before_step(self, model: ModelState) -> RowPlan | None:

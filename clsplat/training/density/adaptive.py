@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adaptive density control (Kerbl et al. 2023, section 5): clone, split and prune. Policy only: no device."""
+"""Adaptive density control (Kerbl et al. 2023, section 5): clone, split and prune. Uses no OpenCL."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ from clsplat.training.density import SPLIT_GROUPS, ModelState, RowPlan, Statisti
 HALF_OFFSET_DEVIATIONS, LONG_AXIS_HALF_RATIO, SHORT_AXIS_HALF_RATIO, HALF_OPACITY_RATIO = 1.35, 0.55, 0.893, 0.6
 """Constants of halves along the longest axis (Improved-GS, Deng et al. 2025).
 
-They are the distance of the halves' means from the original mean, in standard deviations, and the factors on the scale
-of that axis, on the scales of the other axes, and on the opacity.
+HALF_OFFSET_DEVIATIONS: distance of the halves' means from the original mean, in standard deviations.
+LONG_AXIS_HALF_RATIO, SHORT_AXIS_HALF_RATIO: factor on the scale of the longest axis, and on the two other scales.
+HALF_OPACITY_RATIO: factor on the opacity.
 """
 SCORED_ROWS = 1 << 16
 """Number of scores that are compared with a given score at a time, which limits the size of copies."""
@@ -161,7 +162,7 @@ def _cut_off(config: DensityConfig, model: ModelState, rules: MarkRules) -> tupl
 
 
 def weakest(scores: Float32, count: int) -> tuple[float, int]:
-    """Score and row of the weakest of the `count` Gaussians with the largest scores.
+    """Score and row of the Gaussian with the smallest score among the `count` Gaussians with the largest scores.
 
     Gaussians with equal scores are taken in the order of their rows. Makes one copy of the scores.
     """
@@ -219,7 +220,7 @@ def long_halves(split: Mapping[str, Float32], second: bool) -> dict[str, Float32
     turned = rotated(split["quaternions"], offsets)
     log_scales += np.log(SHORT_AXIS_HALF_RATIO)
     log_scales[rows, longest] += np.log(LONG_AXIS_HALF_RATIO) - np.log(SHORT_AXIS_HALF_RATIO)
-    # If an opacity has the logit o', the fraction p of it has the logit ln p - ln(e^-o' + 1 - p).
+    # If an opacity has the logit o', p times this opacity has the logit ln p - ln(e^-o' + 1 - p).
     part, logits = HALF_OPACITY_RATIO, split["opacity_logits"].astype(np.float64)
     opacities = np.log(part) - np.logaddexp(-logits, np.log(1 - part))
     means = split["means"] - turned if second else split["means"] + turned

@@ -3,7 +3,7 @@
 
 Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". Unlike there, the model grows by halving
 the Gaussians with the largest gradients (docs/decisions/0029-mcmc-grows-by-halves.md). `optimisation.step_noise` has
-the noise of each step. Policy only: no device.
+the noise of each step. Uses no OpenCL.
 """
 
 from __future__ import annotations
@@ -98,7 +98,8 @@ class Mcmc(Strategy):
         """Relocate the dead Gaussians in rows `left` to live ones, drawn in proportion to opacity (Kheradmand et al.
         2024).
 
-        groups, rows: values by parameter group, and source rows, of the new model; both are updated in place.
+        groups: values of the new model by parameter group, updated in place.
+        rows: source rows of the new model's rows, updated in place.
         Returns the rows whose values change.
         """
         if len(left) == 0:
@@ -166,7 +167,7 @@ def shared(opacities: Float64, numbers: NDArray[np.int64], least: float) -> tupl
     Equation (94) of docs/gradients.md, equation (9) of Kheradmand et al. 2024. All arrays are (n,).
 
     opacities: opacities of the replaced Gaussians.
-    numbers: number of Gaussians that replace each of them.
+    numbers: for each replaced Gaussian, the number of Gaussians that replace it.
     least: lower limit of the new opacities.
     """
     whole = np.minimum(opacities, MAX_SHARED_OPACITY)

@@ -79,7 +79,8 @@ def lost(stage: str, broken: NDArray[np.bool_], refused: NDArray[np.bool_]) -> N
     not at fault and stay.
 
     stage: first stage with non-finite values.
-    broken, refused: results of `examine`.
+    broken: (n,), True for Gaussians with a broken parameter.
+    refused: (n,), True for Gaussians whose step `adam` refused.
     """
     return broken if stage == "loss" else broken | refused
 

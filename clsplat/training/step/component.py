@@ -54,7 +54,11 @@ class Component:
         return True
 
     def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002
-        """True if `before_step` has work before a step of `views` views that ends with view number `step`."""
+        """True if `before_step` has work to do before a step of the training.
+
+        step: number of the last view of this step, counted from the start of the training.
+        views: number of views of this step.
+        """
         return False
 
     def before_step(self, gaussians: AnyGaussians) -> None:
@@ -75,7 +79,8 @@ class Component:
         """Return to the state after step number `step`. Later steps failed before they changed a Gaussian."""
 
     def complete_exactly(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
-        """Make those postponed changes to parameters and moments that give the same bits at any time."""
+        """Make the postponed changes to parameters and moments, but only if their bits do not depend on when they are
+        made."""
 
     def complete(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> None:
         """Make all postponed changes to parameters and moments. Called when every row is needed."""
@@ -87,7 +92,7 @@ class Component:
 
     def rows_changed(self, groups: set[str]) -> None:
         """Forget data that depends on these parameter groups, because density control or a repair has changed
-        values."""
+        parameters in them."""
 
     def rows_moved(self, listed: DeviceArray | HostArray) -> None:
         """Move data of individual Gaussians along with their rows, or forget it.

@@ -79,7 +79,8 @@ class GradientStep:
 
     step: number of the step, for learning rates and Adam.
     fields: values that the step computes for each pair in addition to the plain gradients.
-    turn: which array receives the loss's sums (`stages.loss.loss`), so that an earlier step's sums can still be read.
+    turn: index of the array that receives the sums of the loss (`stages.loss.loss`). Steps use several arrays in turn
+        if the host may still have to read an earlier step's sums.
     room: number of pairs that there is memory for, if the step is launched by capacity; None counts the pairs first.
     explore: noise and penalties of the step.
     """
@@ -117,8 +118,8 @@ class GradientStep:
         """Update the model (parameters, first and second moments) with a view. Returns the loss.
 
         gradients: arrays for the gradients of rows, as `view_gradients` makes them; None if neither the probe nor a
-            part of the view reads gradients. They contain zeros before and after. The model gets the same bits with and
-            without them.
+            part of the view reads gradients. The arrays contain zeros before and after the step. The model gets the
+            same bits with and without them.
         reads_loss: True if the loss will be read. Reading then does not wait for the rest of the step.
         """
         camera = inputs.camera
@@ -135,7 +136,7 @@ class GradientStep:
         else:
             numbers, given = thinning_numbers(self.thinning), (source, sent[0])
             frame, result, slots, own = self.replayed(model[0], key, gradient, numbers, given)
-            self.device.under_way.append(source.buffer)  # keeps the array until the device has read it, as in `target`
+            self.device.under_way.append(source.buffer)  # keeps the photograph's array until the device has read it
             frame = frame.by(camera, sent[0])
             probe.forward(frame)
             probe.loss(result)
@@ -189,15 +190,15 @@ class GradientStep:
         terms: Sequence[LossTerm],
         chunks: ChunkList | ChunkNumbers | None,
     ) -> tuple[object, ...] | None:
-        """Key of the command buffer with all launches of the view's gradient; None if they cannot be in one buffer.
+        """Key of the command buffer with all launches of the view's gradient; None if no buffer can have them all.
 
-        They cannot if pairs are counted exactly, if components have parts in the view, or with a depth loss. Nor can
-        they with a mask, because each photograph then has its own divisor of the loss.
+        No buffer can have them all if pairs are counted exactly, if components have parts in the view, or if the view
+        has a depth loss or a mask. With masks, each photograph has its own divisor of the loss.
         """
         keys, camera, room, fields = tuple(term.key for term in terms), inputs.camera, self.room, self.fields
         if room is None or inputs.parts or inputs.kept is not None or None in keys:
             return None
-        of_view = (self.rasterizer.device_of(camera), source.shape, source.dtype)  # the camera has the source's size
+        of_view = (self.rasterizer.device_of(camera), source.shape, source.dtype)  # the camera has the size of `source`
         of_step = (room.pairs, room.turn, room.appends, fields.absolute, fields.contributions, fields.nearness)
         assert not isinstance(chunks, ChunkNumbers), "such a step has exact counts"
         rows = None if chunks is None else chunks.key
@@ -238,7 +239,7 @@ class GradientStep:
         if None in keys:
             return compared()
         key = (frame.listed, image.buffer, inputs.kept, keys, self.turn)
-        if is_photograph(planes):  # each photograph has its own array, so it is passed to the replay
+        if is_photograph(planes):  # each photograph has its own array, which the replay must be given
             return self.replayed(of, (*key, planes.shape, planes.dtype), compared, given=(planes,))
         return self.replayed(of, key, compared)
 
@@ -275,8 +276,8 @@ class GradientStep:
     def _parts(
         self, model: tuple[AnyGaussians, ...], projected: Projected, chunks: ChunkList | ChunkNumbers | None
     ) -> Iterator[tuple[int, tuple[DeviceGaussians, ...], Projected]]:
-        """Yield the parts of the model that are on the device at a time: for each the number of its first row, its rows
-        of all arrays, and their projection."""
+        """Yield the parts of the model that are on the device at a time. Each has the number of its first row, the
+        part's rows of all arrays of the model, and the projection of these rows."""
         work = self.rasterizer.work
         if isinstance(chunks, ChunkNumbers):
             for start, stop, part, slots in chunk_parts(work, chunks, *model, changes=True):
@@ -350,8 +351,8 @@ class GradientStep:
     ) -> R:
         """Result of `make`, from a command buffer (`Workspace.replayed`) if the step is launched by capacity.
 
-        A step with exact counts has new arrays each time, so its command buffer would never be reused. The arguments
-        are those of `Workspace.replayed`.
+        A step with exact counts has new arrays each time, so its command buffer would never be reused.
+        `Workspace.replayed` describes the arguments.
         """
         if self.room is None:
             return make()
@@ -382,7 +383,7 @@ StepMaker = Callable[..., GradientStep]
 def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = False) -> DeviceGaussians:
     """Arrays for a view's gradients of the rows that are on the device at the same time.
 
-    zero: fill them with zeros, as `GradientStep.run` requires.
+    zero: True to fill the arrays with zeros, as `GradientStep.run` requires.
     """
     rows = min(parameters.rows, parameters.count) if isinstance(parameters, HostGaussians) else parameters.count
     shapes = group_shapes(rows, parameters.coefficients)

@@ -24,9 +24,9 @@ class PlacedChunks:
     """Chunks that a step runs over, ready for its kernels.
 
     model: arrays for the kernels: of the whole model, or of the pool of a streamed model.
-    in_model: the chunks. Usually a `ChunkList`: their numbers in the whole model, or their slots in the pool. If the
-        pool has too few slots for all of them, their `ChunkNumbers`; `model` is then the streamed model, whose chunks
-        come to the pool in parts.
+    in_model: usually a `ChunkList`: the chunks' numbers in the whole model, or their slots in the pool. If the pool has
+        too few slots for all chunks, it is a `ChunkNumbers`. Then `model` is the streamed model, whose chunks come to
+        the pool in parts.
     """
 
     model: tuple[AnyGaussians, ...]
@@ -37,7 +37,7 @@ class ChunksInView(Protocol):
     """Chunks of the model that a step runs over."""
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep) -> PlacedChunks | None:
-        """Make the chunks ready for Adam's step `step`. Returns None if it runs over the whole model instead."""
+        """Make the chunks ready for Adam's step `step`. Returns None if the step runs over the whole model instead."""
 
 
 @dataclass(eq=False)
@@ -107,7 +107,7 @@ class StepRows(ViewRows):
 
     @property
     def parameters(self) -> DeviceGaussians:
-        """Parameters of these rows, the first of `model`."""
+        """Parameters of these rows: the first element of `model`."""
         return self.model[0]
 
 
@@ -122,7 +122,10 @@ class ViewPart:
     """True if `compare` changes the photograph."""
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewPart:  # noqa: ARG002
-        """Return a copy of the part on another device, for `compare` and `gradient` there. values: from `values()`."""
+        """Return a copy of the part on another device, for `compare` and `gradient` there.
+
+        values: the part's parameters on the host, as the method `values` returned them.
+        """
         return self
 
     def values(self) -> NDArray[np.float32]:

@@ -39,7 +39,7 @@ class LateAdam(Component):
 
     def _begin(self, last: NDArray[np.uint32], missed: MissedSteps, step: int) -> None:
         self._last, self._missed, self.step = upload(self._device, last), missed, step
-        self._tables: dict[int, Float32] = {step: missed.rounded()}  # by step number; steps may be repeated
+        self._tables: dict[int, Float32] = {step: missed.rounded()}  # factors by step number, for repeated steps
         self._table = allocate(self._device, self._tables[step].shape, np.float32)
 
     @property
@@ -48,7 +48,11 @@ class LateAdam(Component):
         return 4
 
     def is_due(self, step: int, views: int) -> bool:
-        """True if all Gaussians must be settled before a step of `views` views that ends with view number `step`."""
+        """True if all Gaussians must be settled before a step of the training.
+
+        step: number of the last view of this step, counted from the start of the training.
+        views: number of views of this step.
+        """
         return (step - views) % MOST_MISSED == 0
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
@@ -82,8 +86,8 @@ class LateAdam(Component):
         settle(self._device, self._config, model, step, last, self._table, readback, tile_counts)
 
     def completed(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> AnyGaussians:
-        """Return the parameters with all rows settled. If rows have missed steps it is a copy, so that the training
-        keeps its bits."""
+        """Return the parameters with all rows settled. If rows have missed steps, the result is a copy, so that the
+        training keeps its bits."""
         missed = self.step - self._last.get()
         if not missed.any():
             return parameters

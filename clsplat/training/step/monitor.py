@@ -23,7 +23,7 @@ class StepMonitor(StepProbe):
 
     It also launches each kernel that changes the model in the sandbox before its first use.
 
-    number: number of views that training has used so far, this one included.
+    number: number of views that training has used so far, including the views of this step.
     needs: the statistics that this step gathers for density control.
     tried: combinations of array sizes and build settings whose kernels have passed the sandbox; `before_rows` adds this
         step's.
@@ -41,7 +41,7 @@ class StepMonitor(StepProbe):
     changes: Callable[[], None]
 
     def forward(self, frame: ForwardPass) -> None:
-        """Record how many elements `adam` refused in the previous step. This forward pass has read the number back."""
+        """Record how many elements `adam` refused in the previous step. The forward pass has read this number back."""
         self.monitor.notice(frame.refused)
         self.pending.seen(frame)
 

@@ -83,6 +83,6 @@ class Position:
             why = f"{type(error).__name__}: {error}"
             raise unusable(checkpoint, f"its state cannot be read ({why})") from None
         self.step, self.last_views = checkpoint.step, last_views
-        self.queue = queue if max(queue, default=0) < views else []  # the scene has fewer views: a new epoch
+        self.queue = queue if max(queue, default=0) < views else []  # with fewer views begin a new epoch
         self.controlled = bool(checkpoint.state.get("controlled", False))
         return retries

@@ -29,8 +29,8 @@ BY_CAPACITY_VARIABLE = "CLSPLAT_BY_CAPACITY"
 _STOPPED, _PAIRS, _LONGEST = (READBACK.index(name) for name in ("STOPPED", "PAIRS", "LONGEST"))
 
 Run = Callable[[int, PairCapacity | None], Loss]
-"""Function that runs one step. Its arguments say which array gets the loss's sums, and the capacity in pairs. None
-counts the pairs first."""
+"""Function that runs one step. Its arguments are the index of the array for the sums of the loss, and the capacity in
+pairs. If the capacity is None, the step counts its pairs first."""
 
 
 @dataclass(eq=False)
@@ -38,7 +38,7 @@ class _Step:
     """Launched step whose number of pairs the host has not read yet.
 
     run: function that runs the step again.
-    turn: which of the arrays for the loss's sums this step uses (`SpeculativeSteps.turns`).
+    turn: index of the array that this step uses for the sums of its loss (`SpeculativeSteps.turns`).
     number: number of the step's last view.
     readback: the step's counts on the device.
     counts: function that waits for these counts, and returns them.
@@ -84,7 +84,7 @@ class SpeculativeSteps:
 
     @property
     def turns(self) -> int:
-        """Number of arrays for the sums of the loss. Consecutive steps use different ones."""
+        """Number of arrays for the sums of the loss, which the steps use in turn."""
         return MAX_COUNTED_PASSES if self.on else 1
 
     def forget(self) -> None:
@@ -119,7 +119,7 @@ class SpeculativeSteps:
         if self._most is None:
             return 0
         wanted = max(self._most + self._most // 4, 1024)
-        step = 1 << (wanted.bit_length() - 4)  # rounded up to few sizes, so that arrays are seldom resized
+        step = 1 << (wanted.bit_length() - 4)  # round up to a multiple of this, so that arrays are seldom resized
         wanted = -(-wanted // step) * step
         return wanted if wanted <= rasterizer.capacity else 0
 

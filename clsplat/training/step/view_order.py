@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Order of the views in an epoch, a pass through the training photographs (--view-order). Policy only: no device.
+"""Order of the views in an epoch, a pass through the training photographs (--view-order). Uses no OpenCL.
 
-A pass shows each view once. Its order is random, or alternates between four clusters of views that look at near points.
+A pass shows each view once. Its order is random, or alternates between four clusters of views. The views of a cluster
+look at points that are near each other.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ CLUSTER_VIEWS = 16
 """Maximum number of views in a cluster."""
 CLUSTERS_AT_ONCE = 4
 """Number of clusters whose views alternate. With one cluster after the other, successive views would have more in
-common, but bonsai loses 0.3 dB: the model fits the last cluster at the expense of the others (docs/decisions/0050)."""
+common, but the scene bonsai loses 0.3 dB: the model fits the last cluster at the expense of the other clusters
+(docs/decisions/0050)."""
 GAZE_UNITS = 1.5
 """Distance, in length units, from a camera to the point on its viewing axis that stands for the view.
 
@@ -34,7 +36,7 @@ class ViewOrder:
 
     cameras: cameras of the training views, as given. The order does not follow refined poses.
     unit: length unit of the scene, in world units.
-    near: True to group views that look at near points into clusters; False for a random order.
+    near: True to group views into clusters that look at points near each other; False for a random order.
     """
 
     def __init__(self, cameras: Sequence[Camera], unit: float, *, near: bool) -> None:
@@ -66,8 +68,10 @@ def gaze_points(cameras: Sequence[Camera], unit: float) -> Int64:
 
 
 def clusters_of(points: Int64) -> list[Int64]:
-    """Divide views into clusters by their points (n, d): each of at most `CLUSTER_VIEWS` views with near points, and
-    all of nearly the same size. Returns the indices of each cluster's views.
+    """Divide views into clusters of nearly equal size, each of at most `CLUSTER_VIEWS` views whose points are near each
+    other. Returns the indices of each cluster's views.
+
+    points: (n, d), the point that each view looks at.
 
     The clusters are the leaves of a k-d tree, which divides along the coordinate of the widest range. Views with equal
     coordinates are divided by their index.

@@ -37,11 +37,13 @@ from clsplat.training.step.component import Component, Named
 from clsplat.training.step.inputs import ChunksInView, PlacedChunks, ViewInputs
 
 STEPS_PER_MEASUREMENT = 16
-"""Steps after which the bounds of the chunks that took part in them are measured again. More steps widen the bounds,
-whose growth by each step is an upper limit; fewer wait more often for the device."""
+"""Number of steps after which the bounds of the chunks that took part in them are measured again. With more steps,
+bounds get wider, because each step widens them by an upper limit of the movement. With fewer steps, the host waits more
+often for the device."""
 MAX_SHARE_IN_VIEW = 0.6
-"""Share of the chunks in view above which a step runs over the whole model. Steps over the chunks in view take 0.89 of
-the time of steps over the whole model with 0.4 of a town in view, and 1.01 with 0.78 of bonsai, on a CPU."""
+"""Share of the chunks in view above which a step runs over the whole model. On a CPU, steps over the chunks in view
+take 0.89 of the time of steps over the whole model if 0.4 of a town's chunks are in view. They take 1.01 of this time
+if 0.78 of the chunks of the scene bonsai are in view."""
 _BOUNDED_GROUPS = ("means", "log_scales")
 """Parameter groups that the bounds of a chunk are measured from."""
 _ROWS_AT_ONCE = 1 << 16
@@ -54,8 +56,7 @@ _KEPT_BORDERS = 4096
 
 def settings_of_whole_steps(config: TrainConfig) -> list[str]:
     """Return the options in use, such as "--batch", that make each step run over the whole model. With them, a step
-    reads the gradients of Gaussians that the view does not show, or changes these Gaussians in other ways than by
-    Adam."""
+    reads the gradients of Gaussians that the view does not show, or changes such Gaussians in addition to Adam."""
     wanted = {
         "--density.growth mcmc": config.density.growth == "mcmc",
         "--antialiased": config.antialiased,
@@ -92,8 +93,8 @@ class Missed:
     """Steps that chunks have missed because no view showed them.
 
     numbers: the chunks, in rising order.
-    last: (chunks,) uint32, the last step that each has taken.
-    step: the step up to which they are caught up.
+    last: (chunks,) uint32, the last step that each chunk has taken.
+    step: number of the last missed step.
     table: the steps from number `first_step` on (`stages.catch_up.step_table`).
     """
 
@@ -147,12 +148,13 @@ class VisibleChunks(Component):
         self._unmeasured = np.ones(chunks, np.bool_)
         self._since: int | None = None
         """Steps since the last measurement; None if there is none."""
-        most = 2 * (MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)  # twice the need, so that rows are seldom moved
+        # twice as many steps as chunks may miss, so that the rows of the table are seldom moved
+        most = 2 * (MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
         self._table = np.zeros((most, 2 + len(PARAMETER_GROUPS)), np.float32)
         """The steps from `_first_step` on, of which chunks may have missed some (`stages.catch_up.step_table`)."""
         self._begin_table(step, chunks)
         self._before: dict[int, NDArray[np.uint32]] = {}
-        """By number, `_last` as it was before the latest steps, which may be repeated."""
+        """For each of the latest steps, by number, the value of `_last` before it, because the step may be repeated."""
         self._caught: DeviceArray | None = None
 
     def _divide(self, pool: ChunkPool | None) -> None:
@@ -168,8 +170,8 @@ class VisibleChunks(Component):
 
     @property
     def on(self) -> bool:
-        """True if steps may run over some chunks: they change other Gaussians only by Adam, and read none of their
-        gradients."""
+        """True if steps may leave out chunks that the view does not show. Steps with the present settings then change
+        the Gaussians of such chunks only by Adam, and do not read their gradients."""
         return runs_by_chunk(self._config, self._rasterizer.device) and isfinite(self._step_limit)
 
     def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002
@@ -222,7 +224,7 @@ class VisibleChunks(Component):
         if count <= ORDERED_ROWS or self._since is None:
             return inputs
         (of_view,) = inputs
-        if self.step < step - 1:  # the steps in between ran over all rows, as the model was small or streamed
+        if self.step < step - 1:  # earlier steps ran over all rows, as the model was small or streamed
             self._begin_table(step - 1, len(self._last))
         hidden, most_hidden = self._hidden_movement(step)
         ahead, culled = self._ahead, (of_view.camera, step, self._found)
@@ -259,12 +261,20 @@ class VisibleChunks(Component):
         return self._shown_by(camera, 1.0, *self._hidden_movement(self.step + 1))
 
     def _shown(self, camera: Camera, step: int, hidden: Movement, most: Float64) -> NDArray[np.uint32]:
-        """Chunks that a step's view may show, in rising order. hidden, most: results of `_hidden_movement`."""
+        """Chunks that the view of a camera may show in step number `step`, in rising order.
+
+        hidden: function that returns the limits of the movement of chunks in the steps that they missed.
+        most: (2, 1), the largest of these limits.
+        """
         thinning = thinning_of(self._config, step)
         return self._shown_by(camera, 1.0 if thinning is None else thinning.factor, hidden, most)
 
     def _shown_by(self, camera: Camera, factor: float, hidden: Movement, most: Float64) -> NDArray[np.uint32]:
-        """Chunks that a camera may show if opacities are multiplied by `factor`. Other arguments as for `_shown`."""
+        """Chunks that a camera may show if opacities are multiplied by `factor`.
+
+        hidden: function that returns the limits of the movement of chunks in the steps that they missed.
+        most: (2, 1), the largest of these limits.
+        """
         picture = self._borders(camera, self._config.rasterizer, factor)
         return self._found.seen(partial(visible, picture), hidden, most, MOST_MISSED_STEPS + STEPS_PER_MEASUREMENT)
 
@@ -293,7 +303,7 @@ class VisibleChunks(Component):
         self._unmeasured[chunks] = True
 
     def _missed(self, chunks: NDArray[np.uint32], step: int) -> Missed | None:
-        """The steps up to `step` that these chunks have missed; None if there is none."""
+        """The steps up to number `step` that these chunks have missed; None if no chunk has missed a step."""
         if self._config.optimiser.sparse:
             return None
         numbers = chunks[self._last[chunks] < step]
@@ -305,7 +315,7 @@ class VisibleChunks(Component):
 
     def prepare(self, model: tuple[AnyGaussians, ...], step: AdamStep, chunks: _ChunksInView) -> PlacedChunks | None:
         """Catch up the chunks that a step's view shows, and send their list. A repeated step gives the same bits."""
-        if chunks.of_rows is not self._found:  # rows have moved since, and all have taken every step
+        if chunks.of_rows is not self._found:  # rows have moved, and all rows have taken every step
             self._divide(_pool_of(model))
             everything = np.arange(len(self._last), dtype=np.uint32)
             chunks = _ChunksInView(self, everything, None, self._found, whole=True)
@@ -328,7 +338,8 @@ class VisibleChunks(Component):
         return PlacedChunks(_in_pool(model), slots)
 
     def _note(self, step: AdamStep) -> None:
-        """Add a step to the table. If the table is full, first remove the steps that all chunks have taken."""
+        """Add a step to the table of steps that chunks may have missed. If the table is full, first remove the steps
+        that all chunks have taken."""
         if self._config.optimiser.sparse:
             return
         if step.number - self._first_step >= len(self._table):
@@ -363,8 +374,13 @@ class VisibleChunks(Component):
         step: int,
         table: StepTable,
     ) -> None:
-        """Catch up chunks of a model on the device to a step. numbers: of chunks, or of slots in the pool. Other
-        arguments as for `catch_up`."""
+        """Take the steps of Adam up to number `step` that chunks of a model on the device have missed.
+
+        numbers: numbers of the chunks, or for a streamed model their slots in the pool.
+        last: for each of `numbers`, the last step that updated the chunk with its gradients.
+        caught: for every chunk or slot, the step up to which the device has caught it up.
+        table: the missed steps.
+        """
         device, work, readback = self._rasterizer.device, self._rasterizer.work, self._rasterizer.readback
         chunks = send_chunks(work, "chunks_behind", numbers, model[0].count)
         on_device = work.array("last_steps", chunks.numbers.shape, np.uint32)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decoding of photographs to the sizes that the warm-up needs, or reading of their decoded pixels from the disk cache.
-Policy only: no device."""
+Uses no OpenCL."""
 
 from __future__ import annotations
 

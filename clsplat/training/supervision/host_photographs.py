@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs in main memory, within a limit (--max-host-mem), and read ahead of the steps. Policy only: no device."""
+"""Photographs in main memory, within a limit (--max-host-mem), and read ahead of the steps. Uses no OpenCL."""
 
 from __future__ import annotations
 
@@ -139,7 +139,8 @@ class HostPhotographs:
         images = self.decoder.pixels(index, factor, keeps=not self.bounded)
         with self._lock:
             for each, image in images.items():
-                if each <= self._factor or not self._factor:  # larger factors are of sizes that are no longer used
+                # larger divisors belong to picture sizes that the training no longer uses
+                if each <= self._factor or not self._factor:
                     self._keep((index, each), image)
             self._pending.pop(key, None)
         return images

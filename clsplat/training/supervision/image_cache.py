@@ -96,7 +96,7 @@ class ImageCache:
             return
         try:
             image = self.load(index, factor)
-        except PhotographError:  # `bring` raises it again, before the step that needs the photograph
+        except PhotographError:  # `bring` raises the error again, before the step that needs the photograph
             return
         if self._taken + image.nbytes <= self.allowed:
             return

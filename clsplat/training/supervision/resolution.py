@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Resolution of the pictures in each training step (--warmup): small at first, as there is no fine detail to fit yet.
-Policy only: no device."""
+Uses no OpenCL."""
 
 from __future__ import annotations
 
