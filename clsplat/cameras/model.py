@@ -155,9 +155,10 @@ class CameraModel:
         return 2 * math.pi * view.fx if self.wraps else math.inf
 
     def wrapped(self, view: Intrinsics, u: Float64) -> Float64:
-        """Move u (N,) in pixels by multiples of `turn` to within half a turn of the image's middle: eq. (6).
+        """Move horizontal pixel coordinates u (N,) by multiples of `turn`, near to the image's middle: eq. (6).
 
-        In a panorama of 360 degrees, every u is then in [0, width), for any cx. Other models keep u.
+        The results are at most half a turn from the middle. In a panorama of 360 degrees they are in [0, width), for
+        any cx. Other models keep u.
         """
         if not self.wraps:
             return u
@@ -167,7 +168,7 @@ class CameraModel:
         return np.where(moved >= low + turn, low, moved)  # np.mod of a tiny negative number rounds up to `turn` itself
 
     def whole(self, width: int, height: int) -> tuple[float, float, float, float]:
-        """Return fx, fy, cx and cy of a full panorama of this size in pixels. Only for panoramas."""
+        """Return fx, fy, cx and cy of a full panorama of `width` x `height` pixels. Only for panoramas."""
         raise NotImplementedError(self.projection)
 
     def is_whole(self, view: Intrinsics) -> bool:  # noqa: ARG002
@@ -237,10 +238,10 @@ class CameraModel:
     # Methods for models with RAYS, which draw Gaussians on planes tangent to the sphere of directions.
 
     def footprints(self, view: Intrinsics, directions: Float64) -> tuple[Float64, Float64, Float64]:
-        """Return the unit sphere's tangent planes at `directions` (N, 3), and a pixel's footprint on each: (9), (10).
+        """Return the unit sphere's tangent planes at `directions` (N, 3), and a pixel's footprint on each.
 
         The first two results are the planes' axes to the right and down, each (N, 3). The third is the footprints
-        (N, 2, 2): columns are the pixel's sides along u and v, in radians.
+        (N, 2, 2), eqs. (9), (10): columns are the pixel's horizontal and vertical sides, in radians.
         """
         raise NotImplementedError(self.projection)
 
