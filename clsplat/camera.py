@@ -92,7 +92,7 @@ class Window:
     x, y: frame coordinates of the picture's first pixel; negative if it lies left of or above the frame.
     width, height: size of the frame.
     clamp: distance beyond the frame's edges, in halves of the frame's size, up to which the projection's Jacobian
-    follows a Gaussian's mean; for means farther out, it is the Jacobian at this distance. It is larger than the default
+    follows a Gaussian's mean. For means farther out, the Jacobian at this distance is used. `clamp` exceeds its default
     only for a picture that extends further beyond its frame.
     """
 

@@ -108,7 +108,7 @@ class CameraModel:
     wraps: ClassVar[bool] = False
     """True for panoramas: the right edge continues at the left one, and nothing lies beyond the edges."""
     self_tested: ClassVar[bool] = True
-    """True if the self-test renders a picture with this model. Used only for models with RAYS."""
+    """True if the self-test renders a picture with this model. Used only for models that draw Gaussians along rays."""
     without_motion: ClassVar[str] = ""
     """For models without the channel `motion`: the end of the error message, which names this model and models that
     have the channel. Empty for models with the channel."""

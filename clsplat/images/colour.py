@@ -210,7 +210,7 @@ class Colours:
         return str(resolved)
 
     def _ocio_name(self, space: str) -> str:
-        """Return the name of a space in the OpenColorIO configuration. Raises InputError if it is not there."""
+        """Return the name of a space in the OpenColorIO configuration. Raises InputError if the space is missing."""
         for name in _SPACE_ALIASES.get(space, (space,)):
             if self._config.getColorSpaceIndex(self._config.resolve(name)) >= 0:
                 return str(self._config.resolve(name))

@@ -55,5 +55,8 @@ def strays(places: Float64, most: float, least: float = 0.0, middle: Float64 | N
 
 
 def stray_cameras(cameras: Sequence[Camera], least: float = 0.0) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the outliers among cameras. least: as for `strays`."""
+    """Return a mask (N,) of the outliers among cameras.
+
+    least: lower limit of the distance, in world units, at which the gap before outliers may begin (`strays`).
+    """
     return strays(np.stack([camera.position for camera in cameras]), MAX_OUTLIER_CAMERA_FRACTION, least)

@@ -57,7 +57,7 @@ class Answer:
 
     settings: the recommended settings. Empty if nothing is known to help, or if all that helps is incompatible with the
         other settings.
-    given: name of a setting that the user has chosen and every recommendation would change, so that `settings` is
+    given: name of a setting that the user has chosen, and that every recommendation would change, so that `settings` is
         empty; else "".
     """
 

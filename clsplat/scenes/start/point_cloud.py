@@ -58,8 +58,8 @@ _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5.0))
 COLOUR_VIEWS_PER_POINT = 15
 """Number of nearest photographs that give a point its colour.
 
-In photographs farther away, the colour of a point is mixed with its surroundings. With fewer photographs, one with
-something else in front of the point would have too much weight.
+In photographs farther away, the colour of a point is mixed with its surroundings. With fewer photographs, a
+photograph in which something hides the point would have too much weight.
 """
 OCCLUSION_DEPTH_RATIO = 1.05
 """A point counts as occluded if its depth is over this many times that of the nearest point in its occlusion cell."""
