@@ -76,7 +76,7 @@ class PlaneProjection(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CameraModel:
-    """A camera model: a row of `clsplat.camera.CAMERA_MODELS`. Its kernels are a header of kernels/shared/camera/.
+    """A camera model: a row of `clsplat.camera.CAMERA_MODELS`. Its OpenCL functions are in kernels/shared/camera/.
 
     projection: the model's name in `Camera.projection` and in camera files.
     option: the field of `Camera` that selects this model among those with its projection; "" for the default model.
@@ -155,10 +155,9 @@ class CameraModel:
         return 2 * math.pi * view.fx if self.wraps else math.inf
 
     def wrapped(self, view: Intrinsics, u: Float64) -> Float64:
-        """Move horizontal pixel coordinates u (N,) by multiples of `turn`, near to the image's middle: eq. (6).
+        """Move columns u (N,), in pixels, by multiples of `turn` to within half a turn of the image's middle: eq. (6).
 
-        The results are at most half a turn from the middle. In a panorama of 360 degrees they are in [0, width), for
-        any cx. Other models keep u.
+        In a panorama of 360 degrees, every u is then in [0, width), for any cx. Other models keep u.
         """
         if not self.wraps:
             return u

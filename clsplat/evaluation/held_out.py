@@ -90,7 +90,7 @@ def evaluate(
     model: description of the model, which is copied to the result.
     space: colour space of renders and photographs. They are compared in this space.
     corrected: also measure PSNR after an affine fit of colours.
-    aligned: function that returns the same image after it has fitted the view's pose to the model. The PSNR of this
+    aligned: function that fits a view's pose to the model, and returns the image from this pose. The PSNR of this
         image is also measured.
 
     Scores leave out the pixels that a mask excludes. Raises ClsplatError if a render is not finite. Raises InputError,

@@ -81,7 +81,7 @@ def cameras_of(images: Sequence[PosedImage], lenses: Lenses = "undistort") -> di
 def camera_checks(views: Sequence[Named], points: Float64 | None = None) -> list[str]:
     """Return warnings about implausible cameras.
 
-    views: the photographs, with cameras and lenses for any size of the pictures.
+    views: name, camera and lens of each photograph. Camera and lens may be for any size of the picture.
     points: (N, 3), the scene's points in world coordinates, if it has any.
     """
     flat = [(name, camera) for name, camera, _ in views if camera.is_pinhole]

@@ -209,7 +209,7 @@ class Lens:
         return np.asarray(self._camera().cam_from_img(np.ascontiguousarray(pixels, np.float64)))
 
     def _camera(self) -> pycolmap.Camera:
-        # Of a lens that COLMAP lacks, only focal lengths and principal point are read: PINHOLE takes its place.
+        # PINHOLE stands in for a lens that COLMAP lacks: only focal lengths and principal point are read from it.
         model = self.model if self.is_colmap else "PINHOLE"
         camera = pycolmap.Camera(model=model, width=self.width, height=self.height, params=list(self.params))
         camera.camera_id = 1

@@ -49,7 +49,7 @@ def detect(path: Path) -> Kind:
     if (path / "transforms_train.json").is_file():
         return "blender"
     model = colmap.find_model(path)
-    # Prefer a transforms.json to the model in colmap/, from which nerfstudio made it: that is for larger pictures.
+    # If nerfstudio made transforms.json from the model in colmap/, use the former: the model has larger pictures.
     if model is not None and not (model.is_relative_to(path / "colmap") and (path / "transforms.json").is_file()):
         return "colmap"
     if (path / "transforms.json").is_file():
@@ -142,7 +142,7 @@ def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, ima
     copies = [copy for folder in usual if (copy := or_smaller(folder)) != folder]
     named = [inside(parent, (name,)) for parent in above for name in OTHER_IMAGE_FOLDERS]
     others = [folder for folder in named if folder is not None and has_pictures(folder)]
-    bare = [parent for parent in above if find_images(parent, deep=False)]  # RealityScan writes pictures there
+    bare = [parent for parent in above if find_images(parent, deep=False)]  # RealityScan has no sub-folder for pictures
     found = [*copies, *others, *bare]
     listed = [folder for folder in found if any(is_file(folder / image.name) for image in images)]
     if listed or found:

@@ -101,7 +101,7 @@ def load_scene(
         files = _read(path, kind, images, missing, masks, work_dir, progress)
         views = _views(files, path, resolution, (test_every, test_most), lenses)
         scene = _scene(files, path, kind, views)
-        # Outliers are not checked, because `_scene` has already warned of them.
+        # Cameras that are outliers are left out, because `_scene` has already warned of them.
         near_views = [view for view in views if view.name not in scene.stray_cameras]
         for doubt in camera_checks([(view.name, view.camera, view.lens) for view in near_views], scene.points):
             warn(doubt)

@@ -86,8 +86,8 @@ def owned(
     example: name of a photograph, for messages.
     without: files to skip.
     strict: raise InputError for a file that fits no photograph; otherwise it is skipped.
-    numbered: match mask_0007.png to image_0007.png if no other match is found. All files must have
-        names that differ only in a number, and so must all photographs.
+    numbered: match mask_0007.png to image_0007.png if no other match is found. The files' names must differ only in a
+        number, and the photographs' names too.
 
     Exact names are matched first. In later steps a file may differ from a name in case, then also in the photograph's
     extension, then also in folders, if it fits exactly one photograph. Raises InputError for two files of a photograph;

@@ -179,7 +179,7 @@ class _Candidates:
         self._seen = np.zeros(len(rows), np.bool_)
 
     def see(self, surfaces: NDArray[np.int32], first: int, last: int) -> None:
-        """Mark points in the picture's rows [first, last) as visible if the ray nearest to them meets their surface.
+        """Mark each point in the picture's rows [first, last) as visible if the ray nearest to it meets its surface.
 
         surfaces: (4, rows, columns), the surfaces that the rays meet, as in `Sight`.
         """

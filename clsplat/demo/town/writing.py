@@ -120,11 +120,12 @@ def _take_all(
     progress("painting the town", 0.0)
     textures(config.seed)
     seen: list[Observations] = []
-    pool = ThreadPoolExecutor(workers, "clsplat-town")  # threads, because NumPy releases the interpreter lock
+    # Threads run in parallel, because NumPy releases the interpreter lock.
+    pool = ThreadPoolExecutor(workers, "clsplat-town")
     try:
         for done, observations in enumerate(pool.map(partial(_take_and_write, result, config), planned), 1):
             seen.append(observations)
-            os.utime(result.parent)  # other machines remove folders that look abandoned
+            os.utime(result.parent)  # a recent time shows other machines that the folder is in use
             progress("taking photographs", CountedFraction(done, len(planned), "taken"))
     finally:
         pool.shutdown(cancel_futures=True)

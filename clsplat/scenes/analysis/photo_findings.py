@@ -319,7 +319,7 @@ def _sky_part(visible: VisiblePoints, view: View) -> float:
         & (steps < MAX_SKY_PIXEL_STEP)
         & ((blue > MIN_SKY_BLUE_EXCESS) | (light > MAX_EXPOSURE_COLOUR))
     )
-    reached = np.logical_and.accumulate(likely, axis=0)  # in each column, sky ends at the first unlikely pixel
+    reached = np.logical_and.accumulate(likely, axis=0)  # in each column, sky ends at the first pixel unlike sky
     part = float(reached.mean())
     if part < MIN_SKY_PIXEL_FRACTION or not likely[0].mean() > 0.5:
         return 0.0

@@ -311,7 +311,7 @@ def _find_file(keys: Keys) -> Path:
 
 
 def _file_of(keys: Keys, key: str) -> Path | None:
-    """Return the path that a frame gives under `key`, for a mask or depth map; None without this key."""
+    """Return the path that a frame gives under `key`, for a mask or depth map; None if it lacks the key."""
     listed = keys.frame.get(key)
     if not isinstance(listed, str) or not listed:
         return None

@@ -53,7 +53,7 @@ A shift of 0.2 thumbnail pixels, 1/480 of the picture's width, reaches the secon
 less in pictures of at least 240 pixels.
 """
 MIN_FOLDER_CORRELATION, CORRELATION_SIDE_PX = 0.9, 24
-"""Minimum correlation of the pictures in two related folders, and longer side to which the pictures are reduced for it.
+"""Minimum correlation of the pictures in two related folders, and longer side in pixels at which they are correlated.
 
 The median of FOLDER_PAIR_SAMPLES pairs is compared with the minimum. In the scene fox (k1 0.058, k2 -0.081),
 the correlation of photographs with their undistorted copies is 0.9995. In six other scenes, with k1 from 0.1 to -0.35,
@@ -365,7 +365,7 @@ def _alike(names: Iterable[str]) -> list[list[_Place]]:
 def _found(
     groups: Iterable[list[P]], rank: Callable[[P], tuple[Hashable, ...]], why: Callable[[P, P], str]
 ) -> dict[str, Copy]:
-    """Find the copies in each group: photographs that show the same as a better photograph of the group.
+    """Find the copies in each group: photographs that show the same things as a better photograph of the group.
 
     The better photograph may itself be a copy.
 

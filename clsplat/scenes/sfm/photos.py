@@ -120,7 +120,7 @@ def stage_photos(
     format, are rewritten upright. Other files are linked, or copied if the file system has no links. Raises InputError
     that names the first photograph that does not decode, as pycolmap would silently skip it.
 
-    report: called with the fraction of the photographs that are done.
+    report: function that is called with the fraction of the photographs that are done.
     """
     staged: list[Photo] = []
     compared = to_compare([photo_name(folder, path) for path in photos])

@@ -275,7 +275,7 @@ def _end_with_parent(stream: TextIO) -> None:
 
 def main() -> None:
     """Read the task from standard input, run it, and send the answer to standard output."""
-    # Native code prints to standard output, too. Send its output to standard error, apart from the answers.
+    # Native code prints to standard output, too. Send that to standard error: standard output is for answers.
     channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     task = json.loads(sys.stdin.readline())

@@ -350,7 +350,7 @@ def photographed(scene: Scene, background: ArrayLike) -> Float32:
 
 
 def _medians(colors: Float32) -> Float32:
-    """Return the median per channel of each point's finite colours, (N, 3); UNSEEN_GREY for points without any.
+    """Return the median per channel of each point's finite colours, (N, 3); UNSEEN_GREY if there are none.
 
     colors: (N, K, 3), infinite where a point has fewer than K colours. The function sorts the array.
     """
