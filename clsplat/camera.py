@@ -77,8 +77,8 @@ JACOBIAN_CLAMP_HALF_FRAMES = 0.3
 DEFAULT_NEAR_PLANE = 0.01
 """Default near plane in world units, for cameras and models without their own."""
 MIN_SIZE_IN_NEAR_PLANES = 100.0
-"""The near plane of a scene is at most its length unit divided by this, and that of a tiny model its size divided by
-this."""
+"""A scene's near plane is at most the scene's length unit divided by this number. A tiny model's near plane is at most
+the model's size divided by it."""
 ROTATION_TOLERANCE = 1e-2
 """Largest allowed entry of |R^T R - I|. It is this large because poses may be typed with few digits or be float32."""
 MAX_FOCAL_PX = 1e12
@@ -92,7 +92,7 @@ class Window:
     x, y: frame coordinates of the picture's first pixel; negative if it lies left of or above the frame.
     width, height: size of the frame.
     clamp: distance beyond the frame's edges, in halves of the frame's size, up to which the projection's Jacobian
-    follows a Gaussian's mean; for means farther out, it is the Jacobian at this distance. It is larger than the default
+    follows a Gaussian's mean. For means farther out, the Jacobian at this distance is used. `clamp` exceeds its default
     only for a picture that extends further beyond its frame.
     """
 
@@ -104,9 +104,9 @@ class Window:
 
 
 def _is_set(option: object) -> bool:
-    """Return True for `by_rays` = True, and for a `radial` that is not all zeros.
+    """Return True if an option of a camera is set: `by_rays` if it is True, `radial` if it is not all zeros.
 
-    Plain Python is used for tuples because it is faster than NumPy, and every step calls this often.
+    Tuples are tested in plain Python, which is faster than NumPy, because every step calls this function often.
     """
     if isinstance(option, bool):
         return option
@@ -312,7 +312,7 @@ class Camera:
         return replace(self, by_rays=by_rays) if changes else self
 
     def depths_of_distances(self) -> Float32 | None:
-        """Factors (height, width) that turn distances along the rays of a `by_rays` camera into depths z: `cosines`.
+        """For a `by_rays` camera, the factors (height, width) that convert distances along pixels' rays to depths z.
 
         None for all other cameras, whose depths need no conversion before they are written to files.
         """
@@ -433,7 +433,10 @@ def model_with(column: str, value: object) -> CameraModel | None:
 
 
 def names_of(column: str) -> tuple[str, ...]:
-    """All names that another program has for camera models, those of panoramas last. column: as for `model_with`."""
+    """All names that another program has for camera models; names of panoramas are last.
+
+    column: attribute of CameraModel with the program's names, such as "usd" or "nerfstudio".
+    """
     return tuple(
         name for model in sorted(CAMERA_MODELS, key=lambda each: each.wraps) for name in getattr(model, column)
     )

@@ -73,7 +73,10 @@ class Fisheye(AroundAxis):
         return np.where(seen, depths / focal * np.minimum(along, around), np.inf)
 
     def angles_of_pixel(self, view: Intrinsics, theta: Float64) -> tuple[Float64, Float64, Float64, Float64]:
-        """Return p, q and their derivatives, as described for `AroundAxis`: eqs. (10), (19)."""
+        """Return p, q and their derivatives with respect to theta, each (N,): eqs. (10), (19).
+
+        fx pixels cover p radians in the direction away from the axis, and q radians around the axis.
+        """
         radius, slope, bend = radii(view, theta)
         with np.errstate(all="ignore"):
             ratio = np.where(theta > 1e-6, np.sin(theta) / radius, 1.0)
@@ -86,7 +89,7 @@ class Fisheye(AroundAxis):
 class BentFisheye(Fisheye):
     """A fisheye with coefficients (Kannala and Brandt), eqs. (18), (19). Kernels: fisheye.h with bent_fisheye.h."""
 
-    self_tested = False  # the self-test renders with Fisheye, which has the same kernels and footprints
+    self_tested = False  # the self-test covers Fisheye, whose kernels and footprints are the same
     without_motion = "a fisheye with coefficients, expected a fisheye without them or a pinhole camera"
 
     def fold(self, radial: tuple[float, float, float, float]) -> tuple[float, float]:

@@ -76,7 +76,7 @@ class PlaneProjection(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CameraModel:
-    """A camera model: a row of `clsplat.camera.CAMERA_MODELS`. Its kernels are a header of kernels/shared/camera/.
+    """A camera model: a row of `clsplat.camera.CAMERA_MODELS`. Its OpenCL functions are in kernels/shared/camera/.
 
     projection: the model's name in `Camera.projection` and in camera files.
     option: the field of `Camera` that selects this model among those with its projection; "" for the default model.
@@ -108,7 +108,7 @@ class CameraModel:
     wraps: ClassVar[bool] = False
     """True for panoramas: the right edge continues at the left one, and nothing lies beyond the edges."""
     self_tested: ClassVar[bool] = True
-    """True if the self-test renders a picture with this model. Used only for models with RAYS."""
+    """True if the self-test renders a picture with this model. Used only for models that draw Gaussians along rays."""
     without_motion: ClassVar[str] = ""
     """For models without the channel `motion`: the end of the error message, which names this model and models that
     have the channel. Empty for models with the channel."""
@@ -155,7 +155,7 @@ class CameraModel:
         return 2 * math.pi * view.fx if self.wraps else math.inf
 
     def wrapped(self, view: Intrinsics, u: Float64) -> Float64:
-        """Move u (N,) in pixels by multiples of `turn` to within half a turn of the image's middle: eq. (6).
+        """Move columns u (N,), in pixels, by multiples of `turn` to within half a turn of the image's middle: eq. (6).
 
         In a panorama of 360 degrees, every u is then in [0, width), for any cx. Other models keep u.
         """
@@ -167,7 +167,7 @@ class CameraModel:
         return np.where(moved >= low + turn, low, moved)  # np.mod of a tiny negative number rounds up to `turn` itself
 
     def whole(self, width: int, height: int) -> tuple[float, float, float, float]:
-        """Return fx, fy, cx and cy of a full panorama of this size in pixels. Only for panoramas."""
+        """Return fx, fy, cx and cy of a full panorama of `width` x `height` pixels. Only for panoramas."""
         raise NotImplementedError(self.projection)
 
     def is_whole(self, view: Intrinsics) -> bool:  # noqa: ARG002
@@ -237,10 +237,10 @@ class CameraModel:
     # Methods for models with RAYS, which draw Gaussians on planes tangent to the sphere of directions.
 
     def footprints(self, view: Intrinsics, directions: Float64) -> tuple[Float64, Float64, Float64]:
-        """Return the unit sphere's tangent planes at `directions` (N, 3), and a pixel's footprint on each: (9), (10).
+        """Return the unit sphere's tangent planes at `directions` (N, 3), and a pixel's footprint on each.
 
         The first two results are the planes' axes to the right and down, each (N, 3). The third is the footprints
-        (N, 2, 2): columns are the pixel's sides along u and v, in radians.
+        (N, 2, 2), eqs. (9), (10): columns are the pixel's horizontal and vertical sides, in radians.
         """
         raise NotImplementedError(self.projection)
 

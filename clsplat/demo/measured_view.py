@@ -23,8 +23,8 @@ COEFFICIENTS = 16
 def measured_view(count: int = MEASURED_GAUSSIANS) -> tuple[Gaussians, Camera, NDArray[np.uint8]]:
     """Return Gaussians on the surfaces of the demo's scene, and the camera and pixels of its first photograph.
 
-    The Gaussians are those with which a training from `count` points starts, with zeros for the higher SH bands. Their
-    number on each surface is proportional to its texels.
+    The Gaussians are those with which a training from `count` points starts, with zeros for the higher SH bands. The
+    number of Gaussians on a surface is proportional to the number of the surface's texels.
     """
     surfaces = still_life()
     bake(surfaces, seed=0)

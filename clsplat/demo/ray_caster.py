@@ -121,7 +121,10 @@ class Surface(ABC):
 
     @abstractmethod
     def albedo(self, points: Float32, noise: Noise) -> Float32:
-        """Return the diffuse colour (n, 3), from 0 to 1, at points (n, 3). noise: noise of the material."""
+        """Return the diffuse colour (n, 3), from 0 to 1, at points (n, 3) of the surface.
+
+        noise: 3D noise function, from which the material's irregular pattern is computed.
+        """
 
     def colour(self, points: Float32) -> Float32:
         """Return colours (n, 3) at points (n, 3), by a bilinear look-up in the baked texture."""
@@ -137,7 +140,7 @@ class Surface(ABC):
         return np.asarray(top * (1 - fy) + bottom * fy)
 
     def grid(self, rows: int, columns: int) -> tuple[Float32, Float32]:
-        """Return positions and normals, (rows * columns, 3) each, at the cells' centres of a grid over the texture."""
+        """Return positions and normals, (rows * columns, 3) each, at the cell centres of a grid over the texture."""
         row, column = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
         return self.point(row.ravel().astype(np.float32), column.ravel().astype(np.float32))
 
@@ -178,7 +181,7 @@ class Wall(Surface):
         b = origin[..., 0] * direction[:, 0] + origin[..., 1] * direction[:, 1]
         c = origin[..., 0] ** 2 + origin[..., 1] ** 2 - np.float32(WALL_RADIUS_METRES**2)
         with np.errstate(divide="ignore", invalid="ignore"):
-            t = (-b + np.sqrt(np.maximum(b * b - a * c, 0))) / a  # the larger root: rays start inside
+            t = (-b + np.sqrt(np.maximum(b * b - a * c, 0))) / a  # rays start inside, so the larger root is ahead
             z = origin[..., 2] + t * direction[:, 2]
         return np.where((t > 1e-3) & (z < WALL_HEIGHT_METRES) & (z > 0), t, np.inf).astype(np.float32)
 

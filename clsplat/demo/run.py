@@ -77,7 +77,7 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
 
 
 def claim(output: Path) -> None:
-    """Mark a folder as the demo's. Raises InputError if it has no mark, but files that the demo would replace."""
+    """Mark a folder as the demo's. Raises InputError for an unmarked folder with files that it would replace."""
     if is_file(output / DEMO_MARKER_FILE_NAME):
         return
     existing = [name for name in DEMO_FOLDERS if (output / name).exists() or (output / name).is_symlink()]

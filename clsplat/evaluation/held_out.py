@@ -49,7 +49,7 @@ _AVERAGED_SCORES: tuple[_AveragedScore, ...] = ("psnr", "psnr_corrected", "psnr_
 class Evaluation(TypedDict):
     """Content of eval.json.
 
-    step, gaussians, seconds: as in `EvaluatedModel`.
+    step, gaussians, seconds: training step, number of Gaussians and training time of the model; None if unknown.
     mean: mean of each score over the views, keyed by the score's name; empty without views.
     lpips_missing: reason why LPIPS was not measured.
     """
@@ -90,7 +90,8 @@ def evaluate(
     model: description of the model, which is copied to the result.
     space: colour space of renders and photographs. They are compared in this space.
     corrected: also measure PSNR after an affine fit of colours.
-    aligned: function like `render` that first fits the view's pose to the model. Its PSNR is also measured.
+    aligned: function that fits a view's pose to the model, and returns the image from this pose. The PSNR of this
+        image is also measured.
 
     Scores leave out the pixels that a mask excludes. Raises ClsplatError if a render is not finite. Raises InputError,
     with the view's name, for a view that is too small for SSIM. Also raises InputError for an unknown colour space.
@@ -176,7 +177,7 @@ def picture_names(names: Sequence[str]) -> list[str]:
     ".png" is appended instead.
     """
     stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
-    # ignores case on every system, so that the names are the same everywhere
+    # case is ignored on every system, so that the names are the same everywhere
     keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]
     uses = Counter(keys)
     return [(stem if uses[key] == 1 else name) + ".png" for stem, key, name in zip(stems, keys, names, strict=True)]

@@ -47,7 +47,7 @@ def limit() -> float:
 def fetch() -> None:
     """Download the weights if the file is missing, with progress on standard error.
 
-    Raises ClsplatError if that fails. The message has a curl command for the download.
+    Raises ClsplatError if the download fails. The message has a curl command for it.
     """
     path, seconds = place(), limit()
     if is_file(path):

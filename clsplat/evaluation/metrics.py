@@ -134,7 +134,7 @@ def _lpips_model() -> Callable[[Image, Image], float] | str:
 
 
 def _pair(image: Image, truth: Image) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Convert both images to float64 and clamp them to [0, 1]. Raises ValueError for other shapes than (H, W, 3)."""
+    """Convert both images to float64 and clamp them to [0, 1]. Raises ValueError unless both are (H, W, 3)."""
     if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"image has the shape {image.shape} and truth {truth.shape}, expected (H, W, 3) for both")
     return np.clip(image.astype(np.float64), 0, 1), np.clip(truth.astype(np.float64), 0, 1)

@@ -160,7 +160,7 @@ class Colours:
         return space == LINEAR or (space != SRGB and bool(self._config.isColorSpaceLinear(space)))
 
     def has_rec709(self, space: str) -> bool:
-        """Return True if `space`, one of the job's, has Rec.709's primaries and white point, with any curve."""
+        """Return True if `space`, a colour space of the job, has Rec.709's primaries and white point."""
         if space in _SPACE_ALIASES:
             return True
         light = np.array([[[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]], np.float32)
@@ -210,7 +210,7 @@ class Colours:
         return str(resolved)
 
     def _ocio_name(self, space: str) -> str:
-        """Return the name that a space has in the OpenColorIO configuration. Raises InputError if it has none."""
+        """Return the name of a space in the OpenColorIO configuration. Raises InputError if the space is missing."""
         for name in _SPACE_ALIASES.get(space, (space,)):
             if self._config.getColorSpaceIndex(self._config.resolve(name)) >= 0:
                 return str(self._config.resolve(name))
@@ -249,9 +249,9 @@ class Colours:
         return np.asarray(red * matrix[0] + green * matrix[1] + blue * matrix[2], np.float32)
 
     def _matrix(self, source: str, target: str) -> Float32 | None:
-        """Return the matrix (3, 3) of a conversion, a row for each source channel; None if it is not linear.
+        """Return the matrix (3, 3) of a conversion, a row per source channel; None if the conversion is not linear.
 
-        With a matrix, frames are converted without OpenImageIO, which would load the configuration in every call. That
+        With a matrix, frames are converted without OpenImageIO. It would load the configuration in every call, which
         takes longer than rendering a frame.
         """
         light = np.array([[[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0], [4, -1, 2], [0.2, 0.01, 0.5]]], np.float32)

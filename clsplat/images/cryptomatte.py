@@ -59,7 +59,7 @@ def header_of(layer: str, names: Sequence[str]) -> dict[str, str]:
 def ranked(coverage: Float32, names: Sequence[str]) -> Float32:
     """Return ids and coverages (H, W, 4 CRYPTOMATTE_LAYERS) of the objects that cover most of each pixel.
 
-    They alternate along the last axis, from the largest coverage to the smallest; unused entries are 0. Objects with
+    Ids and coverages alternate along the last axis, the largest coverage first. Unused entries are 0. Objects with
     equal coverage are in the order of `names`.
 
     coverage: (H, W, objects), the fraction of each pixel that each object covers.

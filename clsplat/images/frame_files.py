@@ -132,7 +132,7 @@ def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> 
 
 
 def check_target(path: Path, channels: Iterable[str]) -> None:
-    """Raise InputError like `check_format`, and if the file's folder does not exist."""
+    """Raise InputError if the file's folder does not exist, or a file with this name cannot hold the channels."""
     check_format(str(path), channels)
     if not path.parent.is_dir():
         raise InputError(f"{path.parent}: no such folder to write {path.name} to")
@@ -148,7 +148,8 @@ def write_channels(
 
     channels: arrays (H, W) or (H, W, C) by channel name. rgb is over black, so it is premultiplied by alpha. In an EXR
       part of integers, the id -1, for no Gaussian, becomes 4294967295.
-    encoding, header: None for the defaults.
+    encoding: pixel types and compression of the file; None for the defaults.
+    header: header attributes of the file; None for the defaults.
     Raises InputError and ClsplatError like `writing.write_image`.
     """
     write_views(path, [(channels, header or FrameFileHeader())], encoding)
@@ -382,7 +383,9 @@ def _spec(shape: tuple[int, ...], names: Sequence[str], kind: Any, header: Frame
 
 def record_text(attributes: Mapping[str, Any]) -> str:
     """Return the provenance record for file formats without custom attributes: a text with the digests of model and
-    settings. It is '' if `attributes`, those of a frame's header, lack one of the digests.
+    settings. The text is '' if one of the digests is missing.
+
+    attributes: header attributes of the frame.
     """
     model, settings = attributes.get(MODEL_DIGEST_ATTRIBUTE), attributes.get(SETTINGS_DIGEST_ATTRIBUTE)
     return f"clsplat model {model} settings {settings}" if model and settings else ""

@@ -26,7 +26,8 @@ class Surfaces:
     """The surfaces in each pixel of an image, S in all.
 
     counts: (H, W) int64, number of surfaces of each pixel.
-    rows: (S, 4) float32, HOLDOUT_SURFACE_FIELDS of each surface, ordered by pixel and within a pixel by front depth.
+    rows: (S, 4) float32, the values HOLDOUT_SURFACE_FIELDS of each surface: front depth, back depth, transmittance, and
+        log2 of the transmittance per unit of depth. Rows are ordered by pixel, and within a pixel by front depth.
     """
 
     counts: NDArray[np.int64]
@@ -126,9 +127,11 @@ def surfaces_of(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> 
 def _surfaces(
     begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any], counts: NDArray[np.int64], shape: tuple[int, ...]
 ) -> Surfaces:
-    """Return surfaces like `surfaces_of`, from values (S,) of an image of `shape` (H, W), ordered by pixel.
+    """Return surfaces like `surfaces_of`, from flat arrays that are ordered by pixel.
 
-    counts: (H W,), number of the values that belong to each pixel.
+    begin, end, alpha: (S,), front depths, back depths and alpha.
+    counts: (H W,), number of entries of these arrays that belong to each pixel.
+    shape: height and width of the image.
     """
     alpha = np.clip(alpha, 0, 1)
     shown = (begin > 0) & (begin < np.inf) & (alpha > 0)
@@ -142,7 +145,7 @@ def _surfaces(
 
 
 def _rows(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Float32:
-    """Return HOLDOUT_SURFACE_FIELDS (S, 4) from front depths, back depths and alpha, each (S,).
+    """Return `Surfaces.rows` (S, 4) of surfaces with these front depths, back depths and alpha, each (S,).
 
     The back depth of an opaque surface is set to its front depth.
     """

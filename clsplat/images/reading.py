@@ -158,7 +158,7 @@ def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
 def stored_range(path: Path) -> tuple[int, bool]:
     """Return the largest integer of an image's pixel type, 0 for floats, and True if its compression is lossless.
 
-    Raises InputError like `open_image`.
+    Raises InputError if the file is missing, not an image, or has an implausible size.
     """
     source = open_image(path)
     dtype, kind = np.dtype(str(source.spec().format)), source.format_name()
@@ -235,7 +235,7 @@ def turned(image: NDArray[T], orientation: int) -> NDArray[T]:
 
 
 def channels_of(spec: Any) -> list[str]:
-    """Return each channel's name in upper case; "" for channels that the decoder's list of names does not reach."""
+    """Return each channel's name in upper case; "" for channels after the end of the decoder's list of names."""
     names = [name.upper() for name in spec.channelnames][: spec.nchannels]
     return names + [""] * (spec.nchannels - len(names))
 

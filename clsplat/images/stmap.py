@@ -129,7 +129,7 @@ def _oriented_share(values: Float32) -> float:
     Cells whose values are not finite or do not vary are left out. The result is 1 for a map that is too small to judge
     or has no finite values. It is 0 for a map whose positions lie on a line or in a point.
 
-    values: (H, W, 2), as in `StMap`.
+    values: (H, W, 2), source positions, as in `StMap`.
     """
     rows, columns = (np.arange(0, side, max(side // _ORIENTATION_CELLS_PER_SIDE, 1)) for side in values.shape[:2])
     if len(rows) < _ORIENTATION_CELLS_PER_SIDE // 2 or len(columns) < _ORIENTATION_CELLS_PER_SIDE // 2:

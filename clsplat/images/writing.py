@@ -136,11 +136,12 @@ def _write(
     steps: Callable[[Any, str], Iterable[bool]],
     reasons: Sequence[str] = (),
 ) -> None:
-    """Write an image file with parts of these specifications, atomically, and check that it is complete.
+    """Write an image file, atomically, and check that it is complete.
 
+    specs: OpenImageIO specification of each part of the file.
     kind: the file's extension without the dot.
-    steps: generator function of OpenImageIO's open file and the file's name. It writes the pixels in several calls, and
-    yields after each whether it succeeded.
+    steps: generator function that writes the pixels, given OpenImageIO's open file and the file's name. After each of
+        several calls of OpenImageIO it yields True if the call succeeded.
     reasons: messages of calls that failed in another thread.
     """
     # Before a JPEG is written, disk space is checked, because libjpeg ends the process if it cannot write.

@@ -46,7 +46,7 @@ at least a quarter of the points.
 """
 MAX_CONVERGING_FRACTION_AS_GIVEN, MIN_CONVERGING_FRACTION_INVERTED = 0.2, 0.9
 """Inverted poses are reported if at most the first fraction of the cameras faces a common point with the poses as
-given, and at least the second fraction does after inverting them."""
+given, but at least the second fraction faces a common point with the poses inverted."""
 PARALLEL_MEAN_AXIS_LENGTH = 0.7
 """Length of the mean optical axis above which the cameras look in the same direction, as along a facade.
 
@@ -81,7 +81,7 @@ def cameras_of(images: Sequence[PosedImage], lenses: Lenses = "undistort") -> di
 def camera_checks(views: Sequence[Named], points: Float64 | None = None) -> list[str]:
     """Return warnings about implausible cameras.
 
-    views: the photographs, with cameras and lenses for any size of the pictures.
+    views: name, camera and lens of each photograph. Camera and lens may be for any size of the picture.
     points: (N, 3), the scene's points in world coordinates, if it has any.
     """
     flat = [(name, camera) for name, camera, _ in views if camera.is_pinhole]
@@ -173,7 +173,8 @@ def _poses(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
         if meeting < MIN_CONVERGING_FRACTION_INVERTED or _facing(flat) > MAX_CONVERGING_FRACTION_AS_GIVEN:
             return ""
         evidence = (
-            f"the cameras face no common point, but {100 * meeting:.0f} % of them face one if the poses have {words}"
+            f"the cameras face no common point, but {100 * meeting:.0f} % of them face a common point if the poses "
+            f"have {words}"
         )
     return f"{evidence}: was the file written like that? Export it again, or correct it"
 
@@ -219,7 +220,7 @@ def _inverted_opengl(camera: Camera) -> Camera:
 
 
 def _of_places(camera: Camera) -> Camera:
-    """Return the camera with its pose corrected, assuming that its translation is in fact its position."""
+    """Return the camera with its pose corrected, assuming that the translation is in fact the camera's position."""
     return replace(camera, translation=-camera.rotation @ camera.translation)
 
 

@@ -144,7 +144,8 @@ class Lens:
     def camera(self, rotation: Float64, translation: Float64, lenses: Lenses) -> Camera:
         """Return the camera for training, with the given pose.
 
-        Panoramas keep their projection, and so do fisheyes if `lenses` is "native". Other lenses give `pinhole`.
+        Panoramas keep their projection, and so do fisheyes if `lenses` is "native". For other lenses, this is the
+        camera of `pinhole`.
         """
         native = self.native
         if native is None or (lenses == "undistort" and not native.wraps):
@@ -208,7 +209,7 @@ class Lens:
         return np.asarray(self._camera().cam_from_img(np.ascontiguousarray(pixels, np.float64)))
 
     def _camera(self) -> pycolmap.Camera:
-        # For a lens that COLMAP lacks, only focal lengths and principal point are read, which PINHOLE has.
+        # PINHOLE stands in for a lens that COLMAP lacks: only focal lengths and principal point are read from it.
         model = self.model if self.is_colmap else "PINHOLE"
         camera = pycolmap.Camera(model=model, width=self.width, height=self.height, params=list(self.params))
         camera.camera_id = 1
@@ -377,7 +378,7 @@ def tracked_in_view(tracked: Iterable[tuple[Camera, Lens | None, Float64]]) -> t
 
 
 def occlusion_cell(camera: Camera, points: int) -> float:
-    """Return the side in pixels of an occlusion cell, if the camera's picture shows this number of points."""
+    """Return the side in pixels of an occlusion cell in a picture of this camera that shows this number of points."""
     cell = np.sqrt(POINTS_PER_OCCLUSION_CELL * camera.width * camera.height / max(points, 1))
     return float(max(min(cell, MAX_OCCLUSION_CELL_FRACTION * max(camera.width, camera.height)), 1.0))
 

@@ -96,9 +96,11 @@ def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
 
 
 def _check_frame(scene: Scene, known: Mapping[str, KnownDepth], model: Path) -> None:
-    """Raise InputError if the cameras project hardly any tracked point into its photographs.
+    """Raise InputError if the cameras project hardly any tracked point into the photographs of the point's track.
 
-    The cameras and the points of `model` then have different world frames. known: points of each view, by its name.
+    The cameras and the points of `model` then have different world frames.
+
+    known: points that COLMAP observed in each view, by the view's name.
     """
     views = [view for view in scene.train_views if view.name in known]
     seen, whole, enough = tracked_in_view(

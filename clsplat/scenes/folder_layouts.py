@@ -49,7 +49,7 @@ def detect(path: Path) -> Kind:
     if (path / "transforms_train.json").is_file():
         return "blender"
     model = colmap.find_model(path)
-    # Prefer nerfstudio's transforms.json to the model in colmap/ that it was made from: the model has larger pictures.
+    # If nerfstudio made transforms.json from the model in colmap/, use the former: the model has larger pictures.
     if model is not None and not (model.is_relative_to(path / "colmap") and (path / "transforms.json").is_file()):
         return "colmap"
     if (path / "transforms.json").is_file():
@@ -100,7 +100,8 @@ def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tupl
 def read_transforms(path: Path, kind: Kind, chosen: str | Path | None, missing: Missing, *, masks: bool) -> DataSet:
     """Read the data set of one transforms.json, or of Blender's two files for training and test.
 
-    chosen, missing: as for `read_colmap`.
+    chosen: folder with the pictures, relative to `path`; None to use the paths in the file.
+    missing: how many pictures may be missing, as for `find_pictures`.
     masks: True if masks are used.
     Raises InputError if a file or its pictures cannot be read.
     """
@@ -126,7 +127,7 @@ def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, ima
     """Find the folder with the pictures of a COLMAP model.
 
     The first of these folders that has pictures is used: images/, a downscaled copy such as images_2, a folder named in
-    OTHER_IMAGE_FOLDERS, and the scene's own. After images/, folders with a picture that the model lists come first.
+    OTHER_IMAGE_FOLDERS, and the scene's folder. After images/, folders with a picture that the model lists come first.
     Warns if the folder is not images/. Raises InputError if there is no such folder.
     """
     if chosen is not None:
@@ -141,7 +142,7 @@ def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, ima
     copies = [copy for folder in usual if (copy := or_smaller(folder)) != folder]
     named = [inside(parent, (name,)) for parent in above for name in OTHER_IMAGE_FOLDERS]
     others = [folder for folder in named if folder is not None and has_pictures(folder)]
-    bare = [parent for parent in above if find_images(parent, deep=False)]  # as written by RealityScan
+    bare = [parent for parent in above if find_images(parent, deep=False)]  # RealityScan has no sub-folder for pictures
     found = [*copies, *others, *bare]
     listed = [folder for folder in found if any(is_file(folder / image.name) for image in images)]
     if listed or found:

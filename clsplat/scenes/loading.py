@@ -101,7 +101,8 @@ def load_scene(
         files = _read(path, kind, images, missing, masks, work_dir, progress)
         views = _views(files, path, resolution, (test_every, test_most), lenses)
         scene = _scene(files, path, kind, views)
-        near_views = [view for view in views if view.name not in scene.stray_cameras]  # `_scene` has warned of outliers
+        # Cameras that are outliers are left out, because `_scene` has already warned of them.
+        near_views = [view for view in views if view.name not in scene.stray_cameras]
         for doubt in camera_checks([(view.name, view.camera, view.lens) for view in near_views], scene.points):
             warn(doubt)
     scene.warnings = [plain(str(warning.message)) for warning in caught]
@@ -134,7 +135,7 @@ def _read(
 ) -> _SceneFiles:
     """Read a data set of the layout `kind`. For photographs, run structure from motion first.
 
-    The other arguments are those of `load_scene`.
+    images, missing, masks, work_dir, progress: as for `load_scene`.
     """
     if kind in ("blender", "transforms"):
         return _SceneFiles(read_transforms(path, kind, images, missing, masks=masks.masks != "none"), path, (), masks)

@@ -40,7 +40,7 @@ def strays(places: Float64, most: float, least: float = 0.0, middle: Float64 | N
         `least` is 0 and all positions but a few coincide, no position is an outlier.
     """
     found = np.zeros(len(places), np.bool_)
-    first = len(places) - int(most * len(places))  # this many nearest positions cannot be outliers
+    first = len(places) - int(most * len(places))  # the `first` nearest positions cannot be outliers
     if not 0 < first < len(places):
         return found
     distances = np.linalg.norm(places - (np.median(places, axis=0) if middle is None else middle), axis=1)
@@ -55,5 +55,8 @@ def strays(places: Float64, most: float, least: float = 0.0, middle: Float64 | N
 
 
 def stray_cameras(cameras: Sequence[Camera], least: float = 0.0) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the outliers among cameras. least: as for `strays`."""
+    """Return a mask (N,) of the outliers among cameras.
+
+    least: distance from the middle, in world units, within which no camera is an outlier.
+    """
     return strays(np.stack([camera.position for camera in cameras]), MAX_OUTLIER_CAMERA_FRACTION, least)

@@ -83,7 +83,7 @@ def find_pictures(
 def called(listed: str, exact: Path | None, file: Path | None, folder: Path) -> str:
     """Return the name of a picture in its scene: the listed name, with the file's extension if the name has none.
 
-    If the listed name and the file's path have different numbers of folders, it is the file's path below `folder`.
+    If the listed name and the file's path have different numbers of folders, the path below `folder` is returned.
 
     exact: the file with the listed name.
     file: the file that was found, None for a missing picture.

@@ -65,7 +65,7 @@ class View:
     lens: the lens that took the file, at the file's size.
     upright: True if the camera fits the picture after rotation by its EXIF orientation, False if it fits the stored
         picture.
-    mask: mask of the pixels that training uses, None if it uses all.
+    mask: mask of the pixels that training uses; None if all pixels are used.
     depth_file: the depth map that the data set names, if any.
     depth: known depths for training.
     stamps: size in bytes and modification time in nanoseconds of each of `files` when the scene was loaded; () if
@@ -256,7 +256,7 @@ class Scene:
 
     @cached_property
     def thumbnails(self) -> dict[str, Thumbnail]:
-        """Thumbnail of each sampled view's picture, by view name. Raises InputError like `check_pictures`."""
+        """Thumbnail of each sampled view's picture, by view name. Raises InputError if a picture does not decode."""
         return self._of_each(View.check, self.sampled_views)
 
     @cached_property

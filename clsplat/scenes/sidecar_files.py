@@ -86,8 +86,8 @@ def owned(
     example: name of a photograph, for messages.
     without: files to skip.
     strict: raise InputError for a file that fits no photograph; otherwise it is skipped.
-    numbered: match mask_0007.png to image_0007.png if no other match is found. The names of all files must differ only
-        in their numbers, and so must those of all photographs.
+    numbered: match mask_0007.png to image_0007.png if no other match is found. The files' names must differ only in a
+        number, and the photographs' names too.
 
     Exact names are matched first. In later steps a file may differ from a name in case, then also in the photograph's
     extension, then also in folders, if it fits exactly one photograph. Raises InputError for two files of a photograph;
@@ -156,7 +156,7 @@ _NAME_KEYS: tuple[Callable[[str], str], ...] = (
 def _unambiguous(known: Mapping[str, str], step: Callable[[str], str]) -> dict[str, str]:
     """Map keys to names of photographs. Keys that belong to several photographs are left out.
 
-    known: as for `owned`.
+    known: maps each name that a sidecar file may have to the name of its photograph.
     step: function that reduces a name of `known` to a key, one of _NAME_KEYS.
     """
     if step is str:

@@ -183,7 +183,7 @@ def test_without_points_by_the_cameras_alone(kind: str, tmp_path: Path) -> None:
     write_transforms(tmp_path, matrices=WRONG[kind][0])
     found = [text for text in load_scene(tmp_path).warnings if "the poses have inverted" in text]
     assert len(found) == 1
-    assert "face no common point, but 100 % of them face one if" in found[0]
+    assert "face no common point, but 100 % of them face a common point if" in found[0]
     warned("the poses have inverted", read_poses, tmp_path / "transforms.json")
 
 

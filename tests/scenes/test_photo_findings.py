@@ -170,7 +170,7 @@ def test_few_steps() -> None:
     for steps, expected in ((2399, ["few steps"]), (2400, []), (1000, ["few steps"]), (999, []), (0, [])):
         assert [finding.kind for finding in findings(scene, iterations=steps)] == expected, steps
     (finding,) = findings(scene, iterations=2000)
-    assert finding.text.startswith("2,000 steps are 50.0 for each of 40 training photographs")
+    assert finding.text.startswith("2,000 steps pass 50.0 times through the 40 training photographs")
     many = made(200)
     assert findings(many, iterations=10_001) == [], "nothing is known of longer trainings"
     assert [finding.kind for finding in findings(many, iterations=10_000)] == ["few steps"]

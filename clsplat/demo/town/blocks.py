@@ -234,7 +234,7 @@ def _parked_cars(builder: Builder, generator: np.random.Generator) -> None:
 def _points(
     solids: Solids, generator: np.random.Generator
 ) -> tuple[Float64, NDArray[np.int64], NDArray[np.int64], Float64]:
-    """Draw random points on the ground and the solids of a block, but on no underside.
+    """Draw random points on the ground and the solids of a block, but not on undersides.
 
     Returns the points and, for each point, its solid, face and normal, as in `CityBlock`.
     """
@@ -249,7 +249,7 @@ def _points(
     areas[:, 5] = 4 * x * y
     areas[roofs] = np.stack([y * z, y * z, 0 * x, 0 * x, 0 * x, 0 * x, 2 * x * steep, 2 * x * steep], axis=1)[roofs]
     areas[balls] = 0
-    areas[balls, 0] = 2 * np.pi * x[balls] ** 2  # half of a ball's area: foliage would get too many points
+    areas[balls, 0] = 2 * np.pi * x[balls] ** 2  # count half of a ball's area, so that foliage gets fewer points
     chosen = generator.choice(areas.size, count, p=(areas / areas.sum()).ravel())
     solid, face = chosen // 8, chosen % 8
     a, b = generator.uniform(-1, 1, (2, count))
@@ -280,9 +280,9 @@ def _on_roofs(
     local: Float64,
     normals: Float64,
 ) -> None:
-    """Move points that lie on roofs to the roofs' gables and slopes, in place.
+    """Move the points of roofs from the sides of a box around each roof to its gables and slopes, in place.
 
-    roof: (n,), True for points on roofs.
+    roof: (n,), True for points of roofs.
     face: (n,), index of the face of each point, as in `solids.FACES_PER_SOLID`.
     a: (n,), random numbers in [-1, 1]: the position along the ridge on a slope, across the ridge on a gable.
     b: (n,), random numbers in [-1, 1]: the position from the lower edge to the ridge.

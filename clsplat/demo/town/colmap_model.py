@@ -17,7 +17,7 @@ from clsplat.rotations import quaternion_of
 from clsplat.scenes.dataset import Lens, colmap_camera_models
 
 UNKNOWN_POINT = np.uint64(2**64 - 1)
-"""Number that COLMAP writes in place of the point's for an observation without a point."""
+"""Point number that COLMAP writes for an observation without a point."""
 _OBSERVATION = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
 """Layout of an observation in images.bin: its position in pixels, and the number of its point."""
 _COUNT = struct.Struct("<Q")
@@ -30,7 +30,7 @@ class ModelImage:
     camera: number of the image's camera, from 1.
     rotation, translation: (3, 3) and (3,) float64, `cam_from_world`.
     pixels: (n, 2) float64, position of each observation in pixels.
-    points: (n,) uint64, number of each observation's point; UNKNOWN_POINT without a point.
+    points: (n,) uint64, number of each observation's point; UNKNOWN_POINT for an observation without a point.
     """
 
     name: str

@@ -154,7 +154,7 @@ def _street(count: int, generator: np.random.Generator) -> list[Row]:
 
 
 def _over_block(count: int, lines: int) -> list[tuple[float, float, int]]:
-    """Return `count` positions (x, y, line) over a block, in metres, evenly spaced along lines parallel to x."""
+    """Return `count` positions over a block, evenly spaced along lines parallel to x: x, y in metres, line number."""
     places = []
     for line in range(lines):
         some = len(range(line, count, lines))

@@ -96,7 +96,10 @@ def take(config: TownConfig, photograph: TownPhotograph) -> TakenPhotograph:
 
 
 def _shaded(camera: Camera, shader: Shader, sight: Sight, first: int, last: int) -> Float32:
-    """Return the linear colours (rows, width, 3) of the picture's rows [first, last). sight: what their rays meet."""
+    """Return the linear colours (rows, width, 3) of the picture's rows [first, last).
+
+    sight: surfaces that the rays of these rows meet.
+    """
     centres = world_rays(camera, first, last, ((0.0, 0.0),))
     directions = np.stack([np.broadcast_to(axis, (1, last - first, camera.width)).ravel() for axis in centres], axis=1)
     flat = sight.surfaces.reshape(len(SAMPLES), -1)
@@ -176,7 +179,7 @@ class _Candidates:
         self._seen = np.zeros(len(rows), np.bool_)
 
     def see(self, surfaces: NDArray[np.int32], first: int, last: int) -> None:
-        """Mark points in the picture's rows [first, last) as visible if the ray nearest to them meets their surface.
+        """Mark each point in the picture's rows [first, last) as visible if the ray nearest to it meets its surface.
 
         surfaces: (4, rows, columns), the surfaces that the rays meet, as in `Sight`.
         """
@@ -188,7 +191,11 @@ class _Candidates:
         self._seen[rows] = surfaces[sample, row - first, column] == self._surfaces[rows]
 
     def observations(self, pixels: Float32, mask: Bool | None) -> Observations:
-        """Return the visible points where `mask` is True. pixels, mask: as in `TakenPhotograph`."""
+        """Return the visible points where `mask` is True.
+
+        pixels: (height, width, 3), colours of the photograph.
+        mask: (height, width), False for pixels of moving cars; None without moving cars.
+        """
         column, row = np.floor(self._pixels).astype(np.int64).T
         seen = self._seen if mask is None else self._seen & mask[row, column]
         colours = np.rint(pixels[row[seen], column[seen]] * 255).astype(np.uint8)

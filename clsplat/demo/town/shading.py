@@ -150,7 +150,11 @@ class Shader:
         return _hazy(colours * light_on(np.array([[0, 0, 1]], np.float32)), depth * length)
 
     def _ground_cover(self, px: Float32, py: Float32, first: NDArray[np.int64]) -> tuple[NDArray[np.int32], Float32]:
-        """Choose textures (n,) and tints (n, 3) of the ground at px, py (n,), in metres from block `first`'s corner."""
+        """Choose textures (n,) and tints (n, 3) of points on the ground.
+
+        px, py: (n,), coordinates x and y of the points, in metres from the corner of the block `first`.
+        first: (2,), the two indices of a block.
+        """
         column, row = np.floor(px / BLOCK_METRES), np.floor(py / BLOCK_METRES)
         fx, fy = px - column * BLOCK_METRES, py - row * BLOCK_METRES
         inner = np.minimum(_to_street(fx), _to_street(fy))
@@ -219,7 +223,10 @@ def _to_street(place: Float32) -> Float32:
 
 
 def _cube_coordinates(normals: Float32, radius: Float32) -> tuple[Float32, Float32]:
-    """Return texture coordinates u and v (n,) on balls, in metres: the smaller components of normals times radius."""
+    """Return texture coordinates u and v (n,) in metres on balls: the two smaller components of normals times radius.
+
+    normals: (n, 3), unit normals. radius: (n,), radii of the balls in metres.
+    """
     x, y, z = normals.T
     ax, ay, az = np.abs(normals).T
     along_z, along_x = (az >= ax) & (az >= ay), ax > ay

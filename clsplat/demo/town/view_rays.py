@@ -60,7 +60,9 @@ def world_rays(
 ) -> tuple[Float32, Float32, Float32]:
     """Return x, y and z of ray directions in the world, (places, rows, columns) each, of pixels in rows [first, last).
 
-    Directions of a perspective camera have a depth of 1, other directions a length of 1. places: as in `SAMPLES`.
+    Directions of a perspective camera have a depth of 1, other directions a length of 1.
+
+    places: offsets x, y of each pixel's rays from its centre, in pixels.
     """
     local = _local_rays(lens_key(camera), first, last, places)
     rotation = camera.rotation.astype(np.float32)
@@ -100,7 +102,9 @@ _EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).
 def _flat_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
     """Return bounds (n, 4) of boxes in a perspective picture, in pixels: left, right, top, bottom.
 
-    The parts of boxes before the near plane do not count. low, high: as for `rectangles`.
+    Parts of boxes that are nearer than the near plane do not count.
+
+    low, high: (n, 3), lowest and highest corners of the boxes, relative to the camera's centre, along the world's axes.
     """
     corners = np.where(_CORNERS, high[:, None], low[:, None]) @ camera.rotation.T
     begins, ends = corners[:, _EDGES[:, 0]], corners[:, _EDGES[:, 1]]

@@ -66,7 +66,7 @@ Slices = tuple[slice, slice, slice]
 
 
 class _Part(NamedTuple):
-    """A rectangle of the picture that contains a box. If a panorama's edge divides the box, it has two such parts.
+    """A rectangle of the picture that contains a box. A box that a panorama's edge divides has two parts.
 
     box: index of the box.
     near: distance of the box from the camera, in metres.
@@ -121,7 +121,10 @@ class Caster:
 
 
 def _placed(camera: Camera, low: Float64, high: Float64) -> list[_Part]:
-    """Return rectangles of the picture that contain boxes, from near to far. low, high: as for `rectangles`."""
+    """Return rectangles of the picture that contain boxes, from near to far.
+
+    low, high: (n, 3), lowest and highest corners of the boxes, relative to the camera's centre, along the world's axes.
+    """
     bounds, near = rectangles(camera, low, high), _nearest(low, high)
     width, wraps = camera.width, camera.model.wraps
     order = np.argsort(near, kind="stable")

@@ -86,7 +86,7 @@ def write_town(
         points = _write_model(result, config, planned, seen)
         record = {"town": config.record(), "photographs": len(planned), "points": points}
         atomic_write(result / TOWN_RECORD_FILE, (json.dumps(record, indent=2) + "\n").encode())
-        check_folder(output, overwrite=overwrite)  # another process may have written there
+        check_folder(output, overwrite=overwrite)  # another process may have created the folder
         move_into_place(work, place)
     except KeyboardInterrupt as error:
         error.args = ("before the town was complete: no file of it is left, and the same command starts anew",)
@@ -97,7 +97,7 @@ def write_town(
 
 
 def check_folder(output: Path, *, overwrite: bool) -> None:
-    """Raise InputError if `output` is not free for a town: not missing, not empty, and not an old town to replace."""
+    """Raise InputError unless `output` is missing, an empty folder, or a town that `overwrite` allows to replace."""
     if not (output.exists() or output.is_symlink()):
         return
     if not output.is_dir():
@@ -120,11 +120,12 @@ def _take_all(
     progress("painting the town", 0.0)
     textures(config.seed)
     seen: list[Observations] = []
-    pool = ThreadPoolExecutor(workers, "clsplat-town")  # threads, because NumPy releases the interpreter lock
+    # Threads run in parallel, because NumPy releases the interpreter lock.
+    pool = ThreadPoolExecutor(workers, "clsplat-town")
     try:
         for done, observations in enumerate(pool.map(partial(_take_and_write, result, config), planned), 1):
             seen.append(observations)
-            os.utime(result.parent)  # so that no other machine takes the folder as abandoned
+            os.utime(result.parent)  # a recent time shows other machines that the folder is in use
             progress("taking photographs", CountedFraction(done, len(planned), "taken"))
     finally:
         pool.shutdown(cancel_futures=True)

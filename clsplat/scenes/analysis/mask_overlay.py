@@ -42,7 +42,7 @@ class Masked:
 
 
 def masked(view: View, width: int, height: int) -> Masked:
-    """Load a view at this size, with the parts that its masks leave out. Raises InputError like `View.load`."""
+    """Load a view at this size, with the parts that masks leave out. Raises InputError if a file does not decode."""
     photograph = replace(view, mask=None).load(width, height)[:, :, :3]
     none = np.zeros((height, width, 1), np.float32)
     if view.mask is None:

@@ -45,8 +45,8 @@ in stops.
 With locked exposure, occlusion and highlights cause up to 0.1. From about 0.2, learnt gains improve a model.
 """
 DISTANCE_SPREAD_RATIO = 4.0
-"""Distances count as varying widely if the 90th percentile over the photographs of their distance, divided by the focal
-length, is at least this many times the 10th percentile.
+"""Distances of the photographs from the subject count as varying widely if the longest are at least this many times the
+shortest. They are measured in focal lengths. Longest and shortest are the 90th and the 10th percentile.
 
 At 4, a Gaussian one pixel wide in a near photograph is a quarter of a pixel wide in a far one.
 """
@@ -61,8 +61,8 @@ WIDE_FISHEYE_DEGREES = 100.0
 FEW_TRAINING_VIEWS = 16
 """Number of training photographs below which they hardly constrain the depth of a scene.
 
-According to publications, training on 12 photographs gives a PSNR 8 dB below training on 100, and training on
-24 gives one about 3 dB below.
+According to publications, the PSNR after training on 12 photographs is 8 dB lower than after training on 100, and after
+training on 24 it is about 3 dB lower.
 """
 SPARSE_TRAINING_VIEWS = 30
 """Number of training photographs below which unlimited growth overfits (docs/quality.md)."""
@@ -107,8 +107,8 @@ MAX_SKY_POINT_DENSITY_RATIO = 0.1
 MAX_SKY_PIXEL_STEP, MIN_SKY_LUMA = 0.025, 0.45
 """Maximum luma difference of neighbouring thumbnail pixels in a sky, and minimum luma of a sky."""
 MIN_SKY_BLUE_EXCESS = 0.02
-"""Minimum difference of blue and red in a blue sky; it is negative for a wall in lamplight. The luma of a sky that is
-not blue must exceed MAX_EXPOSURE_COLOUR."""
+"""Minimum of blue minus red in a blue sky. In lamplight, blue minus red is negative for a wall. The luma of a sky that
+is not blue must exceed MAX_EXPOSURE_COLOUR."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def findings(scene: Scene, use: MaskUse = NO_MASKS, iterations: int = 0) -> list
 
     use: the meanings of masks and alpha channels in training.
     iterations: planned number of training steps, 0 if unknown.
-    Raises InputError like `Scene.check_pictures`.
+    Raises InputError if a picture does not decode.
     """
     visible = VisiblePoints(scene)
     found = (
@@ -278,9 +278,8 @@ def _few_steps(scene: Scene, iterations: int) -> Finding | None:
     count = len(scene.train_views)
     if iterations not in SHORT_TRAINING_STEPS or iterations >= FEW_STEPS_PER_VIEW * count:
         return None
-    each = iterations / count
-    text = f"{iterations:,} steps are {each:.1f} for each of {count:,} training photographs: higher learning rates help"
-    return Finding("few steps", text)
+    passes = f"{iterations:,} steps pass {iterations / count:.1f} times through the {count:,} training photographs"
+    return Finding("few steps", f"{passes}: higher learning rates help")
 
 
 def _few_passes(scene: Scene, iterations: int) -> Finding | None:
@@ -308,7 +307,7 @@ def _sky_part(visible: VisiblePoints, view: View) -> float:
     """
     pixels = visible.scene.thumbnails[view.name].pixels
     up = visible.up @ view.camera.rotation.T
-    turns = int(np.round(np.arctan2(up[0], -up[1]) / (np.pi / 2))) % 4  # rotations by 90 degrees for an upright picture
+    turns = int(np.round(np.arctan2(up[0], -up[1]) / (np.pi / 2))) % 4  # quarter turns that make the picture upright
     upright = np.rot90(pixels, turns)
     light = upright @ REC601_LUMA
     steps = np.zeros(light.shape)
@@ -320,7 +319,7 @@ def _sky_part(visible: VisiblePoints, view: View) -> float:
         & (steps < MAX_SKY_PIXEL_STEP)
         & ((blue > MIN_SKY_BLUE_EXCESS) | (light > MAX_EXPOSURE_COLOUR))
     )
-    reached = np.logical_and.accumulate(likely, axis=0)  # sky ends at the first other pixel of a column
+    reached = np.logical_and.accumulate(likely, axis=0)  # in each column, sky ends at the first pixel unlike sky
     part = float(reached.mean())
     if part < MIN_SKY_PIXEL_FRACTION or not likely[0].mean() > 0.5:
         return 0.0

@@ -57,7 +57,7 @@ class Answer:
 
     settings: the recommended settings. Empty if nothing is known to help, or if all that helps is incompatible with the
         other settings.
-    given: name of a setting that the user has chosen and every recommendation would change, so that `settings` is
+    given: name of a setting that the user has chosen, and that every recommendation would change, so that `settings` is
         empty; else "".
     """
 
@@ -138,7 +138,8 @@ def with_settings(
 ) -> TrainConfig:
     """Apply recommended settings to a configuration.
 
-    given, photographs: as for `answered`.
+    given: names of settings that the user has chosen. A recommended number of passes does not change them.
+    photographs: number of training photographs, for settings that count passes through them.
     Raises InputError if the settings are incompatible, or if a schedule would override values that the user has
     changed from the paper's.
     """
@@ -160,14 +161,14 @@ def with_settings(
     return config
 
 
-def paragraph(answers: Sequence[Answer], looked: int, *, auto: bool, sampled: int | None = None) -> str:
+def paragraph(answers: Sequence[Answer], photographs: int, *, auto: bool, sampled: int | None = None) -> str:
     """Return the report of the findings and of the recommended settings, in one line.
 
-    looked: number of photographs in the scene.
+    photographs: number of photographs in the scene.
     auto: True if --auto was given, so that the settings are applied.
     sampled: number of photographs that were inspected, if not all.
     """
-    inspected = f"{looked:,}" if sampled in (None, looked) else f"{sampled:,} of {looked:,}"
+    inspected = f"{photographs:,}" if sampled in (None, photographs) else f"{sampled:,} of {photographs:,}"
     if not answers:
         return f"inspected {inspected} photographs: no setting needs to change"
     text = "; ".join(answer.words for answer in answers)

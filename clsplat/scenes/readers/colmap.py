@@ -110,7 +110,7 @@ def read_cameras(folder: Path, lenses: Lenses = "undistort") -> dict[str, Camera
 def read_images(folder: Path) -> list[PosedImage]:
     """Read the images of a model, sorted by name. Raises InputError and warns like `read_model`.
 
-    folder: as for `read_cameras`.
+    folder: the folder of the model or of the scene.
     """
     model = find_model(Path(folder))
     if model is None:
@@ -132,7 +132,9 @@ class Tracks:
     by_image: dict[str, NDArray[np.int64]]
 
     def shown_in(self, names: Sequence[str]) -> dict[str, NDArray[np.int64]]:
-        """Return the indices (k,) of the points observed in each photograph, by its name, if there are any.
+        """Return the indices (k,) of the points observed in each photograph, by the photograph's name.
+
+        Photographs without observed points are left out.
 
         names: names of the photographs. `photo_names.match` finds the image of each.
         """
@@ -445,7 +447,7 @@ def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
 
 
 def _with_colours(line: str) -> list[str]:
-    """Split a point's line into fields; its track is one field. A point with a position only gets a grey colour."""
+    """Split a point's line into fields; its track is one field. A line without a colour gets grey."""
     words = line.split(maxsplit=8)
     return [*words, "128", "128", "128"] if len(words) == 4 else words
 

@@ -64,7 +64,7 @@ def read_transforms(
 
     masks: True if masks are used. If False, a warning says that the file's masks are ignored.
     images: another folder with the same pictures.
-    missing: as for `find_pictures`.
+    missing: how many listed pictures may be missing, as for `find_pictures`.
     Warns of ignored keys and of contradictions. Raises InputError that names the file and the key for invalid JSON, for
     a key that is missing or has the wrong type, and for missing pictures.
     """
@@ -126,7 +126,7 @@ def _pictures(path: Path, readers: list[Keys], images: Path | None, missing: Mis
 def _smaller_folders(lost: list[Path], folder: Path) -> dict[Path, Path]:
     """Return downscaled copies of picture folders, such as images_2. The keys are the folders that they replace.
 
-    A folder is replaced if it has no pictures, and a copy of it has.
+    A folder is replaced if it has no pictures, but a downscaled copy has pictures.
 
     lost: missing pictures, whose folders are considered.
     folder: folder of the transforms.json.
@@ -155,7 +155,10 @@ def read_poses(path: Path, size: tuple[int, int] | None = None, lenses: Lenses =
 
 
 def read_images(path: Path, size: tuple[int, int] | None = None) -> list[PosedImage]:
-    """Read the images of a transforms.json, in the order of the file. Pictures need not exist, as for `read_poses`."""
+    """Read the images of a transforms.json, in the order of the file. Pictures need not exist.
+
+    size: (width, height) of missing pictures; needed if the file has no `w` and `h`.
+    """
     readers = _readers(path, load_document(path))
     with warnings.catch_warnings():  # no warnings of missing pictures: only names are needed
         warnings.simplefilter("ignore")
@@ -188,7 +191,7 @@ def _images(
 
     frames: the JSON values and the picture file of each frame.
     missing: names of missing pictures, which the file's split may list.
-    size: as for `read_poses`.
+    size: (width, height) of missing pictures; needed if the file has no `w` and `h`.
     Warns of contradictory keys.
     """
     images: dict[str, PosedImage] = {}
@@ -198,7 +201,7 @@ def _images(
         exact = _find_file(keys)
         name = called(listed, None, file, path.parent)
         if exact == file or not file.is_relative_to(path.parent):
-            name = listed + file.name[len(PurePosixPath(listed).name) :]  # add the file's extension
+            name = listed + file.name[len(PurePosixPath(listed).name) :]  # with the file's extension
         lens, parts = _lens(keys, file, size)
         in_parts += [name] if parts else []
         rotation, translation, _ = opengl_pose(keys.frame.get("transform_matrix"), keys.where, "'transform_matrix'")
@@ -216,7 +219,9 @@ def _images(
 def _split(path: Path, readers: list[Keys], images: list[PosedImage], missing: Sequence[str]) -> list[PosedImage]:
     """Return the images, split into training and test images by nerfstudio's keys; unchanged without such keys.
 
-    The keys are `train_filenames`, `test_filenames` and `val_filenames`. missing: as for `_images`.
+    The keys are `train_filenames`, `test_filenames` and `val_filenames`.
+
+    missing: names of missing pictures, which the keys may list.
     """
     names = [*(image.name for image in images), *missing]
     known = dict(zip(names, names, strict=True))
@@ -267,7 +272,9 @@ def read_blender(folder: Path, *, images: Path | None = None, missing: Missing =
     """Read transforms_train.json and, if it exists, transforms_test.json, whose pictures are held out.
 
     transforms_val.json is not used.
-    images, missing: as for `read_transforms`. Raises InputError likewise.
+    images: another folder with the same pictures.
+    missing: how many listed pictures may be missing, as for `find_pictures`.
+    Raises InputError like `read_transforms`.
     """
     train = read_transforms(folder / "transforms_train.json", images=images, missing=missing)
     held_out = folder / "transforms_test.json"
@@ -304,7 +311,7 @@ def _find_file(keys: Keys) -> Path:
 
 
 def _file_of(keys: Keys, key: str) -> Path | None:
-    """Return the path that a frame gives under `key`, for a mask or depth map; None if it gives none."""
+    """Return the path that a frame gives under `key`, for a mask or depth map; None if it lacks the key."""
     listed = keys.frame.get(key)
     if not isinstance(listed, str) or not listed:
         return None
@@ -331,7 +338,7 @@ def _inside(folder: Path, listed: str, where: str) -> None:
 def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> tuple[Lens, bool]:
     """Return the lens of a frame, and True if it was given in fractions of the picture's size.
 
-    size: as for `read_poses`.
+    size: (width, height) of missing pictures; needed if the frame has no `w` and `h`.
     """
     width, height = keys.number("w"), keys.number("h")
     if width is None or height is None:

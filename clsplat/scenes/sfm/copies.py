@@ -34,8 +34,8 @@ Programs with such folders are the 3DGS authors' convert.py, Polycam, OpenSfM (u
 (dense/0/images) and others.
 """
 PLAIN_FOLDER_STAGE, UNDISTORTED_FOLDER_STAGE = 1, 2
-"""Indices in UNDISTORTION_FOLDERS: of the stage of photographs in folders that it does not list, and of the stage of
-undistorted photographs."""
+"""Two indices in UNDISTORTION_FOLDERS. The first is the stage of photographs whose folders are not listed there. The
+second is the stage of undistorted photographs."""
 LOSSLESS_EXTENSIONS = (".png", ".tif", ".tiff", ".bmp")
 """Extensions of lossless photographs, which are preferred to their lossy copies."""
 COPY_THUMBNAIL_SIZE_PX = (96, 72)
@@ -53,7 +53,7 @@ A shift of 0.2 thumbnail pixels, 1/480 of the picture's width, reaches the secon
 less in pictures of at least 240 pixels.
 """
 MIN_FOLDER_CORRELATION, CORRELATION_SIDE_PX = 0.9, 24
-"""Minimum correlation of the pictures in two related folders, and longer side to which the pictures are reduced for it.
+"""Minimum correlation of the pictures in two related folders, and longer side in pixels at which they are correlated.
 
 The median of FOLDER_PAIR_SAMPLES pairs is compared with the minimum. In the scene fox (k1 0.058, k2 -0.081),
 the correlation of photographs with their undistorted copies is 0.9995. In six other scenes, with k1 from 0.1 to -0.35,
@@ -156,8 +156,8 @@ def found_by_picture(photos: Sequence[Decoded]) -> dict[str, Copy]:
     """Find copies among decoded photographs by their thumbnails and names. Returns the copies by name.
 
     Copies have the same picture and the same name, in a sibling folder or with another file type. The photograph with
-    the most pixels is used. Among equals, one with transparency is preferred, then one with a lens in EXIF, then a
-    lossless file.
+    the most pixels is used. If several have as many pixels, a photograph with transparency is preferred, then a
+    photograph with a lens in EXIF, then a lossless file.
     """
     by_name = {photo.name: photo for photo in photos}
 
@@ -365,12 +365,13 @@ def _alike(names: Iterable[str]) -> list[list[_Place]]:
 def _found(
     groups: Iterable[list[P]], rank: Callable[[P], tuple[Hashable, ...]], why: Callable[[P, P], str]
 ) -> dict[str, Copy]:
-    """Find the copies in each group: photographs that show the same as a better photograph of the group.
+    """Find the copies in each group: photographs that show the same things as a better photograph of the group.
 
     The better photograph may itself be a copy.
 
     rank: sort key of a photograph; better photographs have smaller keys.
-    why: function of the better and the other photograph that returns the text for `Copy.why`; "" if they differ.
+    why: function of the better and the other photograph that returns the text for `Copy.why`; "" if they show
+        different things.
     """
     copies: dict[str, Copy] = {}
     for group in groups:
@@ -386,8 +387,8 @@ def _found(
 def _of_same_bytes(folder: Path, names: Sequence[str]) -> dict[str, Copy]:
     """Find files with the same bytes. Returns the copies by name.
 
-    Of equal files, the one whose folder has the earliest stage in UNDISTORTION_FOLDERS is used. If there are several,
-    the one with the shortest name is used.
+    Of equal files, the file whose folder has the earliest stage in UNDISTORTION_FOLDERS is used. If several files share
+    this stage, the file with the shortest name is used.
     """
     alike: dict[tuple[object, ...], list[str]] = {}
     keys: tuple[Callable[[Path], object], ...] = (lambda path: path.stat().st_size, _middle, short_digest)
@@ -421,7 +422,7 @@ def _stage(folder: str) -> int:
 
 
 def _numbered(folder: str) -> tuple[str, int]:
-    """Split a folder's name such as images_4 into "images" and the factor 4. The factor is 1 in a name without one."""
+    """Split a folder's name such as images_4 into "images" and the factor 4. Without a number, the factor is 1."""
     match = _NUMBERED_FOLDER.match(folder)
     return (match[1], int(match[2])) if match else (folder, 1)
 
@@ -429,8 +430,8 @@ def _numbered(folder: str) -> tuple[str, int]:
 def _is_downscaled(factor: int, by: int, whole: tuple[int, int], size: tuple[int, int]) -> bool:
     """Return True if two pictures' sizes agree with the factors in the names of their folders.
 
-    factor, by: the factors of downscaling of the larger and of the smaller picture.
-    whole, size: width and height of the larger and of the smaller picture.
+    whole, factor: width and height of the larger picture, and the factor by which it is downscaled.
+    size, by: width and height of the smaller picture, and the factor by which it is downscaled.
     """
     return factor < by and all(abs(side * by / factor - long) <= by for side, long in zip(size, whole, strict=True))
 

@@ -28,7 +28,7 @@ from clsplat.scenes.sfm.copies import Thumb, thumb_of, to_compare
 SFM_PHOTO_EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 """Extensions that pycolmap's wheel reads and writes. The wheel's OpenImageIO has no WebP, JPEG 2000 or HEIF."""
 SFM_IMAGE_FORMATS = frozenset({"jpeg", "png", "tiff", "bmp"})
-"""OpenImageIO's names of the formats that pycolmap's wheel reads. They are found from the file's contents."""
+"""OpenImageIO's names of the formats that pycolmap's wheel reads. The format is recognised by the file's contents."""
 UNREADABLE_PHOTO_EXTENSIONS = frozenset(
     {".webp", ".heic", ".heif", ".avif", ".jp2", ".gif", ".exr", ".dng", ".cr2", ".nef", ".arw"}
 )
@@ -61,7 +61,7 @@ def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path],
     that does not exist, cannot be read, or has no photographs.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder, expected one with photos")
+        raise InputError(f"{folder}: no such folder, expected a folder with photos")
     skip = excluded.resolve() if excluded is not None else None
     photos: list[Path] = []
     others: list[Path] = []
@@ -120,7 +120,7 @@ def stage_photos(
     format, are rewritten upright. Other files are linked, or copied if the file system has no links. Raises InputError
     that names the first photograph that does not decode, as pycolmap would silently skip it.
 
-    report: called with the fraction of the photographs that are done.
+    report: function that is called with the fraction of the photographs that are done.
     """
     staged: list[Photo] = []
     compared = to_compare([photo_name(folder, path) for path in photos])

@@ -85,7 +85,7 @@ class SfmSettings:
             raise InputError(f"camera model {self.camera_model!r}: expected one of {', '.join(SFM_CAMERA_MODELS)}")
 
     def __str__(self) -> str:
-        """Return the values in one line, for the fingerprint of a result."""
+        """Return the values of the settings in one line, for the fingerprint of a result."""
         lens = f"{self.camera_model} {self.shared_camera}"
         return f"{self.matching} {lens} {self.max_image_size} {self.max_features} {self.seed}"
 

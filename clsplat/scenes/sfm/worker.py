@@ -30,7 +30,7 @@ MAX_SINGLE_THREAD_PHOTOS = 80
 MIN_OPENCV_PHOTOS = 20
 """Minimum number of photographs of one camera for fitting the eight parameters of OPENCV.
 
-On a phone's distorted photographs OPENCV has a reprojection error of 0.477 px, and SIMPLE_RADIAL one of 0.493 px.
+For a phone's distorted photographs, the reprojection error is 0.477 px with OPENCV and 0.493 px with SIMPLE_RADIAL.
 """
 SEQUENTIAL_OVERLAP = 12
 """Number of photographs before and after a photograph that sequential matching pairs with it. It also pairs photographs
@@ -275,7 +275,7 @@ def _end_with_parent(stream: TextIO) -> None:
 
 def main() -> None:
     """Read the task from standard input, run it, and send the answer to standard output."""
-    # Native code prints to standard output, too. Send its output to standard error, so that it is not mixed in.
+    # Native code prints to standard output, too. Send that to standard error: standard output is for answers.
     channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     task = json.loads(sys.stdin.readline())

@@ -58,8 +58,8 @@ _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5.0))
 COLOUR_VIEWS_PER_POINT = 15
 """Number of nearest photographs that give a point its colour.
 
-In photographs farther away, the colour of a point is mixed with its surroundings. With fewer photographs, one with
-something else in front of the point would have too much weight.
+In photographs farther away, the colour of a point is mixed with its surroundings. With fewer photographs, a
+photograph in which something hides the point would have too much weight.
 """
 OCCLUSION_DEPTH_RATIO = 1.05
 """A point counts as occluded if its depth is over this many times that of the nearest point in its occlusion cell."""
@@ -350,7 +350,7 @@ def photographed(scene: Scene, background: ArrayLike) -> Float32:
 
 
 def _medians(colors: Float32) -> Float32:
-    """Return the median per channel of each point's finite colours, (N, 3); UNSEEN_GREY for points without any.
+    """Return the median per channel of each point's finite colours, (N, 3); UNSEEN_GREY if there are none.
 
     colors: (N, K, 3), infinite where a point has fewer than K colours. The function sorts the array.
     """

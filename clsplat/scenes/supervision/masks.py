@@ -23,7 +23,7 @@ OTHER_MASK_FOLDERS = (
     *("images_mask", "images_masks", "image_mask", "image_masks", "masks_images", "masks_png", "dynamic_masks"),
     *("dynamic_mask", "mattes", "matte", "silhouettes", "silhouette", "segmentation", "segmentations"),
 )
-"""More names of mask folders. They are searched if masks are requested and MASK_FOLDERS has none."""
+"""More names of mask folders. They are searched if masks are requested but not found in MASK_FOLDERS."""
 DYNAMIC_FOLDER_PREFIX = "dynamic"
 """Prefix of the names of mask folders in which white may mark moving objects instead of kept pixels."""
 MASK_THRESHOLD = 0.5
@@ -36,8 +36,8 @@ VOID_LABEL = 255
 MAX_LABEL = 40
 """Largest label except VOID_LABEL. A mask with larger values below a half is a soft mask, not a mask of labels."""
 MAX_LABEL_NOISE_RATIO = 0.01
-"""A mask counts as black and white with noise, not as labels, if the pixels with labels from 1 are fewer than this
-fraction of the white pixels."""
+"""A mask counts as black and white with noise, not as labels, if the pixels with labels of 1 or more are fewer
+than this fraction of the white pixels."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,8 @@ def _from_labels(path: Path, values: Float32, pixels: Float32) -> Float32:
 
     A soft mask is returned unchanged if another mask in its folder has values of at least a half.
 
-    pixels: the colours whose means are `values`.
+    values: (H, W, 1), grey values of the mask: means of its colours.
+    pixels: (H, W, 1 or 3), colours of the mask, for the error message.
     Raises InputError for other labels, and for a soft mask if no mask in its folder has values of at least a half.
     """
     most, exact = stored_range(path)
@@ -211,7 +212,9 @@ def find_masks(
     photograph, and for two masks of one photograph.
 
     names: names of all photographs, relative to their folder.
-    without, strict: as for `owned`.
+    without: files to skip.
+    strict: if False, a mask that fits no photograph is skipped. Two masks of one photograph then raise InputError only
+        if both have exact names.
     """
     names = sorted(names)
     example = next(iter(names), "IMAGE.jpg")
@@ -221,7 +224,7 @@ def find_masks(
 
 
 def _known(names: Iterable[str], *, plain: bool = True) -> dict[str, str]:
-    """Return the photograph for each name that its mask may have, without the extension.
+    """Return each name that a mask may have, without extension, with the name of the mask's photograph.
 
     plain: also accept the photograph's own name for its mask.
     """
@@ -287,7 +290,7 @@ def masks_beside(
 
     The keys are the names of the photographs.
     told: masks that the data set names, by photograph. In nerfstudio's scenes, one mask may serve all photographs.
-    strict: as for `find_masks`.
+    strict: if False, a mask that fits no photograph is skipped, as in `find_masks`.
     others: more names of folders, searched if the usual ones have no masks.
     Raises InputError like `find_masks`.
     """
@@ -379,7 +382,7 @@ def for_sfm(use: MaskUse) -> MaskUse | None:
 def after_sfm(use: MaskUse, folder: Path) -> MaskUse:
     """Return how training uses the masks that structure from motion wrote: white is kept, and alpha is included.
 
-    use: the use of the photographs' masks. folder: result of structure from motion.
+    use: the meaning of the photographs' masks and alpha. folder: result of structure from motion.
     """
     if not (folder / MASK_FOLDERS[0]).is_dir():
         return replace(use, masks="none", invert=False)
