@@ -33,7 +33,7 @@ class RemainingTime(Protocol):
     """An estimator of the remaining time, for `TrainProgress` (`training.forecast.Forecast`)."""
 
     def see(self, report: Any) -> None:
-        """Update the estimate with a `training.loop.StepReport`."""
+        """Update the estimate of the remaining time with a `training.loop.StepReport`."""
 
     def left(self) -> float | None:
         """Seconds from the last report to the end, or None if they cannot be estimated yet."""
@@ -153,7 +153,7 @@ class TrainProgress(_Bar):
 
 
 class StageProgress:
-    """Progress of work in named stages. Call it with the stage and the fraction done, or None if unknown.
+    """Progress of work in named stages. Call it with the stage's name and the fraction done, or None if unknown.
 
     A `CountedFraction` is reported as a count. The last report of a stage is always shown.
     after: seconds at the start during which nothing is printed, for work that is usually quick.
@@ -232,9 +232,10 @@ class FrameProgress(_Bar):
         print(text, file=self.lines, flush=True)
 
     def _left(self) -> str:
-        """Text of the remaining time, from the mean time of the written frames; empty if under half a second.
+        """Return a text with the remaining time, or an empty text if that is less than half a second.
 
-        From the second frame on, the mean leaves out the first, during which kernels may have been built.
+        The estimate is the mean time of a written frame times the number of frames left. As soon as two frames are
+        written, the mean leaves out the first one, because kernels may have been built during it.
         """
         now = time.monotonic()
         if self.written == 1:

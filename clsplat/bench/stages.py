@@ -59,7 +59,7 @@ def bench(
     say("frame", None)
     trainer = trainer_of(subject, device, config)
     rasterizer, gaussians = trainer.rasterizer, trainer.parameters
-    if held_kind(config) != held_kind(RasterizerConfig()):  # for reduced SH, the frame needs a copy of the model
+    if held_kind(config) != held_kind(RasterizerConfig()):  # SH is stored in another form: upload a second model
         gaussians = upload_gaussians(device, subject.gaussians, held_sh(subject.gaussians, config))
 
     def draw() -> ForwardPass:
@@ -189,7 +189,7 @@ def _measure(device: Device, work: Callable[[], object], repeat: int) -> _Cost:
 
 @dataclass(frozen=True, eq=False)
 class _Picture(View):
-    """View that returns the photograph `pixels`, which is in memory, for every size."""
+    """View with one photograph, the array `pixels` (H, W, 3 or 5), whatever size is requested."""
 
     pixels: Float32 = field(kw_only=True)
 

@@ -56,7 +56,7 @@ MAX_PALETTE_ENTRIES = 1 << 16
 PALETTE_COLUMNS = 64
 QUATERNION_TAG_BASE = 252
 MAX_UNCHECKED_IMAGE_BYTES = 16 << 20
-"""Number of bytes that an image in an archive may have, in addition to 8 bytes (two raw pixels) for each Gaussian."""
+"""Largest size in bytes of an image in an archive, not counting 8 bytes (two raw pixels) for each Gaussian."""
 
 
 def recognises(head: bytes) -> bool:
@@ -165,9 +165,10 @@ def _beside(path: Path, name: str, _limit: int) -> Path:
 def _unpacked(
     path: Path, archive: zipfile.ZipFile, members: dict[str, str], target: Path, name: str, limit: int
 ) -> Path:
-    """Unpack the file `name` of a .sog archive to `target`, and return `target`. members: result of `_members`.
+    """Unpack the file `name` of a .sog archive to `target`, and return `target`.
 
-    Raises InputError if the archive lacks the file, or if it has more than `limit` bytes.
+    members: names of the archive's files, by their paths relative to the folder of meta.json.
+    Raises InputError if the archive lacks the file, or if the file has more than `limit` bytes.
     """
     stored = _match_case(name, members)
     try:
@@ -179,7 +180,7 @@ def _unpacked(
                     raise InputError(f"{path}: {plain(name)[:80]} has more than {limit} bytes unpacked")
                 try:
                     file.write(block)
-                    file.flush()  # else close would raise write errors, as if reading had failed
+                    file.flush()  # raises an error of a full disk inside this `try`, before close does
                 except OSError as error:
                     raise write_error(target, error) from None
     except KeyError:
@@ -350,7 +351,7 @@ def _unpacked_quaternions(pixels: Bytes) -> Float32:
     tag = pixels[:, 3].astype(np.int64) - QUATERNION_TAG_BASE
     three = (pixels[:, :3] * np.float32(2 / 255) - np.float32(1)) * np.float32(0.5**0.5)
     result = packing.restore_largest(np.maximum(tag, 0), three)
-    result[tag < 0] = (1, 0, 0, 0)  # without a valid index: the identity rotation, as in splat-transform
+    result[tag < 0] = (1, 0, 0, 0)  # an invalid index: as splat-transform, use no rotation
     return result
 
 
