@@ -85,7 +85,7 @@ class _Bar:
 
 
 class TrainProgress(_Bar):
-    """Progress of a training of `total` steps. Call it with each `training.loop.StepReport`, every step or less often.
+    """Progress of a training of `total` steps. Call it with a `training.loop.StepReport` after some or all steps.
 
     forecast: estimates the remaining time. Without it the remaining steps are assumed to take as long as the last ones.
     """

@@ -48,9 +48,9 @@ def bench(
     limits: Limits | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Measure every stage. Returns the object that `clsplat bench --json` prints.
+    """Measure every stage of a frame and of a training step. Returns the object that `clsplat bench --json` prints.
 
-    The device's queue should have been created with profiling.
+    The device's queue should have been created with profiling, as kernels' times come from its events.
     """
     say = progress or no_progress
     config = (config or RasterizerConfig()).switches()

@@ -320,7 +320,7 @@ def _degree(rest: int) -> int:
 
 
 def _colour_names(vertex: Element) -> tuple[str, ...]:
-    """Names of the colour properties: f_dc, or those of RGB_PROPERTY_NAMES if the file has them and no f_dc."""
+    """Names of the colour properties: f_dc, or names in RGB_PROPERTY_NAMES if the file has these instead of f_dc."""
     names = [name for name, _ in vertex.properties]
     return _rgb_names(names) or DC_PROPERTIES if set(DC_PROPERTIES).isdisjoint(names) else DC_PROPERTIES
 
@@ -332,7 +332,10 @@ def _rgb_names(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def _convert_colours(gaussians: Gaussians, vertex: Element) -> None:
-    """Convert `gaussians.sh` to SH coefficients if it holds colours, because the file has them instead of f_dc."""
+    """Convert the colours in `gaussians.sh` to SH coefficients if the file has RGB colours instead of f_dc.
+
+    vertex: the file's element of vertices.
+    """
     if (names := _colour_names(vertex)) != DC_PROPERTIES:
         kinds = {np.dtype(kind) for name, kind in vertex.properties if name in names}
         whole = all(kind.kind in "iu" for kind in kinds)

@@ -338,9 +338,9 @@ class _Meta:
         said = self.section("shN").get("bands") if self.version == 2 else None
         bands = next((degree for degree in range(1, MAX_SH_DEGREE + 1) if degree * (degree + 2) == width), 0)
         if table.shape[1] % PALETTE_COLUMNS or not bands or said not in (None, bands):
-            found = f"{table.shape[1]} pixels wide for {'unstated' if said is None else str(said)[:20]} bands"
+            found = f"{table.shape[1]} pixels wide{'' if said is None else f' for {str(said)[:20]} SH bands'}"
             widths = ", ".join(f"{PALETTE_COLUMNS * d * (d + 2)} for {d}" for d in range(1, MAX_SH_DEGREE + 1))
-            raise InputError(f"{self.path}: shN's palette is {found}, expected a width of {widths} bands")
+            raise InputError(f"{self.path}: shN's palette is {found}, expected a width of {widths} SH bands")
         colours = table.reshape(-1, width, 3)
         if needed > len(colours):
             raise InputError(f"{self.path}: shN has the index {needed - 1}, but its palette has {len(colours)} entries")

@@ -327,7 +327,7 @@ def _plain(where: str, prim: Any, time: Any, count: int, space: str) -> Float32:
 
 
 def _primvar(where: str, prim: Any, name: str, time: Any, width: int, count: int) -> Float32 | None:
-    """Values (count, width) of a primvar, which has a value for each Gaussian or one for all; None without a value."""
+    """Values (count, width) of a primvar, with a value for each Gaussian or one for all; None if it has none."""
     attribute = prim.GetAttribute(name)
     value = attribute.Get(time) if attribute else None
     if value is None or not len(value):

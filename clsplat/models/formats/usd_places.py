@@ -132,7 +132,10 @@ class Instancer:
 
     @property
     def reach(self) -> list[float]:
-        """Time samples of the transforms of the instances and the instancer; with velocities also -inf and inf."""
+        """Time samples of the transforms of the instancer and its instances.
+
+        If the instances have velocities, which move them at any time, -inf and inf are added.
+        """
         moved = [time for name in _TRANSFORM_ATTRIBUTES for time in self._samples(name)]
         own = moved + [time for prim in _above(self.prim, self.outer and self.outer.root) for time in _samples_of(prim)]
         return [-math.inf, math.inf, *own] if moved and any(map(self._has, _VELOCITY_ATTRIBUTES)) else own

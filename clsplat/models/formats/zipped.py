@@ -115,7 +115,10 @@ def unpacked(path: Path, reader: ZipReader) -> Iterator[Path]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
-    """Context manager that opens an archive. Raises InputError if it is damaged or encrypted, also while it is read."""
+    """Context manager that opens an archive.
+
+    Raises InputError if the archive is damaged or encrypted, on opening or when the caller reads from it.
+    """
     with open_input(path, "a .zip archive") as file:
         try:
             with zipfile.ZipFile(file) as archive:
