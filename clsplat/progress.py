@@ -65,7 +65,7 @@ class _Bar:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         if sys.stderr.isatty():
-            # rich estimates the remaining time of frames, which take similar times. Training adds its own estimate.
+            # `rich` estimates the remaining time of frames, which take similar times. Training adds its own estimate.
             more = [MofNCompleteColumn(), TimeRemainingColumn()] if counted else []
             columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), *more)
             self.live = Progress(

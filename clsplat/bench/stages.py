@@ -246,7 +246,7 @@ def table(result: dict[str, Any]) -> str:
     lines = [
         f"{result['device']}, {driver}, {limit['lanes']} lanes x {limit['items']} items",
         f"{result['source']}: {seen}, at {size}",
-        f"pairs: {pairs['listed']:,} of a tile and a Gaussian; of a pixel and a Gaussian, {of_pixels}",
+        f"(tile, Gaussian) pairs: {pairs['listed']:,}; (pixel, Gaussian) pairs: {of_pixels}",
         f"limits: {most}, {copying:.1f} GB/s for copying",
         "",
     ]

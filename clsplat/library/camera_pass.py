@@ -249,7 +249,7 @@ class CameraPass:
 
     @cached_property
     def alpha(self) -> Float32:
-        """Alpha (H, W), 0 to 1."""
+        """The image's alpha (H, W), 0 to 1."""
         return self.pixels.alpha
 
     @cached_property

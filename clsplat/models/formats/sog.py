@@ -180,7 +180,7 @@ def _unpacked(
                     raise InputError(f"{path}: {plain(name)[:80]} has more than {limit} bytes unpacked")
                 try:
                     file.write(block)
-                    file.flush()  # raises an error of a full disk inside this `try`, before close does
+                    file.flush()  # a full disk raises its error here, and not in close
                 except OSError as error:
                     raise write_error(target, error) from None
     except KeyError:

@@ -381,7 +381,7 @@ def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: 
 def write_to(
     file: BinaryIO, gaussians: Gaussians, header: SpzHeader, sh_bits: tuple[int, int] = DEFAULT_SH_BITS
 ) -> None:
-    """Write an SPZ file at the current position of a seekable file. header: from `header_for`."""
+    """Write an SPZ file at the current position of a seekable file. header: as `header_for` returns it."""
     if header.version < 4:
         fields = (header.version, header.count, header.degree, header.fractional_bits, header.flags, 0)
         with gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=6, mtime=0) as stream:

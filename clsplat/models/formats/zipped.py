@@ -176,7 +176,7 @@ def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo, folder: Path) -> 
         while block := source.read(1 << 20):  # zipfile stops at the size that the archive states
             try:
                 file.write(block)
-                file.flush()  # raises an error of a full disk inside this `try`, before close does
+                file.flush()  # a full disk raises its error here, and not in close
             except OSError as error:
                 raise write_error(target, error) from None
 

@@ -167,7 +167,7 @@ def _frozen_deep_pictures(bench: CaseBench) -> list[Inputs]:
 
 
 def launch_deep_merge(device: Device, work: Workspace, given: Inputs) -> Read:
-    """Merge the deep pictures by deep_merge.cl."""
+    """Merge the inputs' deep pictures by deep_merge.cl. Returns a function that reads the merged picture."""
     count, bins, height, width, floats = given.pictures.shape
     planes = np.ascontiguousarray(given.pictures.transpose(0, 1, 4, 2, 3)).reshape(count, bins, floats, -1)
     weights = upload(device, np.ascontiguousarray(given.weights.reshape(count, -1)))
